@@ -1,0 +1,59 @@
+"""BulletArm's robot-manipulation tasks and equivariant baselines, native to TorchRL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from ba_torchrl.envs.base import ManipulationEnv
+
+__version__ = "0.1.0"
+
+__all__ = ["__version__", "list_tasks", "make", "make_vector_env"]
+
+
+def list_tasks() -> list[str]:
+    """Return the ids of all tasks, such as ``close_loop/block_picking``."""
+    from ba_torchrl.tasks.base import TASKS
+
+    return list(TASKS)
+
+
+def make(task: str, **config: Any) -> ManipulationEnv:
+    """Make a TorchRL environment.
+
+    Args:
+        task: one of `list_tasks`.
+        config: fields of `ba_torchrl.config.EnvConfig`, such as ``robot="kuka"``, ``seed=0`` or
+            ``expert=True``.
+
+    Raises:
+        ConfigError: the task or a parameter is unknown, or its value cannot be used.
+    """
+    from ba_torchrl.envs.factory import make_env
+
+    return make_env(task, **config)
+
+
+def make_vector_env(
+    task: str, num_envs: int, *, parallel: bool = True, start_method: str = "spawn", **config: Any
+) -> EnvBase:
+    """Make ``num_envs`` environments that step together.
+
+    Args:
+        task: one of `list_tasks`.
+        num_envs: how many; environment i has the seed ``seed + i``.
+        parallel: one process each (a TorchRL ``ParallelEnv`` that survives its workers), or all
+            in this process (``SerialEnv``). The same seed gives the same episodes in both.
+        start_method: ``spawn`` or ``fork``, how processes start. With ``spawn``, scripts need
+            an ``if __name__ == "__main__":`` guard.
+        config: as for `make`.
+
+    Raises:
+        ConfigError: as for `make`.
+    """
+    from ba_torchrl.envs.factory import make_vector
+
+    return make_vector(task, num_envs, parallel=parallel, start_method=start_method, **config)

@@ -1,0 +1,347 @@
+"""ManipulationEnv: a task, a robot and a world as a TorchRL environment."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ba_torchrl.actions import InvalidActionError
+from ba_torchrl.config import ConfigError, EnvConfig
+from ba_torchrl.envs import keys
+from ba_torchrl.registry import Registry
+from ba_torchrl.sim.cameras import HeightCamera, render_rgb
+from ba_torchrl.sim.motion import CloseLoopMotion
+from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
+from ba_torchrl.sim.world import SimulationError, World
+from ba_torchrl.tasks.base import (
+    SCALE_STEP,
+    TASKS,
+    PlacementError,
+    Reach,
+    Task,
+    TaskSettings,
+    Workspace,
+)
+
+logger = logging.getLogger(__name__)
+
+CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torchrl.envs")
+
+MAX_CONSECUTIVE_FAULTS = 10
+RESET_ATTEMPTS = 50
+
+
+@dataclass
+class Scene:
+    """A sealed world with everything in it."""
+
+    world: World
+    robot: Robot
+    task: Task
+    motion: CloseLoopMotion
+    camera: HeightCamera
+
+
+class ManipulationEnv(EnvBase):
+    """A manipulation task as an unbatched TorchRL environment on the CPU.
+
+    Episodes follow from the seed alone: episode n of seed s is the same in any process, whatever
+    happened before.
+
+    Args:
+        task_id: as listed by `ba_torchrl.list_tasks`.
+        config: the environment's parameters.
+
+    Raises:
+        ConfigError: the parameters do not fit the task or the robot.
+    """
+
+    def __init__(self, task_id: str, config: EnvConfig) -> None:
+        super().__init__(device="cpu", batch_size=[])
+        self.task_id = task_id
+        self.config = config
+        self.task_class = TASKS[task_id]
+        self.robot_class = ROBOTS[config.robot]
+        self.workspace = (
+            self.task_class.workspace if config.workspace is None else Workspace(*config.workspace)
+        )
+        self.max_steps = config.max_steps or self.task_class.max_steps
+        low, high = config.object_scale_range or self.task_class.scale_range
+        self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
+        self._scenes: dict[float, Scene] = {}
+        self._scene: Scene | None = None
+        self._observation: dict[str, torch.Tensor] = {}
+        self._step_count = 0
+        self._episode = 0
+        self.faults = 0
+        """Simulator faults since construction."""
+        self._consecutive_faults = 0
+        self.base_seed = 0
+        self._set_seed(config.seed)
+        self._make_specs()
+        self._try_out()
+
+    # -- for subclasses ----------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def reach(self) -> Reach:
+        """What one action covers."""
+
+    @abstractmethod
+    def _action_size(self) -> int:
+        """Number of action components."""
+
+    @abstractmethod
+    def _pixel_range_m(self) -> tuple[float, float]:
+        """Least and greatest value of the image."""
+
+    @abstractmethod
+    def _place_robot(self, scene: Scene) -> None:
+        """Put the robot into the pose an episode starts from."""
+
+    @abstractmethod
+    def _act(self, scene: Scene, action: np.ndarray) -> None:
+        """Carry out an action."""
+
+    @abstractmethod
+    def _pixels(self, scene: Scene) -> np.ndarray:
+        """Return the image, [C, H, W] in metres."""
+
+    @abstractmethod
+    def _expert_action(self, scene: Scene) -> np.ndarray:
+        """Return the expert's action."""
+
+    # -- public ------------------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Scene:
+        """World, robot and task as they are now.
+
+        Raises:
+            SimulationError: the environment was not reset yet.
+        """
+        if self._scene is None:
+            raise SimulationError("reset the environment first")
+        return self._scene
+
+    def render(self, width: int = 480, height: int = 360) -> np.ndarray:
+        """Return a picture of the scene for people, [height, width, 3] uint8."""
+        return render_rgb(self.scene.world, (*self.workspace.center, 0.14), width, height)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close every world of this environment.
+
+        Raises:
+            RuntimeError: it is closed already and ``raise_if_closed`` is set.
+        """
+        self._drop_scenes()
+        super().close(raise_if_closed=raise_if_closed)
+
+    # -- TorchRL -----------------------------------------------------------------------------
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.base_seed = int(
+            np.random.SeedSequence().generate_state(1)[0] if seed is None else seed
+        )
+        self._episode = 0
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **_: Any
+    ) -> TensorDict:
+        if seed is not None:
+            self._set_seed(seed)
+        rng = np.random.default_rng([self.base_seed, self._episode])
+        self._episode += 1
+        self._step_count = 0
+        self._scene = self._new_episode(rng)
+        self._observation = self._observe(self._scene)
+        return self._tensordict(self._observation)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        action = self._checked(tensordict.get(keys.ACTION))
+        scene = self.scene
+        self._step_count += 1
+        success = valid = False
+        fault = False
+        try:
+            self._act(scene, action)
+            success, valid = self._judge(scene)
+            self._observation = self._observe(scene)
+        except Exception:
+            fault = True
+            self._on_fault()
+        else:
+            self._consecutive_faults = 0
+        terminated = not fault and (success or not valid)
+        truncated = fault or (not terminated and self._step_count >= self.max_steps)
+        return self._tensordict(
+            self._observation,
+            success=success and not fault,
+            fault=fault,
+            reward=float(success and not fault),
+            terminated=terminated,
+            truncated=truncated,
+            done=terminated or truncated,
+        )
+
+    # ----------------------------------------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        def flag() -> Binary:
+            return Binary(n=1, shape=(1,), dtype=torch.bool)
+
+        size = self.config.obs_size
+        low, high = self._pixel_range_m()
+        action = Bounded(-1.0, 1.0, shape=(self._action_size(),), dtype=torch.float32)
+        observation = {
+            keys.PIXELS: Bounded(low, high, shape=(1, size, size), dtype=torch.float32),
+            keys.HOLDING: flag(),
+            keys.SUCCESS: flag(),
+            keys.FAULT: flag(),
+            keys.STEP_COUNT: Unbounded(shape=(1,), dtype=torch.int64),
+        }
+        if self.config.expert:
+            observation[keys.EXPERT_ACTION] = action.clone()
+        self.observation_spec = Composite(observation)
+        self.action_spec = action
+        self.reward_spec = Bounded(0.0, 1.0, shape=(1,), dtype=torch.float32)
+        self.full_done_spec = Composite(
+            {key: flag() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
+        )
+
+    def _try_out(self) -> None:
+        """Fail now, not in a worker, if the objects or the robot do not fit the workspace."""
+        scene = self._scene_for(float(self._scales[-1]))
+        z_low, z_high = self.workspace.z
+        for x in self.workspace.x:
+            for y in self.workspace.y:
+                for z in (z_low, z_high):
+                    if scene.robot.inverse_kinematics((x, y, z), downward(0.0)) is None:
+                        raise ConfigError(
+                            f"workspace: {self.config.robot} cannot reach its corner "
+                            f"({x:g}, {y:g}, {z:g}) m with the gripper pointing down"
+                        )
+        try:
+            scene.task.randomise(np.random.default_rng(0))
+        except PlacementError as error:
+            raise ConfigError(f"{self.task_id}: {error}") from None
+
+    def _scene_for(self, scale: float) -> Scene:
+        """Return the sealed world for objects of this scale, building it the first time."""
+        key = round(scale, 6)
+        if key not in self._scenes:
+            world = World()
+            task = self.task_class(
+                TaskSettings(
+                    workspace=self.workspace,
+                    scale=scale,
+                    random_orientation=self.config.random_orientation,
+                    bounding_box_check=self.config.workspace_check == "bounding_box",
+                    reach=self.reach,
+                )
+            )
+            task.world, task.robot = world, self.robot_class(world)
+            task.build(world)
+            world.seal()
+            self._scenes[key] = Scene(
+                world,
+                task.robot,
+                task,
+                CloseLoopMotion(task.robot, teleport=self.config.fast_mode),
+                HeightCamera(world.bodies),
+            )
+        return self._scenes[key]
+
+    def _drop_scenes(self) -> None:
+        for scene in self._scenes.values():
+            scene.world.close()
+        self._scenes.clear()
+        self._scene = None
+
+    def _new_episode(self, rng: np.random.Generator) -> Scene:
+        for _ in range(RESET_ATTEMPTS):
+            scene = self._scene_for(float(rng.choice(self._scales)))
+            scene.world.restore_pristine()
+            self._place_robot(scene)
+            scene.task.randomise(rng)
+            scene.world.settle(max_steps=100)
+            if scene.task.is_valid() and not scene.task.is_goal():
+                return scene
+        raise PlacementError(
+            f"{self.task_id}: {RESET_ATTEMPTS} random scenes in a row were invalid or solved "
+            "from the start; the workspace is too small for the objects"
+        )
+
+    def _judge(self, scene: Scene) -> tuple[bool, bool]:
+        """Return whether the goal holds, once everything is at rest, and the scene is valid."""
+        if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
+            raise SimulationError("a body's position is not finite")
+        if scene.task.is_goal():
+            scene.world.settle(max_steps=100)
+        valid = scene.task.is_valid()
+        return valid and scene.task.is_goal(), valid
+
+    def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
+        observation = {
+            keys.PIXELS: torch.from_numpy(self._pixels(scene).astype(np.float32)),
+            keys.HOLDING: torch.tensor([scene.robot.held_body() is not None]),
+        }
+        if self.config.expert:
+            observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
+        return observation
+
+    def _tensordict(
+        self,
+        observation: dict[str, torch.Tensor],
+        *,
+        success: bool = False,
+        fault: bool = False,
+        reward: float | None = None,
+        **done: bool,
+    ) -> TensorDict:
+        out = {key: value.clone() for key, value in observation.items()}
+        out[keys.SUCCESS] = torch.tensor([success])
+        out[keys.FAULT] = torch.tensor([fault])
+        out[keys.STEP_COUNT] = torch.tensor([self._step_count])
+        if reward is not None:
+            out[keys.REWARD] = torch.tensor([reward])
+        for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
+            out[key] = torch.tensor([done.get(key, False)])
+        return TensorDict(out, batch_size=[])
+
+    def _checked(self, action: torch.Tensor | None) -> np.ndarray:
+        size = self._action_size()
+        if action is None:
+            raise InvalidActionError(f"the input has no {keys.ACTION!r}: write it before step()")
+        if action.shape != (size,) or not action.dtype.is_floating_point:
+            raise InvalidActionError(
+                f"{self.task_id} takes a floating-point action of shape ({size},), one component "
+                f"per letter of {self.config.action_sequence!r}; got {action.dtype} of shape "
+                f"{tuple(action.shape)}"
+            )
+        array = action.detach().numpy()
+        if not np.isfinite(array).all():
+            raise InvalidActionError(f"the action is not finite: {array.tolist()}")
+        return array
+
+    def _on_fault(self) -> None:
+        """Count and report a simulator fault; the next reset starts with a new world."""
+        self.faults += 1
+        self._consecutive_faults += 1
+        logger.exception("%s: simulator fault %d, episode dropped", self.task_id, self.faults)
+        self._drop_scenes()
+        if self._consecutive_faults > MAX_CONSECUTIVE_FAULTS:
+            raise SimulationError(
+                f"{self.task_id} failed {self._consecutive_faults} times in a row; the log above "
+                "shows the cause"
+            )

@@ -1,0 +1,1 @@
+"""The simulator: PyBullet worlds, bodies, robots and cameras; knows no torch."""

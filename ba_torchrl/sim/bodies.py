@@ -1,0 +1,181 @@
+"""Body: a rigid body of a world; and the shapes that the tasks are made of."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import pybullet
+
+from ba_torchrl.sim.meshes import Mesh, box_mesh
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Color = tuple[float, float, float, float]
+
+CONTACT_M = 5e-4
+"""Bodies closer than this touch; PyBullet already lists pairs that are millimetres apart."""
+
+
+def yaw_quaternion(yaw_rad: float) -> Quaternion:
+    """Return the quaternion (x, y, z, w) of a turn about z."""
+    return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shape(ABC):
+    """Geometry and material of a body.
+
+    Args:
+        mass_kg: 0 for a static body.
+        friction: lateral friction coefficient.
+        color: red, green, blue, alpha in [0, 1].
+    """
+
+    mass_kg: float = 0.1
+    friction: float = 1.0
+    color: Color = (0.8, 0.2, 0.2, 1.0)
+
+    @abstractmethod
+    def mesh(self) -> Mesh:
+        """Return the surface that the depth camera sees."""
+
+    @abstractmethod
+    def create_collision(self, client: int) -> int:
+        """Create PyBullet's collision shape and return its id."""
+
+    @abstractmethod
+    def create_visual(self, client: int) -> int:
+        """Create PyBullet's visual shape and return its id."""
+
+    @property
+    @abstractmethod
+    def height_m(self) -> float:
+        """Height of the body in its upright pose."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(Shape):
+    """A box of the given edge lengths."""
+
+    size_m: Vector
+
+    def mesh(self) -> Mesh:
+        """Return the box's surface."""
+        return box_mesh(self.size_m)
+
+    def create_collision(self, client: int) -> int:
+        """Create the collision box."""
+        return pybullet.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=[s / 2 for s in self.size_m], physicsClientId=client
+        )
+
+    def create_visual(self, client: int) -> int:
+        """Create the visible box."""
+        return pybullet.createVisualShape(
+            pybullet.GEOM_BOX,
+            halfExtents=[s / 2 for s in self.size_m],
+            rgbaColor=self.color,
+            physicsClientId=client,
+        )
+
+    @property
+    def height_m(self) -> float:
+        """Edge length along z."""
+        return self.size_m[2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decal(Box):
+    """A thin coloured sheet without collision, such as a goal area on the floor.
+
+    Args:
+        depth_m: how much lower than the floor the depth camera shows it.
+    """
+
+    depth_m: float = 0.0
+    mass_kg: float = 0.0
+
+    def create_collision(self, client: int) -> int:
+        """A decal collides with nothing."""
+        return -1
+
+
+class Body:
+    """A rigid body in a PyBullet client.
+
+    Args:
+        client: PyBullet's client id.
+        shape: geometry and material.
+        name: for messages.
+    """
+
+    def __init__(self, client: int, shape: Shape, name: str) -> None:
+        self.client = client
+        self.shape = shape
+        self.name = name
+        self.id = pybullet.createMultiBody(
+            baseMass=shape.mass_kg,
+            baseCollisionShapeIndex=shape.create_collision(client),
+            baseVisualShapeIndex=shape.create_visual(client),
+            basePosition=(0.0, 0.0, shape.height_m / 2),
+            physicsClientId=client,
+        )
+        pybullet.changeDynamics(
+            self.id,
+            -1,
+            lateralFriction=shape.friction,
+            frictionAnchor=1,  # a held or stacked body must not creep
+            physicsClientId=client,
+        )
+
+    def __repr__(self) -> str:
+        return f"Body({self.name!r})"
+
+    @property
+    def is_static(self) -> bool:
+        """Whether the body never moves."""
+        return self.shape.mass_kg == 0
+
+    @property
+    def pose(self) -> tuple[Vector, Quaternion]:
+        """Position (metres) and orientation (x, y, z, w)."""
+        return pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+
+    @property
+    def position(self) -> Vector:
+        """Position of the origin in metres."""
+        return self.pose[0]
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading of the body's x axis in the plane."""
+        x, y, z, w = self.pose[1]
+        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    def place(self, position: Vector, yaw_rad: float = 0.0) -> None:
+        """Put the body at rest at a pose."""
+        pybullet.resetBasePositionAndOrientation(
+            self.id, position, yaw_quaternion(yaw_rad), physicsClientId=self.client
+        )
+        pybullet.resetBaseVelocity(
+            self.id, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=self.client
+        )
+
+    def is_still(self, speed_m_s: float, spin_rad_s: float) -> bool:
+        """Whether neither velocity exceeds its limit (sums of absolute components)."""
+        v, w = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
+        return (
+            abs(v[0]) + abs(v[1]) + abs(v[2]) <= speed_m_s
+            and abs(w[0]) + abs(w[1]) + abs(w[2]) <= spin_rad_s
+        )
+
+    def touches(self, other: Body) -> bool:
+        """Whether the two bodies are in contact, as of the last step."""
+        points = pybullet.getContactPoints(self.id, other.id, physicsClientId=self.client)
+        return any(point[8] < CONTACT_M for point in points)
+
+    def bounding_box(self) -> tuple[Vector, Vector]:
+        """Return the lower and upper corner of the axis-aligned bounding box."""
+        return pybullet.getAABB(self.id, physicsClientId=self.client)

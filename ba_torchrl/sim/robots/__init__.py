@@ -1,0 +1,1 @@
+"""Robot arms; each file registers its own."""

@@ -1,0 +1,199 @@
+"""Robot: an arm with a two-finger gripper, as the rest of the simulator sees it."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar
+
+import pybullet
+
+from ba_torchrl.registry import Registry
+from ba_torchrl.sim.bodies import CONTACT_M, Body, Quaternion, Vector
+from ba_torchrl.sim.world import World
+
+ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
+
+HELD_COSINE = 0.9
+"""A finger holds what it presses on within 26 degrees of the line it closes on. An edge that digs
+into the fingers' chamfers while being pushed meets them at 35 degrees and is not held."""
+
+Matrix = tuple[Vector, Vector, Vector]
+Pose = tuple[Vector, float]
+"""Position of the tool point (metres) and yaw (radians), the gripper pointing down."""
+
+
+def downward(yaw_rad: float) -> Matrix:
+    """Return the rotation of a gripper that points down, its fingers along x at yaw 0."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return ((cos, sin, 0.0), (sin, -cos, 0.0), (0.0, 0.0, -1.0))
+
+
+class Robot(ABC):
+    """An arm with a parallel gripper in a world.
+
+    The arm follows stiff position motors, so that it is where it was told to be after one step;
+    whoever moves it keeps the steps small. Subclasses give the model's numbers and its inverse
+    kinematics. A robot is commanded in joint angles; `ba_torchrl.sim.motion` plans them.
+    """
+
+    arm_joints: ClassVar[tuple[int, ...]]
+    finger_joints: ClassVar[tuple[int, ...]]
+    """The two driven joints of the gripper, left and right."""
+    finger_signs: ClassVar[tuple[float, float]]
+    """Joint position of each finger per unit of opening angle or distance."""
+    finger_open: ClassVar[float]
+    """Joint position, up to the sign, of the fully open gripper."""
+    finger_links: ClassVar[tuple[frozenset[int], frozenset[int]]]
+    """Links that belong to the left and to the right finger."""
+    closing_sign: ClassVar[tuple[float, float]]
+    """Sign along the hand's x axis in which each finger is pushed back by what it holds."""
+    passive_links: ClassVar[tuple[int, ...]]
+    """Links that collide with nothing: the arm, which stays above everything it works on."""
+    hand_link: ClassVar[int]
+    """The link that the tool point is fixed to."""
+    tool_offset_m: ClassVar[Vector]
+    """Tool point between the fingertips, in the frame of the hand link."""
+    camera_height_m: ClassVar[float]
+    """The close-loop camera hangs this far above the tool point."""
+    finger_span_m: ClassVar[float]
+    """Distance between the finger squares in the close-loop image when fully open."""
+
+    arm_force: ClassVar[float] = 300.0
+    finger_force: ClassVar[float] = 2.0
+    finger_speed: ClassVar[float] = 4.0
+    """Speed of the finger joints per second when the gripper opens or closes."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.client = world.client
+        self.id = self.load()
+        self.joints: list[float] = [0.0] * len(self.arm_joints)
+        """Commanded arm joints in radians."""
+        self._side = {link: side for side, links in enumerate(self.finger_links) for link in links}
+        for link in self.passive_links:
+            pybullet.setCollisionFilterGroupMask(self.id, link, 0, 0, physicsClientId=self.client)
+
+    @abstractmethod
+    def load(self) -> int:
+        """Load the model and return its PyBullet id."""
+
+    @abstractmethod
+    def inverse_kinematics(
+        self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
+    ) -> list[float] | None:
+        """Return arm joints that bring the tool to a pose, or None if it is out of reach.
+
+        Args:
+            position: tool point in metres.
+            rotation: orientation of the hand; `downward` makes those of top-down grasps.
+            near: joints to stay close to where several solutions exist.
+        """
+
+    # -- arm ---------------------------------------------------------------------------------
+
+    def teleport(self, joints: Sequence[float]) -> None:
+        """Put the arm at rest at ``joints`` and command it to stay."""
+        pybullet.resetJointStatesMultiDof(
+            self.id,
+            self.arm_joints,
+            [[q] for q in joints],
+            [[0.0]] * len(self.arm_joints),
+            physicsClientId=self.client,
+        )
+        self.command(joints)
+
+    def command(self, joints: Sequence[float]) -> None:
+        """Command the arm's motors to ``joints``, to be reached in the next step."""
+        pybullet.setJointMotorControlArray(
+            self.id,
+            self.arm_joints,
+            pybullet.POSITION_CONTROL,
+            joints,
+            forces=[self.arm_force] * len(self.arm_joints),
+            positionGains=[1.0] * len(self.arm_joints),
+            physicsClientId=self.client,
+        )
+        self.joints = list(joints)
+
+    def measured_joints(self) -> list[float]:
+        """Return the arm's joint angles as they are."""
+        states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
+        return [state[0] for state in states]
+
+    def tool_transform(self) -> tuple[Vector, Quaternion]:
+        """Return position (metres) and orientation (x, y, z, w) of the tool point."""
+        state = pybullet.getLinkState(
+            self.id, self.hand_link, computeForwardKinematics=1, physicsClientId=self.client
+        )
+        return pybullet.multiplyTransforms(
+            state[4], state[5], self.tool_offset_m, (0.0, 0.0, 0.0, 1.0)
+        )
+
+    def tool_pose(self) -> Pose:
+        """Return the tool point and the gripper's yaw in [-pi, pi)."""
+        position, (x, y, z, w) = self.tool_transform()
+        # direction of the hand's x axis, along which the fingers open
+        return position, math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+
+    # -- gripper -----------------------------------------------------------------------------
+
+    def opening(self) -> float:
+        """Return how far the gripper is open, 0 to 1."""
+        states = pybullet.getJointStates(self.id, self.finger_joints, physicsClientId=self.client)
+        mean = sum(s * state[0] for s, state in zip(self.finger_signs, states, strict=True)) / 2
+        return min(max(mean / self.finger_open, 0.0), 1.0)
+
+    def set_opening(self, opening: float) -> None:
+        """Put the fingers at rest at an opening and hold them there."""
+        pybullet.resetJointStatesMultiDof(
+            self.id,
+            self.finger_joints,
+            [[sign * opening * self.finger_open] for sign in self.finger_signs],
+            [[0.0]] * len(self.finger_joints),
+            physicsClientId=self.client,
+        )
+        self.hold_opening(opening)
+
+    def hold_opening(self, opening: float) -> None:
+        """Command the fingers to an opening."""
+        pybullet.setJointMotorControlArray(
+            self.id,
+            self.finger_joints,
+            pybullet.POSITION_CONTROL,
+            [sign * opening * self.finger_open for sign in self.finger_signs],
+            forces=[self.finger_force] * 2,
+            positionGains=[1.0] * 2,
+            physicsClientId=self.client,
+        )
+
+    # -- contacts ----------------------------------------------------------------------------
+
+    def held_body(self) -> Body | None:
+        """Return the body squeezed between the fingers, as of the last step.
+
+        Only contacts of finger links count. Both fingers must press on it from opposite sides,
+        along the line they close on up to what friction can bear: a block whose corner rests
+        against both fingers is not held.
+        """
+        touching: tuple[set[int], set[int]] = (set(), set())
+        _, (x, y, z, w) = self.tool_transform()
+        axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+        for point in pybullet.getContactPoints(self.id, physicsClientId=self.client):
+            side = self._side.get(point[3])
+            if side is None or point[8] >= CONTACT_M:
+                continue
+            outward = sum(n * a for n, a in zip(point[7], axis, strict=True))
+            if self.closing_sign[side] * outward > HELD_COSINE:
+                touching[side].add(point[2])
+        both = touching[0] & touching[1]
+        if not both:
+            return None
+        return next((b for b in self.world.bodies if b.id in both and not b.is_static), None)
+
+    def is_near_anything(self, margin_m: float = 1e-3) -> bool:
+        """Whether the hand is closer than ``margin_m`` to a body or the floor, as of now."""
+        self.world.detect_collisions()
+        points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
+        return any(point[8] < margin_m for point in points)

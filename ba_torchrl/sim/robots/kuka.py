@@ -1,0 +1,147 @@
+"""Kuka LBR iiwa with PyBullet's two-finger gripper: closed-form inverse kinematics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pybullet
+import pybullet_data
+
+from ba_torchrl.sim.bodies import Vector
+from ba_torchrl.sim.robots.base import ROBOTS, Matrix, Robot
+
+_SHOULDER_HEIGHT_M = 0.36
+_UPPER_ARM_M = 0.42
+_FOREARM_M = 0.40
+_WRIST_TO_HAND_M = 0.125
+_BASE_M = (-0.1, 0.0, -0.07)
+
+
+@ROBOTS.register("kuka")
+class Kuka(Robot):
+    """Seven-joint arm on a base behind the workspace (paper section 3.4)."""
+
+    arm_joints = tuple(range(7))
+    finger_joints = (8, 11)
+    finger_signs = (-1.0, 1.0)
+    finger_open = 0.2
+    finger_links = (frozenset({8, 9, 10}), frozenset({11, 12, 13}))
+    closing_sign = (-1.0, 1.0)
+    passive_links = tuple(range(-1, 7))
+    hand_link = 7
+    tool_offset_m = (0.0, 0.0218, 0.222)
+    camera_height_m = 0.12
+    finger_span_m = 45 * 0.3 / 128
+
+    _tip_joints = (10, 13)
+
+    def load(self) -> int:
+        """Load the arm, its gear between the fingers, and widen its joint limits."""
+        model = f"{pybullet_data.getDataPath()}/kuka_iiwa/kuka_with_gripper2.sdf"
+        robot = pybullet.loadSDF(model, physicsClientId=self.client)[0]
+        # PyBullet places the centre of mass, not the link frame
+        offset = pybullet.getDynamicsInfo(robot, -1, physicsClientId=self.client)[3]
+        pybullet.resetBasePositionAndOrientation(
+            robot,
+            [b + o for b, o in zip(_BASE_M, offset, strict=True)],
+            (0, 0, 0, 1),
+            physicsClientId=self.client,
+        )
+        for joint in self.arm_joints:
+            # a joint put beyond its limit is flung back by the limit's constraint
+            pybullet.changeDynamics(
+                robot,
+                joint,
+                jointLowerLimit=-10,
+                jointUpperLimit=10,
+                physicsClientId=self.client,
+            )
+        for joint in (7, *self._tip_joints):
+            pybullet.setJointMotorControl2(
+                robot,
+                joint,
+                pybullet.POSITION_CONTROL,
+                targetPosition=0,
+                force=100,
+                positionGain=1.0,
+                physicsClientId=self.client,
+            )
+        # two force-limited fingers have no stiffness along their common axis: held bodies slide
+        gear = pybullet.createConstraint(
+            robot,
+            self.finger_joints[0],
+            robot,
+            self.finger_joints[1],
+            pybullet.JOINT_GEAR,
+            (0, 1, 0),
+            (0, 0, 0),
+            (0, 0, 0),
+            physicsClientId=self.client,
+        )
+        pybullet.changeConstraint(
+            gear, gearRatio=1, maxForce=50, erp=0.5, physicsClientId=self.client
+        )
+        return robot
+
+    def set_opening(self, opening: float) -> None:
+        """Put the fingers at rest at an opening, their tips straight."""
+        pybullet.resetJointStatesMultiDof(
+            self.id, self._tip_joints, [[0.0]] * 2, [[0.0]] * 2, physicsClientId=self.client
+        )
+        super().set_opening(opening)
+
+    def inverse_kinematics(
+        self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
+    ) -> list[float] | None:
+        """Solve shoulder, elbow and wrist in closed form, the elbow in the vertical plane.
+
+        The third joint stays at zero, which leaves one solution with the elbow up and the wrist
+        not flipped over.
+        """
+        _, side, approach = zip(*rotation, strict=True)
+        _, tool_y, tool_z = self.tool_offset_m
+        reach = _WRIST_TO_HAND_M + tool_z
+        x, y, z = (
+            p - s * tool_y - a * reach - b
+            for p, s, a, b in zip(position, side, approach, _BASE_M, strict=True)
+        )
+        z -= _SHOULDER_HEIGHT_M
+        radius = math.hypot(x, y)
+        cos_elbow = (radius**2 + z**2 - _UPPER_ARM_M**2 - _FOREARM_M**2) / (
+            2 * _UPPER_ARM_M * _FOREARM_M
+        )
+        if abs(cos_elbow) > 1:
+            return None
+        elbow = math.acos(cos_elbow)
+        turn = math.atan2(y, x)
+        shoulder = math.atan2(radius, z) - math.atan2(
+            _FOREARM_M * math.sin(elbow), _UPPER_ARM_M + _FOREARM_M * math.cos(elbow)
+        )
+        # rotation left for the wrist, as Rz(q5) Ry(q6) Rz(q7) in the frame of the forearm
+        tilt = shoulder + elbow
+        ct, st = math.cos(tilt), math.sin(tilt)
+        c1, s1 = math.cos(turn), math.sin(turn)
+        forearm_x = (c1 * ct, s1 * ct, -st)
+        forearm_y = (-s1, c1, 0.0)
+        forearm_z = (c1 * st, s1 * st, ct)
+        hand_x = tuple(row[0] for row in rotation)
+        m02, m12, m22 = (_dot(axis, approach) for axis in (forearm_x, forearm_y, forearm_z))
+        bend = math.hypot(m02, m12)
+        if bend > 1e-9:
+            q5, q6, sign = math.atan2(m12, m02), math.atan2(bend, m22), 1.0
+            if abs(q5) > math.pi / 2:  # the other solution, with the wrist folded forward
+                q5, q6, sign = q5 - math.copysign(math.pi, q5), -q6, -1.0
+            q7 = math.atan2(sign * _dot(forearm_z, side), -sign * _dot(forearm_z, hand_x))
+        else:  # wrist stretched or folded: the last two turns are about the same line
+            q5, q6 = 0.0, math.atan2(0.0, m22)
+            q7 = math.atan2(
+                _dot(forearm_y, hand_x), math.copysign(1.0, m22) * _dot(forearm_x, hand_x)
+            )
+        if near is not None:
+            q7 += 2 * math.pi * round((near[6] - q7) / (2 * math.pi))
+        return [turn, shoulder, 0.0, -elbow, q5, q6, q7]
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,0 +1,1 @@
+"""What there is to do: one file per task, each with its goal and expert."""

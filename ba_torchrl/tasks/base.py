@@ -1,0 +1,172 @@
+"""Task: what there is to do, told apart from how it is controlled and observed."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand
+from ba_torchrl.registry import Registry
+from ba_torchrl.sim.bodies import Body, Vector
+from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.world import World
+
+TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks")
+
+BLOCK_M = 0.05
+"""Edge of a block at scale 1."""
+
+SCALE_STEP = 0.02
+
+
+class PlacementError(RuntimeError):
+    """No free place was found for the objects; the workspace is too small for them."""
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """An axis-aligned box in metres."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    z: tuple[float, float]
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Middle of the floor area."""
+        return (sum(self.x) / 2, sum(self.y) / 2)
+
+    @property
+    def width(self) -> float:
+        """Extent along x."""
+        return self.x[1] - self.x[0]
+
+    def contains(self, point: Vector) -> bool:
+        """Whether a point lies strictly inside."""
+        return all(
+            low < value < high
+            for value, (low, high) in zip(point, (self.x, self.y, self.z), strict=True)
+        )
+
+    def clip(self, point: Sequence[float]) -> Vector:
+        """Return the nearest point of the box."""
+        return tuple(
+            min(max(value, low), high)
+            for value, (low, high) in zip(point, (self.x, self.y, self.z), strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What one action covers: experts plan their approach by it."""
+
+    step_m: float
+    turn_rad: float
+    """0 if the gripper cannot be turned."""
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """What of the configuration a task needs, defaults filled in."""
+
+    workspace: Workspace
+    scale: float
+    random_orientation: bool
+    bounding_box_check: bool
+    reach: Reach
+
+
+class Task(ABC):
+    """Bodies, their random poses, the goal, and an expert that reaches it.
+
+    A task is built once per world: `build` loads the bodies, then every episode calls
+    `randomise`. The goal is tested here and nowhere else.
+
+    Args:
+        settings: the resolved configuration.
+    """
+
+    control: ClassVar[Literal["open_loop", "close_loop"]]
+    max_steps: ClassVar[int]
+    workspace: ClassVar[Workspace]
+    scale_range: ClassVar[tuple[float, float]]
+
+    def __init__(self, settings: TaskSettings) -> None:
+        self.settings = settings
+        self.world: World
+        self.robot: Robot
+
+    @abstractmethod
+    def build(self, world: World) -> None:
+        """Load the task's bodies into the world."""
+
+    @abstractmethod
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Give the bodies new random poses.
+
+        Raises:
+            PlacementError: the workspace has no room.
+        """
+
+    @abstractmethod
+    def is_goal(self) -> bool:
+        """Whether the goal holds in the scene as it is now."""
+
+    @abstractmethod
+    def expert_command(self) -> GripperCommand:
+        """Return what the expert does now; a function of the scene, from any state."""
+
+    @property
+    @abstractmethod
+    def objects(self) -> Sequence[Body]:
+        """The bodies that must stay in the workspace."""
+
+    @property
+    def block_m(self) -> float:
+        """Edge of this episode's block."""
+        return BLOCK_M * self.settings.scale
+
+    @property
+    def reach(self) -> Reach:
+        """What one action of the expert covers."""
+        return self.settings.reach
+
+    def is_valid(self) -> bool:
+        """Whether every object that is not in the gripper is inside the workspace."""
+        held = self.robot.held_body()
+        return all(self._is_inside(body) for body in self.objects if body is not held)
+
+    def _is_inside(self, body: Body) -> bool:
+        workspace = self.settings.workspace
+        if not self.settings.bounding_box_check:
+            return workspace.contains(body.position)
+        (x0, y0, _), (x1, y1, top) = body.bounding_box()
+        # the top corners: a body at rest dips a hair below the floor
+        return workspace.contains((x0, y0, top)) and workspace.contains((x1, y1, top))
+
+    def random_point(self, rng: np.random.Generator, padding_m: float) -> tuple[float, float]:
+        """Return a point of the floor that keeps half of ``padding_m`` from the border.
+
+        Raises:
+            PlacementError: the workspace is smaller than that.
+        """
+        point = []
+        for low, high in (self.settings.workspace.x, self.settings.workspace.y):
+            low, high = low + padding_m / 2, high - padding_m / 2
+            if low >= high:
+                raise PlacementError(
+                    f"an object that keeps {padding_m / 2:.3f} m from the border does not fit: "
+                    "enlarge `workspace` or lower `object_scale_range`"
+                )
+            point.append(float(rng.uniform(low, high)))
+        return tuple(point)
+
+    def random_yaw(self, rng: np.random.Generator, span_rad: float) -> float:
+        """Return a yaw uniform over ``span_rad`` about zero, or zero for fixed orientations."""
+        if not self.settings.random_orientation:
+            return 0.0
+        return float(rng.uniform(-span_rad / 2, span_rad / 2))

@@ -1,0 +1,1 @@
+"""The close-loop tasks (appendix A.2)."""

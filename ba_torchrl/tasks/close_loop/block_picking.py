@@ -1,0 +1,49 @@
+"""Block Picking: grasp a block and lift it (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.base import CloseLoopTask
+from ba_torchrl.tasks.experts import grasp, lift
+
+
+@TASKS.register("close_loop/block_picking")
+class BlockPicking(CloseLoopTask):
+    """A 5 cm block at a random pose; success when it is held with the tool 15 cm above ground."""
+
+    lift_height_m: ClassVar[float] = 0.15
+
+    def build(self, world: World) -> None:
+        """Load the block."""
+        self.block = world.add(self.cube(), "block")
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put the block anywhere, 1.2 blocks from the border."""
+        xy = self.random_point(rng, 2.4 * self.block_m)
+        self.stand(self.block, xy, self.random_yaw(rng, math.pi / 2))
+
+    def is_goal(self) -> bool:
+        """Whether the block is held and the tool higher than 15 cm."""
+        if self.robot.held_body() is not self.block:
+            return False
+        return self.robot.tool_pose()[0][2] > self.lift_height_m
+
+    def expert_command(self) -> GripperCommand:
+        """Grasp the block, then go up."""
+        if self.robot.held_body() is self.block and self.robot.opening() < 0.9:
+            return lift(self.reach.step_m)
+        return grasp(self.robot, self.block, self.reach)
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The block."""
+        return (self.block,)

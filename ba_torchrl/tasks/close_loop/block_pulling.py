@@ -1,0 +1,68 @@
+"""Block Pulling: bring two flat blocks into contact (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand
+from ba_torchrl.sim.bodies import Body, Box
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.base import BLUE, RED, CloseLoopTask
+from ba_torchrl.tasks.experts import behind_point, push
+
+
+@TASKS.register("close_loop/block_pulling")
+class BlockPulling(CloseLoopTask):
+    """Two blocks of 8 x 8 x 5 cm; success when they touch."""
+
+    def build(self, world: World) -> None:
+        """Load the blocks."""
+        size = tuple(edge * self.settings.scale for edge in (0.08, 0.08, 0.05))
+        self.blocks = [
+            world.add(Box(size_m=size, mass_kg=0.5, color=color), name)
+            for color, name in ((RED, "first block"), (BLUE, "second block"))
+        ]
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put the blocks 13.6 cm apart or more; with fixed orientations, along y."""
+        spacing = 3.4 * 0.04 * self.settings.scale
+        points = self.random_pair(rng, (spacing, spacing), spacing)
+        for block, xy in zip(self.blocks, points, strict=True):
+            self.stand(block, xy, self.random_yaw(rng, math.pi))
+
+    def is_goal(self) -> bool:
+        """Whether the blocks touch."""
+        return self.blocks[0].touches(self.blocks[1])
+
+    def expert_command(self) -> GripperCommand:
+        """Go beyond the block that is handier and pull it to the other."""
+        pulled, other = min(
+            (tuple(self.blocks), tuple(reversed(self.blocks))), key=lambda pair: self._cost(*pair)
+        )
+        return push(
+            self.robot,
+            pulled,
+            other.position[:2],
+            workspace=self.settings.workspace,
+            reach=self.reach,
+            opening=0.5,  # wide open, the fingers would straddle a corner
+            stop_short_m=0.0,
+        )
+
+    def _cost(self, pulled: Body, other: Body) -> float:
+        """Distance to the place to pull from; close once there, so the choice holds."""
+        (px, py, _), (ox, oy, _) = pulled.position, other.position
+        length = math.hypot(ox - px, oy - py) or 1.0
+        direction = ((ox - px) / length, (oy - py) / length)
+        place = behind_point(pulled, direction, self.settings.workspace)
+        cramped = 0.08 - math.dist(place, (px, py))
+        return math.dist(place, self.robot.tool_pose()[0][:2]) + 2 * cramped
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """Both blocks."""
+        return self.blocks

@@ -1,0 +1,61 @@
+"""Block Pushing: push a block to a goal area (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand
+from ba_torchrl.sim.bodies import Body, Decal
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.base import GREEN, CloseLoopTask
+from ba_torchrl.tasks.experts import push
+
+
+@TASKS.register("close_loop/block_pushing")
+class BlockPushing(CloseLoopTask):
+    """A 5 cm block and a 9 cm goal area; success when their centres are within 5 cm.
+
+    The depth image shows the goal area as a dip of 2 cm in the floor.
+    """
+
+    goal_size_m: ClassVar[float] = 0.09
+    goal_radius_m: ClassVar[float] = 0.05
+    least_distance_m: ClassVar[float] = 0.09
+
+    def build(self, world: World) -> None:
+        """Load the block and the goal area."""
+        self.block = world.add(self.cube(), "block")
+        size = (self.goal_size_m, self.goal_size_m, 1e-3)
+        self.goal = world.add(Decal(size_m=size, color=GREEN, depth_m=0.02), "goal")
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put block and goal at least 9 cm apart; with fixed orientations, along y."""
+        block, goal = self.random_pair(rng, (2.4 * self.block_m, 0.13), self.least_distance_m)
+        self.stand(self.block, block, self.random_yaw(rng, math.pi))
+        self.stand(self.goal, goal, self.random_yaw(rng, math.pi / 2))
+
+    def is_goal(self) -> bool:
+        """Whether the block's centre is within 5 cm of the goal's."""
+        return math.dist(self.block.position[:2], self.goal.position[:2]) < self.goal_radius_m
+
+    def expert_command(self) -> GripperCommand:
+        """Go behind the block and push it with half-open fingers."""
+        return push(
+            self.robot,
+            self.block,
+            self.goal.position[:2],
+            workspace=self.settings.workspace,
+            reach=self.reach,
+            opening=0.5,
+            stop_short_m=0.035,
+        )
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The block; the goal is painted on the floor."""
+        return (self.block,)

@@ -1,0 +1,45 @@
+"""Block Reaching: bring the fingertips to a block (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.base import CloseLoopTask
+from ba_torchrl.tasks.experts import OPEN, grasp
+
+
+@TASKS.register("close_loop/block_reaching")
+class BlockReaching(CloseLoopTask):
+    """A 5 cm block at a random pose; success when the tool point is within 3 cm of its centre."""
+
+    reach_m: ClassVar[float] = 0.03
+
+    def build(self, world: World) -> None:
+        """Load the block."""
+        self.block = world.add(self.cube(), "block")
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put the block anywhere, 1.2 blocks from the border."""
+        xy = self.random_point(rng, 2.4 * self.block_m)
+        self.stand(self.block, xy, self.random_yaw(rng, math.pi))
+
+    def is_goal(self) -> bool:
+        """Whether the tool point is within 3 cm of the block's centre."""
+        return math.dist(self.robot.tool_pose()[0], self.block.position) < self.reach_m
+
+    def expert_command(self) -> GripperCommand:
+        """Go down around the block, without closing the fingers."""
+        return grasp(self.robot, self.block, self.reach)._replace(opening=OPEN)
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The block."""
+        return (self.block,)
