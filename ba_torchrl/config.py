@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -32,26 +32,30 @@ def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigEr
     return ConfigError(f"invalid {what}:\n  " + "\n  ".join(lines))
 
 
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def parse(model: type[Model], values: dict[str, Any], what: str) -> Model:
+    """Validate ``values`` as a ``model``.
+
+    Args:
+        model: a pydantic model.
+        values: field names and their values.
+        what: what is being configured, for the error message.
+
+    Raises:
+        ConfigError: a name is unknown, a type wrong or a value out of range.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise explain(error, model.model_fields, what) from None
+
+
 class StrictModel(BaseModel):
-    """Immutable settings: unknown names and wrong types are refused with a `ConfigError`."""
+    """Immutable settings that refuse unknown names and wrong types."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-    @classmethod
-    def parse(cls, values: dict[str, Any], what: str | None = None) -> Self:
-        """Validate ``values``.
-
-        Args:
-            values: field names and their values.
-            what: what is being configured, for the error message.
-
-        Raises:
-            ConfigError: a name is unknown, a type wrong or a value out of range.
-        """
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            raise explain(error, cls.model_fields, what or cls.__name__) from None
 
 
 class EnvConfig(StrictModel):

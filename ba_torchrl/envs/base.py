@@ -139,11 +139,7 @@ class ManipulationEnv(EnvBase):
         return render_rgb(self.scene.world, (*self.workspace.center, 0.14), width, height)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close every world of this environment.
-
-        Raises:
-            RuntimeError: it is closed already and ``raise_if_closed`` is set.
-        """
+        """Close every world of this environment."""
         self._drop_scenes()
         super().close(raise_if_closed=raise_if_closed)
 
@@ -323,10 +319,10 @@ class ManipulationEnv(EnvBase):
         size = self._action_size()
         if action is None:
             raise InvalidActionError(f"the input has no {keys.ACTION!r}: write it before step()")
-        if action.shape != (size,) or not action.dtype.is_floating_point:
+        if action.shape != (size,) or action.dtype != torch.float32:
             raise InvalidActionError(
-                f"{self.task_id} takes a floating-point action of shape ({size},), one component "
-                f"per letter of {self.config.action_sequence!r}; got {action.dtype} of shape "
+                f"{self.task_id} takes a float32 action of shape ({size},), one component per "
+                f"letter of {self.config.action_sequence!r}; got {action.dtype} of shape "
                 f"{tuple(action.shape)}"
             )
         array = action.detach().numpy()

@@ -30,12 +30,15 @@ class MotionLimits:
     contact_spin_rad_s: float = 6.0
     deceleration_m_s2: float = 4.0
     """Less than the floor's friction times gravity, or a pushed body runs ahead."""
-    held_time_s: float = 0.075
+    held_time_s: float = 0.1
     """Time for 5 cm with a body in hand; scales with the root of the distance."""
     max_press_n: float = 40.0
     """A move stops when the hand or what it holds presses harder than this along z."""
     max_push_n: float = 150.0
     """The same for forces from the side."""
+    creep_m: float = 5e-4
+    """Stride of a move that starts out pressing on something."""
+    creep_steps: int = 8
     sample_m: float = 0.01
     sample_rad: float = 0.14
     gripper_steps: int = 60
@@ -89,6 +92,8 @@ class CloseLoopMotion:
             self._follow(path, [_quintic(i / count) for i in range(1, count + 1)], held)
         else:
             done = self._skip_free_part(path) if self.teleport else 0.0
+            if done == 0.0 and path.goes_down and self._rests_on_something(held):
+                done = self._creep(path)
             if done < 1.0:
                 rest = [done + (1 - done) * u for u in self._contact_profile(path, 1 - done)]
                 self._follow(path, rest, None)
@@ -147,6 +152,27 @@ class CloseLoopMotion:
         self.robot.teleport(free)
         return done
 
+    def _creep(self, path: _Path) -> float:
+        """Press from where the hand rests, a fraction of a millimetre at a time.
+
+        Returns:
+            The place reached; 1 if the press is firm, which ends the move.
+        """
+        stride = self.limits.creep_m / max(path.length_m, self.limits.creep_m)
+        place = 0.0
+        for _ in range(self.limits.creep_steps):
+            place = min(place + stride, 1.0)
+            if not self._follow(path, [place], None):
+                return 1.0
+        return place
+
+    def _rests_on_something(self, held: Body | None) -> bool:
+        """Whether the hand, or what it holds, stands on anything else or all but touches it."""
+        return any(
+            abs(point[7][2]) > 0.6 and point[8] < 2 * self.limits.creep_m
+            for point in self._outer_contacts(held)
+        )
+
     def _contact_profile(self, path: _Path, share: float) -> list[float]:
         """Return the places along the last ``share`` of the path, one per step, from 0 to 1."""
         limits, dt = self.limits, self.world.physics.time_step_s
@@ -169,36 +195,52 @@ class CloseLoopMotion:
 
         return [place(i / count) for i in range(1, count + 1)]
 
-    def _follow(self, path: _Path, places: list[float], held: Body | None) -> None:
-        """Simulate the path; stop where it leaves the reach or presses too hard."""
+    def _follow(self, path: _Path, places: list[float], held: Body | None) -> bool:
+        """Simulate the path; stop where it leaves the reach, step back where it presses.
+
+        Returns:
+            Whether it went all the way.
+        """
+        robot = self.robot
+        arrived = True
         for place in places:
             joints = path.joints_at(place)
             if joints is None:
+                arrived = False
                 break
-            self.robot.command(joints)
+            before = robot.joints
+            robot.command(joints)
             self.world.step()
             if self._overloaded(held):
+                # a stiff arm left where it is would press the body deeper with every try
+                robot.command(before)
+                self.world.step()
+                arrived = False
                 break
-        measured = self.robot.measured_joints()
-        if max(abs(a - b) for a, b in zip(measured, self.robot.joints, strict=True)) > 5e-3:
-            self.robot.command(measured)  # do not go on pushing against what stopped it
+        measured = robot.measured_joints()
+        if max(abs(a - b) for a, b in zip(measured, robot.joints, strict=True)) > 5e-3:
+            robot.command(measured)  # do not go on pushing against what stopped it
+        return arrived
 
     def _overloaded(self, held: Body | None) -> bool:
         """Whether the hand, or what it holds, presses too hard on anything else."""
         pressing = pushing = 0.0
-        robot = self.robot.id
-        inner = -1 if held is None else held.id
-        points = pybullet.getContactPoints(robot, physicsClientId=self.world.client)
-        if held is not None:
-            points += pybullet.getContactPoints(inner, physicsClientId=self.world.client)
-        for point in points:
-            if {point[1], point[2]} == {robot, inner}:
-                continue
+        for point in self._outer_contacts(held):
             if abs(point[7][2]) > 0.6:
                 pressing += point[9]
             else:
                 pushing += point[9]
         return pressing > self.limits.max_press_n or pushing > self.limits.max_push_n
+
+    def _outer_contacts(self, held: Body | None) -> list[tuple]:
+        """Return PyBullet's contact points of hand and held body with everything else."""
+        robot, client = self.robot.id, self.world.client
+        points = pybullet.getContactPoints(robot, physicsClientId=client)
+        if held is None:
+            return points
+        points += pybullet.getContactPoints(held.id, physicsClientId=client)
+        inner = {robot, held.id}
+        return [point for point in points if {point[1], point[2]} != inner]
 
 
 class _Path:
@@ -210,6 +252,7 @@ class _Path:
         self._delta = tuple(e - s for s, e in zip(self._start, end[0], strict=True))
         self._turn = wrap_angle(end[1] - start[1])
         self.length_m = math.hypot(*self._delta)
+        self.goes_down = self._delta[2] < -1e-4
         self.angle_rad = abs(self._turn)
 
     def joints_at(self, place: float) -> list[float] | None:

@@ -18,6 +18,8 @@ ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
 HELD_COSINE = 0.9
 """A finger holds what it presses on within 26 degrees of the line it closes on. An edge that digs
 into the fingers' chamfers while being pushed meets them at 35 degrees and is not held."""
+QUERY_M = 2e-3
+"""Distance up to which a fresh query looks for the surfaces in contact."""
 
 Matrix = tuple[Vector, Vector, Vector]
 Pose = tuple[Vector, float]
@@ -177,20 +179,33 @@ class Robot(ABC):
         along the line they close on up to what friction can bear: a block whose corner rests
         against both fingers is not held.
         """
-        touching: tuple[set[int], set[int]] = (set(), set())
-        _, (x, y, z, w) = self.tool_transform()
-        axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+        touching: tuple[set[tuple[int, int]], ...] = (set(), set())
         for point in pybullet.getContactPoints(self.id, physicsClientId=self.client):
             side = self._side.get(point[3])
-            if side is None or point[8] >= CONTACT_M:
-                continue
-            outward = sum(n * a for n, a in zip(point[7], axis, strict=True))
-            if self.closing_sign[side] * outward > HELD_COSINE:
-                touching[side].add(point[2])
-        both = touching[0] & touching[1]
-        if not both:
-            return None
-        return next((b for b in self.world.bodies if b.id in both and not b.is_static), None)
+            if side is not None and point[8] < CONTACT_M:
+                touching[side].add((point[2], point[3]))
+        both = {body for body, _ in touching[0]} & {body for body, _ in touching[1]}
+        for body in self.world.bodies:
+            if body.id in both and not body.is_static and self._is_squeezed(body, touching):
+                return body
+        return None
+
+    def _is_squeezed(self, body: Body, touching: tuple[set[tuple[int, int]], ...]) -> bool:
+        """Whether each finger has a link that pushes the body towards the other finger."""
+        _, (x, y, z, w) = self.tool_transform()
+        axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+        return all(
+            any(
+                sign * sum(n * a for n, a in zip(point[7], axis, strict=True)) > HELD_COSINE
+                for body_id, link in links
+                if body_id == body.id
+                # a fresh query: normals of lasting contacts do not turn with the bodies
+                for point in pybullet.getClosestPoints(
+                    self.id, body.id, QUERY_M, linkIndexA=link, physicsClientId=self.client
+                )
+            )
+            for sign, links in zip(self.closing_sign, touching, strict=True)
+        )
 
     def is_near_anything(self, margin_m: float = 1e-3) -> bool:
         """Whether the hand is closer than ``margin_m`` to a body or the floor, as of now."""

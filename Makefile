@@ -1,0 +1,66 @@
+# `make train` and `make test` need Python 3.11 and make, nothing else: they set up .venv first.
+
+VENV ?= .venv
+ARGS ?=
+# Another place to take torch from, as a URL for pip's --index-url. Empty: as pip is configured.
+TORCH_INDEX_URL ?=
+
+IS_311 := import sys; sys.exit(sys.version_info[:2] != (3, 11))
+PYTHON ?= $(shell for python in python3.11 python3 python; do \
+	if $$python -c "$(IS_311)" >/dev/null 2>&1; then echo $$python; break; fi; done)
+
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+REQUIREMENTS := requirements.txt requirements-no-deps.txt pyproject.toml
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup train test test-slow lint
+
+help:
+	@echo "make setup      create $(VENV) with everything this project uses"
+	@echo "make train      the quick start: train, evaluate, write curves and a video"
+	@echo "make test       the tests (minutes)"
+	@echo "make test-slow  the tests that take longer"
+	@echo "make lint       check style"
+	@echo
+	@echo "ARGS='...' is passed on: make train ARGS='seed=1', make test ARGS='-k vector'."
+	@echo "PYTHON=/path/to/python3.11 names the interpreter if it is not found."
+	@echo "TORCH_INDEX_URL=... makes setup take another build of torch."
+
+setup: $(STAMP)
+
+train: $(STAMP)
+	$(BIN)/python recipes/train.py --config-name quickstart $(ARGS)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest $(ARGS)
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# The stamp comes last, so an interrupted set-up is taken up again. One recipe, so that -j
+# cannot reorder it: torch goes first, or a requirement would pull in another build of it.
+$(STAMP): $(REQUIREMENTS)
+	@rm -f $(STAMP)
+	@if ! $(BIN)/python -c "import pip; $(IS_311)" >/dev/null 2>&1; then \
+		if ! "$(PYTHON)" -c "$(IS_311)" >/dev/null 2>&1; then \
+			echo "Python 3.11 is needed (PyBullet has no ready-made build for later ones)." >&2; \
+			echo "$(if $(PYTHON),'$(PYTHON)' is not one,None was found): make PYTHON=/path/to/python3.11 ..." >&2; \
+			exit 1; \
+		fi; \
+		echo "Creating $(VENV)"; \
+		"$(PYTHON)" -m venv --clear $(VENV); \
+	fi
+	@echo "Installing torch"
+	@$(BIN)/python -m pip install $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL)) \
+		"$$(grep '^torch==' requirements.txt)"
+	@echo "Installing the other requirements"
+	@$(BIN)/python -m pip install -r requirements.txt
+	@$(BIN)/python -m pip install --no-deps -r requirements-no-deps.txt
+	@$(BIN)/python -m pip install --no-deps -e .
+	@touch $(STAMP)

@@ -1,0 +1,1 @@
+"""Algorithms: networks, losses and data tied together."""

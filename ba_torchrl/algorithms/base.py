@@ -1,0 +1,83 @@
+"""Algorithm: a policy, a replay and an update, ready for the experiment loop."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from ba_torchrl.config import StrictModel
+from ba_torchrl.modules.base import NETWORKS, NetworkConfig
+from ba_torchrl.registry import Registry
+
+__all__ = ["ALGORITHMS", "NETWORKS", "Algorithm", "AlgorithmConfig", "NetworkConfig", "Problem"]
+
+ALGORITHMS: Registry[type[AlgorithmConfig]] = Registry("algorithm", "ba_torchrl.algorithms")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What an algorithm must know about the environments it learns from."""
+
+    image_size: int
+    action_sequence: str
+    max_depth_m: float
+    """Greatest value of the image."""
+    total_updates: int
+    """Length of the run; schedules end with it."""
+    seed: int
+    device: torch.device
+
+
+class Algorithm(ABC):
+    """Learns from transitions; owned and driven by `ba_torchrl.training.experiment`."""
+
+    policy: TensorDictModuleBase
+    """From a root TensorDict of any batch shape to ``action``; explores as TorchRL's
+    ``set_exploration_type`` says."""
+    updates: int = 0
+    """Gradient updates so far."""
+
+    @abstractmethod
+    def extend(self, transitions: TensorDictBase) -> None:
+        """Add transitions [N] to the replay; those with a fault are left out."""
+
+    @property
+    @abstractmethod
+    def replay_size(self) -> int:
+        """Number of transitions in the replay."""
+
+    @abstractmethod
+    def update(self) -> TensorDict:
+        """Sample a batch, take one gradient step and return scalars without gradient.
+
+        Raises:
+            FloatingPointError: a loss is not finite.
+        """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return networks, optimiser, counters and generators."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+
+
+class AlgorithmConfig(StrictModel, ABC):
+    """Hyper-parameters of an algorithm; building it needs a network and the problem."""
+
+    def check(self, network: NetworkConfig) -> None:
+        """Refuse a network that the algorithm does not go with.
+
+        Raises:
+            ConfigError: it does not.
+        """
+
+    @abstractmethod
+    def build(self, network: NetworkConfig, problem: Problem) -> Algorithm:
+        """Return a freshly initialised algorithm."""

@@ -1,0 +1,1 @@
+"""Demonstrations, replay, sampling and augmentation."""

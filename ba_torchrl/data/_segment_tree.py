@@ -1,0 +1,139 @@
+"""NumPy stand-ins for TorchRL's native segment trees.
+
+No published torchrl wheel has an extension that loads against torch 2.13, and prioritised replay
+needs its trees. ``install`` fills the gap where, and only where, the native ones are missing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torchrl.data.replay_buffers.samplers import prioritized
+
+
+class SegmentTree:
+    """Leaves with a running reduction over any range, updated and searched in batches.
+
+    A heap in one array: node i has the children 2 i and 2 i + 1, the leaves are the last half.
+    Values are float64 inside, for sums over many leaves, and come out in ``dtype``.
+
+    Args:
+        capacity: number of leaves.
+    """
+
+    dtype = torch.float64
+    reduce = np.add
+    neutral = 0.0
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = int(capacity)
+        self._leaves = 1 << max(0, self.capacity - 1).bit_length()
+        self._nodes = np.full(2 * self._leaves, self.neutral)
+
+    def __len__(self) -> int:
+        return self.capacity
+
+    def __getitem__(self, index: int | np.ndarray | torch.Tensor) -> float | torch.Tensor:
+        if isinstance(index, int):
+            return float(self._nodes[self._leaves + index])
+        index = np.asarray(index)
+        return torch.as_tensor(self._nodes[self._leaves + index]).to(self.dtype)
+
+    def __setitem__(
+        self, index: int | np.ndarray | torch.Tensor, value: float | np.ndarray | torch.Tensor
+    ) -> None:
+        node = np.atleast_1d(np.asarray(index)).astype(np.int64)
+        if node.size == 0:
+            return
+        if node.min() < 0 or node.max() >= self.capacity:
+            raise IndexError(f"leaf outside [0, {self.capacity})")
+        nodes = self._nodes
+        node = node + self._leaves
+        nodes[node] = np.asarray(value, dtype=np.float64).reshape(-1)
+        if 8 * node.size > self._leaves:  # then whole levels are cheaper than their paths
+            level = self._leaves
+            while level > 1:
+                nodes[level // 2 : level] = self.reduce(
+                    nodes[level : 2 * level : 2], nodes[level + 1 : 2 * level : 2]
+                )
+                level //= 2
+            return
+        while node[0] > 1:  # all paths have the same length
+            node = node >> 1
+            nodes[node] = self.reduce(nodes[2 * node], nodes[2 * node + 1])
+
+    def query(self, start: int, stop: int) -> float:
+        """Return the reduction over the leaves [start, stop).
+
+        Args:
+            start: first leaf.
+            stop: one after the last leaf; at most the capacity counts.
+        """
+        nodes = self._nodes
+        if start <= 0 and stop >= self.capacity:
+            return float(nodes[1])
+        result = self.neutral
+        left, right = max(start, 0) + self._leaves, min(stop, self.capacity) + self._leaves
+        while left < right:
+            if left & 1:
+                result = self.reduce(result, nodes[left])
+                left += 1
+            if right & 1:
+                right -= 1
+                result = self.reduce(result, nodes[right])
+            left, right = left >> 1, right >> 1
+        return float(result)
+
+
+class SumTree(SegmentTree):
+    """Sums, and the search that turns a uniform draw into a leaf."""
+
+    def scan_lower_bound(self, mass: float | np.ndarray | torch.Tensor) -> int | torch.Tensor:
+        """Return the first leaf whose inclusive prefix sum reaches ``mass``.
+
+        Args:
+            mass: in [0, total]; beyond it the answer is the last leaf, or the capacity.
+        """
+        rest = np.atleast_1d(np.asarray(mass, dtype=np.float64)).copy()
+        node = np.ones(rest.shape, dtype=np.int64)
+        while node[0] < self._leaves:
+            left = self._nodes[2 * node]
+            go_right = rest > left
+            rest -= np.where(go_right, left, 0.0)
+            node = 2 * node + go_right
+        leaf = np.minimum(node - self._leaves, self.capacity)
+        return int(leaf[0]) if np.ndim(mass) == 0 else torch.as_tensor(leaf)
+
+
+class MinTree(SegmentTree):
+    """Minima."""
+
+    reduce = np.minimum
+    neutral = np.inf
+
+
+class SumTreeFp32(SumTree):
+    """Sums, read as float32."""
+
+    dtype = torch.float32
+
+
+class MinTreeFp32(MinTree):
+    """Minima, read as float32."""
+
+    dtype = torch.float32
+
+
+_STAND_INS = {
+    "SumSegmentTreeFp32": SumTreeFp32,
+    "SumSegmentTreeFp64": SumTree,
+    "MinSegmentTreeFp32": MinTreeFp32,
+    "MinSegmentTreeFp64": MinTree,
+}
+
+
+def install() -> None:
+    """Give TorchRL's prioritised sampler these trees where its native ones did not load."""
+    for name, stand_in in _STAND_INS.items():
+        if getattr(prioritized, name) is None:
+            setattr(prioritized, name, stand_in)

@@ -1,0 +1,1 @@
+"""Networks and policies: they know shapes, not tasks."""

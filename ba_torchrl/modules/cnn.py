@@ -1,0 +1,127 @@
+"""The plain convolutional actor-critic (appendix G.2; "CNN SACfD")."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.trunk import (
+    ImageTrunk,
+    Precision,
+    scale_from_log_std,
+    scaled_width,
+    trunk_stages,
+)
+
+_WIDTHS = (16, 32, 64, 128, 256, 256, 128)
+_HIDDEN = 128
+
+
+class CastConv2d(nn.Conv2d):
+    """A convolution that computes in its input's dtype and keeps float32 parameters."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the convolution of x [B, C, H, W], in x's dtype."""
+        weight = self.weight.to(dtype=x.dtype, memory_format=torch.channels_last)
+        bias = None if self.bias is None else self.bias.to(x.dtype)
+        return F.conv2d(x, weight, bias, self.stride, self.padding)
+
+
+class CNNActor(nn.Module):
+    """Gaussian policy: an image trunk and one linear layer each for mean and log-std.
+
+    Args:
+        trunk: the image trunk.
+        features: its output size.
+        action_size: number of action components.
+    """
+
+    def __init__(self, trunk: ImageTrunk, features: int, action_size: int) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.loc = nn.Linear(features, action_size)
+        self.log_std = nn.Linear(features, action_size)
+
+    def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
+        features = self.trunk(pixels, holding)
+        return self.loc(features), scale_from_log_std(self.log_std(features))
+
+
+class CNNTwinCritic(nn.Module):
+    """Two value heads on shared features.
+
+    Args:
+        features: size of the features.
+        action_size: number of action components.
+        hidden: width of each head's hidden layer.
+    """
+
+    def __init__(self, features: int, action_size: int, hidden: int) -> None:
+        super().__init__()
+        self.heads = nn.ModuleList(
+            nn.Sequential(
+                nn.Linear(features + action_size, hidden), nn.ReLU(), nn.Linear(hidden, 1)
+            )
+            for _ in range(2)
+        )
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return twin values [..., 2] of features [..., F] and action [..., A]."""
+        x = torch.cat([features, action], dim=-1)
+        return torch.cat([head(x) for head in self.heads], dim=-1)
+
+
+def _initialise(module: nn.Module) -> None:
+    if isinstance(module, nn.Conv2d):
+        nn.init.xavier_normal_(module.weight)
+    elif isinstance(module, nn.Linear):
+        nn.init.xavier_uniform_(module.weight)
+        nn.init.zeros_(module.bias)
+
+
+@NETWORKS.register("cnn")
+class CNNConfig(BaseModel):
+    """Hyper-parameters of the plain convolutional actor-critic.
+
+    Args:
+        width: factor on every layer's width; 1 is the reference's size.
+        precision: number format of the convolutions, see
+            :func:`~ba_torchrl.modules.trunk.compute_dtype`.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    width: float = Field(default=1.0, gt=0)
+    precision: Precision = "auto"
+
+    def build(self, spec: ActorCriticSpec) -> ActorCritic:
+        """Return freshly initialised modules.
+
+        Args:
+            spec: shapes of image and action.
+
+        Raises:
+            ValueError: the image size is not 64 or 128.
+        """
+        features = scaled_width(_WIDTHS[-1], self.width)
+        networks = ActorCritic(
+            actor=CNNActor(self._trunk(spec), features, spec.action_size),
+            encoder=self._trunk(spec),
+            critic=CNNTwinCritic(features, spec.action_size, scaled_width(_HIDDEN, self.width)),
+        )
+        for network in networks:
+            network.apply(_initialise)
+        return networks
+
+    def _trunk(self, spec: ActorCriticSpec) -> ImageTrunk:
+        stages = trunk_stages(spec.image_size, [scaled_width(w, self.width) for w in _WIDTHS])
+        inputs = [spec.image_channels + 1, *(width for width, _, _ in stages)]
+        convs = [
+            CastConv2d(channels, width, 3, padding=padding)
+            for channels, (width, padding, _) in zip(inputs, stages, strict=False)
+        ]
+        return ImageTrunk(convs, [pools for _, _, pools in stages], self.precision)

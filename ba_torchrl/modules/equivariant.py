@@ -1,0 +1,180 @@
+"""The rotation-equivariant actor-critic (appendix G.2; "Equi SACfD").
+
+Turning the scene by +90 degrees about z turns the image by ``torch.rot90(k=1)`` and (dx, dy) into
+(-dy, dx); escnn's rotations have the same sense, so (dx, dy) is a vector field as it stands.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.steerable import (
+    FieldTypes,
+    SteerableConv2d,
+    SteerableLinear,
+    planar_rotations,
+)
+from ba_torchrl.modules.trunk import ImageTrunk, Precision, scale_from_log_std, trunk_stages
+
+if TYPE_CHECKING:
+    from escnn.gspaces import GSpace2D
+
+
+class ActionFields:
+    """How the components of an action transform: (x, y) as a vector, the others not at all.
+
+    Args:
+        action_sequence: one letter per component.
+
+    Raises:
+        ValueError: x or y is missing.
+    """
+
+    def __init__(self, action_sequence: str) -> None:
+        if not {"x", "y"} <= set(action_sequence):
+            raise ValueError(
+                f"an equivariant network needs x and y in the action, got {action_sequence!r}"
+            )
+        self.size = len(action_sequence)
+        self.invariants = [i for i, letter in enumerate(action_sequence) if letter not in "xy"]
+        # Place in the action of each component of [vector, invariants], and the other way round.
+        self._grouped = [action_sequence.index("x"), action_sequence.index("y"), *self.invariants]
+        self._restore = [self._grouped.index(i) for i in range(self.size)]
+
+    def types(self, gspace: GSpace2D, extra_invariants: int = 0) -> FieldTypes:
+        """Return the fields [vector, invariants], with some more invariants at the end."""
+        rotation = gspace.irrep(1)
+        # A half turn acts on x and y separately, so C_2 needs its one-dimensional irrep twice.
+        vector = (rotation, 2 // rotation.size)
+        count = len(self.invariants) + extra_invariants
+        return [vector, (gspace.trivial_repr, count)] if count else [vector]
+
+    def group(self, action: Tensor) -> Tensor:
+        """Return the action's components [..., A] as [vector, invariants]."""
+        return torch.stack([action[..., i] for i in self._grouped], dim=-1)
+
+    def ungroup(self, fields: Tensor) -> Tensor:
+        """Return [vector, invariants] [..., A] in the order of the action."""
+        return torch.stack([fields[..., i] for i in self._restore], dim=-1)
+
+
+class EquivariantActor(nn.Module):
+    """Gaussian policy with equivariant mean and invariant log-std, before the squashing.
+
+    Args:
+        gspace: images and their symmetry group.
+        trunk: the image trunk.
+        features: the fields that it returns.
+        action: how the action transforms.
+    """
+
+    def __init__(
+        self, gspace: GSpace2D, trunk: ImageTrunk, features: FieldTypes, action: ActionFields
+    ) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.action = action
+        # The log-stds are invariants, too.
+        outputs = action.types(gspace, extra_invariants=action.size)
+        self.head = SteerableLinear(gspace, features, outputs)
+
+    def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
+        fields = self.head(self.trunk(pixels, holding))
+        loc, log_std = fields.split(self.action.size, dim=-1)
+        return self.action.ungroup(loc), scale_from_log_std(log_std)
+
+
+class EquivariantTwinCritic(nn.Module):
+    """Two invariant value heads on shared features and the action.
+
+    Args:
+        gspace: images and their symmetry group.
+        features: fields of the features: regular ones.
+        action: how the action transforms.
+    """
+
+    def __init__(self, gspace: GSpace2D, features: FieldTypes, action: ActionFields) -> None:
+        super().__init__()
+        self.action = action
+        ((regular, count),) = features
+        self._group_order = regular.size
+        inputs = [*features, *action.types(gspace)]
+        self.hidden = nn.ModuleList(
+            SteerableLinear(gspace, inputs, [(regular, count)]) for _ in range(2)
+        )
+        # Invariants to one value: its only steerable kernel is the identity, a plain linear map.
+        scalars, value = [(gspace.trivial_repr, count)], [(gspace.trivial_repr, 1)]
+        self.values = nn.ModuleList(SteerableLinear(gspace, scalars, value) for _ in range(2))
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return twin values [..., 2] of features [..., F] and action [..., A]."""
+        x = torch.cat([features, self.action.group(action)], dim=-1)
+        values = []
+        for hidden, value in zip(self.hidden, self.values, strict=True):
+            fields = F.relu(hidden(x)).unflatten(-1, (-1, self._group_order))
+            values.append(value(fields.amax(dim=-1)))
+        return torch.cat(values, dim=-1)
+
+
+@NETWORKS.register("equi")
+class EquivariantConfig(BaseModel):
+    """Hyper-parameters of the rotation-equivariant actor-critic.
+
+    Args:
+        group_order: number of rotations n of the cyclic group C_n, at least 2.
+        n_hidden: regular fields of the last layers; the first has an eighth of them (at 64 px
+            the first stage is missing, and the first layer has a quarter).
+        precision: number format of the convolutions, see
+            :func:`~ba_torchrl.modules.trunk.compute_dtype`.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    group_order: int = Field(default=8, ge=2)
+    n_hidden: int = Field(default=64, ge=4)
+    precision: Precision = "auto"
+
+    def build(self, spec: ActorCriticSpec) -> ActorCritic:
+        """Return freshly initialised modules.
+
+        Args:
+            spec: shapes of image and action.
+
+        Raises:
+            ImportError: escnn is missing; the message names the fix.
+            ValueError: the image size is not 64 or 128, ``n_hidden`` does not divide into whole
+                fields, or the action lacks x or y.
+        """
+        gspace = planar_rotations(self.group_order)
+        action = ActionFields(spec.action_sequence)
+        features = [(gspace.regular_repr, self.n_hidden)]
+        return ActorCritic(
+            actor=EquivariantActor(gspace, self._trunk(gspace, spec), features, action),
+            encoder=self._trunk(gspace, spec),
+            critic=EquivariantTwinCritic(gspace, features, action),
+        )
+
+    def _trunk(self, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:
+        n = self.n_hidden
+        stages = trunk_stages(spec.image_size, (n / 8, n / 4, n / 2, n, 2 * n, n, n))
+        divisor = round(n / stages[0][0])
+        if n % divisor:
+            raise ValueError(
+                f"n_hidden must be a multiple of {divisor} at {spec.image_size} px, since the "
+                f"first layer has n_hidden/{divisor} fields; got {n}"
+            )
+        regular = gspace.regular_repr
+        fields: FieldTypes = [(gspace.trivial_repr, spec.image_channels + 1)]
+        convs = []
+        for width, padding, _ in stages:
+            out = [(regular, int(width))]
+            convs.append(SteerableConv2d(gspace, fields, out, 3, padding=padding))
+            fields = out
+        return ImageTrunk(convs, [pools for _, _, pools in stages], self.precision)

@@ -1,0 +1,121 @@
+"""Shared by the image networks: input assembly, compute precision and the convolution trunk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import cache
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN
+
+Precision = Literal["auto", "float32", "bfloat16"]
+
+SUPPORTED_IMAGE_SIZES = (64, 128)
+
+
+@cache
+def _bfloat16_is_fast(device_type: str) -> bool:
+    if device_type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device_type == "cpu":
+        has = torch.cpu.get_capabilities()
+        return bool(has.get("amx_bf16") or has.get("avx512_bf16"))
+    return False
+
+
+def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
+    """Return the number format that convolutions on ``device`` use.
+
+    Args:
+        precision: "auto" takes bfloat16 where the hardware multiplies it natively.
+        device: where the input lives.
+    """
+    if precision == "auto":
+        return torch.bfloat16 if _bfloat16_is_fast(device.type) else torch.float32
+    return getattr(torch, precision)
+
+
+def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int, bool]]:
+    """Return (width, padding, pools) of each 3x3 stage of a trunk that ends at one pixel.
+
+    128 px shrink to 8 in four pooled stages, then 8 -> 8 -> 6, pool 3 -> 1. At 64 px the first
+    stage is left out (design, section 2).
+
+    Args:
+        image_size: pixels, 64 or 128.
+        widths: the seven widths of the 128 px trunk.
+
+    Raises:
+        ValueError: another image size.
+    """
+    if image_size not in SUPPORTED_IMAGE_SIZES:
+        raise ValueError(
+            f"image_size must be one of {SUPPORTED_IMAGE_SIZES} for this network, got {image_size}"
+        )
+    stages = list(
+        zip(
+            widths,
+            (1, 1, 1, 1, 1, 0, 0),
+            (True, True, True, True, False, True, False),
+            strict=True,
+        )
+    )
+    return stages if image_size == 128 else stages[1:]
+
+
+class ImageTrunk(nn.Module):
+    """Depth image and holding flag to one feature vector, through 3x3 convolutions.
+
+    Activations are channels-last in the compute dtype; parameters stay float32 and each
+    convolution casts its own filter. The result is float32.
+
+    Args:
+        convs: convolutions that take and return plain tensors in the input's dtype.
+        pools: for each, whether a 2x2 max pool follows.
+        precision: see :func:`compute_dtype`.
+    """
+
+    def __init__(
+        self, convs: Iterable[nn.Module], pools: Iterable[bool], precision: Precision
+    ) -> None:
+        super().__init__()
+        self.convs = nn.ModuleList(convs)
+        self.pools = tuple(pools)
+        self.precision: Precision = precision
+
+    def forward(self, pixels: Tensor, holding: Tensor) -> Tensor:
+        """Return features [..., F] of pixels [..., C, H, W] and holding [..., 1]."""
+        leading = pixels.shape[:-3]
+        x = self._input(pixels.flatten(0, -4) if leading else pixels[None], holding)
+        for conv, pool in zip(self.convs, self.pools, strict=True):
+            x = conv(x)
+            # Pooling and ReLU commute; this order leaves the ReLU a quarter of the elements.
+            x = F.relu(F.max_pool2d(x, 2) if pool else x)
+        return x.flatten(1).float().reshape(*leading, -1)
+
+    def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:
+        batch, channels, height, width = pixels.shape
+        x = torch.empty(
+            (batch, channels + 1, height, width),
+            dtype=compute_dtype(self.precision, pixels.device),
+            device=pixels.device,
+            memory_format=torch.channels_last,
+        )
+        x[:, :channels] = pixels
+        x[:, channels:] = holding.reshape(batch, 1, 1, 1)
+        return x
+
+
+def scale_from_log_std(log_std: Tensor) -> Tensor:
+    """Return the standard deviation of a log standard deviation clamped to [-20, 2]."""
+    return log_std.clamp(LOG_STD_MIN, LOG_STD_MAX).exp()
+
+
+def scaled_width(width: int, scale: float) -> int:
+    """Return ``width`` times ``scale``, rounded, at least one."""
+    return max(1, math.floor(width * scale + 0.5))

@@ -1,0 +1,1 @@
+"""Loss modules, after TorchRL's contract."""

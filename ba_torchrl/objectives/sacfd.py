@@ -1,0 +1,282 @@
+"""Soft Actor-Critic from demonstrations (appendix G.2), and plain Soft Actor-Critic within it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.sac import compute_rsample_log_prob
+from torchrl.objectives.utils import dispatch_value_estimator
+
+from ba_torchrl.envs import keys
+
+
+class SACfDLoss(LossModule):
+    """Soft Actor-Critic with a behaviour term on the demonstrations in the batch (appendix G.2).
+
+    With weights w_i (ones without prioritised replay), twin values q_1 and q_2 of the stored
+    action, and an action a ~ pi drawn from the policy::
+
+        y_i         = r_i + gamma (1 - terminated_i) (min_k q'_k(s'_i, a') - alpha log pi(a'|s'_i))
+        loss_qvalue = sum_k mean_i w_i (q_k(s_i, a_i) - y_i)^2
+        loss_actor  = mean_i w_i (alpha log pi(a | s_i) - min_k q_k(s_i, a))
+                      + demonstration_weight * mean over experts of mean over components (a - a_i)^2
+        loss_alpha  = mean_i -log_alpha (log pi(a | s_i) + target_entropy)
+
+    All three are taken at the current parameters and have disjoint gradients, so their sum takes
+    one backward pass. The encoder sees the critic's gradient only; the actor term reuses its
+    features, detached. A truncated step bootstraps, a terminated one does not.
+
+    ``forward`` also writes the priority, mean_k |q_k - y| of shape [..., 1], into its input.
+
+    Args:
+        actor_network: policy; from the observation to a distribution with ``rsample``.
+        encoder_network: from the observation to one entry, the critics' shared features.
+        qvalue_network: from features and action to twin values [..., 2].
+        alpha_init: first value of the entropy temperature.
+        target_entropy: entropy that the temperature steers to, nats.
+        demonstration_weight: factor on the behaviour term; 0 gives plain SAC, and the batch may
+            then lack the expert flag.
+
+    Raises:
+        ValueError: ``alpha_init`` is not positive, or the encoder has several outputs.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Entries that ``set_keys`` can rename; those of the next state are nested in "next"."""
+
+        action: NestedKey = keys.ACTION
+        reward: NestedKey = keys.REWARD
+        done: NestedKey = keys.DONE
+        terminated: NestedKey = keys.TERMINATED
+        is_expert: NestedKey = keys.IS_EXPERT
+        state_action_value: NestedKey = "state_action_value"
+        value: NestedKey = "state_value"
+        priority: NestedKey = keys.TD_ERROR
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    _schedulable_buffers = frozenset({"target_entropy", "demonstration_weight"})
+
+    actor_network: ProbabilisticTensorDictSequential
+    encoder_network: TensorDictModule
+    qvalue_network: TensorDictModule
+    actor_network_params: TensorDictParams
+    encoder_network_params: TensorDictParams
+    qvalue_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    target_encoder_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
+
+    out_keys = (
+        "loss_actor",
+        "loss_qvalue",
+        "loss_alpha",
+        "alpha",
+        "entropy",
+        "demonstration_error",
+        "q_value",
+    )
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        encoder_network: TensorDictModule,
+        qvalue_network: TensorDictModule,
+        *,
+        alpha_init: float = 0.01,
+        target_entropy: float = -5.0,
+        demonstration_weight: float = 1.0,
+    ) -> None:
+        if alpha_init <= 0:
+            raise ValueError(f"alpha_init must be positive, got {alpha_init}")
+        if len(encoder_network.out_keys) != 1:
+            raise ValueError(
+                f"encoder_network must write one entry, got {encoder_network.out_keys}"
+            )
+        super().__init__()
+        self.convert_to_functional(actor_network, "actor_network")
+        self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
+        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
+        device = self._default_device
+        self.register_coeff_buffer("target_entropy", float(target_entropy), device=device)
+        self.register_coeff_buffer(
+            "demonstration_weight", float(demonstration_weight), device=device
+        )
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
+        self._needs_expert_flag = demonstration_weight != 0
+        # Not left to the first forward pass: its gamma is part of the state_dict.
+        self.make_value_estimator(device=device)
+
+    @property
+    def alpha(self) -> Tensor:
+        """The entropy temperature, without gradient."""
+        return self.log_alpha.detach().exp()
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` needs."""
+        observation = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
+        names = [
+            self.tensor_keys.action,
+            *observation,
+            *(_next(key) for key in observation),
+            _next(self.tensor_keys.reward),
+            _next(self.tensor_keys.done),
+            _next(self.tensor_keys.terminated),
+        ]
+        if self._needs_expert_flag:
+            names.append(self.tensor_keys.is_expert)
+        return list(dict.fromkeys(names))
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: object
+    ) -> SACfDLoss:
+        """Choose how targets are formed; TD(0) with gamma 0.99 unless called.
+
+        Args:
+            value_type: TD0, the one estimator that fits a batch of single transitions, or one of
+                TorchRL's estimator objects.
+            hyperparams: its parameters, such as ``gamma``.
+
+        Raises:
+            NotImplementedError: another of TorchRL's named estimators.
+        """
+        value_type, settings = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=(ValueEstimators.TD0,),
+                tensor_keys=self._value_estimator_keys(),
+                value_network=None,
+                **settings,
+            )
+        return self
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._value_estimator_keys())
+
+    def _value_estimator_keys(self) -> dict[str, NestedKey]:
+        return {
+            name: getattr(self.tensor_keys, name)
+            for name in ("value", "reward", "done", "terminated")
+        }
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses and detached diagnostics of a batch of transitions.
+
+        Args:
+            tensordict: transitions [..., B]; gets the priority written into it.
+
+        Returns:
+            Scalars ``loss_actor``, ``loss_qvalue``, ``loss_alpha``; and without gradient
+            ``alpha``, ``entropy``, ``demonstration_error`` (the unweighted behaviour term) and
+            ``q_value`` (mean of the twin values of the stored actions).
+
+        Raises:
+            KeyError: an entry is missing, the expert flag included unless built without weight.
+        """
+        weights = self._importance_weights(tensordict)
+        target = self._target(tensordict)
+
+        features = self._features(tensordict, self.encoder_network_params)
+        action = tensordict[self.tensor_keys.action]
+        q = self._twin_values(features, action, self.qvalue_network_params)
+        error = q - target
+        loss_qvalue = _weighted(error.square().sum(dim=-1), weights)
+        priority = error.detach().abs().mean(dim=-1, keepdim=True)
+        tensordict.set(self.tensor_keys.priority, priority)
+
+        sample, log_prob = self._sample_action(tensordict)
+        # Frozen heads on detached features: the action is the only way back to any parameter.
+        q_pi = self._twin_values(features.detach(), sample, self.qvalue_network_params.data)
+        policy_term = self.alpha * log_prob - q_pi.amin(dim=-1)
+        demonstration = self._demonstration_error(tensordict, sample, action)
+        loss_actor = _weighted(policy_term, weights) + self.demonstration_weight * demonstration
+        log_prob = log_prob.detach()
+        loss_alpha = -(self.log_alpha * (log_prob + self.target_entropy)).mean()
+        return TensorDict(
+            {
+                "loss_actor": loss_actor,
+                "loss_qvalue": loss_qvalue,
+                "loss_alpha": loss_alpha,
+                "alpha": self.alpha,
+                "entropy": -log_prob.mean(),
+                "demonstration_error": demonstration.detach(),
+                "q_value": q.detach().mean(),
+            }
+        )
+
+    @torch.no_grad()
+    def _target(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the critics' target y, [..., 1]."""
+        following = tensordict.get(keys.NEXT)
+        action, log_prob = self._sample_action(following)
+        features = self._features(following, self.target_encoder_network_params)
+        q = self._twin_values(features, action, self.target_qvalue_network_params)
+        value = q.amin(dim=-1, keepdim=True) - self.alpha * log_prob.unsqueeze(-1)
+        return self.value_estimator.value_estimate(tensordict, next_value=value)
+
+    def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return an action [..., A] drawn with gradient and its log-probability [...]."""
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            observation = tensordict.select(*self.actor_network.in_keys)
+            return compute_rsample_log_prob(self.actor_network.get_dist(observation))
+
+    def _features(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        with params.to_module(self.encoder_network, preserve_module_state=False):
+            observation = tensordict.select(*self.encoder_network.in_keys)
+            return self.encoder_network(observation)[self.encoder_network.out_keys[0]]
+
+    def _twin_values(self, features: Tensor, action: Tensor, params: TensorDictBase) -> Tensor:
+        """Return the values [..., 2] of an action at given features."""
+        inputs = TensorDict(
+            {self.encoder_network.out_keys[0]: features, self.tensor_keys.action: action},
+            batch_size=action.shape[:-1],
+        )
+        with params.to_module(self.qvalue_network, preserve_module_state=False):
+            return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
+
+    def _importance_weights(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return the batch's importance weights [...] divided by their largest, None if absent."""
+        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        if weights is None:
+            return None
+        weights = weights.reshape(tensordict.batch_size)
+        return weights / weights.amax()
+
+    def _demonstration_error(
+        self, tensordict: TensorDictBase, sample: Tensor, action: Tensor
+    ) -> Tensor:
+        """Return the squared error to the experts' actions, zero if the batch holds none."""
+        flag = tensordict.get(self.tensor_keys.is_expert, None)
+        if flag is None:
+            if self._needs_expert_flag:
+                raise KeyError(
+                    f"the batch lacks {self.tensor_keys.is_expert!r}, which the behaviour term "
+                    "needs; for plain SAC set demonstration_weight=0"
+                )
+            return sample.new_zeros(())
+        flag = flag.reshape(tensordict.batch_size).to(sample.dtype)
+        error = (sample - action).square().mean(dim=-1)
+        return (flag * error).sum() / flag.sum().clamp_min(1)
+
+
+def _next(key: NestedKey) -> tuple[str, ...]:
+    return (keys.NEXT, key) if isinstance(key, str) else (keys.NEXT, *key)
+
+
+def _weighted(loss: Tensor, weights: Tensor | None) -> Tensor:
+    return (loss if weights is None else weights * loss).mean()

@@ -1,0 +1,1 @@
+"""Scalars, plots and videos."""

@@ -1,0 +1,162 @@
+"""Scalars of a run: one tidy CSV always, and a TorchRL logger beside it on request."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from torchrl.record.loggers import Logger, get_logger
+
+Backend = Literal["csv", "tensorboard", "wandb"]
+
+SCALARS_FILE = "scalars.csv"
+_COLUMNS = ("step", "name", "value")
+
+
+class Series(NamedTuple):
+    """One scalar over a run."""
+
+    steps: np.ndarray
+    """[n] int64, ascending."""
+    values: np.ndarray
+    """[n] float64."""
+
+
+def make_logger(
+    backend: Backend, run_dir: str | Path, name: str, config: Mapping[str, Any]
+) -> Logger | None:
+    """Return TorchRL's logger for ``backend``; none is needed for "csv", see `ScalarLog`.
+
+    Args:
+        backend: "csv", "tensorboard" or "wandb".
+        run_dir: folder of the run, where the logger keeps its files.
+        name: of the run.
+        config: shown with the run; may be nested.
+
+    Raises:
+        ValueError: the backend is unknown.
+        ImportError: its package is missing; the message says how to install it.
+    """
+    if backend == "csv":
+        return None
+    if backend not in ("tensorboard", "wandb"):
+        raise ValueError(f"unknown logger {backend!r}; known are csv, tensorboard and wandb")
+    if importlib.util.find_spec(backend) is None:
+        raise ImportError(
+            f"the logger {backend!r} needs a package that is not installed: "
+            f"pip install 'ba-torchrl[{backend}]'"
+        )
+    options = {"wandb_kwargs": {"project": "ba-torchrl"}} if backend == "wandb" else {}
+    logger = get_logger(backend, logger_name=str(run_dir), experiment_name=name, **options)
+    logger.log_hparams(_flat(config))
+    return logger
+
+
+class ScalarLog:
+    """Writes scalars to ``scalars.csv`` in the run folder, and to a TorchRL logger if asked.
+
+    The file has the columns step, name and value, one row per scalar, and is complete after each
+    `write`. A run that is resumed goes on in the same file. TorchRL's own CSV logger is not used:
+    it writes a file without a header per scalar and keeps everything in memory.
+
+    Args:
+        run_dir: folder of the run; made if it does not exist.
+        backend: "csv" for the file alone, or "tensorboard" or "wandb" beside it.
+        config: of the run, for the backend.
+
+    Raises:
+        ImportError: the package of the backend is missing.
+    """
+
+    def __init__(
+        self,
+        run_dir: str | Path,
+        backend: Backend = "csv",
+        config: Mapping[str, Any] | None = None,
+    ) -> None:
+        run_dir = Path(run_dir)
+        run_dir.mkdir(parents=True, exist_ok=True)
+        self.path = run_dir / SCALARS_FILE
+        self.logger = make_logger(backend, run_dir, run_dir.name, config or {})
+        _drop_torn_row(self.path)
+        self._file = self.path.open("a", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        if self._file.tell() == 0:
+            self._writer.writerow(_COLUMNS)
+
+    def write(self, step: int, scalars: Mapping[str, float]) -> None:
+        """Write scalars by name.
+
+        Args:
+            step: gradient updates so far.
+            scalars: numbers, or tensors of one element.
+        """
+        values = {name: float(value) for name, value in scalars.items()}
+        self._writer.writerows((step, name, repr(value)) for name, value in values.items())
+        self._file.flush()
+        if self.logger is not None:
+            for name, value in values.items():
+                self.logger.log_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Close the file and the logger; closing twice does nothing."""
+        self._file.close()
+        if self.logger is not None:
+            self.logger.close()
+            self.logger = None
+
+
+def read_scalars(path: str | Path) -> dict[str, Series]:
+    """Read the scalars of a run.
+
+    Steps that a resumed run wrote a second time count once, with their later value. A row that
+    was cut off at the end of the file, because the run was killed, is left out.
+
+    Args:
+        path: ``scalars.csv`` or the run folder.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is something else.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path /= SCALARS_FILE
+    text = path.read_text(encoding="utf-8")
+    rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
+    if tuple(next(rows, ())) != _COLUMNS:
+        raise ValueError(f"{path} does not start with the columns {', '.join(_COLUMNS)}")
+    found: dict[str, dict[int, float]] = {}
+    for number, row in enumerate(rows, start=2):
+        try:
+            step, name, value = row
+            found.setdefault(name, {})[int(step)] = float(value)
+        except ValueError:
+            raise ValueError(f"{path}, line {number} is no step, name and value: {row}") from None
+    return {
+        name: Series(np.array(sorted(points)), np.array([points[step] for step in sorted(points)]))
+        for name, points in found.items()
+    }
+
+
+def _drop_torn_row(path: Path) -> None:
+    """Cut off a last row without an end, which a killed run leaves behind."""
+    if path.exists():
+        content = path.read_bytes()
+        if not content.endswith(b"\n"):
+            path.write_bytes(content[: content.rfind(b"\n") + 1])
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested settings to what every backend can show: numbers, flags and text."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value if isinstance(value, int | float | str) else str(value)
+    return flat

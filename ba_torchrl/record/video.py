@@ -1,0 +1,70 @@
+"""Videos of episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+_SUFFIXES = (".mp4", ".gif")
+
+
+def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> Path:
+    """Write pictures as a video.
+
+    Args:
+        path: ends in ``.mp4`` (H.264) or ``.gif``; its folder is made if it does not exist.
+        frames: [T, H, W, 3] uint8, or a sequence of T pictures of one size. In a ``.mp4``, an odd
+            height or width gets one more row or column, a copy of the last.
+        fps: pictures per second.
+
+    Returns:
+        The path.
+
+    Raises:
+        ImportError: imageio or its ffmpeg is missing.
+        ValueError: the frames or the suffix are something else.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise ValueError(f"a video ends in {' or '.join(_SUFFIXES)}, not {path.name!r}")
+    if not fps > 0:
+        raise ValueError(f"fps must be positive, got {fps}")
+    pictures = _checked(frames)
+    try:
+        import imageio
+        import imageio_ffmpeg  # noqa: F401  imageio would find out late, and say less
+    except ImportError as error:
+        raise ImportError("writing videos needs pip install 'ba-torchrl[recipes]'") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if suffix == ".gif":
+        imageio.mimwrite(path, pictures, duration=1000 / fps, loop=0)
+        return path
+    # Players want chroma at half the resolution, hence even sizes; by default imageio would
+    # stretch the picture to multiples of 16 instead.
+    pictures = [_even(picture) for picture in pictures]
+    imageio.mimwrite(
+        path, pictures, fps=fps, codec="libx264", pixelformat="yuv420p", macro_block_size=2
+    )
+    return path
+
+
+def _checked(frames: Sequence[np.ndarray] | np.ndarray) -> list[np.ndarray]:
+    pictures = [np.asarray(frame) for frame in frames]
+    if not pictures:
+        raise ValueError("a video needs at least one frame")
+    for number, picture in enumerate(pictures):
+        right = picture.ndim == 3 and picture.shape[-1] == 3 and picture.dtype == np.uint8
+        if not right or picture.shape != pictures[0].shape or 0 in picture.shape:
+            raise ValueError(
+                f"frames are [H, W, 3] uint8 of one size; frame {number} is "
+                f"{list(picture.shape)} {picture.dtype}, the first {list(pictures[0].shape)}"
+            )
+    return pictures
+
+
+def _even(picture: np.ndarray) -> np.ndarray:
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -1,0 +1,121 @@
+"""Checkpoints of a run: written whole or not at all, with the configuration that rebuilds them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
+
+from ba_torchrl import __version__
+from ba_torchrl.algorithms.base import Algorithm, Problem
+from ba_torchrl.config import ConfigError
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.factory import make_env
+from ba_torchrl.training.config import ExperimentConfig
+
+CONFIG_FILE = "config.json"
+
+
+class Checkpoints:
+    """The checkpoints of a run folder: the newest ones and the best.
+
+    TorchRL publishes each under its final name only when it is complete, so that a crash leaves
+    the previous one whole.
+
+    Args:
+        folder: the run folder.
+        algorithm: what to save.
+        keep_last: how many of the newest to keep.
+    """
+
+    def __init__(self, folder: Path, algorithm: Algorithm, keep_last: int = 2) -> None:
+        self._checkpoint = Checkpoint(algorithm=algorithm)
+        self._rotation = CheckpointRotation(
+            folder / "checkpoints", keep_last=keep_last, keep_best=("success_rate", "max")
+        )
+
+    def save(self, updates: int, success_rate: float) -> Path:
+        """Write a checkpoint and return its folder."""
+        metadata = {
+            "updates": updates,
+            "success_rate": success_rate,
+            "ba_torchrl": __version__,
+            "torch": torch.__version__,
+        }
+        return Path(self._rotation.save(self._checkpoint, step=updates, metadata=metadata))
+
+    def latest(self) -> Path | None:
+        """Return the newest checkpoint's folder, if there is one."""
+        path = self._rotation.latest()
+        return None if path is None else Path(path)
+
+
+def write_config(config: ExperimentConfig) -> None:
+    """Write the run's resolved configuration into its folder."""
+    config.folder.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(config.model_dump(mode="json"), indent=2)
+    (config.folder / CONFIG_FILE).write_text(text + "\n")
+
+
+def find_checkpoint(path: str | Path) -> Path:
+    """Return the checkpoint meant by ``path``: itself, or the newest of a run folder.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    path = Path(path)
+    if (path / "checkpoints").is_dir():
+        rotation = CheckpointRotation(path / "checkpoints", keep_last=1)
+        latest = rotation.latest()
+        if latest is not None:
+            return Path(latest)
+    if path.parent.name == "checkpoints" and path.exists():
+        return path
+    raise ConfigError(
+        f"{path} is neither a run folder with checkpoints nor one of its checkpoints; "
+        "a run folder holds config.json and checkpoints/"
+    )
+
+
+def load(path: str | Path, **changes: Any) -> tuple[ExperimentConfig, Algorithm]:
+    """Rebuild the algorithm of a checkpoint.
+
+    Args:
+        path: a run folder (its newest checkpoint is taken) or one of its checkpoints.
+        changes: fields of `ExperimentConfig` to override, such as ``device="cpu"``.
+
+    Raises:
+        ConfigError: there is no checkpoint, or its configuration does not parse.
+    """
+    checkpoint = find_checkpoint(path)
+    config_file = checkpoint.parent.parent / CONFIG_FILE
+    try:
+        values = json.loads(config_file.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise ConfigError(f"cannot read {config_file}: {error}") from None
+    config = ExperimentConfig.parse({**values, **changes}, what=str(config_file))
+    algorithm = build_algorithm(config)
+    Checkpoint(algorithm=algorithm).load(checkpoint, map_location=config.torch_device)
+    return config, algorithm
+
+
+def build_algorithm(config: ExperimentConfig) -> Algorithm:
+    """Build the untrained algorithm of an experiment."""
+    torch.manual_seed(config.seed)
+    env = make_env(config.task, **config.env)
+    try:
+        pixels = env.observation_spec[keys.PIXELS]
+        problem = Problem(
+            image_size=pixels.shape[-1],
+            action_sequence=env.config.action_sequence,
+            max_depth_m=float(pixels.space.high.max()),
+            total_updates=config.total_updates,
+            seed=config.seed,
+            device=config.torch_device,
+        )
+    finally:
+        env.close()
+    return config.algorithm_config.build(config.network_config, problem)

@@ -1,0 +1,148 @@
+"""ExperimentConfig: everything that determines a training run."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
+from ba_torchrl.config import ConfigError, EnvConfig, StrictModel, parse
+from ba_torchrl.tasks.base import TASKS
+
+
+class SeedUse(IntEnum):
+    """What a seed is derived for; no two uses share episodes, nor do two runs."""
+
+    DEMONSTRATIONS = 0
+    COLLECTION = 1
+    EVALUATION = 2
+
+
+class ExperimentConfig(StrictModel):
+    """One training run. Fields that the paper fixes have its values (appendix G.2).
+
+    Parsing it checks all of it, nested parts included, before anything starts.
+    """
+
+    task: str
+    """Id of the task."""
+    env: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `EnvConfig`."""
+    algorithm: dict[str, Any]
+    """``name`` of a registered algorithm and its hyper-parameters."""
+    network: dict[str, Any]
+    """``name`` of a registered network and its hyper-parameters."""
+    seed: int = Field(default=0, ge=0)
+    """Seed of networks, environments, replay and augmentation."""
+    device: str = "auto"
+    """Where the learner runs; "auto" takes a GPU if there is one."""
+    threads: int | None = Field(default=None, ge=1)
+    """torch threads of the learner; None leaves torch's choice."""
+    num_envs: int = Field(default=5, ge=1)
+    """Environments that collect side by side."""
+    parallel: bool = True
+    """One process per environment, or all in the learner's process."""
+    start_method: Literal["spawn", "fork"] = "spawn"
+    """How those processes start."""
+    demonstrations: int = Field(default=100, ge=0)
+    """Expert episodes in the replay from the start."""
+    only_successful_demonstrations: bool = False
+    """Leave out expert episodes that failed."""
+    pretrain_updates: int = Field(default=0, ge=0)
+    """Updates on the demonstrations alone, before the first step."""
+    total_updates: int = Field(default=10_000, ge=1)
+    """Gradient updates of the run, pretraining included."""
+    updates_per_step: int = Field(default=1, ge=1)
+    """Updates for each step of all environments together."""
+    min_replay: int = Field(default=100, ge=1)
+    """Transitions in the replay before the first update."""
+    eval_every: int = Field(default=500, ge=1)
+    """Updates between evaluations of the greedy policy."""
+    eval_episodes: int = Field(default=100, ge=1)
+    """Episodes of each of them."""
+    final_eval_episodes: int = Field(default=100, ge=1)
+    """Episodes of the last evaluation, the one that is reported."""
+    checkpoint_every: int = Field(default=500, ge=1)
+    """Updates between checkpoints; the best and the last are kept besides."""
+    log_every: int = Field(default=50, ge=1)
+    """Updates between rows of the losses."""
+    logger: Literal["csv", "tensorboard", "wandb"] = "csv"
+    """Where scalars go, besides the run folder's CSV."""
+    video_episodes: int = Field(default=3, ge=0)
+    """Greedy episodes in the video at the end."""
+    label: str = "run"
+    """Name of the curve in plots, such as "sacfd equi"."""
+    run_dir: str = "runs/run"
+    """Folder of everything the run writes."""
+
+    @cached_property
+    def env_config(self) -> EnvConfig:
+        """The environments' parameters."""
+        return parse(EnvConfig, self.env, "env")
+
+    @cached_property
+    def network_config(self) -> NetworkConfig:
+        """The network's hyper-parameters."""
+        return _choose(NETWORKS, self.network, "network")
+
+    @cached_property
+    def algorithm_config(self) -> AlgorithmConfig:
+        """The algorithm's hyper-parameters."""
+        return _choose(ALGORITHMS, self.algorithm, "algorithm")
+
+    def derived_seed(self, use: SeedUse) -> int:
+        """Return the first seed of the environments that serve ``use``."""
+        return int(np.random.SeedSequence([self.seed, use]).generate_state(1)[0])
+
+    @property
+    def torch_device(self) -> torch.device:
+        """The learner's device."""
+        if self.device == "auto":
+            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(self.device)
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return Path(self.run_dir)
+
+    @classmethod
+    def parse(cls, values: dict[str, Any], what: str = "experiment") -> ExperimentConfig:
+        """Validate ``values``, nested parts included.
+
+        Raises:
+            ConfigError: a name is unknown, a type wrong, or parts do not go together.
+        """
+        config = parse(cls, values, what)
+        TASKS[config.task]  # raises with the known names
+        for reserved in ("seed", "expert"):
+            if reserved in config.env:
+                raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
+        _ = config.env_config
+        config.algorithm_config.check(config.network_config)
+        if config.pretrain_updates > config.total_updates:
+            raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
+        if config.pretrain_updates and not config.demonstrations:
+            raise ConfigError("pretrain_updates needs demonstrations")
+        try:
+            device = config.torch_device
+        except RuntimeError as error:
+            raise ConfigError(f"device: {error}") from None
+        if device.type == "cuda" and not torch.cuda.is_available():
+            raise ConfigError("device: no CUDA device is there; use device=cpu or device=auto")
+        return config
+
+
+def _choose(registry: Any, values: dict[str, Any], kind: str) -> Any:
+    """Return the registered configuration class called ``values["name"]``, filled in."""
+    rest = dict(values)
+    name = rest.pop("name", None)
+    if name is None:
+        raise ConfigError(f"{kind}.name is missing; known: {', '.join(registry)}")
+    return parse(registry[name], rest, f"{kind} {name!r}")

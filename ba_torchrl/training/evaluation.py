@@ -1,0 +1,108 @@
+"""Evaluation: the greedy policy on episodes of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ba_torchrl import make
+from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
+from ba_torchrl.envs import keys
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found."""
+
+    episodes: int
+    success_rate: float
+    """Share of episodes that reached the goal."""
+    standard_error: float
+    """Of the success rate (binomial)."""
+    mean_length: float
+    """Steps per episode, failures at their full length."""
+
+    def scalars(self) -> dict[str, float]:
+        """Return the figures by name, for loggers."""
+        return {
+            "eval/success_rate": self.success_rate,
+            "eval/standard_error": self.standard_error,
+            "eval/mean_length": self.mean_length,
+        }
+
+
+def evaluate(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    episodes: int,
+    seed: int,
+    on_episode: Callable[[TensorDict], None] | None = None,
+) -> Evaluation:
+    """Play greedy episodes, a fixed number per environment, always from the same seeds.
+
+    Args:
+        env: a vector of environments.
+        policy: acts greedily under TorchRL's deterministic exploration type.
+        episodes: how many in all.
+        seed: of the first episodes.
+        on_episode: called with each episode, for progress bars.
+    """
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        played = collect_episodes(
+            env,
+            policy,
+            episodes,
+            seed=seed,
+            exclude=(keys.PIXELS, keys.EXPERT_ACTION),
+            on_episode=on_episode,
+        )
+    rate = success_rate(played)
+    error = math.sqrt(rate * (1 - rate) / len(played))
+    return Evaluation(len(played), rate, error, mean_length(played))
+
+
+@torch.no_grad()
+def film(
+    task: str,
+    env_settings: dict[str, Any],
+    policy: Callable[[TensorDict], TensorDict],
+    episodes: int,
+    seed: int,
+    hold_frames: int = 4,
+) -> list[np.ndarray]:
+    """Play greedy episodes and photograph every step.
+
+    Args:
+        task: id of the task.
+        env_settings: fields of `EnvConfig`.
+        policy: acts on an unbatched root TensorDict.
+        episodes: how many.
+        seed: of the first.
+        hold_frames: how often the last picture of an episode is repeated.
+
+    Returns:
+        Pictures [H, W, 3] uint8 in a row.
+    """
+    frames: list[np.ndarray] = []
+    env = make(task, **{**env_settings, "seed": seed})
+    try:
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            for _ in range(episodes):
+                state = env.reset()
+                frames.append(env.render())
+                while not state[keys.DONE]:
+                    state = env.step(policy(state))[keys.NEXT]
+                    frames.append(env.render())
+                frames += [frames[-1]] * hold_frames
+    finally:
+        env.close()
+    return frames

@@ -1,0 +1,231 @@
+"""Experiment: the one training loop. Collect, store, update, evaluate, save."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from ba_torchrl import make_vector_env
+from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.episodes import mean_length, success_rate
+from ba_torchrl.envs import keys
+from ba_torchrl.record.logging import ScalarLog
+from ba_torchrl.record.plots import plot_learning_curve
+from ba_torchrl.record.video import write_video
+from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, write_config
+from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.evaluation import Evaluation, evaluate, film
+
+logger = logging.getLogger(__name__)
+
+RECENT_EPISODES = 100
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run ended with, and where to find it."""
+
+    evaluation: Evaluation
+    checkpoint: Path
+    curve: Path
+    video: Path | None
+    seconds: float
+
+
+class Experiment:
+    """A training run, from demonstrations to the last evaluation.
+
+    Args:
+        config: the run.
+        progress: show a progress bar.
+    """
+
+    def __init__(self, config: ExperimentConfig, progress: bool = True) -> None:
+        self.config = config
+        self.progress = progress
+        if config.threads is not None:
+            torch.set_num_threads(config.threads)
+        write_config(config)
+        self.algorithm = build_algorithm(config)
+        self.checkpoints = Checkpoints(config.folder, self.algorithm)
+        self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
+        self._train_env: EnvBase | None = None
+        self._eval_env: EnvBase | None = None
+        self._curve: list[tuple[int, Evaluation]] = []
+        self._recent: deque[bool] = deque(maxlen=RECENT_EPISODES)
+        self._env_steps = 0
+        self._faults = 0
+
+    def run(self) -> Result:
+        """Train, evaluate, and write curve, video and checkpoint into the run folder."""
+        started = time.perf_counter()
+        try:
+            self._demonstrate()
+            self._learn()
+            return self._finish(started)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Close environments and loggers."""
+        for env in (self._train_env, self._eval_env):
+            if env is not None and not env.is_closed:
+                env.close()
+        self.log.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- stages ------------------------------------------------------------------------------
+
+    def _demonstrate(self) -> None:
+        """Fill the replay with the expert's episodes."""
+        if not self.config.demonstrations:
+            return
+        seed = self.config.derived_seed(SeedUse.DEMONSTRATIONS)
+        env = self._make_env(seed, expert=True)
+        try:
+            episodes = collect_demonstrations(
+                env,
+                self.config.demonstrations,
+                seed=seed,
+                only_successful=self.config.only_successful_demonstrations,
+            )
+        finally:
+            env.close()
+        if not episodes:
+            raise RuntimeError(
+                "the expert did not succeed once; see only_successful_demonstrations"
+            )
+        for episode in episodes:
+            self.algorithm.extend(as_transitions(episode, is_expert=True))
+        self.log.write(
+            0,
+            {
+                "demonstrations/success_rate": success_rate(episodes),
+                "demonstrations/mean_length": mean_length(episodes),
+            },
+        )
+
+    def _learn(self) -> None:
+        """Alternate collecting and updating until the updates are used up."""
+        config, algorithm = self.config, self.algorithm
+        with tqdm(total=config.total_updates, disable=not self.progress, unit="update") as bar:
+            self._bar = bar
+            for _ in range(config.pretrain_updates):
+                self._update()
+            if algorithm.updates == config.total_updates:
+                return
+            self._train_env = self._make_env(config.derived_seed(SeedUse.COLLECTION))
+            collector = Collector(
+                self._train_env,
+                algorithm.policy,
+                frames_per_batch=config.num_envs,
+                total_frames=-1,
+                postproc=lambda data: data.reshape(-1),
+            )
+            try:
+                for data in collector:
+                    self._store(data)
+                    if algorithm.replay_size < config.min_replay:
+                        continue
+                    for _ in range(config.updates_per_step):
+                        self._update()
+                        if algorithm.updates == config.total_updates:
+                            return
+            finally:
+                collector.shutdown(close_env=False)
+
+    def _finish(self, started: float) -> Result:
+        """Evaluate for the record; write curve, video and the last checkpoint."""
+        config = self.config
+        evaluation = self._evaluate(config.final_eval_episodes)
+        checkpoint = self.checkpoints.save(self.algorithm.updates, evaluation.success_rate)
+        curve = config.folder / "learning_curve.png"
+        updates = [updates for updates, _ in self._curve]
+        rates = [item.success_rate for _, item in self._curve]
+        errors = [item.standard_error for _, item in self._curve]
+        low = [rate - error for rate, error in zip(rates, errors, strict=True)]
+        high = [rate + error for rate, error in zip(rates, errors, strict=True)]
+        plot_learning_curve(
+            {config.label: (updates, rates, low, high)},
+            curve,
+            title=config.task,
+            xlabel="updates",
+            ylabel="success rate of the greedy policy",
+        )
+        video = None
+        if config.video_episodes:
+            video = config.folder / "evaluation.mp4"
+            frames = film(
+                config.task,
+                config.env,
+                self.algorithm.policy,
+                config.video_episodes,
+                config.derived_seed(SeedUse.EVALUATION),
+            )
+            write_video(video, frames, fps=5)
+        return Result(evaluation, checkpoint, curve, video, time.perf_counter() - started)
+
+    # -- parts -------------------------------------------------------------------------------
+
+    def _make_env(self, seed: int, expert: bool = False) -> EnvBase:
+        config = self.config
+        return make_vector_env(
+            config.task,
+            config.num_envs,
+            parallel=config.parallel,
+            start_method=config.start_method,
+            **{**config.env, "seed": seed, "expert": expert},
+        )
+
+    def _store(self, data: TensorDict) -> None:
+        """Add collected transitions to the replay and keep score of the episodes."""
+        self._env_steps += data.numel()
+        following = data[keys.NEXT]
+        self._faults += int(following[keys.FAULT].sum())
+        ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
+        self._recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
+        self.algorithm.extend(as_transitions(data, is_expert=False))
+
+    def _update(self) -> None:
+        """Take one update, and whatever is due after it."""
+        config = self.config
+        scalars = self.algorithm.update()
+        updates = self.algorithm.updates
+        self._bar.update()
+        if updates % config.log_every == 0:
+            values = {f"train/{key}": float(value) for key, value in scalars.items()}
+            values |= {"train/env_steps": self._env_steps, "train/faults": self._faults}
+            if self._recent:
+                values["train/success_rate"] = sum(self._recent) / len(self._recent)
+            self.log.write(updates, values)
+        is_last = updates == config.total_updates
+        if updates % config.eval_every == 0 and not is_last:
+            self._evaluate(config.eval_episodes)
+        if updates % config.checkpoint_every == 0 and not is_last:
+            rate = self._curve[-1][1].success_rate if self._curve else 0.0
+            self.checkpoints.save(updates, rate)
+
+    def _evaluate(self, episodes: int) -> Evaluation:
+        seed = self.config.derived_seed(SeedUse.EVALUATION)
+        if self._eval_env is None:
+            self._eval_env = self._make_env(seed)
+        evaluation = evaluate(self._eval_env, self.algorithm.policy, episodes, seed)
+        self._curve.append((self.algorithm.updates, evaluation))
+        self.log.write(self.algorithm.updates, evaluation.scalars())
+        self._bar.set_postfix(success=f"{evaluation.success_rate:.2f}")
+        return evaluation

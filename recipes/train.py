@@ -1,0 +1,35 @@
+"""Train a policy.
+
+python recipes/train.py task=close_loop/block_picking algorithm=sacfd network=equi seed=0
+python recipes/train.py --config-name quickstart
+"""
+
+from ba_torchrl._malloc import tune_malloc
+
+tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
+
+import hydra  # noqa: E402
+from omegaconf import DictConfig, OmegaConf  # noqa: E402
+
+from ba_torchrl.training.config import ExperimentConfig  # noqa: E402
+from ba_torchrl.training.experiment import Experiment  # noqa: E402
+
+OmegaConf.register_new_resolver("task_name", lambda task: task.replace("/", "_"))
+
+
+@hydra.main(config_path="../configs", config_name="train", version_base="1.3")
+def main(settings: DictConfig) -> None:
+    """Run the experiment that the configuration describes."""
+    config = ExperimentConfig.parse(OmegaConf.to_container(settings, resolve=True))
+    result = Experiment(config).run()
+    evaluation = result.evaluation
+    print(f"success_rate {evaluation.success_rate:.2f} over {evaluation.episodes} episodes")
+    print(f"  {evaluation.mean_length:.1f} steps per episode; {result.seconds / 60:.1f} minutes")
+    print(f"  curve       {result.curve}")
+    if result.video is not None:
+        print(f"  video       {result.video}")
+    print(f"  checkpoint  {result.checkpoint}")
+
+
+if __name__ == "__main__":
+    main()

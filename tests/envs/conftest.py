@@ -1,0 +1,33 @@
+import multiprocessing
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from ba_torchrl.envs.vector import make_vector_env
+
+# Spawned workers inherit this path and find the modules of the tests there.
+sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture
+def make_fakes():
+    """Make vectors of fake environments (forked, unless told otherwise) and close them."""
+    from fake_env import FakeEnv
+
+    made = []
+
+    def make(num_envs=2, *, seed=0, folder=None, horizon=1000, **options):
+        options = {"start_method": "fork", "timeout_s": 20.0} | options
+        factory = partial(FakeEnv, folder=folder, horizon=horizon)
+        env = make_vector_env(factory, num_envs, seed=seed, **options)
+        made.append(env)
+        return env
+
+    yield make
+    for env in made:
+        for worker in getattr(env, "parent_channels", ()):
+            worker.abort()  # faster than an orderly end, which tests of `close` look at
+        env.close(raise_if_closed=False)
+    assert multiprocessing.active_children() == []

@@ -1,0 +1,117 @@
+"""For the tests of vectors: a tiny environment that fails on demand, and what they all ask."""
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+FLAGS = ("done", "terminated", "truncated")
+BUFFERS = pytest.mark.parametrize("use_buffers", [True, False], ids=["buffers", "pipes"])
+
+
+def flag():
+    return Binary(n=1, shape=(1,), dtype=torch.bool)
+
+
+class FakeEnv(EnvBase):
+    """Pixels are drawn from the seed; the reward is the sum of the action.
+
+    A file named ``<pid>.<when>`` (when: step, reset) in ``folder`` makes that process raise,
+    hang or die as the file says; it is removed first, unless the word starts with "always".
+    A file named ``build`` makes every constructor but the first raise.
+    """
+
+    def __init__(self, folder=None, horizon=1000, size=4, work_s=0.0):
+        super().__init__(device="cpu", batch_size=[])
+        self.folder = None if folder is None else Path(folder)
+        self.horizon = horizon
+        self.size = size
+        self.work_s = work_s
+        self.observation_spec = Composite(
+            pixels=Bounded(0, 1, shape=(1, size, size), dtype=torch.float32),
+            holding=flag(),
+            success=flag(),
+            fault=flag(),
+            step_count=Unbounded(shape=(1,), dtype=torch.int64),
+        )
+        self.action_spec = Bounded(-1, 1, shape=(2,), dtype=torch.float32)
+        self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32)
+        self.full_done_spec = Composite({key: flag() for key in FLAGS})
+        self.generator = torch.Generator()
+        self.count = None
+        if self.folder is not None and (self.folder / "build").exists():
+            raise OSError("no simulator today")
+
+    def _set_seed(self, seed):
+        self.generator.manual_seed(seed)
+
+    def _misbehave(self, when):
+        if self.folder is None:
+            return
+        for name in (f"{os.getpid()}.{when}", f"all.{when}"):
+            path = self.folder / name
+            if path.exists():
+                order = path.read_text()
+                if not order.startswith("always"):
+                    path.unlink()
+                if order.endswith("raise"):
+                    raise ArithmeticError("the simulator exploded")
+                if order.endswith("hang"):
+                    time.sleep(1000)
+                os.kill(os.getpid(), 9)
+
+    def _observe(self, **flags):
+        out = {
+            "pixels": torch.rand(1, self.size, self.size, generator=self.generator),
+            "step_count": torch.tensor([self.count]),
+            **{key: torch.tensor([False]) for key in ("holding", "success", "fault")},
+            **{key: torch.tensor([flags.get(key, False)]) for key in FLAGS},
+        }
+        return TensorDict(out, batch_size=[])
+
+    def _reset(self, tensordict=None, *, seed=None, **kwargs):
+        self._misbehave("reset")
+        if seed is not None:
+            self._set_seed(seed)
+        self.count = 0
+        return self._observe()
+
+    def _step(self, tensordict):
+        self._misbehave("step")
+        if self.work_s:
+            end = time.perf_counter() + self.work_s
+            while time.perf_counter() < end:
+                pass
+        self.count += 1
+        end = self.count >= self.horizon
+        out = self._observe(truncated=end, done=end)
+        out["reward"] = tensordict["action"].sum(-1, keepdim=True)
+        return out
+
+
+def act(env, td, value=0.1):
+    return td.set("action", torch.full((*env.batch_size, 2), value))
+
+
+def assert_lost(result, index, before):
+    """``result`` reports for one environment that its episode was lost after ``before``."""
+    answer = result["next"][index]
+    assert torch.equal(answer["pixels"], before["pixels"][index])
+    for key in ("fault", "truncated", "done"):
+        assert answer[key].item(), key
+    for key in ("success", "terminated"):
+        assert not answer[key].item(), key
+    assert answer["reward"].item() == 0
+
+
+def assert_stepped(result, index, before):
+    answer = result["next"][index]
+    assert not torch.equal(answer["pixels"], before["pixels"][index])
+    assert answer["step_count"].item() == before["step_count"][index].item() + 1
+    assert not answer["fault"].item()
+    assert answer["reward"].item() == pytest.approx(0.2)

@@ -1,0 +1,162 @@
+import logging
+
+import pybullet
+import pytest
+import torch
+from torchrl.collectors import Collector
+
+import ba_torchrl
+from ba_torchrl.actions import InvalidActionError
+from ba_torchrl.envs import base
+
+TASK = "close_loop/block_picking"
+
+
+@pytest.fixture
+def env():
+    env = ba_torchrl.make(TASK, obs_size=16, seed=0)
+    yield env
+    if not env.is_closed:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (torch.full((5,), float("nan")), "not finite"),
+        (torch.tensor([0, 0, float("inf"), 0, 0]), "not finite"),
+        (torch.zeros(4), r"shape \(5,\)"),
+        (torch.zeros(5, dtype=torch.int64), "float32"),
+    ],
+)
+def test_bad_actions_raise_before_anything_moves(env, action, message):
+    state = env.reset()
+    before = env.scene.world.steps
+    with pytest.raises(InvalidActionError, match=message):
+        env._step(state.clone().set("action", action))
+    assert env.scene.world.steps == before
+    assert env.step(state.set("action", torch.zeros(5)))["next", "step_count"] == 1
+
+
+def test_a_missing_action_says_so(env):
+    with pytest.raises(InvalidActionError, match="'action'"):
+        env._step(env.reset())
+
+
+def test_nan_through_parallel_env_raises_in_the_parent():
+    env = ba_torchrl.make_vector_env(TASK, 2, start_method="fork", obs_size=16, seed=0)
+    try:
+        state = env.reset()
+        action = torch.zeros(2, 5)
+        action[1, 2] = float("nan")
+        with pytest.raises(ValueError, match="1"):
+            env.step(state.clone().set("action", action))
+        following = env.step(state.set("action", torch.zeros(2, 5)))["next"]
+        assert following["step_count"].flatten().tolist() == [1, 1]
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("start_method", ["fork", "spawn"])
+def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel(start_method):
+    policy = lambda td: td.set("action", torch.full((2, 5), -0.4))  # noqa: E731
+    rollouts = []
+    for parallel in (True, False):
+        env = ba_torchrl.make_vector_env(
+            TASK, 2, parallel=parallel, start_method=start_method, obs_size=16, seed=5
+        )
+        rollouts.append(env.rollout(6, policy, break_when_any_done=False))
+        env.close()
+    assert torch.equal(rollouts[0]["next", "pixels"], rollouts[1]["next", "pixels"])
+    assert not torch.equal(rollouts[0]["pixels"][0, 0], rollouts[0]["pixels"][1, 0])
+
+
+def test_a_simulator_fault_ends_the_episode_truncated(env, monkeypatch, caplog):
+    state = env.reset()
+    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
+        patch.setattr(env.scene.motion, "move_to", _fail)
+        following = env.step(state.set("action", torch.zeros(5)))["next"]
+    assert following["fault"]
+    assert following["truncated"]
+    assert not following["terminated"]
+    assert following["reward"] == 0
+    assert env.faults == 1
+    assert "simulator fault" in caplog.text
+    assert "the solver exploded" in caplog.text
+    state = env.reset()
+    assert not env.step(state.set("action", torch.zeros(5)))["next", "fault"]
+
+
+def test_faults_without_end_are_an_error(env, monkeypatch):
+    monkeypatch.setattr(base, "MAX_CONSECUTIVE_FAULTS", 2)
+    monkeypatch.setattr("ba_torchrl.sim.motion.CloseLoopMotion.move_to", _fail)
+    for _ in range(2):
+        assert env.step(env.reset().set("action", torch.zeros(5)))["next", "fault"]
+    with pytest.raises(base.SimulationError, match="3 times in a row"):
+        env.step(env.reset().set("action", torch.zeros(5)))
+
+
+def _fail(*_):
+    raise RuntimeError("the solver exploded")
+
+
+def test_collectors_reset_each_environment_on_its_own():
+    env = ba_torchrl.make_vector_env(TASK, 3, parallel=False, obs_size=16, seed=0, max_steps=7)
+    collector = Collector(env, frames_per_batch=60, total_frames=60)
+    (data,) = list(collector)
+    collector.shutdown()
+    assert data.shape == (3, 20)
+    for row in data:
+        counts = row["next", "step_count"].flatten().tolist()
+        starts = row["step_count"].flatten().tolist()
+        done = row["next", "done"].flatten().tolist()
+        for t in range(19):
+            assert starts[t + 1] == (0 if done[t] else counts[t])
+            if not done[t]:
+                assert torch.equal(row["pixels"][t + 1], row["next", "pixels"][t])
+        assert max(counts) <= 7
+
+
+def test_expert_key_only_on_request(env):
+    assert "expert_action" not in env.reset().keys()  # noqa: SIM118 -- a TensorDict
+    with_expert = ba_torchrl.make(TASK, obs_size=16, seed=0, expert=True)
+    assert with_expert.reset()["expert_action"].shape == (5,)
+    with_expert.close()
+
+
+def test_closing_frees_the_simulator(env):
+    env.reset()
+    client = env.scene.world.client
+    env.close()
+    env.close(raise_if_closed=False)
+    assert not pybullet.isConnected(physicsClientId=client)
+
+
+def test_dpos_and_drot_scale_the_action():
+    moved = []
+    for dpos, drot in ((0.05, 0.6), (0.01, 0.2)):
+        env = ba_torchrl.make(TASK, obs_size=16, seed=0, dpos=dpos, drot=drot)
+        state = env.reset()
+        env.step(state.set("action", torch.tensor([1.0, 1.0, 0.0, 0.0, 1.0])))
+        (x, _, _), yaw = env.scene.robot.tool_pose()
+        moved.append((x - 0.45, yaw))
+        env.close()
+    assert moved[0] == pytest.approx((0.05, 0.6), abs=1e-3)
+    assert moved[1] == pytest.approx((0.01, 0.2), abs=1e-3)
+
+
+def test_translations_are_clipped_to_the_workspace(env):
+    state = env.reset()
+    for _ in range(8):
+        state = env.step(state.set("action", torch.tensor([1.0, 1, -1, 1, 0])))["next"]
+    assert env.scene.robot.tool_pose()[0] == pytest.approx((0.6, -0.15, 0.25), abs=1e-3)
+
+
+def test_view_scale_sets_the_width_of_the_image():
+    heights = []
+    for scale in (1.5, 0.75):
+        env = ba_torchrl.make(TASK, obs_size=64, seed=0, view_scale=scale)
+        depth = env.reset()["pixels"]
+        heights.append(int((depth == 0).sum()))
+        env.close()
+    assert heights[1] == pytest.approx(4 * heights[0], rel=0.35)

@@ -1,0 +1,197 @@
+"""The steerable layer against escnn's own."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+
+pytest.importorskip("escnn")
+
+from escnn import nn as enn
+
+from ba_torchrl.modules.steerable import (
+    SteerableConv2d,
+    SteerableLinear,
+    he_scales,
+    kernel_block,
+    planar_rotations,
+)
+
+
+def field_types(gspace, spec):
+    named = {
+        "regular": gspace.regular_repr,
+        "trivial": gspace.trivial_repr,
+        "vector": gspace.irrep(1),
+    }
+    return [(named[name], count) for name, count in spec]
+
+
+def escnn_twin(ours, gspace, in_types, out_types):
+    """escnn's layer with the coefficients and biases of ours."""
+
+    def flat(types):
+        return enn.FieldType(gspace, [rep for rep, count in types for _ in range(count)])
+
+    twin = enn.R2Conv(
+        flat(in_types),
+        flat(out_types),
+        ours.kernel_size,
+        padding=ours.padding,
+        initialize=False,
+    )
+    # escnn orders the blocks by the names of their representations, in then out.
+    pairs = sorted(
+        (in_types[i][0].name, out_types[o][0].name, f"in{i}_out{o}")
+        for i in range(len(in_types))
+        for o in range(len(out_types))
+        if f"in{i}_out{o}" in ours.coefficients
+    )
+    with torch.no_grad():
+        twin.weights.copy_(torch.cat([ours.coefficients[name].flatten() for *_, name in pairs]))
+        if ours.bias is not None:
+            twin.bias.copy_(ours.bias)
+    return twin
+
+
+CASES = [
+    (8, [("trivial", 2)], [("regular", 3)], 3),
+    (8, [("regular", 3)], [("regular", 2)], 3),
+    (4, [("regular", 2)], [("regular", 4)], 5),
+    (6, [("regular", 2)], [("vector", 1), ("trivial", 8)], 1),
+    (8, [("regular", 4), ("vector", 1), ("trivial", 3)], [("regular", 4)], 1),
+    (8, [("vector", 2), ("trivial", 3)], [("trivial", 2), ("regular", 1)], 3),
+    (2, [("regular", 2), ("vector", 2)], [("vector", 2), ("trivial", 1)], 3),
+    (8, [("trivial", 3)], [("vector", 1), ("trivial", 2)], 1),  # trivial to vector: no kernel
+]
+
+
+def build(case):
+    order, inputs, outputs, kernel_size = case
+    gspace = planar_rotations(order)
+    types = field_types(gspace, inputs), field_types(gspace, outputs)
+    ours = SteerableConv2d(gspace, *types, kernel_size, padding=kernel_size // 2)
+    with torch.no_grad():
+        for bias in [ours.bias] if ours.bias is not None else []:
+            bias.normal_()
+    return ours, gspace, *types
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_forward_equals_escnn(case):
+    torch.manual_seed(0)
+    ours, gspace, in_types, out_types = build(case)
+    twin = escnn_twin(ours, gspace, in_types, out_types)
+    x = torch.randn(2, twin.in_type.size, 9, 9)
+    expected = twin(twin.in_type(x)).tensor
+    torch.testing.assert_close(ours(x), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_he_scales_equal_escnn(case):
+    ours, gspace, in_types, out_types = build(case)
+    twin = escnn_twin(ours, gspace, in_types, out_types)
+    # Filling our coefficients with their own standard deviations lines both layers up.
+    scales = he_scales(ours._blocks, in_types, out_types)
+    with torch.no_grad():
+        for (i, o), scale in scales.items():
+            ours.coefficients[f"in{i}_out{o}"].copy_(
+                scale.expand_as(ours.coefficients[f"in{i}_out{o}"])
+            )
+    expected = enn.init._generalized_he_init_variances(twin.basisexpansion)
+    actual = escnn_twin(ours, gspace, in_types, out_types).weights.detach()
+    torch.testing.assert_close(actual, expected)
+
+
+def test_initial_coefficients_have_the_he_scale():
+    torch.manual_seed(0)
+    gspace = planar_rotations(8)
+    types = [(gspace.regular_repr, 32)]
+    layer = SteerableConv2d(gspace, types, types, 3)
+    (scale,) = he_scales(layer._blocks, types, types).values()
+    measured = layer.coefficients["in0_out0"].detach().flatten(0, 1).std(dim=0)
+    torch.testing.assert_close(measured, scale, rtol=0.15, atol=0)
+    assert not layer.bias.any()
+
+
+def test_weight_change_shows_at_once_in_eval_mode():
+    ours, *_ = build(CASES[1])
+    ours.eval()
+    x = torch.randn(1, 24, 7, 7)
+    with torch.no_grad():
+        before = ours(x)
+        for parameter in ours.parameters():
+            parameter.mul_(2)
+        torch.testing.assert_close(ours(x), 2 * before)
+
+
+def test_copies_state_dict_and_pickle_carry_parameters_only():
+    ours, *_ = build(CASES[4])
+    x = torch.randn(2, 37, 5, 5)
+    expected = ours(x)
+    assert set(ours.state_dict()) == {name for name, _ in ours.named_parameters()}
+    other = copy.deepcopy(ours)
+    assert torch.equal(other(x), expected)
+    stream = io.BytesIO(pickle.dumps(ours))
+    assert torch.equal(pickle.load(stream)(x), expected)
+    fresh, *_ = build(CASES[4])
+    assert not torch.equal(fresh(x), expected)
+    fresh.load_state_dict(ours.state_dict())
+    assert torch.equal(fresh(x), expected)
+    with torch.no_grad():
+        other.coefficients["in0_out0"].zero_()
+    assert torch.equal(ours(x), expected)
+
+
+def test_bfloat16_input_computes_in_bfloat16_with_float32_gradients():
+    ours, *_ = build(CASES[1])
+    x = torch.randn(2, 24, 6, 6)
+    out = ours(x.bfloat16())
+    assert out.dtype == torch.bfloat16
+    torch.testing.assert_close(out.float(), ours(x), atol=0.15, rtol=0.05)
+    out.float().sum().backward()
+    assert all(p.grad is not None and p.grad.dtype == torch.float32 for p in ours.parameters())
+
+
+@pytest.mark.parametrize("order", [4, 8])
+def test_quarter_turn_of_one_layer_is_exact(order):
+    torch.manual_seed(0)
+    gspace = planar_rotations(order)
+    layer = SteerableConv2d(
+        gspace, [(gspace.trivial_repr, 2)], [(gspace.irrep(1), 1)], 5, padding=2
+    )
+    x = torch.randn(1, 2, 12, 12)
+    plain, turned = layer(x), layer(torch.rot90(x, 1, (-2, -1)))
+    expected = torch.rot90(torch.stack([-plain[:, 1], plain[:, 0]], dim=1), 1, (-2, -1))
+    torch.testing.assert_close(turned, expected, atol=1e-5, rtol=1e-4)
+
+
+def test_linear_is_the_one_pixel_convolution():
+    gspace = planar_rotations(8)
+    types = [(gspace.regular_repr, 2)], [(gspace.irrep(1), 1), (gspace.trivial_repr, 2)]
+    linear = SteerableLinear(gspace, *types)
+    conv = SteerableConv2d(gspace, *types, 1)
+    conv.load_state_dict(linear.state_dict())
+    x = torch.randn(3, 2, 16)
+    expected = conv(x.flatten(0, 1)[:, :, None, None])[:, :, 0, 0].unflatten(0, (3, 2))
+    torch.testing.assert_close(linear(x), expected)
+
+
+def test_blocks_are_shared_in_the_process():
+    gspace = planar_rotations(8)
+    again = planar_rotations(8)
+    regular = kernel_block(gspace, gspace.regular_repr, gspace.regular_repr, 3)
+    assert kernel_block(again, again.regular_repr, again.regular_repr, 3) is regular
+
+
+def test_bad_field_types_are_refused():
+    gspace = planar_rotations(8)
+    trivial, vector, regular = gspace.trivial_repr, gspace.irrep(1), gspace.regular_repr
+    with pytest.raises(ValueError, match="each representation once"):
+        SteerableConv2d(gspace, [(regular, 1), (regular, 2)], [(regular, 1)], 3)
+    with pytest.raises(ValueError, match="at least one"):
+        SteerableConv2d(gspace, [(regular, 0)], [(regular, 1)], 3)
+    with pytest.raises(ValueError, match="no steerable kernel"):
+        SteerableConv2d(gspace, [(trivial, 1)], [(vector, 1)], 1)

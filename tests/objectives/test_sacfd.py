@@ -1,0 +1,417 @@
+"""The SACfD loss against plain arithmetic, and against TorchRL's contract."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from torch import nn
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import SoftUpdate, ValueEstimators
+
+from ba_torchrl.envs import keys
+from ba_torchrl.objectives.sacfd import SACfDLoss
+
+
+class LinearPolicy(nn.Module):
+    """loc = W [pixels, holding], scale constant per component."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Linear(3, 2)
+        self.log_std = nn.Parameter(torch.tensor([-0.5, -1.0]))
+
+    def forward(self, pixels, holding):
+        x = torch.cat([pixels, holding.to(pixels.dtype)], dim=-1)
+        loc = self.net(x)
+        return loc, self.log_std.exp().expand_as(loc)
+
+
+class LinearEncoder(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Linear(3, 4)
+
+    def forward(self, pixels, holding):
+        return torch.tanh(self.net(torch.cat([pixels, holding.to(pixels.dtype)], dim=-1)))
+
+
+class LinearTwins(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Linear(6, 2)
+
+    def forward(self, features, action):
+        return self.net(torch.cat([features, action], dim=-1))
+
+
+class NoiselessTanhNormal:
+    """A distribution whose draws are its tanh mean and whose log-probability is a formula.
+
+    So the arithmetic below needs no random numbers.
+    """
+
+    def __init__(self, loc, scale):
+        self.loc, self.scale = loc, scale
+
+    def rsample(self, shape=()):
+        return self.loc.tanh()
+
+    def log_prob(self, action):
+        return (action.sum(dim=-1) + self.scale.log().sum(dim=-1)) / 2
+
+
+def make(distribution=NoiselessTanhNormal, seed=0, policy=None, **settings):
+    torch.manual_seed(seed)
+    observation = [keys.PIXELS, keys.HOLDING]
+    network = TensorDictModule(policy or LinearPolicy(), observation, ["loc", "scale"])
+    head = ProbabilisticTensorDictModule(
+        in_keys=["loc", "scale"],
+        out_keys=[keys.ACTION],
+        distribution_class=distribution,
+    )
+    loss = SACfDLoss(
+        ProbabilisticTensorDictSequential(network, head),
+        TensorDictModule(LinearEncoder(), observation, ["features"]),
+        TensorDictModule(LinearTwins(), ["features", keys.ACTION], ["state_action_value"]),
+        **settings,
+    )
+    loss.double()
+    SoftUpdate(loss, tau=0.01)
+    with torch.no_grad():  # targets that differ from the online networks
+        for name in ("target_encoder_network_params", "target_qvalue_network_params"):
+            for value in getattr(loss, name).values(True, True):
+                value.mul_(0.7)
+    return loss
+
+
+def batch(experts=(True, False, True, False), weights=(0.2, 0.8, 0.4, 0.1)):
+    """Four transitions: running, terminated, truncated, terminated by success."""
+    generator = torch.Generator().manual_seed(7)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64) * 2 - 1
+
+    def flag(*values):
+        return torch.tensor(values)[:, None]
+
+    terminated, truncated = flag(False, True, False, True), flag(False, False, True, False)
+    data = {
+        keys.PIXELS: rand(4, 2),
+        keys.HOLDING: flag(True, False, False, True),
+        keys.ACTION: rand(4, 2),
+        keys.NEXT: {
+            keys.PIXELS: rand(4, 2),
+            keys.HOLDING: flag(False, False, True, True),
+            keys.REWARD: torch.tensor([[0.0], [0.0], [0.5], [1.0]], dtype=torch.float64),
+            keys.TERMINATED: terminated,
+            keys.TRUNCATED: truncated,
+            keys.DONE: terminated | truncated,
+        },
+    }
+    if experts is not None:
+        data[keys.IS_EXPERT] = flag(*experts)
+    if weights is not None:
+        data["priority_weight"] = torch.tensor(weights, dtype=torch.float64)
+    return TensorDict(data, [4])
+
+
+def affine(row_weights, bias, x):
+    return [
+        sum(w * v for w, v in zip(row, x, strict=True)) + b
+        for row, b in zip(row_weights, bias, strict=True)
+    ]
+
+
+def by_hand(loss, data, gamma, alpha, target_entropy, demonstration_weight):
+    """Every number of the loss, with Python floats and loops only."""
+
+    def parameters(name):
+        tree = getattr(loss, name)
+        return tree["module", "net", "weight"].tolist(), tree["module", "net", "bias"].tolist()
+
+    actor_tree = loss.actor_network_params["module", "0", "module"]
+    actor = actor_tree["net", "weight"].tolist(), actor_tree["net", "bias"].tolist()
+    log_std = actor_tree["log_std"].tolist()
+
+    def policy(x):
+        action = [math.tanh(v) for v in affine(*actor, x)]
+        return action, (sum(action) + sum(log_std)) / 2
+
+    def q(x, action, prefix):
+        encoder = parameters(f"{prefix}encoder_network_params")
+        features = [math.tanh(v) for v in affine(*encoder, x)]
+        return affine(*parameters(f"{prefix}qvalue_network_params"), features + action)
+
+    def observation(tree, i):
+        return [*tree[keys.PIXELS][i].tolist(), float(tree[keys.HOLDING][i])]
+
+    n = len(data)
+    weights = data["priority_weight"].tolist() if "priority_weight" in data else [1.0] * n
+    weights = [w / max(weights) for w in weights]
+    qvalue = actor_term = alpha_term = entropy = value = behaviour = 0.0
+    experts, priorities = 0, []
+    for i in range(n):
+        x, following = observation(data, i), observation(data[keys.NEXT], i)
+        stored = data[keys.ACTION][i].tolist()
+        next_action, next_log_prob = policy(following)
+        bootstrap = min(q(following, next_action, "target_")) - alpha * next_log_prob
+        y = float(data[keys.NEXT, keys.REWARD][i])
+        if not data[keys.NEXT, keys.TERMINATED][i]:
+            y += gamma * bootstrap
+        errors = [v - y for v in q(x, stored, "")]
+        qvalue += weights[i] * sum(e * e for e in errors) / n
+        value += sum(q(x, stored, "")) / 2 / n
+        priorities.append([sum(abs(e) for e in errors) / 2])
+        action, log_prob = policy(x)
+        actor_term += weights[i] * (alpha * log_prob - min(q(x, action, ""))) / n
+        alpha_term -= math.log(alpha) * (log_prob + target_entropy) / n
+        entropy -= log_prob / n
+        if keys.IS_EXPERT in data and data[keys.IS_EXPERT][i]:
+            experts += 1
+            behaviour += sum((a - e) ** 2 for a, e in zip(action, stored, strict=True)) / 2
+    behaviour /= max(experts, 1)
+    return {
+        "loss_qvalue": qvalue,
+        "loss_actor": actor_term + demonstration_weight * behaviour,
+        "loss_alpha": alpha_term,
+        "alpha": alpha,
+        "entropy": entropy,
+        "demonstration_error": behaviour,
+        "q_value": value,
+    }, priorities
+
+
+@pytest.mark.parametrize("weights", [(0.2, 0.8, 0.4, 0.1), None], ids=["weights", "uniform"])
+@pytest.mark.parametrize("experts", [(True, False, True, False), (False,) * 4, (True,) * 4])
+@pytest.mark.parametrize("demonstration_weight", [1.0, 0.3])
+def test_numbers_worked_out_by_hand(experts, weights, demonstration_weight):
+    loss = make(
+        alpha_init=0.2, target_entropy=-1.5, demonstration_weight=demonstration_weight
+    ).make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+    data = batch(experts, weights)
+    expected, priorities = by_hand(loss, data, 0.9, 0.2, -1.5, demonstration_weight)
+    out = loss(data)
+    assert set(out.keys()) == set(loss.out_keys) == set(expected)
+    for name, value in expected.items():
+        assert out[name].item() == pytest.approx(value, rel=1e-6), name
+    assert data[keys.TD_ERROR].shape == (4, 1)
+    expected_priorities = torch.tensor(priorities, dtype=torch.float64)
+    torch.testing.assert_close(data[keys.TD_ERROR], expected_priorities, rtol=1e-6, atol=0)
+
+
+def test_defaults_are_the_papers():
+    loss = make()
+    assert float(loss.value_estimator.gamma) == pytest.approx(0.99)
+    assert float(loss.alpha) == pytest.approx(0.01)
+    assert float(loss.target_entropy) == -5
+    data = batch()
+    expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 1)
+    assert float(loss(data)["loss_qvalue"]) == pytest.approx(expected["loss_qvalue"], rel=1e-6)
+
+
+def test_truncated_bootstraps_and_terminated_does_not():
+    loss = make()
+    data = batch()
+    priority = loss(data.clone())["loss_qvalue"]
+    far = data.clone()
+    far[keys.NEXT, keys.PIXELS][2] += 5  # the truncated one
+    assert loss(far)["loss_qvalue"] != priority
+    same = data.clone()
+    same[keys.NEXT, keys.PIXELS][[1, 3]] += 5  # the terminated ones
+    assert loss(same)["loss_qvalue"] == priority
+
+
+def test_steps_to_next_obs_raises_gamma():
+    loss = make(alpha_init=0.2).make_value_estimator(gamma=0.9)
+    data = batch(weights=None)
+    data["steps_to_next_obs"] = torch.full((4, 1), 3)
+    expected, _ = by_hand(loss, data, 0.9**3, 0.2, -5, 1)
+    assert float(loss(data)["loss_qvalue"]) == pytest.approx(expected["loss_qvalue"], rel=1e-6)
+
+
+def test_plain_sac_needs_no_expert_flag():
+    loss = make(demonstration_weight=0.0)
+    assert keys.IS_EXPERT not in loss.in_keys
+    data = batch(experts=None)
+    out = loss(data)
+    expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 0)
+    assert float(out["loss_actor"]) == pytest.approx(expected["loss_actor"], rel=1e-6)
+    assert out["demonstration_error"] == 0
+    with pytest.raises(KeyError, match="demonstration_weight=0"):
+        make()(data)
+
+
+def gradients(loss, data, *names):
+    loss.zero_grad()
+    out = loss(data.clone())
+    sum(out[name] for name in names).backward()
+    return {name for name, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
+
+
+def test_each_term_reaches_its_own_parameters_only():
+    loss, data = make(), batch()
+
+    def owned(*prefixes):
+        return {n for n, _ in loss.named_parameters() if n.startswith(prefixes)}
+
+    assert gradients(loss, data, "loss_actor") == owned("actor_network_params")
+    assert gradients(loss, data, "loss_qvalue") == owned("encoder_network", "qvalue_network")
+    assert gradients(loss, data, "loss_alpha") == {"log_alpha"}
+    everything = gradients(loss, data, "loss_actor", "loss_qvalue", "loss_alpha")
+    assert everything == {name for name, _ in loss.named_parameters()}
+    out = loss(data)
+    for name in ("alpha", "entropy", "demonstration_error", "q_value"):
+        assert not out[name].requires_grad
+
+
+def test_behaviour_term_pulls_the_sample_to_the_expert():
+    loss = make(alpha_init=1e-9, demonstration_weight=1.0)
+    data = batch()
+    with torch.no_grad():  # critics that do not care
+        loss.qvalue_network_params["module", "net", "weight"].zero_()
+    optimizer = torch.optim.SGD(loss.actor_network_params.parameters(), 0.1)
+    errors = []
+    for _ in range(20):
+        out = loss(data.clone())
+        errors.append(float(out["demonstration_error"]))
+        optimizer.zero_grad()
+        out["loss_actor"].backward()
+        optimizer.step()
+    assert all(later < earlier for earlier, later in itertools.pairwise(errors))
+
+
+def test_soft_update_moves_the_targets():
+    loss = make()
+    updater = SoftUpdate(loss, tau=0.25)
+    pairs = [("encoder_network_params", "net", "weight"), ("qvalue_network_params", "net", "bias")]
+    with torch.no_grad():
+        for name, *path in pairs:
+            getattr(loss, name)["module", *path].add_(1.0)
+    before = [getattr(loss, f"target_{name}")["module", *path].clone() for name, *path in pairs]
+    updater.step()
+    for (name, *path), old in zip(pairs, before, strict=True):
+        source = getattr(loss, name)["module", *path]
+        target = getattr(loss, f"target_{name}")["module", *path]
+        torch.testing.assert_close(target, old + 0.25 * (source - old))
+        assert not torch.equal(target, old)
+    assert not any(n.startswith("target") for n, _ in loss.named_parameters())
+
+
+def loss_names(out):
+    return sorted(out.keys())
+
+
+def test_renamed_keys():
+    data = batch()
+    plain, renamed = make(), make()
+    expected = plain(data.clone())
+    renames = {
+        keys.ACTION: "act",
+        keys.IS_EXPERT: ("meta", "demo"),
+        (keys.NEXT, keys.REWARD): (keys.NEXT, "r"),
+        (keys.NEXT, keys.TERMINATED): (keys.NEXT, "end"),
+        (keys.NEXT, keys.DONE): (keys.NEXT, "stop"),
+        "priority_weight": "w",
+    }
+    other = data.clone()
+    for old, new in renames.items():
+        other.rename_key_(old, new)
+    renamed.qvalue_network.in_keys[1] = "act"
+    renamed.set_keys(
+        action="act",
+        is_expert=("meta", "demo"),
+        reward="r",
+        terminated="end",
+        done="stop",
+        priority="prio",
+        priority_weight="w",
+    )
+    assert {"act", ("meta", "demo"), ("next", "r")} <= set(renamed.in_keys)
+    out = renamed(other)
+    for name in loss_names(expected):
+        torch.testing.assert_close(out[name], expected[name])
+    assert other["prio"].shape == (4, 1)
+    with pytest.raises(ValueError, match="not an accepted tensordict key"):
+        renamed.set_keys(colour="red")
+
+
+def test_dispatch_takes_keyword_tensors():
+    loss, data = make(), batch(weights=None)
+    expected = loss(data.clone())
+    named = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in loss.in_keys}
+    values = loss(**named)
+    assert len(values) == len(loss.out_keys)
+    for name, value in zip(loss.out_keys, values, strict=True):
+        torch.testing.assert_close(value, expected[name])
+
+
+def test_coefficients_can_be_scheduled_and_saved():
+    loss, data = make(), batch()
+    before = loss(data.clone())
+    loss.demonstration_weight = 0.0
+    loss.target_entropy = -3.0
+    after = loss(data.clone())
+    change = (before["loss_actor"] - after["loss_actor"]).detach()
+    torch.testing.assert_close(change, before["demonstration_error"])
+    assert after["loss_alpha"] != before["loss_alpha"]
+    state = loss.state_dict()
+    other = make(seed=5)
+    other.load_state_dict(state)
+    torch.testing.assert_close(other(data.clone())["loss_actor"], after["loss_actor"])
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="alpha_init"):
+        make(alpha_init=0.0)
+    with pytest.raises(NotImplementedError):
+        make().make_value_estimator(ValueEstimators.TDLambda)
+
+
+def test_with_tanh_normal_actor_and_image_networks():
+    """The real thing: TorchRL's actor on the plain network, one joint backward pass."""
+    from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
+
+    torch.manual_seed(0)
+    networks = NETWORKS["cnn"](width=0.1).build(ActorCriticSpec(64, "pxyz"))
+    observation = [keys.PIXELS, keys.HOLDING]
+    actor = ProbabilisticActor(
+        TensorDictModule(networks.actor, observation, ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": -1.0, "high": 1.0},
+        return_log_prob=True,
+    )
+    loss = SACfDLoss(
+        actor,
+        TensorDictModule(networks.encoder, observation, ["features"]),
+        TensorDictModule(networks.critic, ["features", keys.ACTION], ["state_action_value"]),
+        target_entropy=-4.0,
+    )
+    updater = SoftUpdate(loss, tau=0.01)
+    data = batch().apply(lambda x: x.float() if x.is_floating_point() else x)
+    data[keys.PIXELS] = torch.rand(4, 1, 64, 64)
+    data[keys.NEXT, keys.PIXELS] = torch.rand(4, 1, 64, 64)
+    data[keys.ACTION] = torch.rand(4, 4) * 2 - 1
+    optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
+    history = []
+    for _ in range(15):
+        out = loss(data)
+        total = out["loss_actor"] + out["loss_qvalue"] + out["loss_alpha"]
+        optimizer.zero_grad()
+        total.backward()
+        assert all(p.grad is not None and p.grad.isfinite().all() for p in loss.parameters())
+        optimizer.step()
+        updater.step()
+        history.append(float(out["loss_qvalue"]))
+    assert history[-1] < history[0] / 2
+    # The policy that acts shares its parameters with the loss.
+    acting = dict(actor.named_parameters())
+    assert {p.data_ptr() for p in acting.values()} <= {p.data_ptr() for p in loss.parameters()}
+    assert actor(data.select(*observation))[keys.ACTION].abs().max() <= 1

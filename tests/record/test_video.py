@@ -1,0 +1,66 @@
+import sys
+
+import numpy as np
+import pytest
+
+from ba_torchrl.record.video import write_video
+
+imageio = pytest.importorskip("imageio.v3")
+
+
+def film(frames, height, width):
+    """A bright square moves to the right over a dark background."""
+    video = np.full((frames, height, width, 3), 30, dtype=np.uint8)
+    for t in range(frames):
+        video[t, 8:24, 4 * t : 4 * t + 16] = (250, 120, 40)
+    return video
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "written"), [(64, 96, (64, 96)), (61, 75, (62, 76)), (360, 480, (360, 480))]
+)
+def test_mp4_shows_the_frames(tmp_path, height, width, written):
+    video = film(7, height, width)
+    path = write_video(tmp_path / "new" / "episode.mp4", list(video), fps=5)
+    read = imageio.imread(path, plugin="FFMPEG")
+    assert read.shape == (7, *written, 3)
+    assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 5
+    assert np.abs(read[:, :height, :width].astype(int) - video).mean() < 6
+
+
+def test_gif_shows_the_frames(tmp_path):
+    video = film(5, 33, 41)
+    path = write_video(tmp_path / "episode.GIF", video, fps=4)
+    read = imageio.imread(path, index=None)
+    assert np.abs(read[..., :3].astype(int) - video).max() < 16
+    assert imageio.immeta(path)["duration"] == 250
+    assert imageio.immeta(path)["loop"] == 0
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ([], "at least one frame"),
+        (np.zeros((3, 8, 8, 3)), r"frame 0 is \[8, 8, 3\] float64"),
+        (np.zeros((3, 8, 8, 1), np.uint8), r"frame 0 is \[8, 8, 1\]"),
+        ([np.zeros((8, 8, 3), np.uint8), np.zeros((8, 6, 3), np.uint8)], "frame 1"),
+    ],
+)
+def test_refuses_other_frames(tmp_path, frames, message):
+    with pytest.raises(ValueError, match=message):
+        write_video(tmp_path / "episode.mp4", frames, fps=5)
+    assert not list(tmp_path.iterdir())
+
+
+def test_refuses_other_suffixes_and_speeds(tmp_path):
+    with pytest.raises(ValueError, match=r"mp4 or \.gif"):
+        write_video(tmp_path / "episode.avi", film(2, 32, 32), fps=5)
+    with pytest.raises(ValueError, match="fps must be positive"):
+        write_video(tmp_path / "episode.mp4", film(2, 32, 32), fps=0)
+
+
+@pytest.mark.parametrize("package", ["imageio", "imageio_ffmpeg"])
+def test_missing_package_names_the_way_out(tmp_path, monkeypatch, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=r"pip install 'ba-torchrl\[recipes\]'"):
+        write_video(tmp_path / "episode.mp4", film(2, 32, 32), fps=5)

@@ -1,0 +1,125 @@
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pytest
+
+import ba_torchrl
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.world import SimulationError, World
+
+
+def test_worlds_do_not_share_anything():
+    with World() as first, World() as second:
+        a = first.add(Box(size_m=(0.05, 0.05, 0.05)), "a")
+        b = second.add(Box(size_m=(0.05, 0.05, 0.05)), "b")
+        a.place((0, 0, 1.0))
+        b.place((0, 0, 1.0))
+        first.step(10)
+        assert a.position[2] < 1.0
+        assert b.position[2] == 1.0
+
+
+def test_a_sealed_world_takes_no_bodies():
+    with World() as world:
+        world.seal()
+        with pytest.raises(SimulationError, match="sealed"):
+            world.add(Box(size_m=(0.05, 0.05, 0.05)), "late")
+
+
+def test_resetting_before_sealing_is_an_error():
+    with World() as world, pytest.raises(SimulationError, match="seal"):
+        world.restore_pristine()
+
+
+def test_settle_is_bounded_and_says_whether_it_worked():
+    with World() as world:
+        box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
+        box.place((0, 0, 0.025))
+        assert world.settle()
+        box.place((0, 0, 50.0))
+        before = world.steps
+        assert not world.settle(max_steps=20)
+        assert world.steps - before == 20
+
+
+def test_closing_frees_the_client():
+    world = World()
+    client = world.client
+    world.close()
+    world.close()
+    assert world.is_closed
+    assert not pybullet.isConnected(physicsClientId=client)
+
+
+def test_dropping_a_world_frees_its_client():
+    client = World().client
+    assert not pybullet.isConnected(physicsClientId=client)
+
+
+def test_touching_means_contact():
+    with World() as world:
+        a, b = (world.add(Box(size_m=(0.05, 0.05, 0.05)), n) for n in "ab")
+        a.place((0, 0, 0.025))
+        for gap, expected in ((0.002, False), (0.0, True)):
+            b.place((0.05 + gap, 0, 0.025))
+            world.step(2)
+            assert a.touches(b) is expected
+
+
+def fingerprint(env):
+    """Hash of every pose, velocity and joint of the scene."""
+    scene = env.scene
+    client = scene.world.client
+    values = []
+    for body in scene.world.bodies:
+        values += sum(body.pose, ())
+        values += sum(pybullet.getBaseVelocity(body.id, physicsClientId=client), ())
+    joints = pybullet.getJointStates(scene.robot.id, range(14), physicsClientId=client)
+    values += [x for state in joints for x in state[:2]]
+    return hashlib.sha1(np.array(values).tobytes()).hexdigest()
+
+
+def test_episodes_repeat_bit_by_bit_whatever_came_before():
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (8, 5)).astype(np.float32)
+
+    def episode(env, seed):
+        import torch
+
+        state = env.reset(seed=seed)
+        prints = [fingerprint(env)]
+        for action in actions:
+            env.step(state.set("action", torch.from_numpy(action)))
+            prints.append(fingerprint(env))
+        return prints
+
+    used = ba_torchrl.make("close_loop/block_pulling", obs_size=16)
+    fresh = ba_torchrl.make("close_loop/block_pulling", obs_size=16)
+    first = {seed: episode(used, seed) for seed in range(4)}
+    for seed in (2, 0, 3, 1, 1):
+        assert episode(used, seed) == first[seed]
+    assert episode(fresh, 3) == first[3]
+    assert first[0] != first[1]
+    used.close()
+    fresh.close()
+
+
+def resident_mb():
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 1e6
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
+def test_two_thousand_resets_do_not_grow():
+    env = ba_torchrl.make("close_loop/block_pushing", obs_size=16)
+    for _ in range(200):
+        env.reset()
+    before = resident_mb()
+    bodies = pybullet.getNumBodies(physicsClientId=env.scene.world.client)
+    for _ in range(2000):
+        env.reset()
+    assert resident_mb() - before < 5
+    assert pybullet.getNumBodies(physicsClientId=env.scene.world.client) == bodies
+    env.close()

@@ -1,0 +1,120 @@
+"""Goals hold where they should and not next to it; bad scenes end the episode."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ba_torchrl
+
+
+@pytest.fixture
+def make():
+    envs = []
+
+    def build(task, **config):
+        env = ba_torchrl.make(f"close_loop/{task}", obs_size=16, seed=0, **config)
+        env.reset()
+        envs.append(env)
+        return env
+
+    yield build
+    for env in envs:
+        env.close()
+
+
+def test_reaching_needs_three_centimetres(make):
+    env = make("block_reaching")
+    scene = env.scene
+    scene.task.block.place((0.45, 0.0, 0.025))
+    for z, expected in ((0.025 + 0.031, False), (0.025 + 0.029, True)):
+        scene.motion.reset(((0.45, 0.0, z), 0.0))
+        assert scene.task.is_goal() is expected
+
+
+def test_picking_needs_the_grasp_and_the_height(make):
+    env = make("block_picking")
+    scene = env.scene
+    scene.task.block.place((0.45, 0.0, 0.025))
+    scene.motion.reset(((0.45, 0.0, 0.16), 0.0))
+    assert not scene.task.is_goal()  # high, but empty
+    scene.motion.move_to((0.45, 0.0, 0.025), 0.0)
+    scene.motion.grip(0.0)
+    scene.motion.move_to((0.45, 0.0, 0.14), 0.0)
+    assert not scene.task.is_goal()  # held, but low
+    scene.motion.move_to((0.45, 0.0, 0.16), 0.0)
+    assert scene.task.is_goal()
+    scene.motion.grip(1.0)
+    scene.world.settle()
+    assert not scene.task.is_goal()
+
+
+def test_pushing_needs_five_centimetres(make):
+    env = make("block_pushing")
+    task = env.scene.task
+    task.goal.place((0.45, 0.0, 0.0))
+    for distance, expected in ((0.051, False), (0.049, True)):
+        task.block.place((0.45 + distance * math.cos(1.0), distance * math.sin(1.0), 0.025))
+        assert task.is_goal() is expected
+
+
+def test_pulling_needs_contact(make):
+    env = make("block_pulling")
+    scene = env.scene
+    first, second = scene.task.blocks
+    first.place((0.4, 0.0, 0.025))
+    for gap, expected in ((0.003, False), (0.0, True)):
+        second.place((0.4 + 0.08 + gap, 0.0, 0.025))
+        scene.world.step(2)
+        assert scene.task.is_goal() is expected
+
+
+def test_an_object_that_leaves_the_workspace_terminates_without_reward(make):
+    env = make("block_picking")
+    env.scene.task.block.place((0.45, 0.16, 0.025))
+    outcome = env._step(env.full_action_spec.zero())
+    assert outcome["terminated"]
+    assert outcome["done"]
+    assert not outcome["success"]
+    assert outcome["reward"] == 0
+
+
+def test_bounding_box_check_is_stricter_than_the_origin(make):
+    for check, valid in (("point", True), ("bounding_box", False)):
+        env = make("block_picking", workspace_check=check)
+        env.scene.task.block.place((0.45, 0.13, 0.025))
+        assert env.scene.task.is_valid() is valid
+
+
+def test_fixed_orientations(make):
+    env = make("block_pulling", random_orientation=False)
+    for _ in range(5):
+        env.reset()
+        first, second = env.scene.task.blocks
+        assert abs(first.yaw_rad) < 1e-3
+        assert abs(second.yaw_rad) < 1e-3
+        assert first.position[0] == pytest.approx(second.position[0], abs=1e-3)
+
+
+def test_scales_are_drawn_in_steps_and_show_in_the_image(make):
+    env = make("block_picking", object_scale_range=(0.8, 0.9))
+    seen = set()
+    for _ in range(40):
+        state = env.reset()
+        edge = env.scene.task.block.shape.size_m[0]
+        seen.add(round(edge / 0.05, 4))
+        depth = state["pixels"]
+        assert float(depth.max() - depth[depth > 0].min()) == pytest.approx(edge, abs=1e-3)
+    assert seen == {0.8, 0.82, 0.84, 0.86, 0.88, 0.9}
+
+
+def test_positions_cover_the_workspace_and_keep_clear_of_the_border(make):
+    env = make("block_picking")
+    points = []
+    for _ in range(300):
+        env.reset()
+        points.append(env.scene.task.block.position[:2])
+    points = np.array(points)
+    low, high = points.min(axis=0), points.max(axis=0)
+    np.testing.assert_allclose(low, (0.36, -0.09), atol=5e-3)
+    np.testing.assert_allclose(high, (0.54, 0.09), atol=5e-3)

@@ -1,0 +1,214 @@
+"""Who may import whom, read off the sources and off what an import pulls in."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "ba_torchrl"
+
+BASE = {"config", "registry", "actions"}
+# Each part may import itself, what comes before it, and what EXTRA names. `__init__` is the
+# package itself, whose functions make environments.
+CHAIN = ["sim", "tasks", "envs", "data", "algorithms", "training", "recipes"]
+EXTRA = {
+    "data": {"__init__"},
+    "algorithms": {"__init__", "modules", "objectives"},
+    "training": {"__init__", "record"},
+    "recipes": {"__init__", "record"},
+}
+SHARED = {"_malloc"}
+APART = {
+    "__init__": BASE | {"tasks", "envs"},
+    "modules": BASE | {"modules", "envs.keys"},
+    "objectives": BASE | {"objectives", "envs.keys"},
+    "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
+    "_malloc": set(),
+}
+LEARNING = {"torch", "tensordict", "torchrl"}
+FORBIDDEN_PACKAGES = {"sim": LEARNING, "tasks": LEARNING, "config": LEARNING, "actions": LEARNING}
+
+
+def allowed_parts(part):
+    if part in APART:
+        return APART[part] | SHARED
+    if part in BASE:
+        return BASE | SHARED
+    before = set(CHAIN[: CHAIN.index(part) + 1])
+    return BASE | SHARED | before | EXTRA.get(part, set())
+
+
+def part_of(module):
+    """Return the part a dotted module name belongs to: 'ba_torchrl.sim.world' -> 'sim'."""
+    names = module.split(".")
+    if names[0] != PACKAGE:
+        return names[0]
+    return names[1] if len(names) > 1 else "__init__"
+
+
+def imported_modules(source, module, is_package, known):
+    """Yield (line, dotted name) of every import in ``source``, those for type checkers included.
+
+    ``from package import name`` counts as the module ``package.name`` if that is in ``known``.
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            origin = node.module or ""
+            if node.level:
+                parents = module.split(".")
+                parents = parents[: len(parents) - node.level + is_package]
+                origin = ".".join([*parents, *([origin] if origin else [])])
+            for alias in node.names:
+                name = f"{origin}.{alias.name}"
+                yield node.lineno, name if name in known else origin
+
+
+def violations(source, module, known=(), is_package=False):
+    """Return what ``source``, as the text of ``module``, imports against the rules."""
+    part = part_of(module)
+    allowed = allowed_parts(part)
+    found = []
+    for line, name in imported_modules(source, module, is_package, set(known)):
+        if name.split(".")[0] == PACKAGE:
+            target = part_of(name)
+            inside = name.removeprefix(f"{PACKAGE}.")
+            if target not in allowed and inside not in allowed:
+                found.append(f"{module}:{line} {part} imports {target} ({name})")
+        elif name.split(".")[0] in FORBIDDEN_PACKAGES.get(part, ()):
+            found.append(f"{module}:{line} {part} imports {name}")
+    return found
+
+
+def modules_below(folder):
+    """Return {dotted name: path} of every module below ``folder``, itself in the repository."""
+    found = {}
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        names = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(names[:-1] if names[-1] == "__init__" else names)] = path
+    return found
+
+
+MODULES = modules_below(PACKAGE)
+RECIPES = modules_below("recipes")
+
+
+@pytest.mark.parametrize("module", [*MODULES, *RECIPES])
+def test_imports_go_one_way(module):
+    path = {**MODULES, **RECIPES}[module]
+    source = path.read_text(encoding="utf-8")
+    assert violations(source, module, MODULES, path.name == "__init__.py") == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "culprit"),
+    [
+        ("ba_torchrl.sim.world", "import ba_torchrl.tasks.base", "tasks"),
+        ("ba_torchrl.sim.world", "import torch", "torch"),
+        ("ba_torchrl.sim.world", "def f():\n    from torch.nn import Linear", "torch.nn"),
+        ("ba_torchrl.tasks.base", "from tensordict import TensorDict", "tensordict"),
+        ("ba_torchrl.tasks.base", "from ..envs import keys", "envs"),
+        ("ba_torchrl.tasks.base", "from ba_torchrl import envs", "envs"),
+        ("ba_torchrl.registry", "from ba_torchrl.sim import world", "sim"),
+        (
+            "ba_torchrl.envs.base",
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n"
+            "    from ba_torchrl.modules.cnn import CNN",
+            "modules",
+        ),
+        ("ba_torchrl.data.replay", "from ba_torchrl.algorithms.sac import SAC", "algorithms"),
+        ("ba_torchrl.modules.cnn", "from ba_torchrl.envs.base import ManipulationEnv", "envs"),
+        ("ba_torchrl.modules.cnn", "from ba_torchrl.objectives.sac import Loss", "objectives"),
+        ("ba_torchrl.objectives.sac", "from ba_torchrl.modules.cnn import CNN", "modules"),
+        ("ba_torchrl.training.loop", "from ba_torchrl.modules.cnn import CNN", "modules"),
+        ("ba_torchrl.algorithms.sac", "from ba_torchrl.record.plots import plot", "record"),
+        ("ba_torchrl.envs.base", "from ba_torchrl import make", "__init__"),
+        ("ba_torchrl._malloc", "from ba_torchrl.config import EnvConfig", "config"),
+        ("recipes.train", "from ba_torchrl.modules.cnn import CNN", "modules"),
+    ],
+)
+def test_a_wrong_import_is_found(module, source, culprit):
+    found = violations(source, module, {"ba_torchrl.envs"})
+    assert len(found) == 1
+    assert f"imports {culprit}" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("ba_torchrl.sim.robots.kuka", "import numpy\nfrom ..world import World"),
+        ("ba_torchrl.modules.cnn", "import torch\nfrom ba_torchrl.envs import keys"),
+        ("ba_torchrl.modules.cnn", "from ba_torchrl.envs.keys import ACTION"),
+        ("ba_torchrl.algorithms.sac", "from ba_torchrl.modules.cnn import CNN"),
+        ("ba_torchrl.training.loop", "from ba_torchrl import make\nimport ba_torchrl.record.plots"),
+        ("recipes.train", "from ba_torchrl._malloc import tune_malloc"),
+    ],
+)
+def test_a_right_import_passes(module, source):
+    assert violations(source, module, {"ba_torchrl.envs.keys"}) == []
+
+
+def test_a_new_part_must_be_given_a_place():
+    with pytest.raises(ValueError, match="is not in list"):
+        violations("", "ba_torchrl.newcomer")
+
+
+def loaded_after(imports):
+    """Return the top-level packages a fresh interpreter holds after importing ``imports``."""
+    code = (
+        "import importlib, json, sys\n"
+        f"for name in {list(imports)!r}: importlib.import_module(name)\n"
+        "print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_the_package_itself_is_light():
+    loaded = loaded_after([PACKAGE])
+    assert PACKAGE in loaded
+    assert not loaded & (LEARNING | {"pybullet", "numba", "gymnasium", "pydantic"})
+
+
+@pytest.mark.parametrize(
+    ("part", "heavy"),
+    [
+        ("sim", LEARNING),
+        ("tasks", LEARNING),
+        ("envs", {"escnn", "matplotlib", "hydra", "omegaconf", "imageio"}),
+    ],
+)
+def test_workers_stay_light(part, heavy):
+    names = modules_below(f"{PACKAGE}/{part}")
+    assert len(names) > 1
+    assert not loaded_after(names) & heavy
+
+
+def test_requirements_fit_the_package():
+    pins = {}
+    for name in ("requirements.txt", "requirements-no-deps.txt"):
+        for line in (ROOT / name).read_text(encoding="utf-8").splitlines():
+            if line and not line.startswith("#"):
+                package, version = line.split("==")
+                pins[package.lower().replace("_", "-")] = version
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["recipes"], *extras["equivariant"], *extras["dev"]]
+    for requirement in wanted:
+        package, bounds = re.fullmatch(r"([\w.-]+?)\s*((?:[<>=!~].*)?)", requirement).groups()
+        pinned = pins[package.lower().replace("_", "-")]
+        for bound in filter(None, bounds.split(",")):
+            operator, version = re.fullmatch(r"(==|>=|<)(.+)", bound).groups()
+            left, right = ([int(n) for n in text.split(".")] for text in (pinned, version))
+            holds = {"==": left == right, ">=": left >= right, "<": left < right}[operator]
+            assert holds, f"{package} is pinned to {pinned}, but pyproject.toml says {bound}"
