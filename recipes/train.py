@@ -11,15 +11,18 @@ tune_malloc()  # before torch allocates anything: halves the time of an update o
 import hydra  # noqa: E402
 from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
+from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
+from ba_torchrl.training import hydra_schema  # noqa: E402
 from ba_torchrl.training.config import ExperimentConfig  # noqa: E402
 from ba_torchrl.training.experiment import Experiment  # noqa: E402
 
-OmegaConf.register_new_resolver("task_name", lambda task: task.replace("/", "_"))
+hydra_schema.register()
 
 
 @hydra.main(config_path="../configs", config_name="train", version_base="1.3")
 def main(settings: DictConfig) -> None:
     """Run the experiment that the configuration describes."""
+    quiet_libraries()
     config = ExperimentConfig.parse(OmegaConf.to_container(settings, resolve=True))
     result = Experiment(config).run()
     evaluation = result.evaluation

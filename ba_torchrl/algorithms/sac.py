@@ -138,7 +138,7 @@ class SAC(Algorithm):
         scalars = self.loss(batch)
         total = scalars["loss_qvalue"] + scalars["loss_actor"] + scalars["loss_alpha"]
         if not torch.isfinite(total):
-            values = {key: float(value) for key, value in scalars.items()}
+            values = {key: value.item() for key, value in scalars.items()}
             raise FloatingPointError(f"a loss is not finite at update {self.updates}: {values}")
         self.optimizer.zero_grad()
         total.backward()
@@ -154,6 +154,7 @@ class SAC(Algorithm):
         return {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "augmentation": self.augmentation.state_dict(),
             "updates": self.updates,
         }
 
@@ -161,6 +162,7 @@ class SAC(Algorithm):
         """Restore what `state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.augmentation.load_state_dict(state["augmentation"])
         self.updates = state["updates"]
 
 

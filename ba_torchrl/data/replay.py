@@ -1,4 +1,4 @@
-"""The replay: each image once, eight bits per pixel, behind TorchRL's own replay buffer."""
+"""The replay: each image once, compressed, behind TorchRL's own replay buffer."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class ReplaySchemaError(ValueError):
 
 
 class FrameStorage(LazyTensorStorage):
-    """A TorchRL storage that keeps ``pixels`` and ("next", "pixels") as uint8, each frame once.
+    """A TorchRL storage that keeps each frame of ``pixels`` and ("next", "pixels") once.
 
     Everything else lies in ordinary columns. Images go in and come out as float32 metres, within
-    the quantiser's error.
+    the quantiser's error; in between they are eight bits per pixel, compressed without loss.
 
     Args:
         max_size: number of transitions.
@@ -69,8 +69,7 @@ class FrameStorage(LazyTensorStorage):
         super().set(places, data.exclude(*_FRAME_KEYS), set_cursor=set_cursor)
         images = [data.get(key).cpu() for key in _FRAME_KEYS]
         if self._frames is None:
-            # Every transition may have two frames of its own, and one more is on its way in.
-            self._frames = FrameTable(2 * self.max_size + 2, images[0].shape[1:])
+            self._frames = FrameTable(images[0].shape[1:])
         self._store_frames(places, images)
 
     def _store_frames(self, places: Tensor, images: list[Tensor]) -> None:
@@ -96,7 +95,7 @@ class FrameStorage(LazyTensorStorage):
         """
         data = super().get(index).copy()
         slots = self._slots[: len(self)][index]
-        images = self.quantizer.decode(self._frames.read(slots.long()))
+        images = self.quantizer.decode(self._frames.read(slots))
         for i, key in enumerate(_FRAME_KEYS):
             data.set(key, images.select(slots.ndim - 1, i))
         return data
@@ -121,7 +120,7 @@ class FrameStorage(LazyTensorStorage):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory in use, reserved but untouched pages not counted."""
+        """Bytes of memory in use; reserved pages that were never written are not counted."""
         if self._frames is None:
             return 0
         row = sum(
@@ -142,6 +141,7 @@ class FrameStorage(LazyTensorStorage):
             return {"size": 0}
         size = len(self)
         columns = self._storage[:size]
+        frames, frame_sizes = self._frames.dump()
         return {
             "size": size,
             "columns": {
@@ -149,7 +149,9 @@ class FrameStorage(LazyTensorStorage):
                 for key, value in columns.items(True, True)
             },
             "slots": self._slots[:size],
-            "frames": self._frames.touched(),
+            "frame_shape": list(self._frames.shape),
+            "frame_sizes": frame_sizes,
+            "frames": frames,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -172,11 +174,12 @@ class FrameStorage(LazyTensorStorage):
             batch_size=[size],
         )
         super().set(torch.arange(size), columns)
-        slots, frames = state_dict["slots"], state_dict["frames"]
+        slots = state_dict["slots"]
         self._slots[:size] = slots
-        if self._frames is None:
-            self._frames = FrameTable(2 * self.max_size + 2, frames.shape[1:])
-        self._frames.restore(frames, slots)
+        self._frames = FrameTable(torch.Size(state_dict["frame_shape"]))
+        self._frames.load(
+            state_dict["frames"], state_dict["frame_sizes"], slots.reshape(-1).tolist()
+        )
 
     def dumps(self, path: str | Path) -> None:
         """Write the contents into a folder, made if missing."""

@@ -136,7 +136,7 @@ class ManipulationEnv(EnvBase):
 
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return a picture of the scene for people, [height, width, 3] uint8."""
-        return render_rgb(self.scene.world, (*self.workspace.center, 0.14), width, height)
+        return render_rgb(self.scene.world, (*self.workspace.center, 0.12), width, height)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close every world of this environment."""

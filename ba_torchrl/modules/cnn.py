@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor, nn
 
+from ba_torchrl.config import StrictModel
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
 from ba_torchrl.modules.trunk import (
     ImageTrunk,
@@ -84,7 +85,7 @@ def _initialise(module: nn.Module) -> None:
 
 
 @NETWORKS.register("cnn")
-class CNNConfig(BaseModel):
+class CNNConfig(StrictModel):
     """Hyper-parameters of the plain convolutional actor-critic.
 
     Args:
@@ -92,8 +93,6 @@ class CNNConfig(BaseModel):
         precision: number format of the convolutions, see
             :func:`~ba_torchrl.modules.trunk.compute_dtype`.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     width: float = Field(default=1.0, gt=0)
     precision: Precision = "auto"

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor, nn
 
+from ba_torchrl.config import StrictModel
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
 from ba_torchrl.modules.steerable import (
     FieldTypes,
@@ -124,7 +125,7 @@ class EquivariantTwinCritic(nn.Module):
 
 
 @NETWORKS.register("equi")
-class EquivariantConfig(BaseModel):
+class EquivariantConfig(StrictModel):
     """Hyper-parameters of the rotation-equivariant actor-critic.
 
     Args:
@@ -134,8 +135,6 @@ class EquivariantConfig(BaseModel):
         precision: number format of the convolutions, see
             :func:`~ba_torchrl.modules.trunk.compute_dtype`.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     group_order: int = Field(default=8, ge=2)
     n_hidden: int = Field(default=64, ge=4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -54,6 +55,12 @@ def make_logger(
     logger = get_logger(backend, logger_name=str(run_dir), experiment_name=name, **options)
     logger.log_hparams(_flat(config))
     return logger
+
+
+def quiet_libraries() -> None:
+    """Keep the libraries' notes out of a recipe's output; warnings and errors stay."""
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 class ScalarLog:

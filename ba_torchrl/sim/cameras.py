@@ -157,9 +157,9 @@ def render_rgb(
     target_m: tuple[float, float, float],
     width: int = 480,
     height: int = 360,
-    distance_m: float = 0.95,
-    yaw_deg: float = 125.0,
-    pitch_deg: float = -28.0,
+    distance_m: float = 0.72,
+    yaw_deg: float = 60.0,
+    pitch_deg: float = -24.0,
 ) -> np.ndarray:
     """Return a picture of the whole scene, arm included, for people to look at.
 

@@ -54,6 +54,8 @@ class ExperimentConfig(StrictModel):
     """Expert episodes in the replay from the start."""
     only_successful_demonstrations: bool = False
     """Leave out expert episodes that failed."""
+    demonstrations_path: str | None = None
+    """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
     pretrain_updates: int = Field(default=0, ge=0)
     """Updates on the demonstrations alone, before the first step."""
     total_updates: int = Field(default=10_000, ge=1)

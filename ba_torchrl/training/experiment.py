@@ -16,7 +16,8 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.config import ConfigError
+from ba_torchrl.data.demos import as_transitions, collect_demonstrations, load_demonstrations
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import ScalarLog
@@ -65,6 +66,7 @@ class Experiment:
         self._recent: deque[bool] = deque(maxlen=RECENT_EPISODES)
         self._env_steps = 0
         self._faults = 0
+        self._bar = tqdm(total=config.total_updates, disable=not progress, unit="update")
 
     def run(self) -> Result:
         """Train, evaluate, and write curve, video and checkpoint into the run folder."""
@@ -78,6 +80,7 @@ class Experiment:
 
     def close(self) -> None:
         """Close environments and loggers."""
+        self._bar.close()
         for env in (self._train_env, self._eval_env):
             if env is not None and not env.is_closed:
                 env.close()
@@ -93,19 +96,31 @@ class Experiment:
 
     def _demonstrate(self) -> None:
         """Fill the replay with the expert's episodes."""
-        if not self.config.demonstrations:
+        config = self.config
+        if not config.demonstrations:
             return
-        seed = self.config.derived_seed(SeedUse.DEMONSTRATIONS)
-        env = self._make_env(seed, expert=True)
-        try:
-            episodes = collect_demonstrations(
-                env,
-                self.config.demonstrations,
-                seed=seed,
-                only_successful=self.config.only_successful_demonstrations,
+        if config.demonstrations_path is not None:
+            episodes = load_demonstrations(
+                config.demonstrations_path, task=config.task, env=config.env
             )
-        finally:
-            env.close()
+            if len(episodes) < config.demonstrations:
+                raise ConfigError(
+                    f"{config.demonstrations_path} holds {len(episodes)} episodes, fewer than "
+                    f"demonstrations={config.demonstrations}"
+                )
+            episodes = episodes[: config.demonstrations]
+        else:
+            seed = config.derived_seed(SeedUse.DEMONSTRATIONS)
+            env = self._make_env(seed, expert=True)
+            try:
+                episodes = collect_demonstrations(
+                    env,
+                    config.demonstrations,
+                    seed=seed,
+                    only_successful=config.only_successful_demonstrations,
+                )
+            finally:
+                env.close()
         if not episodes:
             raise RuntimeError(
                 "the expert did not succeed once; see only_successful_demonstrations"
@@ -123,31 +138,30 @@ class Experiment:
     def _learn(self) -> None:
         """Alternate collecting and updating until the updates are used up."""
         config, algorithm = self.config, self.algorithm
-        with tqdm(total=config.total_updates, disable=not self.progress, unit="update") as bar:
-            self._bar = bar
-            for _ in range(config.pretrain_updates):
-                self._update()
-            if algorithm.updates == config.total_updates:
-                return
-            self._train_env = self._make_env(config.derived_seed(SeedUse.COLLECTION))
-            collector = Collector(
-                self._train_env,
-                algorithm.policy,
-                frames_per_batch=config.num_envs,
-                total_frames=-1,
-                postproc=lambda data: data.reshape(-1),
-            )
-            try:
-                for data in collector:
-                    self._store(data)
-                    if algorithm.replay_size < config.min_replay:
-                        continue
-                    for _ in range(config.updates_per_step):
-                        self._update()
-                        if algorithm.updates == config.total_updates:
-                            return
-            finally:
-                collector.shutdown(close_env=False)
+        for _ in range(config.pretrain_updates):
+            self._update()
+        if algorithm.updates == config.total_updates:
+            return
+        self._train_env = self._make_env(config.derived_seed(SeedUse.COLLECTION))
+        collector = Collector(
+            self._train_env,
+            algorithm.policy,
+            frames_per_batch=config.num_envs,
+            total_frames=-1,
+            postproc=lambda data: data.reshape(-1),
+            auto_register_policy_transforms=False,
+        )
+        try:
+            for data in collector:
+                self._store(data)
+                if algorithm.replay_size < config.min_replay:
+                    continue
+                for _ in range(config.updates_per_step):
+                    self._update()
+                    if algorithm.updates == config.total_updates:
+                        return
+        finally:
+            collector.shutdown(close_env=False)
 
     def _finish(self, started: float) -> Result:
         """Evaluate for the record; write curve, video and the last checkpoint."""

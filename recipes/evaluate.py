@@ -1,0 +1,51 @@
+"""Evaluate a trained policy.
+
+python recipes/evaluate.py checkpoint=runs/my-run episodes=100 video=my-run.mp4
+"""
+
+from ba_torchrl._malloc import tune_malloc
+
+tune_malloc()  # before torch allocates anything
+
+import hydra  # noqa: E402
+from omegaconf import DictConfig  # noqa: E402
+from tqdm import tqdm  # noqa: E402
+
+from ba_torchrl import make_vector_env  # noqa: E402
+from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
+from ba_torchrl.record.video import write_video  # noqa: E402
+from ba_torchrl.training.checkpoint import load  # noqa: E402
+from ba_torchrl.training.config import SeedUse  # noqa: E402
+from ba_torchrl.training.evaluation import evaluate, film  # noqa: E402
+
+
+@hydra.main(config_path="../configs", config_name="evaluate", version_base="1.3")
+def main(settings: DictConfig) -> None:
+    """Play greedy episodes with the policy of a checkpoint."""
+    quiet_libraries()
+    config, algorithm = load(settings.checkpoint)
+    seed = settings.seed
+    if seed is None:
+        seed = config.derived_seed(SeedUse.EVALUATION)
+    env = make_vector_env(
+        config.task, settings.num_envs, parallel=settings.parallel, **{**config.env, "seed": seed}
+    )
+    try:
+        with tqdm(total=settings.episodes, unit="episode") as bar:
+            evaluation = evaluate(
+                env, algorithm.policy, settings.episodes, seed, lambda _: bar.update()
+            )
+    finally:
+        env.close()
+    print(
+        f"success_rate {evaluation.success_rate:.2f} "
+        f"(standard error {evaluation.standard_error:.3f}) over {evaluation.episodes} episodes "
+        f"of {config.task}, {evaluation.mean_length:.1f} steps each"
+    )
+    if settings.video is not None:
+        frames = film(config.task, config.env, algorithm.policy, settings.video_episodes, seed)
+        print(f"  video  {write_video(settings.video, frames, fps=5)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from ba_torchrl.config import ConfigError
+from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, find_checkpoint, load
+from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.experiment import Experiment
+
+ROOT = Path(__file__).parents[2]
+TINY = {
+    "task": "close_loop/block_reaching",
+    "env": {"obs_size": 64, "max_steps": 8},
+    "algorithm": {"name": "sac", "batch_size": 8},
+    "network": {"name": "cnn", "width": 0.25},
+    "num_envs": 2,
+    "parallel": False,
+    "demonstrations": 3,
+    "pretrain_updates": 2,
+    "total_updates": 6,
+    "min_replay": 5,
+    "eval_every": 3,
+    "eval_episodes": 3,
+    "final_eval_episodes": 4,
+    "checkpoint_every": 2,
+    "log_every": 1,
+    "video_episodes": 1,
+}
+
+
+def tiny(tmp_path, **changes):
+    return ExperimentConfig.parse({**TINY, "run_dir": str(tmp_path / "run"), **changes})
+
+
+def test_a_run_leaves_everything_behind(tmp_path):
+    result = Experiment(tiny(tmp_path), progress=False).run()
+    folder = tmp_path / "run"
+    assert result.evaluation.episodes == 4
+    assert result.curve.read_bytes().startswith(b"\x89PNG")
+    assert result.video.stat().st_size > 1000
+    assert json.loads((folder / "config.json").read_text())["task"] == TINY["task"]
+    scalars = read_scalars(folder)
+    assert scalars["eval/success_rate"].steps.tolist() == [3, 6]
+    assert scalars["train/loss_qvalue"].steps.tolist() == [1, 2, 3, 4, 5, 6]
+    assert scalars["demonstrations/success_rate"].values[0] == 1.0
+    # two pretraining updates, then one per step of both environments
+    assert scalars["train/env_steps"].values[-1] == 8
+    assert find_checkpoint(folder).name.endswith("6")
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_runs_of_one_seed_are_equal_and_of_two_differ(tmp_path, parallel):
+    def losses(name, seed):
+        config = tiny(
+            tmp_path / name,
+            seed=seed,
+            parallel=parallel,
+            start_method="fork",
+            video_episodes=0,
+            threads=1,
+        )
+        Experiment(config, progress=False).run()
+        return read_scalars(tmp_path / name / "run")["train/loss_qvalue"].values.tolist()
+
+    first = losses("a", 0)
+    assert first == losses("b", 0)
+    assert first != losses("c", 1)
+
+
+def test_a_checkpoint_rebuilds_the_policy(tmp_path):
+    config = tiny(tmp_path, total_updates=2, video_episodes=0)
+    experiment = Experiment(config, progress=False)
+    experiment.run()
+    loaded_config, loaded = load(tmp_path / "run")
+    assert loaded_config == config
+    assert loaded.updates == 2
+    state = experiment.algorithm.loss.state_dict()
+    for key, value in loaded.loss.state_dict().items():
+        assert torch.equal(value, state[key]), key
+    pixels = torch.rand(3, 1, 64, 64) * 0.3
+    holding = torch.zeros(3, 1, dtype=torch.bool)
+    from tensordict import TensorDict
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    observation = TensorDict({"pixels": pixels, "holding": holding}, batch_size=[3])
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        a = experiment.algorithm.policy(observation.clone())
+        b = loaded.policy(observation.clone())
+    assert torch.equal(a["action"], b["action"])
+    assert set(a.keys()) == {"pixels", "holding", "action"}
+
+
+def test_a_crash_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeypatch):
+    config = tiny(tmp_path)
+    algorithm = build_algorithm(config)
+    checkpoints = Checkpoints(config.folder, algorithm)
+    checkpoints.save(1, 0.1)
+    with monkeypatch.context() as patch:
+        patch.setattr(algorithm, "state_dict", lambda: {"loss": 1 / 0})
+        with pytest.raises(ZeroDivisionError):
+            checkpoints.save(2, 0.2)
+    assert find_checkpoint(config.folder).name.endswith("1")
+
+
+def test_the_best_checkpoint_outlives_the_rotation(tmp_path):
+    config = tiny(tmp_path)
+    checkpoints = Checkpoints(config.folder, build_algorithm(config), keep_last=1)
+    for updates, rate in ((1, 0.9), (2, 0.1), (3, 0.2)):
+        checkpoints.save(updates, rate)
+    kept = sorted(path.name[-1] for path in (config.folder / "checkpoints").iterdir())
+    assert kept == ["1", "3"]
+
+
+def test_a_missing_checkpoint_says_what_is_needed(tmp_path):
+    with pytest.raises(ConfigError, match=r"config\.json and checkpoints"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"task": "close_loop/flying"}, "Known: .*block_picking"),
+        ({"env": {"obs_sise": 64}}, "Did you mean 'obs_size'"),
+        ({"env": {"seed": 3}}, "set by the experiment"),
+        ({"algorithm": {"name": "ppo"}}, "unknown algorithm 'ppo'.*sac"),
+        ({"algorithm": {"name": "sac", "gama": 0.9}}, "Did you mean 'gamma'"),
+        ({"algorithm": {"batch_size": 3}}, "algorithm.name is missing"),
+        ({"network": {"name": "mlp"}}, "Known: cnn, equi"),
+        ({"network": {"name": "cnn", "width": "wide"}}, "width"),
+        ({"total_updates": 1}, "pretrain_updates"),
+        ({"demonstrations": 0}, "needs demonstrations"),
+        ({"device": "gpu"}, "device"),
+        ({"num_envs": 0}, "num_envs"),
+        ({"total_update": 5}, "Did you mean 'total_updates'"),
+    ],
+)
+def test_wrong_configurations_fail_before_anything_starts(tmp_path, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        tiny(tmp_path, **changes)
+    assert not (tmp_path / "run").exists()
+
+
+def test_seeds_of_different_uses_and_runs_do_not_meet(tmp_path):
+    seeds = [tiny(tmp_path, seed=s).derived_seed(use) for s in range(4) for use in SeedUse]
+    spread = sorted(seeds)
+    assert all(b - a > 1000 for a, b in zip(spread, spread[1:], strict=False))
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
+    experiment = Experiment(tiny(tmp_path, video_episodes=0), progress=False)
+    with torch.no_grad():
+        experiment.algorithm.loss.log_alpha.fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match="update 0"):
+        experiment.run()
+
+
+def run_recipe(name, *arguments):
+    command = [sys.executable, f"recipes/{name}.py", *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def test_the_recipes_from_the_command_line(tmp_path):
+    demos = tmp_path / "demos"
+    out = run_recipe(
+        "collect_demos",
+        "task=close_loop/block_reaching",
+        "episodes=4",
+        "num_envs=2",
+        "env.obs_size=64",
+        f"path={demos}",
+    )
+    assert "4 episodes of close_loop/block_reaching, success 1.00" in out
+    out = run_recipe(
+        "train",
+        "--config-name=quickstart",
+        "task=close_loop/block_reaching",
+        "network=cnn",
+        "network.width=0.25",
+        "algorithm.batch_size=8",
+        "demonstrations=4",
+        f"demonstrations_path={demos}",
+        "pretrain_updates=2",
+        "total_updates=3",
+        "eval_every=100",
+        "final_eval_episodes=4",
+        "num_envs=2",
+        "video_episodes=1",
+        f"run_dir={tmp_path}/run",
+    )
+    assert "over 4 episodes" in out
+    assert f"{tmp_path}/run/learning_curve.png" in out
+    gif = tmp_path / "film.gif"
+    out = run_recipe(
+        "evaluate", f"checkpoint={tmp_path}/run", "episodes=3", f"video={gif}", "video_episodes=1"
+    )
+    assert "over 3 episodes of close_loop/block_reaching" in out
+    assert gif.read_bytes().startswith(b"GIF")
