@@ -16,7 +16,7 @@ from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
 from ba_torchrl.record.video import write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import load  # noqa: E402
 from ba_torchrl.training.config import SeedUse  # noqa: E402
-from ba_torchrl.training.evaluation import evaluate, film  # noqa: E402
+from ba_torchrl.training.evaluation import acting_on, evaluate, film  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="evaluate", version_base="1.3")
@@ -24,6 +24,7 @@ def main(settings: DictConfig) -> None:
     """Play greedy episodes with the policy of a checkpoint."""
     quiet_libraries()
     config, algorithm = load(settings.checkpoint)
+    policy = acting_on(algorithm.policy, config.torch_device)
     seed = settings.seed
     if seed is None:
         seed = config.derived_seed(SeedUse.EVALUATION)
@@ -32,9 +33,7 @@ def main(settings: DictConfig) -> None:
     )
     try:
         with tqdm(total=settings.episodes, unit="episode") as bar:
-            evaluation = evaluate(
-                env, algorithm.policy, settings.episodes, seed, lambda _: bar.update()
-            )
+            evaluation = evaluate(env, policy, settings.episodes, seed, lambda _: bar.update())
     finally:
         env.close()
     print(
@@ -43,7 +42,7 @@ def main(settings: DictConfig) -> None:
         f"of {config.task}, {evaluation.mean_length:.1f} steps each"
     )
     if settings.video is not None:
-        frames = film(config.task, config.env, algorithm.policy, settings.video_episodes, seed)
+        frames = film(config.task, config.env, policy, settings.video_episodes, seed)
         print(f"  video  {write_video(settings.video, frames, fps=5)}")
 
 

@@ -145,7 +145,8 @@ class SAC(Algorithm):
         self.optimizer.step()
         self.target_updater.step()
         if self.config.prioritized:
-            self.replay.update_tensordict_priority(batch)
+            # the sampler's trees are on the CPU, wherever the learner is
+            self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
         self.updates += 1
         return scalars.detach()
 

@@ -12,8 +12,8 @@ from torch import Tensor
 
 _LEVEL = 1
 """Of zlib. Rendered depth shrinks fifty-fold; higher levels take longer for little more."""
-_BYTES_PER_FRAME = 180
-"""Of slot, count and index entry beside the frame itself in CPython, tables growing by halves."""
+_BYTES_PER_FRAME = 100
+"""Of slot, count and index entry in CPython, beside the frame itself."""
 
 
 class FrameTable:

@@ -282,10 +282,12 @@ class ManipulationEnv(EnvBase):
         """Return whether the goal holds, once everything is at rest, and the scene is valid."""
         if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
             raise SimulationError("a body's position is not finite")
-        if scene.task.is_goal():
+        success = scene.task.is_goal()
+        if success:
             scene.world.settle(max_steps=100)
+            success = scene.task.is_goal()
         valid = scene.task.is_valid()
-        return valid and scene.task.is_goal(), valid
+        return valid and success, valid
 
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
         observation = {

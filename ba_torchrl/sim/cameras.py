@@ -3,8 +3,8 @@
 The height image is rasterised here, from the triangles of the bodies' meshes. Compared on 128 x 128
 pixels with four cubes (`recipes/speed.py` prints it): PyBullet's TinyRenderer takes milliseconds,
 cannot be asked to leave out the arm cheaply, shifts edges by half a pixel and its orthographic
-depth does not read linearly; a NumPy z-buffer is correct and takes 0.1 ms; the compiled one below
-gives the same numbers in hundredths of a millisecond.
+depth does not read linearly; a NumPy z-buffer is correct and takes tenths of a millisecond; the
+compiled one below gives the same numbers in hundredths.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ def _rasterise(vertices, faces, x0, y0, pixel, image):  # noqa: ANN001, ANN202 -
                     image[i, j] = max(image[i, j], height)
 
 
+@numba.njit(cache=True)
 def paint_square(
     image: np.ndarray,
     center_px: tuple[float, float],
@@ -82,22 +83,14 @@ def paint_square(
         value: what to write.
     """
     reach = half_px * math.sqrt(2)
-    i0, i1 = (
-        max(0, math.floor(center_px[0] - reach)),
-        min(image.shape[0], math.ceil(center_px[0] + reach)),
-    )
-    j0, j1 = (
-        max(0, math.floor(center_px[1] - reach)),
-        min(image.shape[1], math.ceil(center_px[1] + reach)),
-    )
-    if i0 >= i1 or j0 >= j1:
-        return
-    di = (np.arange(i0, i1) + 0.5 - center_px[0])[:, None]
-    dj = (np.arange(j0, j1) + 0.5 - center_px[1])[None, :]
+    x, y = center_px
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     limit = half_px + 1e-9
-    inside = (np.abs(cos * di + sin * dj) <= limit) & (np.abs(cos * dj - sin * di) <= limit)
-    image[i0:i1, j0:j1][inside] = value
+    for i in range(max(0, math.floor(x - reach)), min(image.shape[0], math.ceil(x + reach))):
+        for j in range(max(0, math.floor(y - reach)), min(image.shape[1], math.ceil(y + reach))):
+            di, dj = i + 0.5 - x, j + 0.5 - y
+            if abs(cos * di + sin * dj) <= limit and abs(cos * dj - sin * di) <= limit:
+                image[i, j] = value
 
 
 class HeightCamera:

@@ -60,6 +60,24 @@ def write_config(config: ExperimentConfig) -> None:
     (config.folder / CONFIG_FILE).write_text(text + "\n")
 
 
+def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
+    """Read the configuration of a run folder.
+
+    Args:
+        folder: the run folder.
+        changes: fields to override.
+
+    Raises:
+        ConfigError: there is none, or it does not parse.
+    """
+    file = Path(folder) / CONFIG_FILE
+    try:
+        values = json.loads(file.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise ConfigError(f"cannot read {file}: {error}") from None
+    return ExperimentConfig.parse({**values, **changes}, what=str(file))
+
+
 def find_checkpoint(path: str | Path) -> Path:
     """Return the checkpoint meant by ``path``: itself, or the newest of a run folder.
 
@@ -91,12 +109,7 @@ def load(path: str | Path, **changes: Any) -> tuple[ExperimentConfig, Algorithm]
         ConfigError: there is no checkpoint, or its configuration does not parse.
     """
     checkpoint = find_checkpoint(path)
-    config_file = checkpoint.parent.parent / CONFIG_FILE
-    try:
-        values = json.loads(config_file.read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise ConfigError(f"cannot read {config_file}: {error}") from None
-    config = ExperimentConfig.parse({**values, **changes}, what=str(config_file))
+    config = read_config(checkpoint.parent.parent, **changes)
     algorithm = build_algorithm(config)
     Checkpoint(algorithm=algorithm).load(checkpoint, map_location=config.torch_device)
     return config, algorithm

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make
-from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
+from ba_torchrl.data.episodes import Policy, collect_episodes, mean_length, success_rate
 from ba_torchrl.envs import keys
 
 
@@ -40,9 +40,21 @@ class Evaluation:
         }
 
 
+def acting_on(policy: TensorDictModuleBase, device: torch.device) -> Policy:
+    """Return a policy for environments on the CPU, computed on ``device``."""
+    if device.type == "cpu":
+        return policy
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        observation = tensordict.select(*policy.in_keys).to(device)
+        return tensordict.set(keys.ACTION, policy(observation)[keys.ACTION].cpu())
+
+    return act
+
+
 def evaluate(
     env: EnvBase,
-    policy: TensorDictModuleBase,
+    policy: Policy,
     episodes: int,
     seed: int,
     on_episode: Callable[[TensorDict], None] | None = None,
@@ -74,7 +86,7 @@ def evaluate(
 def film(
     task: str,
     env_settings: dict[str, Any],
-    policy: Callable[[TensorDict], TensorDict],
+    policy: Policy,
     episodes: int,
     seed: int,
     hold_frames: int = 4,

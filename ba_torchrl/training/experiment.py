@@ -25,7 +25,7 @@ from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.video import write_video
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, write_config
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
-from ba_torchrl.training.evaluation import Evaluation, evaluate, film
+from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate, film
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +58,7 @@ class Experiment:
             torch.set_num_threads(config.threads)
         write_config(config)
         self.algorithm = build_algorithm(config)
+        self._greedy = acting_on(self.algorithm.policy, config.torch_device)
         self.checkpoints = Checkpoints(config.folder, self.algorithm)
         self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
         self._train_env: EnvBase | None = None
@@ -149,6 +150,8 @@ class Experiment:
             frames_per_batch=config.num_envs,
             total_frames=-1,
             postproc=lambda data: data.reshape(-1),
+            policy_device=config.torch_device,
+            storing_device="cpu",
             auto_register_policy_transforms=False,
         )
         try:
@@ -187,7 +190,7 @@ class Experiment:
             frames = film(
                 config.task,
                 config.env,
-                self.algorithm.policy,
+                self._greedy,
                 config.video_episodes,
                 config.derived_seed(SeedUse.EVALUATION),
             )
@@ -238,7 +241,7 @@ class Experiment:
         seed = self.config.derived_seed(SeedUse.EVALUATION)
         if self._eval_env is None:
             self._eval_env = self._make_env(seed)
-        evaluation = evaluate(self._eval_env, self.algorithm.policy, episodes, seed)
+        evaluation = evaluate(self._eval_env, self._greedy, episodes, seed)
         self._curve.append((self.algorithm.updates, evaluation))
         self.log.write(self.algorithm.updates, evaluation.scalars())
         self._bar.set_postfix(success=f"{evaluation.success_rate:.2f}")

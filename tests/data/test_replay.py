@@ -232,7 +232,7 @@ def test_overwriting_reuses_frames():
     for _ in range(50):
         rb.extend(episode(5, rng))
     assert rb.storage.frame_count == 24
-    assert rb.storage._frames.nbytes < 30 * (180 + 64 + 60)  # slots are used again
+    assert rb.storage._frames.nbytes < 30 * (100 + 64 + 60)  # slots are used again
 
 
 @pytest.mark.parametrize("prioritized", [True, False])

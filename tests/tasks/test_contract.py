@@ -26,9 +26,24 @@ def make(task, **config):
     return ba_torchrl.make(task, **{"obs_size": 32, "seed": 0, **config})
 
 
-@pytest.mark.parametrize("break_when", [True, False])
-def test_specs(task, break_when):
+def test_specs(task):
     env = make(task, expert=True, max_steps=2)
+    check_env_specs(env, break_when_any_done="both", seed=0)
+    env.close()
+
+
+@pytest.mark.parametrize("parallel", [False, True], ids=["serial", "parallel"])
+def test_specs_of_vectors(task, parallel):
+    env = ba_torchrl.make_vector_env(
+        task,
+        2,
+        parallel=parallel,
+        start_method="fork",
+        obs_size=32,
+        seed=0,
+        expert=True,
+        max_steps=2,
+    )
     check_env_specs(env, break_when_any_done="both", seed=0)
     env.close()
 
@@ -163,19 +178,21 @@ def test_expert_succeeds_over_200_episodes(task, variant):
 
 def test_expert_recovers_from_any_state(task):
     env = make(task, expert=True)
-    solved = 0
-    for episode in range(15):
+    outcomes = []
+    for episode in range(40):
         state = env.reset(seed=episode)
         rng = np.random.default_rng(episode)
-        for _ in range(6):  # somebody else acts first
+        for _ in range(8):  # somebody else acts first
             action = torch.from_numpy(rng.uniform(-1, 1, 5).astype(np.float32))
             state = env.step(state.set("action", action))["next"]
             if state["done"]:
                 break
-        while not state["done"]:
-            state = env.step(state.set("action", state["expert_action"]))["next"]
-        solved += bool(state["success"] or (state["terminated"] and not state["success"]))
-    assert solved >= 14
+        else:
+            while not state["done"]:
+                state = env.step(state.set("action", state["expert_action"]))["next"]
+            outcomes.append(bool(state["success"]))
+    assert len(outcomes) >= 20
+    assert np.mean(outcomes) >= 0.95
     env.close()
 
 

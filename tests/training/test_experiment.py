@@ -1,4 +1,7 @@
+import itertools
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -148,7 +151,7 @@ def test_wrong_configurations_fail_before_anything_starts(tmp_path, changes, mes
 def test_seeds_of_different_uses_and_runs_do_not_meet(tmp_path):
     seeds = [tiny(tmp_path, seed=s).derived_seed(use) for s in range(4) for use in SeedUse]
     spread = sorted(seeds)
-    assert all(b - a > 1000 for a, b in zip(spread, spread[1:], strict=False))
+    assert all(b - a > 1000 for a, b in itertools.pairwise(spread))
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
@@ -157,6 +160,27 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
         experiment.algorithm.loss.log_alpha.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="update 0"):
         experiment.run()
+
+
+def test_a_run_survives_a_worker_that_dies(tmp_path, monkeypatch):
+    config = tiny(tmp_path, parallel=True, start_method="fork", video_episodes=0, total_updates=12)
+    experiment = Experiment(config, progress=False)
+    store = experiment._store
+    batches = 0
+
+    def kill_then_store(data):
+        nonlocal batches
+        batches += 1
+        if batches == 3:
+            os.kill(experiment._train_env.worker_pids[0], signal.SIGKILL)
+        store(data)
+
+    monkeypatch.setattr(experiment, "_store", kill_then_store)
+    experiment.run()
+    scalars = read_scalars(config.folder)
+    assert scalars["train/faults"].values[-1] == 1
+    assert experiment._train_env.restarts == 1
+    assert experiment.algorithm.replay.faults_dropped == 1
 
 
 def run_recipe(name, *arguments):

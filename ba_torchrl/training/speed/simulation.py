@@ -1,0 +1,153 @@
+"""Times of the simulator: steps, resets and images, in steps of PyBullet."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pybullet
+from torch import Tensor
+
+from ba_torchrl import list_tasks, make
+from ba_torchrl.envs import keys
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.cameras import HeightCamera
+from ba_torchrl.sim.robots.base import ROBOTS, downward
+from ba_torchrl.sim.world import World
+from ba_torchrl.training.speed.numpy_camera import NumpyHeightCamera
+from ba_torchrl.training.speed.table import Bench, Budget, Row, measurement, seconds, timed_row
+
+SEED = 0
+CAMERA_M = 1.0
+
+
+class SimulationUnit:
+    """One `stepSimulation` of kuka, floor and four cubes at rest."""
+
+    def __init__(self) -> None:
+        self.world = World()
+        self.robot = ROBOTS["kuka"](self.world)
+        box = Box(size_m=(0.05, 0.05, 0.05))
+        self.bodies = [self.world.add(box, f"cube {i}") for i in range(4)]
+        for i, body in enumerate(self.bodies):
+            body.place((0.39 + 0.12 * (i // 2), -0.06 + 0.12 * (i % 2), 0.025), 0.4 * i)
+        home = self.robot.inverse_kinematics((0.45, 0.0, 0.2), downward(0.0))
+        self.robot.teleport(home)
+        self.robot.set_opening(1.0)
+        self.world.settle()
+
+    def __call__(self) -> None:
+        """Take the step."""
+        self.world.step()
+
+
+def _close_loop_tasks() -> list[str]:
+    return [task for task in list_tasks() if task.startswith("close_loop/")]
+
+
+def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
+    """Return the actions of the expert's first episodes."""
+    env = make(task, seed=SEED, expert=True)
+    played: list[list[Tensor]] = []
+    for _ in range(episodes):
+        state, actions = env.reset(), []
+        while not actions or not state[keys.DONE]:
+            actions.append(state[keys.EXPERT_ACTION].clone())
+            state = env.step(state.set(keys.ACTION, actions[-1]))[keys.NEXT]
+        played.append(actions)
+    env.close()
+    return played
+
+
+@measurement("simulation/close_loop_step", over=_close_loop_tasks)
+def close_loop_step(bench: Bench, task: str) -> list[Row]:
+    """Steps and resets of a task, the actions the expert's but not asked for while the clock runs.
+
+    The same seed gives the same episodes, so the actions are recorded beforehand.
+    """
+    unit = SimulationUnit()
+    env = make(task, seed=SEED)
+    steps, resets, units, physics = [], [], [], []
+    episodes = _expert_actions(task, bench.repeats)
+    for number in bench.rounds():
+        units += [seconds(unit) for _ in range(5)]
+        start = time.perf_counter()
+        state = env.reset()
+        resets.append(time.perf_counter() - start)
+        for action in episodes[number]:
+            state[keys.ACTION] = action
+            before = env.scene.world.steps
+            start = time.perf_counter()
+            result = env.step(state)
+            steps.append(time.perf_counter() - start)
+            physics.append(env.scene.world.steps - before)
+            units.append(seconds(unit))
+            state = result[keys.NEXT]
+    env.close()
+    unit.world.close()
+    name = task.removeprefix("close_loop/").replace("_", " ")
+    budget = {
+        "close_loop/block_picking": Budget("31", 4.0, 1.5),
+        "close_loop/object_grasping": Budget("79", 15.0, 8.0),
+    }.get(task, Budget("36-60", 5.0, 2.5))
+    notes = f"{np.mean(physics):.1f} physics steps per action, {len(steps)} actions"
+    return [
+        timed_row(f"close-loop step, {name}, 128 px", "ms", steps, units, budget, notes),
+        timed_row(f"close-loop reset, {name}", "ms", resets, units),
+    ]
+
+
+@measurement("simulation/depth_image")
+def depth_image(bench: Bench) -> list[Row]:
+    """One image of four cubes at 128 x 128: compiled, in NumPy, and by PyBullet."""
+    unit = SimulationUnit()
+    center, side_m, pixels = (0.45, 0.0), 0.45, 128
+    camera, plain = HeightCamera(unit.bodies), NumpyHeightCamera(unit.bodies)
+    view, projection = _looking_down(center, side_m)
+
+    def tiny_renderer() -> tuple:
+        return pybullet.getCameraImage(
+            pixels,
+            pixels,
+            view,
+            projection,
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=unit.world.client,
+        )
+
+    heights = camera.heightmap(center, side_m, pixels)
+    np.testing.assert_allclose(plain.heightmap(center, side_m, pixels), heights, atol=1e-12)
+    units, times = bench.time_against(
+        unit,
+        {
+            "compiled": lambda: camera.heightmap(center, side_m, pixels),
+            "NumPy": lambda: plain.heightmap(center, side_m, pixels),
+            "TinyRenderer, arm and floor visible": tiny_renderer,
+        },
+        repeats=10,
+    )
+    cubes = [body.id for body in unit.bodies]
+    pybullet.removeBody(unit.robot.id, physicsClientId=unit.world.client)  # it hides cubes
+    drawn = np.isin(np.reshape(tiny_renderer()[4], (pixels, pixels)), cubes)
+    off = int((drawn != (heights > 0)).sum())
+    unit.world.close()
+    notes = {
+        "NumPy": "equal to the compiled one within 1e-12 m",
+        "TinyRenderer, arm and floor visible": (
+            f"{off} pixels differ at the edges of {int((heights > 0).sum())}"
+        ),
+    }
+    return [
+        timed_row(f"depth image, 128 px, {name}", "ms", values, units, notes=notes.get(name, ""))
+        for name, values in times.items()
+    ]
+
+
+def _looking_down(center_m: tuple[float, float], side_m: float) -> tuple[list, list]:
+    """Return PyBullet's matrices of an orthographic view from above, rows along +x."""
+    x, y = center_m
+    view = pybullet.computeViewMatrix((x, y, CAMERA_M), (x, y, 0.0), (-1.0, 0.0, 0.0))
+    near, far = 0.1, 2 * CAMERA_M
+    projection = np.diag([2 / side_m, 2 / side_m, -2 / (far - near), 1.0])
+    projection[2, 3] = -(far + near) / (far - near)
+    return view, projection.T.reshape(-1).tolist()

@@ -1,0 +1,135 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import ba_torchrl
+from ba_torchrl.algorithms.base import NETWORKS, Problem
+from ba_torchrl.algorithms.sac import SACConfig
+from ba_torchrl.config import parse
+from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+
+TASK = "close_loop/block_reaching"
+DEPTH_M = 0.39
+
+
+def build(network="cnn", **config):
+    torch.manual_seed(0)
+    sizes = {"cnn": {"width": 0.25}, "equi": {"group_order": 4, "n_hidden": 8}}[network]
+    problem = Problem(
+        image_size=64,
+        action_sequence="pxyzr",
+        max_depth_m=DEPTH_M,
+        total_updates=10,
+        seed=0,
+        device=torch.device("cpu"),
+    )
+    settings = parse(SACConfig, {"batch_size": 16, "buffer_size": 500, **config}, "sac")
+    return settings.build(parse(NETWORKS[network], sizes, network), problem)
+
+
+@pytest.fixture(scope="module")
+def demonstrations():
+    env = ba_torchrl.make_vector_env(TASK, 2, parallel=False, expert=True, obs_size=64, seed=0)
+    episodes = collect_demonstrations(env, 6, seed=0)
+    env.close()
+    return torch.cat([as_transitions(episode, is_expert=True) for episode in episodes])
+
+
+@pytest.mark.parametrize("network", ["cnn", "equi"])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
+def test_the_policy_writes_nothing_but_the_action_for_any_batch_shape(network, shape):
+    policy = build(network).policy
+    observation = TensorDict(
+        {
+            "pixels": torch.rand(*shape, 1, 64, 64) * DEPTH_M,
+            "holding": torch.ones(*shape, 1, dtype=torch.bool),
+        },
+        batch_size=shape,
+    )
+    out = policy(observation)
+    assert set(out.keys()) == {"pixels", "holding", "action"}
+    assert out["action"].shape == (*shape, 5)
+    assert (out["action"].abs() <= 1).all()
+
+
+def test_the_policy_sees_depth_as_the_replay_stores_it():
+    sac = build()
+    codes = torch.randint(0, 256, (4, 1, 64, 64), dtype=torch.uint8)
+    stored = sac.quantizer.decode(codes)
+    nearby = (stored + (torch.rand_like(stored) - 0.5) * 1.9 * sac.quantizer.max_error_m).clamp(0)
+    holding = torch.zeros(4, 1, dtype=torch.bool)
+    actions = []
+    for pixels in (stored, nearby):
+        assert not torch.equal(pixels, stored) or pixels is stored
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            td = TensorDict({"pixels": pixels, "holding": holding}, batch_size=[4])
+            actions.append(sac.policy(td)["action"])
+    assert torch.equal(*actions)
+
+
+def test_the_acting_policy_follows_the_learner(demonstrations):
+    sac = build("equi")
+    sac.extend(demonstrations)
+    td = TensorDict(
+        {"pixels": torch.rand(1, 1, 64, 64) * DEPTH_M, "holding": torch.zeros(1, 1).bool()},
+        batch_size=[1],
+    )
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        before = sac.policy(td.clone())["action"]
+        sac.policy.eval()  # no filter may be cached in evaluation mode
+        sac.update()
+        after = sac.policy(td.clone())["action"]
+    assert not torch.equal(before, after)
+
+
+def test_updates_move_priorities_and_counter_and_imitate(demonstrations):
+    sac = build(learning_rate=3e-3)
+    sac.extend(demonstrations)
+    assert sac.replay_size == len(demonstrations)
+    sampler = sac.replay.sampler
+    before = sampler._sum_tree[torch.arange(len(demonstrations))]
+    errors = []
+    for _ in range(30):
+        scalars = sac.update()
+        assert not any(value.requires_grad for value in scalars.values())
+        errors.append(float(scalars["demonstration_error"]))
+    after = sampler._sum_tree[torch.arange(len(demonstrations))]
+    assert (torch.as_tensor(before) != torch.as_tensor(after)).sum() > len(demonstrations) / 2
+    assert sac.updates == 30
+    assert sum(errors[-5:]) < 0.7 * sum(errors[:5])
+    assert sampler.beta == 1.0
+
+
+def test_plain_sac_needs_no_demonstrations(demonstrations):
+    sac = build(demonstration_weight=0.0, prioritized=False, augmentation="none")
+    online = demonstrations.clone()
+    online["is_expert"] = torch.zeros_like(online["is_expert"])
+    sac.extend(online)
+    scalars = sac.update()
+    assert float(scalars["demonstration_error"]) == 0.0
+
+
+def test_faults_never_enter_the_replay(demonstrations):
+    sac = build()
+    data = demonstrations.clone()
+    data["next", "fault"][::2] = True
+    sac.extend(data)
+    assert sac.replay_size == len(data) // 2
+
+
+def test_a_restored_learner_goes_on_alike(demonstrations):
+    first, second = build(), build()
+    first.extend(demonstrations)
+    for _ in range(3):
+        first.update()
+    second.load_state_dict(first.state_dict())
+    assert second.updates == 3
+    batch = first.replay.sample()
+    losses = []
+    for sac in (first, second):
+        torch.manual_seed(1)
+        losses.append(sac.loss(batch.clone())["loss_qvalue"])
+    assert torch.equal(*losses)
+    moments = [sac.optimizer.state_dict()["state"][0]["exp_avg"].sum() for sac in (first, second)]
+    assert torch.equal(*moments)
