@@ -30,6 +30,8 @@ class SACConfig(AlgorithmConfig):
 
     learning_rate: float = Field(default=1e-3, gt=0)
     """Adam's, for actor, critic and temperature."""
+    learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
+    """Share of the learning rate that is left at the end of the run; it falls linearly."""
     gamma: float = Field(default=0.99, gt=0, le=1)
     """Discount factor."""
     tau: float = Field(default=0.01, gt=0, le=1)
@@ -96,6 +98,12 @@ class SAC(Algorithm):
         self.optimizer = torch.optim.Adam(
             self.loss.parameters(), lr=config.learning_rate, fused=True
         )
+        self.scheduler = torch.optim.lr_scheduler.LinearLR(
+            self.optimizer,
+            start_factor=1.0,
+            end_factor=config.learning_rate_end_factor,
+            total_iters=problem.total_updates,
+        )
         self.replay = make_replay_buffer(
             config.buffer_size,
             config.batch_size,
@@ -143,6 +151,7 @@ class SAC(Algorithm):
         self.optimizer.zero_grad()
         total.backward()
         self.optimizer.step()
+        self.scheduler.step()
         self.target_updater.step()
         if self.config.prioritized:
             # the sampler's trees are on the CPU, wherever the learner is
@@ -151,10 +160,11 @@ class SAC(Algorithm):
         return scalars.detach()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, optimiser and counter."""
+        """Return networks, optimiser, schedule, augmentation and counter."""
         return {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            "scheduler": self.scheduler.state_dict(),
             "augmentation": self.augmentation.state_dict(),
             "updates": self.updates,
         }
@@ -163,6 +173,7 @@ class SAC(Algorithm):
         """Restore what `state_dict` returned."""
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self.scheduler.load_state_dict(state["scheduler"])
         self.augmentation.load_state_dict(state["augmentation"])
         self.updates = state["updates"]
 
