@@ -27,7 +27,10 @@ def main(settings: DictConfig) -> None:
     result = Experiment(config).run()
     evaluation = result.evaluation
     print(f"success_rate {evaluation.success_rate:.2f} over {evaluation.episodes} episodes")
-    print(f"  {evaluation.mean_length:.1f} steps per episode; {result.seconds / 60:.1f} minutes")
+    print(
+        f"  {config.report} policy, of update {result.updates}; "
+        f"{evaluation.mean_length:.1f} steps per episode; {result.seconds / 60:.1f} minutes"
+    )
     print(f"  curve       {result.curve}")
     if result.video is not None:
         print(f"  video       {result.video}")

@@ -7,11 +7,10 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.config import StrictModel
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
 from ba_torchrl.modules.trunk import (
+    ImageNetworkConfig,
     ImageTrunk,
-    Precision,
     scale_from_log_std,
     scaled_width,
     trunk_stages,
@@ -85,17 +84,14 @@ def _initialise(module: nn.Module) -> None:
 
 
 @NETWORKS.register("cnn")
-class CNNConfig(StrictModel):
+class CNNConfig(ImageNetworkConfig):
     """Hyper-parameters of the plain convolutional actor-critic.
 
     Args:
         width: factor on every layer's width; 1 is the reference's size.
-        precision: number format of the convolutions, see
-            :func:`~ba_torchrl.modules.trunk.compute_dtype`.
     """
 
     width: float = Field(default=1.0, gt=0)
-    precision: Precision = "auto"
 
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
         """Return freshly initialised modules.
@@ -123,4 +119,4 @@ class CNNConfig(StrictModel):
             CastConv2d(channels, width, 3, padding=padding)
             for channels, (width, padding, _) in zip(inputs, stages, strict=False)
         ]
-        return ImageTrunk(convs, [pools for _, _, pools in stages], self.precision)
+        return self.image_trunk(convs, [pools for _, _, pools in stages])

@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.config import StrictModel
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
 from ba_torchrl.modules.steerable import (
     FieldTypes,
@@ -21,7 +20,12 @@ from ba_torchrl.modules.steerable import (
     SteerableLinear,
     planar_rotations,
 )
-from ba_torchrl.modules.trunk import ImageTrunk, Precision, scale_from_log_std, trunk_stages
+from ba_torchrl.modules.trunk import (
+    ImageNetworkConfig,
+    ImageTrunk,
+    scale_from_log_std,
+    trunk_stages,
+)
 
 if TYPE_CHECKING:
     from escnn.gspaces import GSpace2D
@@ -125,20 +129,17 @@ class EquivariantTwinCritic(nn.Module):
 
 
 @NETWORKS.register("equi")
-class EquivariantConfig(StrictModel):
+class EquivariantConfig(ImageNetworkConfig):
     """Hyper-parameters of the rotation-equivariant actor-critic.
 
     Args:
         group_order: number of rotations n of the cyclic group C_n, at least 2.
         n_hidden: regular fields of the last layers; the first has an eighth of them (at 64 px
             the first stage is missing, and the first layer has a quarter).
-        precision: number format of the convolutions, see
-            :func:`~ba_torchrl.modules.trunk.compute_dtype`.
     """
 
     group_order: int = Field(default=8, ge=2)
     n_hidden: int = Field(default=64, ge=4)
-    precision: Precision = "auto"
 
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
         """Return freshly initialised modules.
@@ -176,4 +177,4 @@ class EquivariantConfig(StrictModel):
             out = [(regular, int(width))]
             convs.append(SteerableConv2d(gspace, fields, out, 3, padding=padding))
             fields = out
-        return ImageTrunk(convs, [pools for _, _, pools in stages], self.precision)
+        return self.image_trunk(convs, [pools for _, _, pools in stages])

@@ -28,10 +28,14 @@ class Checkpoints:
     Args:
         folder: the run folder.
         algorithm: what to save.
+        device: where to load it to.
         keep_last: how many of the newest to keep.
     """
 
-    def __init__(self, folder: Path, algorithm: Algorithm, keep_last: int = 2) -> None:
+    def __init__(
+        self, folder: Path, algorithm: Algorithm, device: torch.device, keep_last: int = 2
+    ) -> None:
+        self._device = device
         self._checkpoint = Checkpoint(algorithm=algorithm)
         self._rotation = CheckpointRotation(
             folder / "checkpoints", keep_last=keep_last, keep_best=("success_rate", "max")
@@ -47,10 +51,17 @@ class Checkpoints:
         }
         return Path(self._rotation.save(self._checkpoint, step=updates, metadata=metadata))
 
-    def latest(self) -> Path | None:
-        """Return the newest checkpoint's folder, if there is one."""
-        path = self._rotation.latest()
-        return None if path is None else Path(path)
+    def load_best(self) -> Path:
+        """Put the algorithm back to the checkpoint with the best evaluation; return its folder.
+
+        Raises:
+            ConfigError: nothing was saved yet.
+        """
+        path = self._rotation.best()
+        if path is None:
+            raise ConfigError("there is no checkpoint yet")
+        self._checkpoint.load(path, map_location=self._device)
+        return Path(path)
 
 
 def write_config(config: ExperimentConfig) -> None:

@@ -22,6 +22,7 @@ class SeedUse(IntEnum):
     DEMONSTRATIONS = 0
     COLLECTION = 1
     EVALUATION = 2
+    REPORT = 3
 
 
 class ExperimentConfig(StrictModel):
@@ -65,13 +66,15 @@ class ExperimentConfig(StrictModel):
     min_replay: int = Field(default=100, ge=1)
     """Transitions in the replay before the first update."""
     eval_every: int = Field(default=500, ge=1)
-    """Updates between evaluations of the greedy policy."""
+    """Updates between evaluations of the greedy policy; each is followed by a checkpoint, of
+    which the best and the newest are kept."""
     eval_episodes: int = Field(default=100, ge=1)
     """Episodes of each of them."""
     final_eval_episodes: int = Field(default=100, ge=1)
     """Episodes of the last evaluation, the one that is reported."""
-    checkpoint_every: int = Field(default=500, ge=1)
-    """Updates between checkpoints; the best and the last are kept besides."""
+    report: Literal["last", "best"] = "last"
+    """Which policy the last evaluation is of: the run's last, or that of the checkpoint with the
+    best evaluation. Its episodes are others than those that chose the checkpoint."""
     log_every: int = Field(default=50, ge=1)
     """Updates between rows of the losses."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"

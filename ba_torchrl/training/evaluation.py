@@ -31,12 +31,12 @@ class Evaluation:
     mean_length: float
     """Steps per episode, failures at their full length."""
 
-    def scalars(self) -> dict[str, float]:
+    def scalars(self, prefix: str) -> dict[str, float]:
         """Return the figures by name, for loggers."""
         return {
-            "eval/success_rate": self.success_rate,
-            "eval/standard_error": self.standard_error,
-            "eval/mean_length": self.mean_length,
+            f"{prefix}/success_rate": self.success_rate,
+            f"{prefix}/standard_error": self.standard_error,
+            f"{prefix}/mean_length": self.mean_length,
         }
 
 

@@ -37,6 +37,8 @@ class Result:
     """What a run ended with, and where to find it."""
 
     evaluation: Evaluation
+    updates: int
+    """Age of the policy that was evaluated."""
     checkpoint: Path
     curve: Path
     video: Path | None
@@ -59,7 +61,7 @@ class Experiment:
         write_config(config)
         self.algorithm = build_algorithm(config)
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)
-        self.checkpoints = Checkpoints(config.folder, self.algorithm)
+        self.checkpoints = Checkpoints(config.folder, self.algorithm, config.torch_device)
         self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
         self._train_env: EnvBase | None = None
         self._eval_env: EnvBase | None = None
@@ -167,10 +169,13 @@ class Experiment:
             collector.shutdown(close_env=False)
 
     def _finish(self, started: float) -> Result:
-        """Evaluate for the record; write curve, video and the last checkpoint."""
+        """Evaluate for the record, on episodes that chose nothing; write curve and video."""
         config = self.config
-        evaluation = self._evaluate(config.final_eval_episodes)
-        checkpoint = self.checkpoints.save(self.algorithm.updates, evaluation.success_rate)
+        checkpoint = self._evaluate_and_save()
+        if config.report == "best":
+            checkpoint = self.checkpoints.load_best()
+        evaluation = self._evaluate(config.final_eval_episodes, SeedUse.REPORT)
+        self.log.write(self.algorithm.updates, evaluation.scalars("final"))
         curve = config.folder / "learning_curve.png"
         updates = [updates for updates, _ in self._curve]
         rates = [item.success_rate for _, item in self._curve]
@@ -192,10 +197,11 @@ class Experiment:
                 config.env,
                 self._greedy,
                 config.video_episodes,
-                config.derived_seed(SeedUse.EVALUATION),
+                config.derived_seed(SeedUse.REPORT),
             )
             write_video(video, frames, fps=5)
-        return Result(evaluation, checkpoint, curve, video, time.perf_counter() - started)
+        seconds = time.perf_counter() - started
+        return Result(evaluation, self.algorithm.updates, checkpoint, curve, video, seconds)
 
     # -- parts -------------------------------------------------------------------------------
 
@@ -230,19 +236,20 @@ class Experiment:
             if self._recent:
                 values["train/success_rate"] = sum(self._recent) / len(self._recent)
             self.log.write(updates, values)
-        is_last = updates == config.total_updates
-        if updates % config.eval_every == 0 and not is_last:
-            self._evaluate(config.eval_episodes)
-        if updates % config.checkpoint_every == 0 and not is_last:
-            rate = self._curve[-1][1].success_rate if self._curve else 0.0
-            self.checkpoints.save(updates, rate)
+        if updates % config.eval_every == 0 and updates < config.total_updates:
+            self._evaluate_and_save()
 
-    def _evaluate(self, episodes: int) -> Evaluation:
-        seed = self.config.derived_seed(SeedUse.EVALUATION)
+    def _evaluate_and_save(self) -> Path:
+        """Add a point to the learning curve and write a checkpoint that bears its success rate."""
+        updates = self.algorithm.updates
+        evaluation = self._evaluate(self.config.eval_episodes, SeedUse.EVALUATION)
+        self._curve.append((updates, evaluation))
+        self.log.write(updates, evaluation.scalars("eval"))
+        self._bar.set_postfix(success=f"{evaluation.success_rate:.2f}")
+        return self.checkpoints.save(updates, evaluation.success_rate)
+
+    def _evaluate(self, episodes: int, use: SeedUse) -> Evaluation:
+        seed = self.config.derived_seed(use)
         if self._eval_env is None:
             self._eval_env = self._make_env(seed)
-        evaluation = evaluate(self._eval_env, self._greedy, episodes, seed)
-        self._curve.append((self.algorithm.updates, evaluation))
-        self.log.write(self.algorithm.updates, evaluation.scalars())
-        self._bar.set_postfix(success=f"{evaluation.success_rate:.2f}")
-        return evaluation
+        return evaluate(self._eval_env, self._greedy, episodes, seed)

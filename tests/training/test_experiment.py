@@ -13,6 +13,7 @@ from ba_torchrl.config import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, find_checkpoint, load
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
 
 ROOT = Path(__file__).parents[2]
@@ -30,7 +31,6 @@ TINY = {
     "eval_every": 3,
     "eval_episodes": 3,
     "final_eval_episodes": 4,
-    "checkpoint_every": 2,
     "log_every": 1,
     "video_episodes": 1,
 }
@@ -49,6 +49,8 @@ def test_a_run_leaves_everything_behind(tmp_path):
     assert json.loads((folder / "config.json").read_text())["task"] == TINY["task"]
     scalars = read_scalars(folder)
     assert scalars["eval/success_rate"].steps.tolist() == [3, 6]
+    assert scalars["final/success_rate"].steps.tolist() == [6]
+    assert result.updates == 6
     assert scalars["train/loss_qvalue"].steps.tolist() == [1, 2, 3, 4, 5, 6]
     assert scalars["demonstrations/success_rate"].values[0] == 1.0
     # two pretraining updates, then one per step of both environments
@@ -101,7 +103,7 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
 def test_a_crash_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeypatch):
     config = tiny(tmp_path)
     algorithm = build_algorithm(config)
-    checkpoints = Checkpoints(config.folder, algorithm)
+    checkpoints = Checkpoints(config.folder, algorithm, config.torch_device)
     checkpoints.save(1, 0.1)
     with monkeypatch.context() as patch:
         patch.setattr(algorithm, "state_dict", lambda: {"loss": 1 / 0})
@@ -112,11 +114,34 @@ def test_a_crash_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeyp
 
 def test_the_best_checkpoint_outlives_the_rotation(tmp_path):
     config = tiny(tmp_path)
-    checkpoints = Checkpoints(config.folder, build_algorithm(config), keep_last=1)
+    checkpoints = Checkpoints(
+        config.folder, build_algorithm(config), config.torch_device, keep_last=1
+    )
     for updates, rate in ((1, 0.9), (2, 0.1), (3, 0.2)):
         checkpoints.save(updates, rate)
     kept = sorted(path.name[-1] for path in (config.folder / "checkpoints").iterdir())
     assert kept == ["1", "3"]
+
+
+def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
+    experiment = Experiment(tiny(tmp_path, report="best", video_episodes=0), progress=False)
+    rates = iter([0.9, 0.4, 0.7])
+    seeds = []
+
+    def fake(env, policy, episodes, seed):
+        seeds.append(seed)
+        weights.append(next(experiment.algorithm.loss.parameters()).detach().clone())
+        return Evaluation(episodes, next(rates), 0.0, 1.0)
+
+    weights = []
+    monkeypatch.setattr("ba_torchrl.training.experiment.evaluate", fake)
+    result = experiment.run()
+    assert result.updates == 3
+    assert result.evaluation.success_rate == 0.7
+    assert result.checkpoint.name.endswith("3")
+    assert torch.equal(weights[2], weights[0])
+    assert not torch.equal(weights[1], weights[0])
+    assert seeds[0] == seeds[1] != seeds[2]
 
 
 def test_a_missing_checkpoint_says_what_is_needed(tmp_path):
