@@ -58,10 +58,21 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+Rgb = tuple[float, float, float]
+
+CUSTOM_PHYSICS = ("time_step_s", "solver_iterations", "solver_residual")
+
+_CLOSE_LOOP = {"control": "close_loop"}
+_OPEN_LOOP = {"control": "open_loop"}
+_SOME_TASKS = {"task_parameter": True}
+
+
 class EnvConfig(StrictModel):
     """The parameters of an environment (appendix B, table 4), under the paper's names.
 
     A value of ``None`` stands for the task's own default. Lengths are metres, angles radians.
+    Fields marked "close loop" or "open loop" are refused by tasks of the other kind, those marked
+    "some tasks" by tasks that have no use for them.
     """
 
     robot: str = "kuka"
@@ -74,20 +85,56 @@ class EnvConfig(StrictModel):
     """Scale of the objects, drawn per episode in steps of 0.02; a number means that scale."""
     max_steps: int | None = Field(default=None, ge=1)
     """Steps until the episode is truncated."""
+    num_objects: int | None = Field(default=None, ge=1)
+    """Number of objects, where the task leaves it open."""
     obs_size: int = Field(default=128, ge=16, le=1024)
     """Pixels along each side of the image."""
+    in_hand_size: int = Field(default=24, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
+    """Open loop: pixels along each side of the image of what is held."""
     fast_mode: bool = True
     """Teleport the arm where it touches nothing; off, every centimetre is simulated."""
+    render: bool = False
+    """Show the simulation in PyBullet's window."""
     random_orientation: bool = True
     """Objects start with random yaw."""
+    half_rotation: bool | None = None
+    """Keep the gripper's yaw within a half turn, which is all a two-finger gripper needs. Open
+    loop: 0 to pi, on by default. Close loop: -pi/2 to pi/2 about the start, off by default."""
     workspace_check: Literal["point", "bounding_box"] = "point"
     """What of an object must stay inside the workspace: its origin, or its whole outline."""
-    view_scale: float = Field(default=1.5, gt=0)
-    """Width of the close-loop image as a multiple of the workspace's width."""
-    dpos: float = Field(default=0.05, gt=0)
+    close_loop_tray: bool = Field(default=False, json_schema_extra=_CLOSE_LOOP)
+    """Close loop: the objects lie in a tray as in Object Grasping."""
+    view_type: str = Field(default="camera_center_xyz", json_schema_extra=_CLOSE_LOOP)
+    """Close loop: from where the depth image is taken; see `ba_torchrl.sim.views`."""
+    view_scale: float = Field(default=1.5, gt=0, json_schema_extra=_CLOSE_LOOP)
+    """Close loop: width of the image as a multiple of the workspace's width."""
+    dpos: float = Field(default=0.05, gt=0, json_schema_extra=_CLOSE_LOOP)
     """Close loop: displacement along an axis at action 1."""
-    drot: float = Field(default=math.pi / 4, gt=0)
+    drot: float = Field(default=math.pi / 4, gt=0, json_schema_extra=_CLOSE_LOOP)
     """Close loop: change of yaw at action 1."""
+    obs_type: Literal["pixel", "vec"] = "pixel"
+    """Observe an image, or the poses of gripper and objects as a vector."""
+    rgb: bool = False
+    """Add a colour picture of the scene, arm included, and its depth to every observation."""
+    point_cloud: int = Field(default=0, ge=0, le=1_000_000)
+    """Add this many points of the scene's surfaces to every observation."""
+    object_set: str = Field(default="random", json_schema_extra=_SOME_TASKS)
+    """Some tasks: which shapes the objects have; see `ba_torchrl.sim.assets`."""
+    asset_root: str | None = Field(default=None, json_schema_extra=_SOME_TASKS)
+    """Some tasks: folder of a set of objects that does not ship with the package."""
+    floor_color: Rgb | None = None
+    """Colour of the floor in pictures, each component from 0 to 1; None is a chequered blue."""
+    workspace_color: Rgb | None = None
+    """Colour of the workspace's floor area in pictures; None leaves it unmarked."""
+    physics_mode: Literal["fast", "slow", "custom"] = "fast"
+    """Settings of the physics engine: the cheapest that hold a grasp firmly, finer ones, or those
+    given by `time_step_s`, `solver_iterations` and `solver_residual`."""
+    time_step_s: float | None = Field(default=None, gt=0, le=1 / 60)
+    """Custom physics: length of a physics step."""
+    solver_iterations: int | None = Field(default=None, ge=1)
+    """Custom physics: iterations of the contact solver in each step."""
+    solver_residual: float | None = Field(default=None, ge=0)
+    """Custom physics: residual at which the solver stops early."""
     expert: bool = False
     """Add what the expert would do to every observation."""
     seed: int | None = Field(default=None, ge=0)
@@ -112,6 +159,19 @@ class EnvConfig(StrictModel):
             return (float(value), float(value))
         return tuple(value) if isinstance(value, list) else value
 
+    @field_validator("floor_color", "workspace_color", mode="before")
+    @classmethod
+    def _as_color(cls, value: Any) -> Any:
+        if value is None:
+            return None
+        try:
+            color = tuple(float(x) for x in value)
+        except TypeError:
+            color = ()
+        if len(color) != 3 or not all(0 <= x <= 1 for x in color):
+            raise ValueError("must be red, green and blue from 0 to 1")
+        return color
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.workspace is not None:
@@ -122,4 +182,28 @@ class EnvConfig(StrictModel):
             low, high = self.object_scale_range
             if not 0 < low <= high < math.inf:
                 raise ValueError("object_scale_range must satisfy 0 < low <= high")
+        custom = [name for name in CUSTOM_PHYSICS if getattr(self, name) is not None]
+        if custom and self.physics_mode != "custom":
+            raise ValueError(f"{', '.join(custom)} needs physics_mode='custom'")
+        if self.physics_mode == "custom" and not custom:
+            raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
         return self
+
+    def check_for(self, task_id: str, control: str, task_parameters: Iterable[str]) -> None:
+        """Check that the parameters that were given have a meaning for a task.
+
+        Args:
+            task_id: for the message.
+            control: "open_loop" or "close_loop".
+            task_parameters: fields marked "some tasks" that this one takes.
+
+        Raises:
+            ConfigError: one has none.
+        """
+        for name in sorted(self.model_fields_set):
+            marks = type(self).model_fields[name].json_schema_extra or {}
+            if marks.get("control", control) != control:
+                kind = marks["control"].replace("_", "-")
+                raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")
+            if marks.get("task_parameter") and name not in task_parameters:
+                raise ConfigError(f"{name!r} has no meaning for {task_id}: leave it out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 from abc import abstractmethod
@@ -15,13 +16,14 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ba_torchrl.actions import InvalidActionError
-from ba_torchrl.config import ConfigError, EnvConfig
+from ba_torchrl.config import CUSTOM_PHYSICS, ConfigError, EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.registry import Registry
+from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.cameras import HeightCamera, render_rgb
 from ba_torchrl.sim.motion import CloseLoopMotion
 from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
-from ba_torchrl.sim.world import SimulationError, World
+from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SimulationError, World
 from ba_torchrl.tasks.base import (
     SCALE_STEP,
     TASKS,
@@ -38,6 +40,9 @@ CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torc
 
 MAX_CONSECUTIVE_FAULTS = 10
 RESET_ATTEMPTS = 50
+SETTLE_STEPS = 100
+MARK_M = 1e-3
+"""Thickness of the coloured sheet that marks the workspace."""
 
 
 @dataclass
@@ -70,11 +75,19 @@ class ManipulationEnv(EnvBase):
         self.task_id = task_id
         self.config = config
         self.task_class = TASKS[task_id]
+        config.check_for(task_id, self.task_class.control, self.task_class.parameters)
         self.robot_class = ROBOTS[config.robot]
         self.workspace = (
             self.task_class.workspace if config.workspace is None else Workspace(*config.workspace)
         )
         self.max_steps = config.max_steps or self.task_class.max_steps
+        self.num_objects = config.num_objects or self.task_class.num_objects
+        least, most = self.task_class.num_objects_range
+        if not least <= self.num_objects <= most:
+            allowed = str(least) if least == most else f"{least} to {most}"
+            raise ConfigError(
+                f"num_objects: {task_id} takes {allowed} objects, not {self.num_objects}"
+            )
         low, high = config.object_scale_range or self.task_class.scale_range
         self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._scenes: dict[float, Scene] = {}
@@ -159,7 +172,8 @@ class ManipulationEnv(EnvBase):
         rng = np.random.default_rng([self.base_seed, self._episode])
         self._episode += 1
         self._step_count = 0
-        self._scene = self._new_episode(rng)
+        afresh = self._episode == 1
+        self._scene = self._new_episode(rng, afresh)
         self._observation = self._observe(self._scene)
         return self._tensordict(self._observation)
 
@@ -236,7 +250,7 @@ class ManipulationEnv(EnvBase):
         """Return the sealed world for objects of this scale, building it the first time."""
         key = round(scale, 6)
         if key not in self._scenes:
-            world = World()
+            world = self._new_world()
             task = self.task_class(
                 TaskSettings(
                     workspace=self.workspace,
@@ -244,6 +258,10 @@ class ManipulationEnv(EnvBase):
                     random_orientation=self.config.random_orientation,
                     bounding_box_check=self.config.workspace_check == "bounding_box",
                     reach=self.reach,
+                    num_objects=self.num_objects,
+                    parameters={
+                        name: getattr(self.config, name) for name in self.task_class.parameters
+                    },
                 )
             )
             task.world, task.robot = world, self.robot_class(world)
@@ -258,19 +276,53 @@ class ManipulationEnv(EnvBase):
             )
         return self._scenes[key]
 
+    def _new_world(self) -> World:
+        """Return an empty world."""
+        config = self.config
+        physics = {"fast": Physics(), "slow": FINE_PHYSICS, "custom": Physics()}[
+            config.physics_mode
+        ]
+        custom = {
+            name: getattr(config, name)
+            for name in CUSTOM_PHYSICS
+            if getattr(config, name) is not None
+        }
+        color = None if config.floor_color is None else (*config.floor_color, 1.0)
+        try:
+            world = World(
+                dataclasses.replace(physics, **custom), window=config.render, floor_color=color
+            )
+        except SimulationError as error:
+            if config.render:
+                raise ConfigError(str(error)) from None
+            raise
+        if config.workspace_color is not None:
+            ws = self.workspace
+            size = (ws.x[1] - ws.x[0], ws.y[1] - ws.y[0], MARK_M)
+            mark = Decal(size_m=size, color=(*config.workspace_color, 1.0))
+            world.add(mark, "workspace").place((*ws.center, MARK_M / 2))
+        return world
+
     def _drop_scenes(self) -> None:
         for scene in self._scenes.values():
             scene.world.close()
         self._scenes.clear()
         self._scene = None
 
-    def _new_episode(self, rng: np.random.Generator) -> Scene:
+    def _new_episode(self, rng: np.random.Generator, afresh: bool) -> Scene:
+        """Return a scene at the start of an episode: with new objects, or the last one's."""
+        scene = self._scene
+        if scene is not None and not afresh and scene.task.continues:
+            self._place_robot(scene)
+            scene.world.settle(max_steps=SETTLE_STEPS)
+            if scene.task.is_valid() and not scene.task.is_goal():
+                return scene
         for _ in range(RESET_ATTEMPTS):
             scene = self._scene_for(float(rng.choice(self._scales)))
             scene.world.restore_pristine()
             self._place_robot(scene)
             scene.task.randomise(rng)
-            scene.world.settle(max_steps=100)
+            scene.world.settle(max_steps=SETTLE_STEPS)
             if scene.task.is_valid() and not scene.task.is_goal():
                 return scene
         raise PlacementError(
@@ -284,7 +336,7 @@ class ManipulationEnv(EnvBase):
             raise SimulationError("a body's position is not finite")
         success = scene.task.is_goal()
         if success:
-            scene.world.settle(max_steps=100)
+            scene.world.settle(max_steps=SETTLE_STEPS)
             success = scene.task.is_goal()
         valid = scene.task.is_valid()
         return valid and success, valid

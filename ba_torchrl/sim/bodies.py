@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
 
 import pybullet
 
-from ba_torchrl.sim.meshes import Mesh, box_mesh
+from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, write_obj
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Color = tuple[float, float, float, float]
+
+_NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 CONTACT_M = 5e-4
 """Bodies closer than this touch; PyBullet already lists pairs that are millimetres apart."""
@@ -31,11 +37,16 @@ class Shape(ABC):
         mass_kg: 0 for a static body.
         friction: lateral friction coefficient.
         color: red, green, blue, alpha in [0, 1].
+        center_of_mass_m: in the frame of the geometry.
     """
 
     mass_kg: float = 0.1
     friction: float = 1.0
     color: Color = (0.8, 0.2, 0.2, 1.0)
+    center_of_mass_m: Vector = (0.0, 0.0, 0.0)
+
+    collision_margin_m: ClassVar[float | None] = None
+    """Gap that PyBullet keeps around the geometry; None leaves its own choice."""
 
     @abstractmethod
     def mesh(self) -> Mesh:
@@ -49,10 +60,17 @@ class Shape(ABC):
     def create_visual(self, client: int) -> int:
         """Create PyBullet's visual shape and return its id."""
 
+    @cached_property
+    def bounds_m(self) -> tuple[Vector, Vector]:
+        """Lower and upper corner of the geometry in its own frame."""
+        vertices = self.mesh().vertices
+        return tuple(map(float, vertices.min(axis=0))), tuple(map(float, vertices.max(axis=0)))
+
     @property
-    @abstractmethod
     def height_m(self) -> float:
         """Height of the body in its upright pose."""
+        low, high = self.bounds_m
+        return high[2] - low[2]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,11 +98,6 @@ class Box(Shape):
             physicsClientId=client,
         )
 
-    @property
-    def height_m(self) -> float:
-        """Edge length along z."""
-        return self.size_m[2]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Decal(Box):
@@ -102,6 +115,56 @@ class Decal(Box):
         return -1
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solid(Shape):
+    """A body of convex parts, hollow where they leave a gap.
+
+    Collisions see the convex hull of each part.
+
+    Args:
+        parts: their surfaces, in the common frame.
+        surface: what cameras see; the parts unless given.
+    """
+
+    parts: tuple[Mesh, ...]
+    surface: Mesh | None = None
+
+    # PyBullet's millimetre stands outside a hull: stacks would float
+    collision_margin_m: ClassVar[float | None] = 2e-4
+
+    def mesh(self) -> Mesh:
+        """Return what cameras see."""
+        return joined(self.parts) if self.surface is None else self.surface
+
+    def create_collision(self, client: int) -> int:
+        """Create one hull for each part."""
+        if len(self.parts) == 1:
+            return pybullet.createCollisionShape(
+                pybullet.GEOM_MESH,
+                vertices=self.parts[0].vertices.tolist(),
+                physicsClientId=client,
+            )
+        # PyBullet takes several hulls from a file only
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "parts.obj"
+            write_obj(path, self.parts)
+            return pybullet.createCollisionShape(
+                pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client
+            )
+
+    def create_visual(self, client: int) -> int:
+        """Create the visible surface."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "surface.obj"
+            write_obj(path, [self.mesh()])
+            return pybullet.createVisualShape(
+                pybullet.GEOM_MESH,
+                fileName=str(path),
+                rgbaColor=self.color,
+                physicsClientId=client,
+            )
+
+
 class Body:
     """A rigid body in a PyBullet client.
 
@@ -115,11 +178,16 @@ class Body:
         self.client = client
         self.shape = shape
         self.name = name
+        # PyBullet's poses are of the centre of mass
+        self._from_center = (
+            tuple(-x for x in shape.center_of_mass_m) if any(shape.center_of_mass_m) else None
+        )
         self.id = pybullet.createMultiBody(
             baseMass=shape.mass_kg,
             baseCollisionShapeIndex=shape.create_collision(client),
             baseVisualShapeIndex=shape.create_visual(client),
-            basePosition=(0.0, 0.0, shape.height_m / 2),
+            basePosition=(0.0, 0.0, -shape.bounds_m[0][2]),
+            baseInertialFramePosition=shape.center_of_mass_m,
             physicsClientId=client,
         )
         pybullet.changeDynamics(
@@ -129,6 +197,10 @@ class Body:
             frictionAnchor=1,  # a held or stacked body must not creep
             physicsClientId=client,
         )
+        if shape.collision_margin_m is not None:
+            pybullet.changeDynamics(
+                self.id, -1, collisionMargin=shape.collision_margin_m, physicsClientId=client
+            )
 
     def __repr__(self) -> str:
         return f"Body({self.name!r})"
@@ -140,8 +212,13 @@ class Body:
 
     @property
     def pose(self) -> tuple[Vector, Quaternion]:
-        """Position (metres) and orientation (x, y, z, w)."""
-        return pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+        """Position of the geometry's frame (metres) and orientation (x, y, z, w)."""
+        pose = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+        return (
+            pose
+            if self._from_center is None
+            else pybullet.multiplyTransforms(*pose, self._from_center, _NO_TURN)
+        )
 
     @property
     def position(self) -> Vector:
@@ -154,10 +231,24 @@ class Body:
         x, y, z, w = self.pose[1]
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
+    @property
+    def tilt_rad(self) -> float:
+        """Angle between the body's z axis and the vertical."""
+        x, y, _, _ = self.pose[1]
+        return math.acos(min(max(1 - 2 * (x * x + y * y), -1.0), 1.0))
+
     def place(self, position: Vector, yaw_rad: float = 0.0) -> None:
-        """Put the body at rest at a pose."""
+        """Put the body at rest, upright, at a pose."""
+        self.move_to(position, yaw_quaternion(yaw_rad))
+
+    def move_to(self, position: Vector, orientation: Quaternion) -> None:
+        """Put the body at rest at any pose."""
+        if self._from_center is not None:
+            position, orientation = pybullet.multiplyTransforms(
+                position, orientation, self.shape.center_of_mass_m, _NO_TURN
+            )
         pybullet.resetBasePositionAndOrientation(
-            self.id, position, yaw_quaternion(yaw_rad), physicsClientId=self.client
+            self.id, position, orientation, physicsClientId=self.client
         )
         pybullet.resetBaseVelocity(
             self.id, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), physicsClientId=self.client

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import weakref
 from dataclasses import dataclass
 from typing import Self
@@ -9,7 +11,7 @@ from typing import Self
 import pybullet
 import pybullet_data
 
-from ba_torchrl.sim.bodies import Body, Shape
+from ba_torchrl.sim.bodies import Body, Color, Shape
 
 
 class SimulationError(RuntimeError):
@@ -33,6 +35,10 @@ class Physics:
     settle_spin_rad_s: float = 0.2
 
 
+FINE_PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=200)
+"""Four times the work of the default."""
+
+
 class World:
     """A physics client of its own with a floor, whose bodies are loaded once.
 
@@ -42,14 +48,23 @@ class World:
 
     Args:
         physics: settings of the engine.
+        window: show the simulation in PyBullet's window; a process can have one.
+        floor_color: red, green, blue, alpha of the floor; None is PyBullet's chequered blue.
 
     Raises:
-        SimulationError: PyBullet offers no further client (it allows 1024).
+        SimulationError: there is no display for the window, it is in use, or PyBullet offers no
+            further client (it allows 1024).
     """
 
-    def __init__(self, physics: Physics | None = None) -> None:
+    def __init__(
+        self,
+        physics: Physics | None = None,
+        *,
+        window: bool = False,
+        floor_color: Color | None = None,
+    ) -> None:
         self.physics = physics or Physics()
-        self.client = pybullet.connect(pybullet.DIRECT)
+        self.client = _connect_window() if window else pybullet.connect(pybullet.DIRECT)
         if self.client < 0:
             raise SimulationError("PyBullet has no free client: close environments not in use")
         self._disconnect = weakref.finalize(self, _disconnect, self.client)
@@ -76,6 +91,14 @@ class World:
             lateralFriction=self.physics.floor_friction,
             physicsClientId=self.client,
         )
+        if floor_color is not None:
+            pybullet.changeVisualShape(
+                self.floor,
+                -1,
+                textureUniqueId=-1,
+                rgbaColor=floor_color,
+                physicsClientId=self.client,
+            )
 
     def add(self, shape: Shape, name: str) -> Body:
         """Load a body; only before `seal`.
@@ -145,6 +168,25 @@ class World:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _connect_window() -> int:
+    """Open PyBullet's window and return its client."""
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        # PyBullet would end the process
+        raise SimulationError(
+            "render=True opens a window, and there is no display (DISPLAY is not set): use "
+            "env.render() for pictures, or start under a virtual display such as xvfb-run"
+        )
+    try:
+        client = pybullet.connect(pybullet.GUI, options="--width=960 --height=720")
+    except pybullet.error as error:
+        raise SimulationError(
+            f"PyBullet cannot open a window ({error}): a process can have one at a time"
+        ) from None
+    if client >= 0:
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+    return client
 
 
 def _disconnect(client: int) -> None:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.bodies import Body, Vector
-from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.robots.base import Pose, Robot
 from ba_torchrl.sim.world import World
 
 TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks")
@@ -21,6 +22,19 @@ BLOCK_M = 0.05
 """Edge of a block at scale 1."""
 
 SCALE_STEP = 0.02
+
+
+LAYOUT_ATTEMPTS = 2000
+"""Random layouts tried before giving up; bowl and block fit in about one of ten."""
+
+
+class Spot(NamedTuple):
+    """Room that an object needs."""
+
+    padding_m: float
+    """Twice the distance that its centre keeps from the border."""
+    distance_m: float
+    """Distance that its centre keeps from those placed before it."""
 
 
 class PlacementError(RuntimeError):
@@ -67,6 +81,8 @@ class Reach:
     step_m: float
     turn_rad: float
     """0 if the gripper cannot be turned."""
+    yaw_range_rad: tuple[float, float] | None = None
+    """What the gripper's yaw is kept within, if anything."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +94,11 @@ class TaskSettings:
     random_orientation: bool
     bounding_box_check: bool
     reach: Reach
+    num_objects: int
+    surface_z_m: float = 0.0
+    """Height of what the objects stand on."""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Values of `Task.parameters`."""
 
 
 class Task(ABC):
@@ -94,6 +115,14 @@ class Task(ABC):
     max_steps: ClassVar[int]
     workspace: ClassVar[Workspace]
     scale_range: ClassVar[tuple[float, float]]
+    num_objects: ClassVar[int] = 1
+    """How many objects there are by default."""
+    num_objects_range: ClassVar[tuple[int, int]] = (1, 1)
+    """How many there may be."""
+    fits_tray: ClassVar[bool] = False
+    """Whether everything has room in the tray of `close_loop_tray`."""
+    parameters: ClassVar[frozenset[str]] = frozenset()
+    """Fields of `EnvConfig` for some tasks only that this one takes."""
 
     def __init__(self, settings: TaskSettings) -> None:
         self.settings = settings
@@ -124,6 +153,25 @@ class Task(ABC):
     @abstractmethod
     def objects(self) -> Sequence[Body]:
         """The bodies that must stay in the workspace."""
+
+    @property
+    def landmarks(self) -> Sequence[Pose]:
+        """Positions and yaws that the vector observation lists: by default the objects'."""
+        return [(body.position, body.yaw_rad) for body in self.objects]
+
+    @property
+    def continues(self) -> bool:
+        """Whether the next episode goes on with the objects as they are now."""
+        return False
+
+    def get_state(self) -> Any:
+        """Return what the task remembers beyond the poses of its bodies."""
+        return None
+
+    def set_state(self, state: Any) -> None:
+        """Take up what `get_state` returned."""
+        if state is not None:
+            raise ValueError(f"{type(self).__name__} remembers nothing beyond its bodies' poses")
 
     @property
     def block_m(self) -> float:
@@ -164,6 +212,28 @@ class Task(ABC):
                 )
             point.append(float(rng.uniform(low, high)))
         return tuple(point)
+
+    def random_points(
+        self, rng: np.random.Generator, spots: Sequence[Spot]
+    ) -> list[tuple[float, float]]:
+        """Return random points of the floor, one for each spot, apart from each other.
+
+        Raises:
+            PlacementError: the workspace has no room for them.
+        """
+        for _ in range(LAYOUT_ATTEMPTS):
+            points: list[tuple[float, float]] = []
+            for spot in spots:
+                point = self.random_point(rng, spot.padding_m)
+                if any(math.dist(point, other) < spot.distance_m for other in points):
+                    break
+                points.append(point)
+            else:
+                return points
+        raise PlacementError(
+            f"no room for {len(spots)} things apart from each other: enlarge `workspace`, or lower "
+            "`num_objects` or `object_scale_range`"
+        )
 
     def random_yaw(self, rng: np.random.Generator, span_rad: float) -> float:
         """Return a yaw uniform over ``span_rad`` about zero, or zero for fixed orientations."""

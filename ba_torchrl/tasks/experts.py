@@ -32,6 +32,29 @@ def towards(
     return GripperCommand(opening, dx, dy, dz, wrap_angle(yaw_rad - yaw))
 
 
+def turned(
+    yaw_rad: float, target_rad: float, reach: Reach, period_rad: float = 2 * math.pi
+) -> float:
+    """Return the yaw to turn to.
+
+    Args:
+        yaw_rad: the gripper's.
+        target_rad: wanted, up to multiples of the period.
+        reach: of an action; a gripper that cannot turn keeps its yaw.
+        period_rad: yaws this far apart serve alike.
+    """
+    if not reach.turn_rad:
+        return yaw_rad
+    nearest = yaw_rad + wrap_angle(target_rad - yaw_rad, period_rad)
+    if reach.yaw_range_rad is not None:
+        low, high = reach.yaw_range_rad
+        if nearest < low and nearest + period_rad <= high:
+            return nearest + period_rad
+        if nearest > high and nearest - period_rad >= low:
+            return nearest - period_rad
+    return nearest
+
+
 def lift(height_m: float, opening: float = CLOSED) -> GripperCommand:
     """Return the command that goes straight up."""
     return GripperCommand(opening, 0.0, 0.0, height_m, 0.0)
@@ -45,7 +68,7 @@ def grasp(robot: Robot, body: Body, reach: Reach) -> GripperCommand:
     """
     (x, y, z), yaw = robot.tool_pose()
     bx, by, bz = body.position
-    target_yaw = yaw + wrap_angle(body.yaw_rad - yaw, math.pi / 2) if reach.turn_rad else yaw
+    target_yaw = turned(yaw, body.yaw_rad, reach, math.pi / 2)
     above_z = bz + body.shape.height_m / 2 + CLEARANCE_M
     is_beside = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
     is_aligned = is_beside and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
@@ -82,7 +105,7 @@ def push(
     along = (x - bx) * ux + (y - by) * uy
     aside = abs((y - by) * ux - (x - bx) * uy)
     across = math.atan2(uy, ux) + math.pi / 2
-    target_yaw = yaw + wrap_angle(across - yaw, math.pi) if reach.turn_rad else yaw
+    target_yaw = turned(yaw, across, reach, math.pi)
     turn = abs(wrap_angle(target_yaw - yaw))
     low_z = workspace.z[0] + 0.02
 

@@ -54,5 +54,5 @@ class CloseLoopTask(Task):
         )
 
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
-        """Put a body on the floor."""
-        body.place((*xy, body.shape.height_m / 2), yaw_rad)
+        """Put a body on the floor, or on the tray's."""
+        body.place((*xy, self.settings.surface_z_m - body.shape.bounds_m[0][2]), yaw_rad)
