@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import math
 from abc import abstractmethod
@@ -16,23 +15,14 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ba_torchrl.actions import InvalidActionError
-from ba_torchrl.config import CUSTOM_PHYSICS, ConfigError, EnvConfig
+from ba_torchrl.config import ConfigError, EnvConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.scene import Scene, SceneState, build_scene, check_task_parameters
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import Decal
-from ba_torchrl.sim.cameras import HeightCamera, render_rgb
-from ba_torchrl.sim.motion import CloseLoopMotion
-from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
-from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SimulationError, World
-from ba_torchrl.tasks.base import (
-    SCALE_STEP,
-    TASKS,
-    PlacementError,
-    Reach,
-    Task,
-    TaskSettings,
-    Workspace,
-)
+from ba_torchrl.sim.cameras import render_rgb
+from ba_torchrl.sim.robots.base import ROBOTS, downward
+from ba_torchrl.sim.world import SimulationError
+from ba_torchrl.tasks.base import SCALE_STEP, TASKS, PlacementError, Reach, Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -41,19 +31,19 @@ CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torc
 MAX_CONSECUTIVE_FAULTS = 10
 RESET_ATTEMPTS = 50
 SETTLE_STEPS = 100
-MARK_M = 1e-3
-"""Thickness of the coloured sheet that marks the workspace."""
 
 
-@dataclass
-class Scene:
-    """A sealed world with everything in it."""
+@dataclass(frozen=True)
+class EnvState:
+    """Everything an environment's future follows from; see `ManipulationEnv.get_state`."""
 
-    world: World
-    robot: Robot
-    task: Task
-    motion: CloseLoopMotion
-    camera: HeightCamera
+    scale: float
+    scene: SceneState
+    observation: dict[str, torch.Tensor]
+    base_seed: int
+    episode: int
+    step_count: int
+    ends: dict[str, bool]
 
 
 class ManipulationEnv(EnvBase):
@@ -75,24 +65,19 @@ class ManipulationEnv(EnvBase):
         self.task_id = task_id
         self.config = config
         self.task_class = TASKS[task_id]
-        config.check_for(task_id, self.task_class.control, self.task_class.parameters)
+        check_task_parameters(task_id, config)
         self.robot_class = ROBOTS[config.robot]
         self.workspace = (
             self.task_class.workspace if config.workspace is None else Workspace(*config.workspace)
         )
         self.max_steps = config.max_steps or self.task_class.max_steps
-        self.num_objects = config.num_objects or self.task_class.num_objects
-        least, most = self.task_class.num_objects_range
-        if not least <= self.num_objects <= most:
-            allowed = str(least) if least == most else f"{least} to {most}"
-            raise ConfigError(
-                f"num_objects: {task_id} takes {allowed} objects, not {self.num_objects}"
-            )
         low, high = config.object_scale_range or self.task_class.scale_range
         self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._scenes: dict[float, Scene] = {}
         self._scene: Scene | None = None
         self._observation: dict[str, torch.Tensor] = {}
+        self._ends: dict[str, bool] = {}
+        """How the last step ended, by key."""
         self._step_count = 0
         self._episode = 0
         self.faults = 0
@@ -151,6 +136,49 @@ class ManipulationEnv(EnvBase):
         """Return a picture of the scene for people, [height, width, 3] uint8."""
         return render_rgb(self.scene.world, (*self.workspace.center, 0.12), width, height)
 
+    def get_state(self) -> EnvState:
+        """Return the whole state, to come back to with `set_state`.
+
+        It lives in this process and costs a few milliseconds; ten thousand of them cost memory.
+
+        Raises:
+            SimulationError: the environment was not reset yet.
+        """
+        scene = self.scene
+        return EnvState(
+            scale=next(key for key, value in self._scenes.items() if value is scene),
+            scene=scene.get_state(),
+            observation=self._observation,
+            base_seed=self.base_seed,
+            episode=self._episode,
+            step_count=self._step_count,
+            ends=self._ends,
+        )
+
+    def set_state(self, state: EnvState) -> TensorDict:
+        """Return to a state of this environment: the same actions then give the same future.
+
+        Args:
+            state: what `get_state` returned, at any time before.
+
+        Returns:
+            What was observed in it, as `step` gives under "next", without reward.
+
+        Raises:
+            SimulationError: it is the state of another environment, or of a simulation that
+                failed and was rebuilt since.
+        """
+        scene = self._scenes.get(state.scale)
+        if scene is None:
+            raise SimulationError("the state's world is gone: it is not this environment's")
+        scene.set_state(state.scene)
+        self._scene = scene
+        self._observation = state.observation
+        self.base_seed, self._episode = state.base_seed, state.episode
+        self._step_count = state.step_count
+        self._ends = state.ends
+        return self._tensordict(self._observation, **self._ends)
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close every world of this environment."""
         self._drop_scenes()
@@ -175,6 +203,7 @@ class ManipulationEnv(EnvBase):
         afresh = self._episode == 1
         self._scene = self._new_episode(rng, afresh)
         self._observation = self._observe(self._scene)
+        self._ends = {}
         return self._tensordict(self._observation)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -194,15 +223,15 @@ class ManipulationEnv(EnvBase):
             self._consecutive_faults = 0
         terminated = not fault and (success or not valid)
         truncated = fault or (not terminated and self._step_count >= self.max_steps)
-        return self._tensordict(
-            self._observation,
-            success=success and not fault,
-            fault=fault,
-            reward=float(success and not fault),
-            terminated=terminated,
-            truncated=truncated,
-            done=terminated or truncated,
-        )
+        self._ends = {
+            keys.SUCCESS: success and not fault,
+            keys.FAULT: fault,
+            keys.TERMINATED: terminated,
+            keys.TRUNCATED: truncated,
+            keys.DONE: terminated or truncated,
+        }
+        reward = float(self._ends[keys.SUCCESS])
+        return self._tensordict(self._observation, reward=reward, **self._ends)
 
     # ----------------------------------------------------------------------------------------
 
@@ -211,10 +240,16 @@ class ManipulationEnv(EnvBase):
             return Binary(n=1, shape=(1,), dtype=torch.bool)
 
         size = self.config.obs_size
-        low, high = self._pixel_range_m()
         action = Bounded(-1.0, 1.0, shape=(self._action_size(),), dtype=torch.float32)
+        if self.config.obs_type == "vec":
+            task = self._scene_for(float(self._scales[-1])).task
+            length = 1 + 4 * (1 + len(task.landmarks))
+            seen = {keys.OBSERVATION: Unbounded(shape=(length,), dtype=torch.float32)}
+        else:
+            low, high = self._pixel_range_m()
+            seen = {keys.PIXELS: Bounded(low, high, shape=(1, size, size), dtype=torch.float32)}
         observation = {
-            keys.PIXELS: Bounded(low, high, shape=(1, size, size), dtype=torch.float32),
+            **seen,
             keys.HOLDING: flag(),
             keys.SUCCESS: flag(),
             keys.FAULT: flag(),
@@ -250,58 +285,10 @@ class ManipulationEnv(EnvBase):
         """Return the sealed world for objects of this scale, building it the first time."""
         key = round(scale, 6)
         if key not in self._scenes:
-            world = self._new_world()
-            task = self.task_class(
-                TaskSettings(
-                    workspace=self.workspace,
-                    scale=scale,
-                    random_orientation=self.config.random_orientation,
-                    bounding_box_check=self.config.workspace_check == "bounding_box",
-                    reach=self.reach,
-                    num_objects=self.num_objects,
-                    parameters={
-                        name: getattr(self.config, name) for name in self.task_class.parameters
-                    },
-                )
-            )
-            task.world, task.robot = world, self.robot_class(world)
-            task.build(world)
-            world.seal()
-            self._scenes[key] = Scene(
-                world,
-                task.robot,
-                task,
-                CloseLoopMotion(task.robot, teleport=self.config.fast_mode),
-                HeightCamera(world.bodies),
+            self._scenes[key] = build_scene(
+                self.task_id, self.config, self.workspace, self.reach, scale
             )
         return self._scenes[key]
-
-    def _new_world(self) -> World:
-        """Return an empty world."""
-        config = self.config
-        physics = {"fast": Physics(), "slow": FINE_PHYSICS, "custom": Physics()}[
-            config.physics_mode
-        ]
-        custom = {
-            name: getattr(config, name)
-            for name in CUSTOM_PHYSICS
-            if getattr(config, name) is not None
-        }
-        color = None if config.floor_color is None else (*config.floor_color, 1.0)
-        try:
-            world = World(
-                dataclasses.replace(physics, **custom), window=config.render, floor_color=color
-            )
-        except SimulationError as error:
-            if config.render:
-                raise ConfigError(str(error)) from None
-            raise
-        if config.workspace_color is not None:
-            ws = self.workspace
-            size = (ws.x[1] - ws.x[0], ws.y[1] - ws.y[0], MARK_M)
-            mark = Decal(size_m=size, color=(*config.workspace_color, 1.0))
-            world.add(mark, "workspace").place((*ws.center, MARK_M / 2))
-        return world
 
     def _drop_scenes(self) -> None:
         for scene in self._scenes.values():
@@ -342,31 +329,41 @@ class ManipulationEnv(EnvBase):
         return valid and success, valid
 
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
-        observation = {
-            keys.PIXELS: torch.from_numpy(self._pixels(scene).astype(np.float32)),
-            keys.HOLDING: torch.tensor([scene.robot.held_body() is not None]),
-        }
+        observation = {keys.HOLDING: torch.tensor([scene.robot.held_body() is not None])}
+        if self.config.obs_type == "vec":
+            observation[keys.OBSERVATION] = torch.from_numpy(self._vector(scene))
+        else:
+            pixels = self._pixels(scene).astype(np.float32)
+            observation[keys.PIXELS] = torch.from_numpy(pixels)
         if self.config.expert:
             observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
         return observation
+
+    def _vector(self, scene: Scene) -> np.ndarray:
+        """Return the poses of gripper and landmarks, scaled to [-1, 1] by the workspace."""
+        axes = (self.workspace.x, self.workspace.y, self.workspace.z)
+        values = [2 * scene.robot.opening() - 1]
+        for position, yaw in (scene.robot.tool_pose(), *scene.task.landmarks):
+            values += [
+                (2 * value - low - high) / (high - low)
+                for value, (low, high) in zip(position, axes, strict=True)
+            ]
+            values.append(yaw / math.pi)
+        return np.array(values, dtype=np.float32)
 
     def _tensordict(
         self,
         observation: dict[str, torch.Tensor],
         *,
-        success: bool = False,
-        fault: bool = False,
         reward: float | None = None,
-        **done: bool,
+        **ends: bool,
     ) -> TensorDict:
         out = {key: value.clone() for key, value in observation.items()}
-        out[keys.SUCCESS] = torch.tensor([success])
-        out[keys.FAULT] = torch.tensor([fault])
         out[keys.STEP_COUNT] = torch.tensor([self._step_count])
         if reward is not None:
             out[keys.REWARD] = torch.tensor([reward])
-        for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-            out[key] = torch.tensor([done.get(key, False)])
+        for key in (keys.SUCCESS, keys.FAULT, keys.DONE, keys.TERMINATED, keys.TRUNCATED):
+            out[key] = torch.tensor([ends.get(key, False)])
         return TensorDict(out, batch_size=[])
 
     def _checked(self, action: torch.Tensor | None) -> np.ndarray:

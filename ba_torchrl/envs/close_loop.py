@@ -8,12 +8,15 @@ import numpy as np
 
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.config import EnvConfig
-from ba_torchrl.envs.base import CONTROLS, ManipulationEnv, Scene
+from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.cameras import paint_square
 from ba_torchrl.tasks.base import Reach
 
 START_HEIGHT_M = 0.2
 FINGER_GLYPH_HALF_M = 5 * 0.3 / 128
+HALF_TURN = (-math.pi / 2, math.pi / 2)
+"""What `half_rotation` keeps the yaw within; episodes start in its middle."""
 DEEPEST_DIP_M = 0.02
 """Goal areas appear in the image as dips of this depth."""
 
@@ -34,7 +37,8 @@ class CloseLoopEnv(ManipulationEnv):
     @property
     def reach(self) -> Reach:
         """What one action covers."""
-        return Reach(self.config.dpos, self.config.drot if self.actions.has_yaw else 0.0)
+        turn = self.config.drot if self.actions.has_yaw else 0.0
+        return Reach(self.config.dpos, turn, HALF_TURN if self.config.half_rotation else None)
 
     @property
     def view_width_m(self) -> float:
@@ -56,7 +60,10 @@ class CloseLoopEnv(ManipulationEnv):
         command = self.actions.decode(action)
         (x, y, z), yaw = scene.robot.tool_pose()
         target = self.workspace.clip((x + command.dx_m, y + command.dy_m, z + command.dz_m))
-        scene.motion.move_to(target, yaw + command.dyaw_rad)
+        yaw += command.dyaw_rad
+        if self.config.half_rotation:
+            yaw = min(max(yaw, HALF_TURN[0]), HALF_TURN[1])
+        scene.motion.move_to(target, yaw)
         scene.motion.grip(command.opening)
 
     def _pixels(self, scene: Scene) -> np.ndarray:

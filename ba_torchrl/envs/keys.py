@@ -2,6 +2,15 @@
 
 PIXELS = "pixels"
 """[C, H, W] float32, metres. Open loop: heightmap. Close loop: depth below the camera."""
+OBSERVATION = "observation"
+"""[1 + 4 + 4 n] float32, with ``obs_type="vec"``: gripper opening in [-1, 1], then x, y, z scaled
+to [-1, 1] by the workspace and yaw over pi, of the gripper and of each of n objects."""
+RGB = "rgb"
+"""[3, H, W] uint8: a colour picture of the scene, arm included."""
+RGB_DEPTH = "rgb_depth"
+"""[1, H, W] float32, metres: depth of the same picture along the camera's axis."""
+POINT_CLOUD = "point_cloud"
+"""[N, 3] float32, metres: points on the surfaces of the scene."""
 HOLDING = "holding"
 """[1] bool: the gripper holds an object."""
 ACTION = "action"

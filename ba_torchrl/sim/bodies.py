@@ -178,6 +178,8 @@ class Body:
         self.client = client
         self.shape = shape
         self.name = name
+        self.is_hidden = False
+        """Put aside for now: cameras and settling leave it out."""
         # PyBullet's poses are of the centre of mass
         self._from_center = (
             tuple(-x for x in shape.center_of_mass_m) if any(shape.center_of_mass_m) else None

@@ -79,6 +79,14 @@ class CloseLoopMotion:
         self.robot.set_opening(opening)
         self._wanted_opening = opening
 
+    def get_state(self) -> float:
+        """Return the wanted opening, which the next `grip` is compared with."""
+        return self._wanted_opening
+
+    def set_state(self, state: float) -> None:
+        """Take up what `get_state` returned."""
+        self._wanted_opening = state
+
     def move_to(self, position: Vector, yaw_rad: float) -> None:
         """Move the tool in a straight line towards a pose, as far as reach and contacts allow."""
         robot, limits = self.robot, self.limits

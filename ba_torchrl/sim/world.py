@@ -39,6 +39,15 @@ FINE_PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=200)
 """Four times the work of the default."""
 
 
+class Snapshot:
+    """A state that PyBullet keeps in memory for as long as this object lives."""
+
+    def __init__(self, client: int) -> None:
+        self.client = client
+        self.id = pybullet.saveState(physicsClientId=client)
+        weakref.finalize(self, _forget, self.id, client)
+
+
 class World:
     """A physics client of its own with a floor, whose bodies are loaded once.
 
@@ -71,7 +80,7 @@ class World:
         self.bodies: list[Body] = []
         self.steps = 0
         """Physics steps since construction, for measurements."""
-        self._pristine: int | None = None
+        self._pristine: Snapshot | None = None
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.physics.time_step_s,
             numSolverIterations=self.physics.solver_iterations,
@@ -114,13 +123,27 @@ class World:
 
     def seal(self) -> None:
         """Take the state that every reset starts from."""
-        self._pristine = pybullet.saveState(physicsClientId=self.client)
+        self._pristine = self.snapshot()
 
     def restore_pristine(self) -> None:
         """Return to the state taken by `seal`, velocities and contacts included."""
         if self._pristine is None:
             raise SimulationError("seal() the world before resetting it")
-        pybullet.restoreState(self._pristine, physicsClientId=self.client)
+        self.restore(self._pristine)
+
+    def snapshot(self) -> Snapshot:
+        """Keep the state of every body and contact in memory, for `restore`."""
+        return Snapshot(self.client)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Return to a snapshot of this world; motor commands are the caller's to repeat.
+
+        Raises:
+            SimulationError: the snapshot is of another world, or of one that was closed.
+        """
+        if snapshot.client != self.client or self.is_closed:
+            raise SimulationError("the state is of another world: that one was closed or rebuilt")
+        pybullet.restoreState(snapshot.id, physicsClientId=self.client)
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by ``count`` time steps."""
@@ -136,6 +159,7 @@ class World:
         """Whether no movable body moves faster than the settling limits."""
         return all(
             body.is_static
+            or body.is_hidden
             or body.is_still(self.physics.settle_speed_m_s, self.physics.settle_spin_rad_s)
             for body in self.bodies
         )
@@ -187,6 +211,11 @@ def _connect_window() -> int:
     if client >= 0:
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
     return client
+
+
+def _forget(state: int, client: int) -> None:
+    if pybullet.isConnected(physicsClientId=client):
+        pybullet.removeState(state, physicsClientId=client)
 
 
 def _disconnect(client: int) -> None:

@@ -77,6 +77,7 @@ class Robot(ABC):
         self.id = self.load()
         self.joints: list[float] = [0.0] * len(self.arm_joints)
         """Commanded arm joints in radians."""
+        self.commanded_opening = 1.0
         self._side = {link: side for side, links in enumerate(self.finger_links) for link in links}
         for link in self.passive_links:
             pybullet.setCollisionFilterGroupMask(self.id, link, 0, 0, physicsClientId=self.client)
@@ -173,6 +174,19 @@ class Robot(ABC):
             positionGains=[1.0] * 2,
             physicsClientId=self.client,
         )
+        self.commanded_opening = opening
+
+    # -- state -------------------------------------------------------------------------------
+
+    def get_state(self) -> tuple[list[float], float]:
+        """Return the motors' commands, which PyBullet's own snapshots leave out."""
+        return list(self.joints), self.commanded_opening
+
+    def set_state(self, state: tuple[list[float], float]) -> None:
+        """Repeat the commands that `get_state` returned."""
+        joints, opening = state
+        self.command(joints)
+        self.hold_opening(opening)
 
     # -- contacts ----------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Decal
+from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.base import GREEN, CloseLoopTask
@@ -54,6 +55,11 @@ class BlockPushing(CloseLoopTask):
             opening=0.5,
             stop_short_m=0.035,
         )
+
+    @property
+    def landmarks(self) -> Sequence[Pose]:
+        """Block and goal."""
+        return [(body.position, body.yaw_rad) for body in (self.block, self.goal)]
 
     @property
     def objects(self) -> Sequence[Body]:

@@ -1,0 +1,143 @@
+"""Scene: a sealed world with robot, task and what watches them, built from a configuration."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+from ba_torchrl.config import CUSTOM_PHYSICS, ConfigError, EnvConfig
+from ba_torchrl.sim.bodies import Decal
+from ba_torchrl.sim.cameras import HeightCamera
+from ba_torchrl.sim.motion import CloseLoopMotion
+from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SimulationError, Snapshot, World
+from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace
+
+MARK_M = 1e-3
+"""Thickness of the coloured sheet that marks the workspace."""
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Everything in a scene, at one moment."""
+
+    world: Snapshot
+    robot: Any
+    motion: Any
+    task: Any
+
+
+@dataclass
+class Scene:
+    """A sealed world with everything in it."""
+
+    world: World
+    robot: Robot
+    task: Task
+    motion: CloseLoopMotion
+    camera: HeightCamera
+
+    def get_state(self) -> SceneState:
+        """Return the state to come back to."""
+        return SceneState(
+            self.world.snapshot(),
+            self.robot.get_state(),
+            self.motion.get_state(),
+            self.task.get_state(),
+        )
+
+    def set_state(self, state: SceneState) -> None:
+        """Return to a state of this scene.
+
+        Raises:
+            SimulationError: it is another scene's.
+        """
+        self.world.restore(state.world)
+        self.task.set_state(state.task)
+        self.robot.set_state(state.robot)
+        self.motion.set_state(state.motion)
+
+
+def build_scene(
+    task_id: str, config: EnvConfig, workspace: Workspace, reach: Reach, scale: float
+) -> Scene:
+    """Build the world of a task for objects of one scale.
+
+    Args:
+        task_id: as listed by `ba_torchrl.list_tasks`.
+        config: the environment's parameters.
+        workspace: where the task takes place.
+        reach: what one action covers.
+        scale: of the objects.
+
+    Raises:
+        ConfigError: there is no display for ``render=True``.
+    """
+    task_class = TASKS[task_id]
+    world = _empty_world(config, workspace)
+    surface_z_m = 0.0
+    if config.close_loop_tray:
+        from ba_torchrl.tasks.tray import add_tray
+
+        surface_z_m = add_tray(world, workspace.center, workspace.width)
+    task = task_class(
+        TaskSettings(
+            workspace=workspace,
+            scale=scale,
+            random_orientation=config.random_orientation,
+            bounding_box_check=config.workspace_check == "bounding_box",
+            reach=reach,
+            num_objects=config.num_objects or task_class.num_objects,
+            surface_z_m=surface_z_m,
+            parameters={name: getattr(config, name) for name in task_class.parameters},
+        )
+    )
+    task.world, task.robot = world, ROBOTS[config.robot](world)
+    task.build(world)
+    world.seal()
+    motion = CloseLoopMotion(task.robot, teleport=config.fast_mode)
+    return Scene(world, task.robot, task, motion, HeightCamera(world.bodies))
+
+
+def check_task_parameters(task_id: str, config: EnvConfig) -> None:
+    """Check that a task can be had with these parameters.
+
+    Raises:
+        ConfigError: one has no meaning for it, or a value it does not take.
+    """
+    task_class = TASKS[task_id]
+    config.check_for(task_id, task_class.control, task_class.parameters)
+    least, most = task_class.num_objects_range
+    if config.num_objects is not None and not least <= config.num_objects <= most:
+        allowed = str(least) if least == most else f"{least} to {most}"
+        raise ConfigError(
+            f"num_objects: {task_id} takes {allowed} objects, not {config.num_objects}"
+        )
+    if config.close_loop_tray and not task_class.fits_tray:
+        fitting = ", ".join(name for name in TASKS if TASKS[name].fits_tray)
+        raise ConfigError(
+            f"close_loop_tray: the tray has no room for {task_id}; it is for {fitting}"
+        )
+
+
+def _empty_world(config: EnvConfig, workspace: Workspace) -> World:
+    """Return a world with nothing but the floor."""
+    physics = FINE_PHYSICS if config.physics_mode == "slow" else Physics()
+    custom = {
+        name: getattr(config, name) for name in CUSTOM_PHYSICS if getattr(config, name) is not None
+    }
+    color = None if config.floor_color is None else (*config.floor_color, 1.0)
+    try:
+        world = World(
+            dataclasses.replace(physics, **custom), window=config.render, floor_color=color
+        )
+    except SimulationError as error:
+        if config.render:
+            raise ConfigError(str(error)) from None
+        raise
+    if config.workspace_color is not None:
+        (x0, x1), (y0, y1) = workspace.x, workspace.y
+        mark = Decal(size_m=(x1 - x0, y1 - y0, MARK_M), color=(*config.workspace_color, 1.0))
+        world.add(mark, "workspace").place((*workspace.center, MARK_M / 2))
+    return world

@@ -1,0 +1,104 @@
+"""get_state and set_state: the same state and the same actions give the same future."""
+
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.sim.world import SimulationError
+
+
+def play(env, state, actions):
+    """Return what follows from ``actions``: observations, and the bodies' poses at the end."""
+    seen = []
+    for action in actions:
+        state = env.step(state.clone().set("action", action))["next"]
+        seen.append(state)
+        if state["done"]:
+            break
+    return seen, [body.pose for body in env.scene.world.bodies]
+
+
+def same(first, second):
+    (a, poses_a), (b, poses_b) = first, second
+    return (
+        poses_a == poses_b
+        and len(a) == len(b)
+        and all((x == y).all() for x, y in zip(a, b, strict=True))
+    )
+
+
+@pytest.mark.parametrize("task", ba_torchrl.list_tasks())
+def test_a_state_and_its_actions_have_one_future(task):
+    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True)
+    generator = torch.Generator().manual_seed(0)
+    for taken in (0, 3, 5):  # before, near and after a grasp
+        state = env.reset()
+        for _ in range(taken):
+            state = env.step(state.set("action", state["expert_action"]))["next"]
+            if state["done"]:
+                state = env.reset()
+        kept = env.get_state()
+        actions = [torch.rand(5, generator=generator) * 2 - 1 for _ in range(6)]
+        others = [-action for action in actions]
+        first = play(env, state, actions)
+        returned = env.set_state(kept)
+        assert (returned == state.select(*returned.keys())).all()
+        away = play(env, returned, others)
+        second = play(env, env.set_state(kept), actions)
+        assert same(first, second)
+        assert not same(first, away)
+    env.close()
+
+
+def test_an_action_can_be_tried_and_taken_back():
+    tried = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
+    plain = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
+    a, b = tried.reset(), plain.reset()
+    while not a["done"]:
+        kept = tried.get_state()
+        tried.step(a.clone().set("action", torch.tensor([-1.0, 0.3, -0.8, -1.0, 0.5])))
+        a = tried.set_state(kept)
+        a = tried.step(a.set("action", a["expert_action"]))["next"]
+        b = plain.step(b.set("action", b["expert_action"]))["next"]
+        assert (a == b).all()
+    assert a["success"]
+    assert torch.equal(tried.reset()["pixels"], plain.reset()["pixels"])  # the next episode, too
+    tried.close()
+    plain.close()
+
+
+def test_a_state_keeps_how_its_episode_ended():
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, max_steps=1)
+    last = env.step(env.reset().set("action", torch.zeros(5)))["next"]
+    kept = env.get_state()
+    env.reset()
+    returned = env.set_state(kept)
+    assert last["truncated"]
+    assert returned["truncated"]
+    assert returned["done"]
+    assert returned["step_count"] == 1
+    env.close()
+
+
+def test_a_state_of_another_environment_is_refused():
+    first, second = (ba_torchrl.make("close_loop/block_picking", obs_size=32) for _ in range(2))
+    first.reset()
+    with pytest.raises(SimulationError, match="another world"):
+        second.set_state(first.get_state())
+    with pytest.raises(SimulationError, match="reset"):
+        second.get_state()
+    first.close()
+    second.close()
+
+
+def test_states_are_forgotten_with_their_object():
+    import pybullet
+
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
+    env.reset()
+    kept = env.get_state()
+    number, client = kept.scene.world.id, env.scene.world.client
+    del kept
+    with pytest.raises(pybullet.error):
+        pybullet.restoreState(number, physicsClientId=client)
+    env.close()
