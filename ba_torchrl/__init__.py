@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ba_torchrl.envs.registration import register_with_gymnasium
+
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
@@ -12,6 +14,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = ["__version__", "list_tasks", "make", "make_vector_env"]
+
+register_with_gymnasium()
 
 
 def list_tasks() -> list[str]:

@@ -1,0 +1,146 @@
+"""The environments for Gymnasium: NumPy in, NumPy out, nothing of torch to be seen."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+
+from ba_torchrl.actions import InvalidActionError
+from ba_torchrl.config import ConfigError
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.factory import make_env
+
+Observation = dict[str, np.ndarray]
+
+INFO_KEYS = (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT, keys.EXPERT_ACTION)
+"""What a policy is not to see."""
+
+
+class GymEnv(gymnasium.Env[Observation, np.ndarray]):
+    """A task as a Gymnasium environment with a dictionary of observations.
+
+    ``info`` holds ``success``, ``fault``, ``step_count`` and, with ``expert=True``,
+    ``expert_action``; ``is_success`` is ``success`` under the name that Stable-Baselines3 logs.
+
+    Args:
+        task: as listed by `ba_torchrl.list_tasks`.
+        render_mode: ``rgb_array`` for pictures from `render`, ``human`` for PyBullet's window.
+        config: fields of `ba_torchrl.config.EnvConfig`.
+
+    Raises:
+        ConfigError: the task or a parameter is unknown, or its value cannot be used.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}
+
+    def __init__(self, task: str, render_mode: str | None = None, **config: Any) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            known = ", ".join(self.metadata["render_modes"])
+            raise ConfigError(f"unknown render_mode {render_mode!r}. Known: {known}")
+        if render_mode == "human":
+            config = {**config, "render": True}
+        self.render_mode = render_mode
+        self.torchrl_env = make_env(task, **config)
+        """The same environment for TorchRL; stepping it steps this one."""
+        specs = self.torchrl_env.observation_spec
+        self.observation_space = spaces.Dict(
+            {key: space_of(spec) for key, spec in specs.items() if key not in INFO_KEYS}
+        )
+        self.action_space = space_of(self.torchrl_env.action_spec)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode: the first of ``seed``, or the next one of the seed in use.
+
+        Raises:
+            ConfigError: there are ``options``; episodes have none.
+        """
+        super().reset(seed=seed)
+        if options:
+            raise ConfigError(
+                f"reset takes no options, got {', '.join(map(repr, options))}; parameters are "
+                "given to gymnasium.make"
+            )
+        if seed is not None:
+            self.torchrl_env.set_seed(seed, static_seed=True)
+        return self._split(self.torchrl_env.reset())
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Carry out an action of `action_space` (floats of any precision).
+
+        Raises:
+            InvalidActionError: it has the wrong shape or type, or is not finite.
+        """
+        following = self.torchrl_env.step(_as_tensordict(action))[keys.NEXT]
+        observation, info = self._split(following)
+        return (
+            observation,
+            following[keys.REWARD].item(),
+            following[keys.TERMINATED].item(),
+            following[keys.TRUNCATED].item(),
+            info,
+        )
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture of the scene, [height, width, 3] uint8, in the mode ``rgb_array``."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "nothing is rendered without a render mode: "
+                f"gymnasium.make({self.spec.id if self.spec else '...'!r}, render_mode='rgb_array')"
+            )
+        return self.torchrl_env.render() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the simulator; closing twice does no harm."""
+        self.torchrl_env.close(raise_if_closed=False)
+
+    def _split(self, state: TensorDictBase) -> tuple[Observation, dict[str, Any]]:
+        """Return the observation and the info in what TorchRL's environment returned."""
+        observation = {
+            key: state[key].numpy().astype(space.dtype, copy=False)
+            for key, space in self.observation_space.items()
+        }
+        info: dict[str, Any] = {
+            key: state[key].item() for key in (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT)
+        }
+        info["is_success"] = info[keys.SUCCESS]
+        if keys.EXPERT_ACTION in state:
+            info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
+        return observation, info
+
+
+def space_of(spec: TensorSpec) -> spaces.Space:
+    """Return Gymnasium's space for one of TorchRL's specs, with the same shape.
+
+    Raises:
+        TypeError: there is none.
+    """
+    if isinstance(spec, Composite):
+        return spaces.Dict({key: space_of(part) for key, part in spec.items()})
+    if isinstance(spec, Binary):
+        return spaces.MultiBinary(spec.shape[0] if len(spec.shape) == 1 else list(spec.shape))
+    if isinstance(spec, Bounded):
+        return spaces.Box(spec.low.numpy(), spec.high.numpy(), dtype=_numpy_dtype(spec))
+    if isinstance(spec, Unbounded):
+        return spaces.Box(-np.inf, np.inf, tuple(spec.shape), dtype=_numpy_dtype(spec))
+    raise TypeError(f"no Gymnasium space stands for {spec}")
+
+
+def _numpy_dtype(spec: TensorSpec) -> np.dtype:
+    return torch.empty(0, dtype=spec.dtype).numpy().dtype
+
+
+def _as_tensordict(action: Any) -> TensorDict:
+    array = np.asarray(action)
+    if array.dtype.kind != "f":
+        raise InvalidActionError(f"actions are floating-point numbers, got {array.dtype}")
+    with np.errstate(over="ignore"):  # becomes infinite, which the environment refuses
+        array = array.astype(np.float32)
+    return TensorDict({keys.ACTION: torch.from_numpy(array)}, batch_size=[])

@@ -1,0 +1,416 @@
+import json
+import logging
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.passive_env_checker import env_render_passive_checker
+from torchrl.data import Categorical
+
+import ba_torchrl
+from ba_torchrl.actions import InvalidActionError
+from ba_torchrl.config import ConfigError
+from ba_torchrl.envs import gym
+from ba_torchrl.envs.registration import gym_id, register_tasks
+
+TASKS = ba_torchrl.list_tasks()
+PICKING = "BulletArm/CloseLoopBlockPicking-v0"
+NOTHING = np.zeros(5, dtype=np.float32)
+
+
+@pytest.fixture
+def make():
+    """Make environments, small and seeded unless told otherwise, and close them."""
+    made = []
+
+    def make(gym_id=PICKING, **config):
+        made.append(gymnasium.make(gym_id, **{"obs_size": 16, "seed": 0, **config}))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+# -- registration ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "wanted"),
+    [
+        ("close_loop/block_picking", "BulletArm/CloseLoopBlockPicking-v0"),
+        ("open_loop/house_building_3", "BulletArm/OpenLoopHouseBuilding3-v0"),
+        ("ramp/block_stacking", "BulletArm/RampBlockStacking-v0"),
+    ],
+)
+def test_ids(task, wanted):
+    assert gym_id(task) == wanted
+
+
+def test_every_task_has_an_id_of_its_own():
+    specs = {spec.id: spec for spec in gymnasium.registry.values() if spec.namespace == "BulletArm"}
+    assert {name: spec.kwargs["task"] for name, spec in specs.items()} == {
+        gym_id(task): task for task in TASKS
+    }
+    assert len(specs) == len(TASKS)
+    assert all(spec.max_episode_steps is None for spec in specs.values())
+
+
+def test_registering_again_adds_only_what_is_missing(monkeypatch):
+    before = gymnasium.registry[PICKING]
+    missing = gym_id("close_loop/block_reaching")
+    monkeypatch.delitem(gymnasium.registry, missing)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register_tasks()
+    assert missing in gymnasium.registry
+    assert gymnasium.registry[PICKING] is before
+
+
+def run(code, folder):
+    """Run ``code`` in a fresh interpreter, outside the repository; return what it prints last."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import ba_torchrl, gymnasium",
+        "import gymnasium, ba_torchrl",
+        "import ba_torchrl, importlib.util; importlib.util.find_spec('gymnasium')",
+    ],
+)
+def test_ids_are_known_whatever_is_imported_first_and_without_torch(imports, tmp_path):
+    known, loaded = run(
+        f"{imports}\nimport gymnasium, json, sys\n"
+        "known = sorted(name for name in gymnasium.registry if name.startswith('BulletArm/'))\n"
+        "print(json.dumps([known, sorted(sys.modules)]))",
+        tmp_path,
+    )
+    assert known == sorted(map(gym_id, TASKS))
+    assert not {"torch", "torchrl", "numba"} & set(loaded)
+
+
+def test_make_needs_no_import_of_the_package(tmp_path):
+    code = (
+        "import gymnasium, json, sys\n"
+        "light = not {'torch', 'pybullet', 'ba_torchrl'} & set(sys.modules)\n"
+        f"env = gymnasium.make('ba_torchrl:{PICKING}', obs_size=16)\n"
+        "observation, info = env.reset(seed=0)\n"
+        "env.close()\n"
+        "print(json.dumps([light, observation['pixels'].shape]))"
+    )
+    assert run(code, tmp_path) == [True, [1, 16, 16]]
+
+
+# -- every task ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_has_nothing_to_say(make, task):
+    env = make(gym_id(task), expert=True, render_mode="rgb_array", max_steps=3).unwrapped
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Rendering is checked below: this check would open a window for the mode "human".
+        check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_stable_baselines_only_warns_that_depth_is_not_a_photograph(make, task):
+    from stable_baselines3.common.env_checker import check_env
+
+    env = make(gym_id(task), obs_size=36)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    said = [str(warning.message) for warning in caught]
+    assert all("uint8" in text or "[0, 255]" in text for text in said), said
+
+
+# -- spaces, configuration -------------------------------------------------------------------
+
+
+def test_spaces_are_the_specs(make):
+    env = make(action_sequence="pxyz", expert=True)
+    assert set(env.observation_space) == {"pixels", "holding"}
+    pixels, spec = env.observation_space["pixels"], env.unwrapped.torchrl_env.observation_spec
+    assert pixels.shape == (1, 16, 16)
+    assert pixels.dtype == np.float32
+    assert pixels.low.tolist() == spec["pixels"].low.tolist()
+    assert pixels.high.tolist() == spec["pixels"].high.tolist()
+    assert env.observation_space["holding"] == spaces.MultiBinary(1)
+    assert env.action_space == spaces.Box(-1, 1, (4,), np.float32)
+
+
+def test_a_spec_without_a_space_is_refused():
+    with pytest.raises(TypeError, match="Categorical"):
+        gym.space_of(Categorical(3))
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"robbot": "kuka"}, r"Did you mean 'robot'\? Known: .*obs_size"),
+        ({"robot": "nobody"}, "Known: .*kuka"),
+        ({"obs_size": "big"}, "obs_size"),
+    ],
+)
+def test_wrong_keywords_are_explained(make, config, message):
+    with pytest.raises(ConfigError, match=message):
+        make(**config)
+
+
+@pytest.mark.filterwarnings("ignore:.*render_mode='ascii'")
+def test_an_unknown_render_mode_is_explained(make):
+    with pytest.raises(ConfigError, match=r"'ascii'\. Known: human, rgb_array"):
+        make(render_mode="ascii")
+
+
+def test_reset_takes_no_options(make):
+    with pytest.raises(ConfigError, match="'block'"):
+        make().reset(options={"block": 1})
+
+
+# -- episodes --------------------------------------------------------------------------------
+
+
+def episode(env, seed=None, steps=5):
+    """Return the observations of an episode of fixed actions."""
+    observations = [env.reset(seed=seed)[0]]
+    for t in range(steps):
+        observations.append(env.step(np.full(5, 0.3 - 0.1 * t, dtype=np.float32))[0])
+    return observations
+
+
+def same(first, second):
+    return all(
+        np.array_equal(a[key], b[key]) for a, b in zip(first, second, strict=True) for key in a
+    )
+
+
+def test_a_seed_fixes_an_episode_and_those_that_follow(make):
+    env, other = make(seed=8), make(seed=9)
+    first = [episode(env, seed=3), episode(env), episode(env)]
+    second = [episode(other, seed=3), episode(other), episode(other)]
+    again = [episode(env, seed=3), episode(env)]
+    assert all(same(a, b) for a, b in zip(first, second, strict=True))
+    assert all(same(a, b) for a, b in zip(first[:2], again, strict=True))
+    assert not same(first[0], first[1])
+    assert not same(first[0], episode(env, seed=4))
+
+
+def test_episodes_are_those_of_torchrl(make):
+    env = make(seed=5, expert=True)
+    reference = ba_torchrl.make("close_loop/block_picking", obs_size=16, seed=5, expert=True)
+    for seed in (None, 7):
+        if seed is not None:
+            reference.set_seed(seed, static_seed=True)
+        state = reference.reset()
+        observation, info = env.reset(seed=seed)
+        for _ in range(3):
+            assert np.array_equal(observation["pixels"], state["pixels"].numpy())
+            assert np.array_equal(info["expert_action"], state["expert_action"].numpy())
+            state = reference.step(state.set("action", state["expert_action"]))["next"]
+            observation, *_, info = env.step(info["expert_action"])
+    reference.close()
+
+
+def test_the_expert_in_info_succeeds_and_success_terminates(make):
+    env = make(expert=True)
+    _, info = env.reset(seed=1)
+    assert (info["success"], info["fault"], info["step_count"]) == (False, False, 0)
+    for step in range(1, 16):
+        observation, reward, terminated, truncated, info = env.step(info["expert_action"])
+        assert info["step_count"] == step
+        assert not truncated
+        assert reward == float(info["success"]) == float(info["is_success"])
+        assert terminated == info["success"]
+        if terminated:
+            break
+    assert terminated
+    assert observation["holding"].tolist() == [1]
+
+
+def test_types_are_those_of_numpy_and_python(make):
+    env = make(expert=True).unwrapped
+    observation, info = env.reset(seed=0)
+    assert {type(value) for value in observation.values()} == {np.ndarray}
+    assert type(info["expert_action"]) is np.ndarray
+    observation, reward, terminated, truncated, info = env.step(NOTHING)
+    assert [type(x) for x in (reward, terminated, truncated)] == [float, bool, bool]
+    assert type(info["success"]) is type(info["fault"]) is bool
+    assert observation in env.observation_space
+    assert "expert_action" not in make().reset()[1]
+
+
+def test_the_step_limit_truncates(make):
+    env = make(max_steps=2)
+    env.reset()
+    assert env.step(NOTHING)[2:4] == (False, False)
+    assert env.step(NOTHING)[2:4] == (False, True)
+    shorter = make(max_steps=2, max_episode_steps=1)
+    shorter.reset()
+    assert shorter.step(NOTHING)[2:4] == (False, True)
+
+
+def test_a_simulator_fault_truncates_and_is_told(make, monkeypatch, caplog):
+    def fail(*_):
+        raise RuntimeError("the solver exploded")
+
+    env = make()
+    env.reset()
+    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
+        patch.setattr(env.unwrapped.torchrl_env.scene.motion, "move_to", fail)
+        _, reward, terminated, truncated, info = env.step(NOTHING)
+    assert (reward, terminated, truncated, info["fault"]) == (0.0, False, True, True)
+    env.reset()
+    assert not env.step(NOTHING)[-1]["fault"]
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.full(5, np.nan), "not finite"),
+        (np.array([0, 0, 1e300, 0, 0]), "not finite"),
+        (np.zeros(4, dtype=np.float32), r"shape \(5,\)"),
+        (np.zeros((1, 5), dtype=np.float32), r"shape \(5,\)"),
+        (np.zeros(5, dtype=np.int64), "int64"),
+        (["open", 0.0, 0.0, 0.0, 0.0], "floating-point"),
+    ],
+)
+def test_bad_actions_raise_before_anything_moves(make, action, message):
+    env = make().unwrapped
+    env.reset()
+    before = env.torchrl_env.scene.world.steps
+    with pytest.raises(InvalidActionError, match=message):
+        env.step(action)
+    assert env.torchrl_env.scene.world.steps == before
+    assert env.step(NOTHING)[-1]["step_count"] == 1
+
+
+def test_actions_of_any_precision_mean_the_same(make):
+    action = [0.5, 0.25, -0.5, -0.25, 0.125]
+    results = []
+    for given in (np.array(action, np.float32), np.array(action, np.float64), action):
+        env = make().unwrapped
+        env.reset(seed=2)
+        results.append([env.step(given)[0]])
+    assert same(results[0], results[1])
+    assert same(results[0], results[2])
+
+
+# -- pictures, ends --------------------------------------------------------------------------
+
+
+def test_rgb_array_gives_pictures(make):
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    env_render_passive_checker(env.unwrapped)
+    before = env.render()
+    env.step(np.array([-1, 1, 1, -1, 0], dtype=np.float32))
+    assert before.dtype == np.uint8
+    assert before.ndim == 3
+    assert before.shape[2] == 3
+    assert (env.render() != before).any()
+    assert env.metadata["render_fps"] > 0
+
+
+def test_a_list_of_pictures_can_be_collected(make):
+    env = make(render_mode="rgb_array_list")
+    env.reset()
+    env.step(NOTHING)
+    assert len(env.render()) == 2
+
+
+def test_without_a_render_mode_render_says_so(make):
+    env = make()
+    env.reset()
+    with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
+        assert env.unwrapped.render() is None
+
+
+def test_human_asks_for_a_window(monkeypatch):
+    asked = []
+    real = gym.make_env
+
+    def make_env(task, *, render=False, **config):
+        asked.append(render)
+        return real(task, **config)
+
+    monkeypatch.setattr(gym, "make_env", make_env)
+    for mode in ("human", "rgb_array", None):
+        env = gym.GymEnv("close_loop/block_picking", render_mode=mode, obs_size=16)
+        env.reset()
+        if mode == "human":
+            assert env.render() is None
+        env.close()
+    assert asked == [True, False, False]
+
+
+def test_closing_closes_the_simulator_and_may_be_repeated(make):
+    env = make()
+    env.reset()
+    env.close()
+    assert env.unwrapped.torchrl_env.is_closed
+    env.close()
+
+
+# -- vectors, training -----------------------------------------------------------------------
+
+
+def test_vectors_give_the_episodes_of_single_environments(make):
+    single = [episode(make(), seed=seed, steps=2) for seed in (4, 5)]
+    actions = [np.full((2, 5), 0.3 - 0.1 * t, dtype=np.float32) for t in range(2)]
+    options = {
+        "sync": {},
+        "async": {"vector_kwargs": {"context": "spawn"}},
+    }
+    for mode, kwargs in options.items():
+        env = gymnasium.make_vec(
+            PICKING, 2, vectorization_mode=mode, obs_size=16, expert=True, **kwargs
+        )
+        try:
+            observation, info = env.reset(seed=[4, 5])
+            assert info["expert_action"].shape == (2, 5)
+            observations = [observation]
+            for action in actions:
+                observation, _, _, _, info = env.step(action)
+                observations.append({key: value.copy() for key, value in observation.items()})
+            assert info["step_count"].tolist() == [2, 2]
+        finally:
+            env.close()
+        for index in range(2):
+            row = [{key: value[index] for key, value in each.items()} for each in observations]
+            assert same(single[index], row), f"{mode}, environment {index}"
+
+
+def test_stable_baselines_trains_on_it(make):
+    from stable_baselines3 import SAC
+
+    env = make(obs_size=36, max_steps=4)
+    agent = SAC(
+        "MultiInputPolicy",
+        env,
+        policy_kwargs={"normalize_images": False, "net_arch": [16]},
+        buffer_size=32,
+        learning_starts=4,
+        batch_size=4,
+        seed=0,
+        device="cpu",
+    )
+    before = [parameter.clone() for parameter in agent.actor.parameters()]
+    agent.learn(8)
+    pairs = zip(before, agent.actor.parameters(), strict=True)
+    assert any(not torch.equal(old, new) for old, new in pairs)
+    action, _ = agent.predict(env.reset(seed=0)[0], deterministic=True)
+    assert action in env.action_space

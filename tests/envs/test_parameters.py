@@ -1,0 +1,265 @@
+"""Every parameter of `EnvConfig` does what it says (appendix B, table 4)."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.config import ConfigError, EnvConfig
+from ba_torchrl.envs import keys
+
+PICKING = "close_loop/block_picking"
+
+
+@pytest.fixture
+def make():
+    """Make environments that are closed at the end."""
+    made = []
+
+    def make(task=PICKING, **config):
+        made.append(ba_torchrl.make(task, **{"obs_size": 32, "seed": 0, **config}))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+def act(env, state, **components):
+    """Take one step with the named components, the others zero and the gripper open."""
+    sequence = env.config.action_sequence
+    action = torch.tensor([components.get(c, float(c == "p")) for c in sequence])
+    return env.step(state.clone().set(keys.ACTION, action))[keys.NEXT]
+
+
+def test_action_sequence_orders_the_components(make):
+    poses = []
+    for sequence in ("pxyzr", "rzyxp", "xyzpr"):
+        env = make(action_sequence=sequence)
+        act(env, env.reset(), x=0.5, y=-0.7, z=-0.2, r=0.6, p=-1.0)
+        poses.append((*env.scene.robot.tool_pose()[0], env.scene.robot.tool_pose()[1]))
+        assert env.scene.robot.opening() < 0.1
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-9)
+    np.testing.assert_allclose(poses[2], poses[0], atol=1e-9)
+
+
+def test_workspace_bounds_gripper_and_objects(make):
+    env = make(workspace=((0.4, 0.58), (-0.08, 0.1), (0.01, 0.22)))
+    state = env.reset()
+    for _ in range(8):
+        state = act(env, state, x=1.0, y=-1.0, z=1.0)
+    np.testing.assert_allclose(env.scene.robot.tool_pose()[0], (0.58, -0.08, 0.22), atol=2e-3)
+    for _ in range(10):
+        env.reset()
+        x, y, _ = env.scene.task.block.position
+        assert 0.4 < x < 0.58
+        assert -0.08 < y < 0.1
+
+
+def test_object_scale_range_sets_the_size(make):
+    for scale in (0.6, (0.8, 0.8)):
+        env = make(object_scale_range=scale)
+        env.reset()
+        expected = 0.05 * (scale if isinstance(scale, float) else scale[0])
+        np.testing.assert_allclose(env.scene.task.block.shape.size_m, expected)
+    env = make(object_scale_range=(0.6, 0.8))
+    sizes = set()
+    for _ in range(30):
+        env.reset()
+        sizes.add(round(env.scene.task.block.shape.size_m[0], 6))
+    assert min(sizes) >= 0.03
+    assert max(sizes) <= 0.04
+    assert len(sizes) > 5
+
+
+def test_obs_size_and_view_scale(make):
+    for size in (32, 50):
+        env = make(obs_size=size)
+        assert env.reset()[keys.PIXELS].shape == (1, size, size)
+    tops = []
+    for view_scale in (1.0, 2.0):
+        env = make(obs_size=128, view_scale=view_scale)
+        depth = env.reset()[keys.PIXELS]
+        tops.append(int(((depth < depth.max() - 0.03) & (depth > 0)).sum()))
+    assert tops[0] == pytest.approx(4 * tops[1], rel=0.15)  # half the width, four times the area
+
+
+def test_fast_mode_skips_physics_and_nothing_else(make):
+    fast, slow = make(), make(fast_mode=False)
+    states = fast.reset(), slow.reset()
+    for env, state in zip((fast, slow), states, strict=True):
+        act(env, state, x=1.0, z=-0.5, r=0.5)
+    steps = [env.scene.world.steps for env in (fast, slow)]
+    assert steps[1] > steps[0] + 10
+    poses = [env.scene.robot.tool_pose() for env in (fast, slow)]
+    np.testing.assert_allclose(poses[0][0], poses[1][0], atol=2e-3)
+    assert poses[0][1] == pytest.approx(poses[1][1], abs=0.01)
+
+
+def test_random_orientation(make):
+    for random, spread in ((True, 0.2), (False, 0.0)):
+        env = make(random_orientation=random)
+        yaws = []
+        for _ in range(20):
+            env.reset()
+            yaws.append(env.scene.task.block.yaw_rad)
+        assert (np.std(yaws) > spread) if random else np.allclose(yaws, 0.0, atol=1e-3)
+
+
+def test_half_rotation_keeps_the_yaw_within_a_half_turn(make):
+    reached = {}
+    for half in (False, True):
+        env = make(half_rotation=half)
+        state = env.reset()
+        for _ in range(3):
+            state = act(env, state, r=1.0)
+        reached[half] = env.scene.robot.tool_pose()[1]
+    assert reached[False] == pytest.approx(3 * math.pi / 4, abs=0.02)
+    assert reached[True] == pytest.approx(math.pi / 2, abs=0.02)
+
+
+@pytest.mark.parametrize("task", ba_torchrl.list_tasks())
+def test_experts_stay_within_the_half_turn(make, task):
+    if not task.startswith("close_loop"):
+        pytest.skip("open-loop yaws are within a half turn by default")
+    env = make(task, half_rotation=True, expert=True)
+    successes = 0
+    for _ in range(10):
+        state = env.reset()
+        while not state["done"]:
+            state = env.step(state.set("action", state["expert_action"]))["next"]
+        successes += bool(state["success"])
+    assert successes >= 9
+
+
+def test_workspace_check_looks_at_centres_or_outlines(make):
+    for check, valid in (("point", True), ("bounding_box", False)):
+        env = make(workspace_check=check)
+        env.reset()
+        env.scene.task.block.place((0.59, 0.0, 0.025))
+        assert env.scene.task.is_valid() == valid
+
+
+def test_close_loop_tray_raises_the_objects_and_shows(make):
+    env, plain = make(close_loop_tray=True, obs_size=64), make(obs_size=64)
+    depths = env.reset()[keys.PIXELS], plain.reset()[keys.PIXELS]
+    assert env.scene.task.block.position[2] == pytest.approx(0.027, abs=5e-4)
+    assert plain.scene.task.block.position[2] == pytest.approx(0.025, abs=5e-4)
+    assert not torch.equal(*depths)
+    # the walls rise towards the border: less deep than the floor
+    assert depths[0][0, 32, 6] < depths[1][0, 32, 6] - 0.02
+    state = env.reset()
+    env.close()
+    env = make(close_loop_tray=True, expert=True)
+    for _ in range(10):
+        state = env.reset()
+        while not state["done"]:
+            state = env.step(state.set("action", state["expert_action"]))["next"]
+        assert state["success"]
+
+
+def test_close_loop_tray_is_refused_where_it_has_no_room():
+    with pytest.raises(ConfigError, match="block_picking"):
+        ba_torchrl.make("close_loop/block_pulling", close_loop_tray=True)
+
+
+def test_dpos_and_drot_bound_an_action(make):
+    env = make(dpos=0.02, drot=math.pi / 8)
+    state = env.reset()
+    before = env.scene.robot.tool_pose()
+    act(env, state, x=1.0, y=-1.0, r=1.0)
+    after = env.scene.robot.tool_pose()
+    np.testing.assert_allclose(np.subtract(after[0], before[0]), (0.02, -0.02, 0.0), atol=1e-3)
+    assert after[1] - before[1] == pytest.approx(math.pi / 8, abs=5e-3)
+
+
+def test_obs_type_vec_lists_scaled_poses(make):
+    env = make("close_loop/block_pushing", obs_type="vec")
+    state = env.reset()
+    assert keys.PIXELS not in state
+    task, robot = env.scene.task, env.scene.robot
+    expected = [2 * robot.opening() - 1]
+    for position, yaw in (
+        robot.tool_pose(),
+        (task.block.position, task.block.yaw_rad),
+        (task.goal.position, task.goal.yaw_rad),
+    ):
+        low, high = np.array([0.3, -0.15, 0.01]), np.array([0.6, 0.15, 0.25])
+        expected += [*(2 * (np.array(position) - low) / (high - low) - 1), yaw / math.pi]
+    np.testing.assert_allclose(state[keys.OBSERVATION], expected, atol=1e-6)
+    moved = act(env, state, x=1.0)[keys.OBSERVATION] - state[keys.OBSERVATION]
+    assert moved[1] == pytest.approx(0.05 / 0.15, abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "time_step_s", "iterations"),
+    [
+        ({"physics_mode": "fast"}, 1 / 120, 50),
+        ({"physics_mode": "slow"}, 1 / 240, 200),
+        ({"physics_mode": "custom", "solver_iterations": 80}, 1 / 120, 80),
+        ({"physics_mode": "custom", "time_step_s": 1 / 300}, 1 / 300, 50),
+    ],
+)
+def test_physics_mode_sets_up_the_engine(make, settings, time_step_s, iterations):
+    import pybullet
+
+    env = make(expert=True, **settings)
+    state = env.reset()
+    engine = pybullet.getPhysicsEngineParameters(physicsClientId=env.scene.world.client)
+    assert engine["fixedTimeStep"] == pytest.approx(time_step_s)
+    assert engine["numSolverIterations"] == iterations
+    while not state["done"]:
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+    assert state["success"]
+
+
+def test_colours_of_floor_and_workspace_show_in_pictures_only(make):
+    plain = make()
+    colored = make(floor_color=(1.0, 1.0, 1.0), workspace_color=(0.1, 0.1, 0.1))
+    pixels = plain.reset()[keys.PIXELS], colored.reset()[keys.PIXELS]
+    assert torch.equal(*pixels)
+    before, after = plain.render(), colored.render()
+    assert before.shape == after.shape
+    assert (before != after).any(axis=-1).mean() > 0.2
+
+
+def test_render_needs_a_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(ConfigError, match="DISPLAY"):
+        ba_torchrl.make(PICKING, render=True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"in_hand_size": 24}, "open-loop"),
+        ({"object_set": "random"}, "no meaning"),
+        ({"asset_root": "somewhere"}, "no meaning"),
+        ({"num_objects": 2}, "takes 1 "),
+        ({"solver_iterations": 10}, "physics_mode='custom'"),
+        ({"physics_mode": "custom"}, "time_step_s"),
+        ({"floor_color": (0.1, 0.2)}, "red, green and blue"),
+        ({"workspace_color": (0.1, 0.2, 2.0)}, "red, green and blue"),
+        ({"view_type": "from_below"}, "camera_center_xyz"),
+        ({"num_object": 2}, "Did you mean 'num_objects'"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        ba_torchrl.make(PICKING, **settings)
+
+
+def test_every_parameter_is_documented():
+    import ast
+    import inspect
+    import textwrap
+
+    tree = ast.parse(textwrap.dedent(inspect.getsource(EnvConfig))).body[0]
+    documented = {
+        node.target.id
+        for node, after in zip(tree.body, tree.body[1:], strict=False)
+        if isinstance(node, ast.AnnAssign) and isinstance(after, ast.Expr)
+    }
+    assert documented == set(EnvConfig.model_fields)
