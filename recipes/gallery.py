@@ -1,23 +1,29 @@
-"""Draw the tasks: a contact sheet of the experts at work.
+"""Draw the tasks: for each the expert at work, and all of them on one page.
 
-python recipes/gallery.py                       # docs/gallery.png, every task
-python recipes/gallery.py tasks=[close_loop/block_picking] path=picking.png
+python recipes/gallery.py                       # docs/gallery/*.png and docs/gallery.png
+python recipes/gallery.py tasks=[close_loop/block_picking] folder=pictures overview=null
 """
+
+from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
-from ba_torchrl.record.gallery import contact_sheet, expert_strip
+from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
 
 
 @hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Play one episode per task and write the sheet."""
-    tasks = settings.tasks or list_tasks()
-    rows = [(task, *expert_strip(task, settings.seed)) for task in tqdm(tasks, unit="task")]
-    print(contact_sheet(rows, settings.path))
+    """Play one episode per task and write the pictures."""
+    strips = {}
+    for task in tqdm(settings.tasks or list_tasks(), unit="task"):
+        strips[task] = expert_strip(task, settings.seed, settings.pictures)
+        path = Path(settings.folder) / f"{task.replace('/', '_')}.png"
+        tqdm.write(str(strip_figure(task, strips[task], path)))
+    if settings.overview is not None:
+        print(overview_figure(strips, settings.overview))
 
 
 if __name__ == "__main__":

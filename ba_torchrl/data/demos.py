@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 import torchrl
@@ -14,8 +15,9 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl import __version__
 from ba_torchrl.config import ConfigError, EnvConfig, parse
-from ba_torchrl.data.episodes import collect_episodes, is_success
+from ba_torchrl.data.episodes import collect_episodes, is_success, mean_length, success_rate
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.factory import make_vector
 
 _METADATA_FILE = "demonstrations.json"
 _EPISODE = "episode"
@@ -63,6 +65,42 @@ def collect_demonstrations(
     """
     played = collect_episodes(env, expert_policy, episodes, seed=seed, on_episode=on_episode)
     return [episode for episode in played if is_success(episode) or not only_successful]
+
+
+class ExpertScores(NamedTuple):
+    """How an expert did."""
+
+    success_rate: float
+    mean_length: float
+    """Steps of the episodes that reached the goal; nan if none did."""
+
+
+def expert_scores(
+    task: str, episodes: int, *, seed: int, num_envs: int = 1, parallel: bool = False, **env: Any
+) -> ExpertScores:
+    """Let a task's expert play and keep score.
+
+    Args:
+        task: id of the task.
+        episodes: how many to play.
+        seed: of the first episodes; environment i starts from ``seed + i``.
+        num_envs: environments side by side.
+        parallel: each in a process of its own.
+        env: fields of `EnvConfig`.
+    """
+    envs = make_vector(
+        task,
+        num_envs,
+        parallel=parallel,
+        start_method="spawn",
+        **{**env, "seed": seed, "expert": True},
+    )
+    try:
+        played = collect_episodes(envs, expert_policy, episodes, seed=seed, exclude=[keys.PIXELS])
+    finally:
+        envs.close()
+    solved = [episode for episode in played if is_success(episode)]
+    return ExpertScores(success_rate(played), mean_length(solved) if solved else math.nan)
 
 
 def save_demonstrations(

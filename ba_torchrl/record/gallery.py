@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -13,16 +16,22 @@ from ba_torchrl import make
 from ba_torchrl.envs import keys
 
 
-def expert_strip(task: str, seed: int, pictures: int = 4) -> tuple[list[np.ndarray], np.ndarray]:
+class Strip(NamedTuple):
+    """An episode in pictures."""
+
+    pictures: list[np.ndarray]
+    """[H, W, 3] uint8, from the first scene to the last."""
+    first_image: np.ndarray
+    """What a policy sees first, [H, W] metres."""
+
+
+def expert_strip(task: str, seed: int, pictures: int = 4) -> Strip:
     """Play one episode with the expert.
 
     Args:
         task: id of the task.
         seed: of the episode.
         pictures: how many to take, evenly spread from the first scene to the last.
-
-    Returns:
-        Pictures [H, W, 3] uint8, and the first image that a policy sees, [H, W] metres.
     """
     env = make(task, expert=True, seed=seed)
     try:
@@ -36,30 +45,53 @@ def expert_strip(task: str, seed: int, pictures: int = 4) -> tuple[list[np.ndarr
     finally:
         env.close()
     chosen = np.linspace(0, len(frames) - 1, pictures).round().astype(int)
-    return [frames[i] for i in chosen], first
+    return Strip([frames[i] for i in chosen], first)
 
 
-def contact_sheet(
-    rows: Sequence[tuple[str, list[np.ndarray], np.ndarray]], path: str | Path
-) -> Path:
-    """Write a sheet with one row per task: the policy's first image, then the expert's episode.
+def strip_figure(name: str, strip: Strip, path: str | Path) -> Path:
+    """Write one row: what the policy sees first, then the expert's episode.
 
     Args:
-        rows: name, pictures and image of each task, as `expert_strip` returns them.
+        name: title.
+        strip: what `expert_strip` returned.
         path: the PNG to write.
     """
-    columns = 1 + max(len(pictures) for _, pictures, _ in rows)
-    figure = Figure(figsize=(2.6 * columns, 2.35 * len(rows)), layout="constrained")
+    columns = 1 + len(strip.pictures)
+    figure, axes = _canvas(1, columns, (2.6 * columns, 2.35))
+    axes[0].imshow(strip.first_image, cmap="gray")
+    axes[0].set_title(name, fontsize=11, loc="left")
+    for axis, picture in zip(axes[1:], strip.pictures, strict=True):
+        axis.imshow(picture)
+    return _write(figure, path, dpi=80)
+
+
+def overview_figure(strips: Mapping[str, Strip], path: str | Path, columns: int = 5) -> Path:
+    """Write a grid with one picture per task, taken half-way through the expert's episode.
+
+    Args:
+        strips: name of each task, and what `expert_strip` returned.
+        path: the PNG to write.
+        columns: pictures side by side.
+    """
+    rows = math.ceil(len(strips) / columns)
+    figure, axes = _canvas(rows, columns, (2.6 * columns, 2.5 * rows))
+    for axis, (name, strip) in zip(axes, strips.items(), strict=False):
+        axis.imshow(strip.pictures[len(strip.pictures) // 2])
+        axis.set_title(name, fontsize=11)
+    return _write(figure, path, dpi=80)
+
+
+def _canvas(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=size_in, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(len(rows), columns, squeeze=False)
-    for line, (name, pictures, image) in zip(axes, rows, strict=True):
-        for axis in line:
-            axis.set_axis_off()
-        line[0].imshow(image, cmap="gray")
-        line[0].set_title(name, fontsize=11, loc="left")
-        for axis, picture in zip(line[1:], pictures, strict=False):
-            axis.imshow(picture)
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axis in axes:
+        axis.set_axis_off()
+    return figure, axes
+
+
+def _write(figure: Figure, path: str | Path, dpi: int) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=70)
+    figure.savefig(path, dpi=dpi)
     return path
