@@ -22,6 +22,23 @@ class GripperCommand(NamedTuple):
     dyaw_rad: float
 
 
+class PickPlaceCommand(NamedTuple):
+    """One open-loop action in physical units; the tool's rotation is Rz(rz) Ry(ry) Rx(rx)."""
+
+    primitive: int | None
+    """`PICK` or `PLACE`; None leaves it to whether something is held."""
+    x_m: float
+    y_m: float
+    z_m: float | None
+    """None leaves it to the heightmap."""
+    rz_rad: float = 0.0
+    ry_rad: float = 0.0
+    rx_rad: float = 0.0
+
+
+PICK, PLACE = 0, 1
+
+
 class InvalidActionError(ValueError):
     """An action of the wrong shape, or one that is not finite."""
 
@@ -89,3 +106,120 @@ class CloseLoopActions:
         }
         action = np.array([value[letter] for letter in self.sequence], dtype=np.float32)
         return np.clip(action, -1.0, 1.0)
+
+
+ANGLES = {0: (), 1: ("rz",), 2: ("rz", "rx"), 3: ("rz", "ry", "rx")}
+"""What the letters r of an open-loop sequence stand for, by their number."""
+
+MAX_TILT_RAD = math.pi / 2
+
+
+@dataclass(frozen=True)
+class OpenLoopActions:
+    """The open-loop action vector: a pose to pick from or place at, in metres and radians.
+
+    Args:
+        sequence: one letter per component, in any order: p the primitive (0 pick, 1 place), x y z
+            the position, and up to three r: rz, then rx, or rz, ry, rx. Only x and y are required.
+        bounds_m: ranges of x, y and z, to which positions are clipped.
+        half_rotation: wrap yaws into [0, pi], with the tilts that leave the fingers where they
+            are, instead of into [0, 2 pi].
+
+    Raises:
+        ConfigError: a letter is missing, unknown or repeated.
+    """
+
+    sequence: str
+    bounds_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+    half_rotation: bool = True
+
+    def __post_init__(self) -> None:
+        letters = self.sequence.replace("r", "")
+        if (
+            not {"x", "y"} <= set(letters) <= set("pxyz")
+            or len(set(letters)) < len(letters)
+            or self.sequence.count("r") > 3
+        ):
+            raise ConfigError(
+                f"action_sequence {self.sequence!r} does not suit an open-loop task: it takes x "
+                "and y once each, p and z at most once, and up to three r, as in 'pxyr'"
+            )
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+        return len(self.sequence)
+
+    @property
+    def components(self) -> list[str]:
+        """Name of each component: p, x, y, z, rz, ry or rx."""
+        angles = iter(ANGLES[self.sequence.count("r")])
+        return [next(angles) if letter == "r" else letter for letter in self.sequence]
+
+    @property
+    def ranges(self) -> list[tuple[float, float]]:
+        """Least and greatest value of each component."""
+        turn = math.pi if self.half_rotation else 2 * math.pi
+        named = {
+            "p": (0.0, 1.0),
+            **dict(zip("xyz", self.bounds_m, strict=True)),
+            "rz": (0.0, turn),
+            "ry": (-MAX_TILT_RAD, MAX_TILT_RAD),
+            "rx": (-MAX_TILT_RAD, MAX_TILT_RAD),
+        }
+        return [named[name] for name in self.components]
+
+    def decode(self, action: np.ndarray) -> PickPlaceCommand:
+        """Return the command of ``action`` [size]; positions are clipped, angles wrapped.
+
+        Raises:
+            InvalidActionError: the primitive is neither 0 nor 1.
+        """
+        value = dict(
+            zip(self.components, np.asarray(action, dtype=np.float64).tolist(), strict=True)
+        )
+        primitive = value.get("p")
+        if primitive is not None and primitive not in (PICK, PLACE):
+            raise InvalidActionError(f"the primitive is 0 (pick) or 1 (place), not {primitive:g}")
+        x, y, z = (
+            min(max(value[name], low), high) if name in value else None
+            for name, (low, high) in zip("xyz", self.bounds_m, strict=True)
+        )
+        rz, ry, rx = self.wrap(*(value.get(name, 0.0) for name in ("rz", "ry", "rx")))
+        return PickPlaceCommand(None if primitive is None else int(primitive), x, y, z, rz, ry, rx)
+
+    def encode(self, command: PickPlaceCommand) -> np.ndarray:
+        """Return the action [size] float32 of a command; what the sequence lacks is dropped.
+
+        Raises:
+            ValueError: the sequence asks for what the command leaves open.
+        """
+        rz, ry, rx = self.wrap(command.rz_rad, command.ry_rad, command.rx_rad)
+        value = {
+            "p": command.primitive,
+            "x": command.x_m,
+            "y": command.y_m,
+            "z": command.z_m,
+            "rz": rz,
+            "ry": ry,
+            "rx": rx,
+        }
+        missing = [name for name in self.components if value[name] is None]
+        if missing:
+            raise ValueError(f"the command leaves {', '.join(missing)} open")
+        action = [
+            min(max(value[name], low), high)
+            for name, (low, high) in zip(self.components, self.ranges, strict=True)
+        ]
+        return np.array(action, dtype=np.float32)
+
+    def wrap(self, rz: float, ry: float, rx: float) -> tuple[float, float, float]:
+        """Return the equivalent angles within the ranges.
+
+        A half turn of the tool about its own axis swaps its fingers, which is the yaw plus pi with
+        both tilts negated.
+        """
+        rz %= 2 * math.pi
+        if self.half_rotation and rz > math.pi:
+            return rz - math.pi, -ry, -rx
+        return rz, ry, rx

@@ -6,7 +6,7 @@ import logging
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -17,12 +17,12 @@ from torchrl.envs import EnvBase
 from ba_torchrl.actions import InvalidActionError
 from ba_torchrl.config import ConfigError, EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.scene import Scene, SceneState, build_scene, check_task_parameters
+from ba_torchrl.envs.scene import Motion, Scene, SceneState, build_scene, check_task_parameters
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.cameras import render_rgb
-from ba_torchrl.sim.robots.base import ROBOTS, downward
-from ba_torchrl.sim.world import SimulationError
-from ba_torchrl.tasks.base import SCALE_STEP, TASKS, PlacementError, Reach, Workspace
+from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
+from ba_torchrl.sim.world import Physics, SimulationError
+from ba_torchrl.tasks.base import SCALE_STEP, TASKS, PlacementError, Reach, Task, Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -89,6 +89,13 @@ class ManipulationEnv(EnvBase):
         self._try_out()
 
     # -- for subclasses ----------------------------------------------------------------------
+
+    physics: ClassVar[Physics] = Physics()
+    """Settings of the physics engine in the mode "fast"."""
+
+    @abstractmethod
+    def _make_motion(self, robot: Robot, task: Task) -> Motion:
+        """Return what carries out actions."""
 
     @property
     @abstractmethod
@@ -286,7 +293,13 @@ class ManipulationEnv(EnvBase):
         key = round(scale, 6)
         if key not in self._scenes:
             self._scenes[key] = build_scene(
-                self.task_id, self.config, self.workspace, self.reach, scale
+                self.task_id,
+                self.config,
+                workspace=self.workspace,
+                reach=self.reach,
+                scale=scale,
+                physics=self.physics,
+                make_motion=self._make_motion,
             )
         return self._scenes[key]
 

@@ -11,7 +11,9 @@ from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.cameras import paint_square
-from ba_torchrl.tasks.base import Reach
+from ba_torchrl.sim.motion import CloseLoopMotion
+from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.tasks.base import Reach, Task
 
 START_HEIGHT_M = 0.2
 FINGER_GLYPH_HALF_M = 5 * 0.3 / 128
@@ -44,6 +46,9 @@ class CloseLoopEnv(ManipulationEnv):
     def view_width_m(self) -> float:
         """Width of the image."""
         return self.config.view_scale * self.workspace.width
+
+    def _make_motion(self, robot: Robot, task: Task) -> CloseLoopMotion:
+        return CloseLoopMotion(robot, teleport=self.config.fast_mode)
 
     def _action_size(self) -> int:
         return self.actions.size

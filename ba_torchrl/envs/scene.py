@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from ba_torchrl.config import CUSTOM_PHYSICS, ConfigError, EnvConfig
 from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.cameras import HeightCamera
-from ba_torchrl.sim.motion import CloseLoopMotion
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SimulationError, Snapshot, World
 from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace
 
 MARK_M = 1e-3
 """Thickness of the coloured sheet that marks the workspace."""
+
+
+class Motion(Protocol):
+    """What carries out actions; its methods beyond these are the control's own."""
+
+    def get_state(self) -> Any:
+        """Return what it remembers from one action to the next."""
+
+    def set_state(self, state: Any) -> None:
+        """Take up what `get_state` returned."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,7 @@ class Scene:
     world: World
     robot: Robot
     task: Task
-    motion: CloseLoopMotion
+    motion: Motion
     camera: HeightCamera
 
     def get_state(self) -> SceneState:
@@ -60,7 +70,14 @@ class Scene:
 
 
 def build_scene(
-    task_id: str, config: EnvConfig, workspace: Workspace, reach: Reach, scale: float
+    task_id: str,
+    config: EnvConfig,
+    *,
+    workspace: Workspace,
+    reach: Reach,
+    scale: float,
+    physics: Physics,
+    make_motion: Callable[[Robot, Task], Motion],
 ) -> Scene:
     """Build the world of a task for objects of one scale.
 
@@ -70,12 +87,14 @@ def build_scene(
         workspace: where the task takes place.
         reach: what one action covers.
         scale: of the objects.
+        physics: settings of the engine, unless the parameters say otherwise.
+        make_motion: from a robot and a task to what carries out actions.
 
     Raises:
         ConfigError: there is no display for ``render=True``.
     """
     task_class = TASKS[task_id]
-    world = _empty_world(config, workspace)
+    world = _empty_world(config, workspace, physics)
     surface_z_m = 0.0
     if config.close_loop_tray:
         from ba_torchrl.tasks.tray import add_tray
@@ -96,7 +115,7 @@ def build_scene(
     task.world, task.robot = world, ROBOTS[config.robot](world)
     task.build(world)
     world.seal()
-    motion = CloseLoopMotion(task.robot, teleport=config.fast_mode)
+    motion = make_motion(task.robot, task)
     return Scene(world, task.robot, task, motion, HeightCamera(world.bodies))
 
 
@@ -121,9 +140,10 @@ def check_task_parameters(task_id: str, config: EnvConfig) -> None:
         )
 
 
-def _empty_world(config: EnvConfig, workspace: Workspace) -> World:
+def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> World:
     """Return a world with nothing but the floor."""
-    physics = FINE_PHYSICS if config.physics_mode == "slow" else Physics()
+    if config.physics_mode == "slow":
+        physics = FINE_PHYSICS
     custom = {
         name: getattr(config, name) for name in CUSTOM_PHYSICS if getattr(config, name) is not None
     }

@@ -1,0 +1,353 @@
+"""Open-loop pick and place: the physics that a grasp and a release need, and no more.
+
+What touches nothing is not simulated: the arm is teleported above the object if the way down is
+free, the fingers are closed up to the last notch before they touch, and what is held is carried
+rigidly. Closing, lifting off, setting down and letting go are physics; a grasp holds by friction or
+it does not. With ``teleport`` off every centimetre is simulated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import pybullet
+
+from ba_torchrl.sim.bodies import Body, Quaternion, Vector
+from ba_torchrl.sim.robots.base import Matrix, Robot
+
+
+@dataclass(frozen=True)
+class PickPlaceLimits:
+    """Distances and step counts of picking and placing."""
+
+    approach_m: float = 0.1
+    """Where a simulated approach starts, along the tool's axis."""
+    free_samples_m: tuple[float, ...] = (0.06, 0.03)
+    """Where on the way down it is tested that nothing is in the way, besides its end."""
+    approach_step_m: float = 0.005
+    """Stride of a simulated approach or retreat, per step."""
+    notch: float = 0.075
+    """Share of the opening by which fingers close without simulation."""
+    closing_steps: int = 40
+    lift_m: float = 0.005
+    lift_steps: int = 4
+    """Least number of steps of a simulated way."""
+    swing_step_rad: float = 0.03
+    """Greatest turn of a joint per step of a simulated swing."""
+    margin_m: float = 5e-4
+    """Closer than this, a way is not free."""
+    carry_step_m: float = 0.004
+    """Stride of simulated carrying."""
+    hover_m: float = 0.003
+    """Height above its place from which an object is lowered."""
+    lower_steps: int = 2
+    release_steps: int = 2
+    max_press_n: float = 40.0
+    """A simulated approach stops when it meets this force."""
+
+
+class HeldState(NamedTuple):
+    """What `PickPlace` remembers."""
+
+    held: Body | None
+    grasp: tuple[Vector, Quaternion] | None
+
+
+def tool_rotation(rz_rad: float, ry_rad: float = 0.0, rx_rad: float = 0.0) -> Matrix:
+    """Return Rz Ry Rx of a tool that points down at zero angles."""
+    cz, sz = math.cos(rz_rad), math.sin(rz_rad)
+    cy, sy = math.cos(ry_rad), math.sin(ry_rad)
+    cx, sx = math.cos(rx_rad), math.sin(rx_rad)
+    # the columns of Rz Ry Rx, the last two negated: the tool's y and z axes at zero angles
+    return (
+        (cz * cy, -(cz * sy * sx - sz * cx), -(cz * sy * cx + sz * sx)),
+        (sz * cy, -(sz * sy * sx + cz * cx), -(sz * sy * cx - cz * sx)),
+        (-sy, -cy * sx, -cy * cx),
+    )
+
+
+class PickPlace:
+    """Picks and places with a robot.
+
+    Args:
+        robot: the robot.
+        teleport: skip the simulation of free travel.
+        opening: how far the fingers open, 0 to 1.
+        top_down: come from straight above even where the tool is tilted, instead of along its
+            axis.
+        limits: distances and step counts.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        teleport: bool = True,
+        opening: float = 1.0,
+        top_down: bool = False,
+        limits: PickPlaceLimits | None = None,
+    ) -> None:
+        self.robot = robot
+        self.world = robot.world
+        self.teleport = teleport
+        self.opening = opening
+        self.top_down = top_down
+        self.limits = limits or PickPlaceLimits()
+        self.held: Body | None = None
+        """What is in the gripper; it is hidden from cameras, as is the arm."""
+        self._grasp: tuple[Vector, Quaternion] | None = None
+        """Its pose in the frame of the tool."""
+
+    def reset(self) -> None:
+        """Empty the gripper and go home, without moving anything else."""
+        self._release()
+        self.robot.teleport(self.robot.home_joints)
+        self.robot.set_opening(self.opening)
+
+    def pick(self, position: Vector, rotation: Matrix) -> Body | None:
+        """Grasp what is at a pose, lift it and go home.
+
+        Args:
+            position: of the tool point, metres.
+            rotation: of the tool.
+
+        Returns:
+            What is held at the end; None if nothing is, or the pose is out of reach.
+        """
+        robot, limits = self.robot, self.limits
+        robot.set_opening(self.opening)
+        if self._approach(position, rotation, 0.0):
+            self._close()
+            reached = robot.tool_transform()[0]
+            self._travel(reached, self._above(reached, rotation, limits.lift_m), rotation, None)
+            body = robot.held_body()
+            if body is not None:
+                self._take(body)
+                self._leave(rotation)
+        self._go_home()
+        if self.held is None:
+            robot.set_opening(self.opening)
+        return self.held
+
+    def place(self, position: Vector, rotation: Matrix) -> None:
+        """Set down what is held at a pose of the tool, let go and go home.
+
+        Out of reach, it stays in the gripper.
+        """
+        if self._approach(position, rotation, self.limits.hover_m):
+            reached = self.robot.tool_transform()[0]
+            down = self._above(reached, rotation, -self.limits.hover_m)
+            self._travel(reached, down, rotation, self.limits.lower_steps)
+            self._release()
+            self._open()
+            if not self.teleport:
+                self._leave(rotation)
+        self._go_home()
+        if self.held is None:
+            self.robot.set_opening(self.opening)
+
+    def get_state(self) -> HeldState:
+        """Return what is held, and how."""
+        return HeldState(self.held, self._grasp)
+
+    def set_state(self, state: HeldState) -> None:
+        """Take up what `get_state` returned."""
+        self._release()
+        self.held, self._grasp = state
+        if self.held is not None:
+            self.held.is_hidden = True
+
+    # -- what is held ------------------------------------------------------------------------
+
+    def _take(self, body: Body) -> None:
+        self.held = body
+        body.is_hidden = True
+        self._remember_grasp()
+
+    def _release(self) -> None:
+        if self.held is not None:
+            self.held.is_hidden = False
+        self.held = self._grasp = None
+
+    def _remember_grasp(self) -> None:
+        """Measure where in the gripper the body is now."""
+        to_tool = pybullet.invertTransform(*self.robot.tool_transform())
+        self._grasp = pybullet.multiplyTransforms(*to_tool, *self.held.pose)
+
+    def _carry(self, joints: Sequence[float]) -> None:
+        """Teleport the arm, and rigidly with it what is held."""
+        self.robot.teleport(joints)
+        if self.held is not None:
+            self.held.move_to(
+                *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self._grasp)
+            )
+
+    def _drop_if_lost(self) -> None:
+        """Take note if what was held slipped out during a simulated move."""
+        if self.held is not None:
+            if self.robot.held_body() is self.held:
+                self._remember_grasp()
+            else:
+                self._release()
+
+    # -- ways --------------------------------------------------------------------------------
+
+    def _above(self, position: Vector, rotation: Matrix, height_m: float) -> Vector:
+        """Return the point from which the tool comes down to ``position``."""
+        up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
+        return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
+
+    def _joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
+        return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
+
+    def _approach(self, position: Vector, rotation: Matrix, clearance_m: float) -> bool:
+        """Bring the tool ``clearance_m`` above a pose; return False if that is out of reach."""
+        limits = self.limits
+        end = self._above(position, rotation, clearance_m)
+        heights = (limits.approach_m, *limits.free_samples_m, 0.0)
+        way = [self._joints(self._above(end, rotation, height), rotation) for height in heights]
+        if any(joints is None for joints in way):
+            return False
+        if self.teleport:
+            for joints in way[1:]:
+                self._carry(joints)
+                if self._touches_anything():
+                    break
+            else:
+                return True
+            self._carry(way[0])
+        else:
+            self._swing(way[0])
+        self._travel(self._above(end, rotation, limits.approach_m), end, rotation, None)
+        self._drop_if_lost()
+        return True
+
+    def _leave(self, rotation: Matrix) -> None:
+        """Go up from where the tool is, in simulation unless nothing is in the way."""
+        start = self.robot.tool_transform()[0]
+        if self.teleport:
+            here = self.robot.joints
+            for height in reversed(self.limits.free_samples_m):
+                joints = self._joints(self._above(start, rotation, height), rotation)
+                if joints is None:
+                    break
+                self._carry(joints)
+                if self._touches_anything():
+                    break
+            else:
+                return
+            self._carry(here)
+        self._travel(start, self._above(start, rotation, self.limits.approach_m), rotation, None)
+        self._drop_if_lost()
+
+    def _go_home(self) -> None:
+        if self.teleport:
+            self._carry(self.robot.home_joints)
+        else:
+            self._swing(self.robot.home_joints)
+            self._drop_if_lost()
+
+    def _travel(self, start: Vector, end: Vector, rotation: Matrix, count: int | None) -> None:
+        """Simulate a straight way of the tool; stop where it presses or leaves the reach.
+
+        Args:
+            start: of the tool point.
+            end: of the tool point.
+            rotation: of the tool.
+            count: number of steps; from the distance by default.
+        """
+        limits = self.limits
+        distance = math.dist(start, end)
+        if count is None:
+            stride = limits.carry_step_m if self.held is not None else limits.approach_step_m
+            count = max(limits.lift_steps, math.ceil(distance / stride))
+        goes_down = end[2] < start[2]
+        for i in range(1, count + 1):
+            place = smooth_step(i / count)
+            point = tuple(s + place * (e - s) for s, e in zip(start, end, strict=True))
+            joints = self._joints(point, rotation)
+            if joints is None:
+                return
+            before = self.robot.joints
+            self.robot.command(joints)
+            self.world.step()
+            if goes_down and self._press_n() > limits.max_press_n:
+                self.robot.command(before)
+                self.world.step()
+                return
+
+    def _swing(self, joints: Sequence[float]) -> None:
+        """Simulate a smooth move of the arm in joint angles."""
+        start = self.robot.joints
+        turns = [e - s for s, e in zip(start, joints, strict=True)]
+        count = max(2, math.ceil(max(map(abs, turns)) / self.limits.swing_step_rad))
+        for i in range(1, count + 1):
+            place = smooth_step(i / count)
+            self.robot.command([s + place * t for s, t in zip(start, turns, strict=True)])
+            self.world.step()
+
+    # -- contacts ----------------------------------------------------------------------------
+
+    def _outer_contacts(self) -> list[tuple]:
+        """Return PyBullet's contact points of the hand, and what it holds, with all else."""
+        client, robot = self.world.client, self.robot.id
+        points = pybullet.getContactPoints(robot, physicsClientId=client)
+        if self.held is None:
+            return points
+        points += pybullet.getContactPoints(self.held.id, physicsClientId=client)
+        inner = {robot, self.held.id}
+        return [point for point in points if {point[1], point[2]} != inner]
+
+    def _touches_anything(self) -> bool:
+        self.world.detect_collisions()
+        return any(point[8] < self.limits.margin_m for point in self._outer_contacts())
+
+    def _press_n(self) -> float:
+        return sum(point[9] for point in self._outer_contacts() if abs(point[7][2]) > 0.6)
+
+    # -- fingers -----------------------------------------------------------------------------
+
+    def _close(self) -> None:
+        """Close the fingers until they meet something, or each other."""
+        if self.teleport:
+            free = self.opening
+            for i in range(1, math.ceil(self.opening / self.limits.notch) + 1):
+                opening = max(self.opening - i * self.limits.notch, 0.0)
+                self.robot.set_opening(opening)
+                if self._touches_anything():
+                    break
+                free = opening
+            self.robot.set_opening(free)
+        ramp_fingers(self.robot, 0.0, self.limits.closing_steps)
+
+    def _open(self) -> None:
+        """Let go of what is between the fingers."""
+        count = self.limits.release_steps if self.teleport else self.limits.closing_steps
+        ramp_fingers(self.robot, self.opening, count)
+
+
+def smooth_step(u: float) -> float:
+    """Return a smooth way from 0 to 1: zero velocity and acceleration at both ends."""
+    return u * u * u * (10 - 15 * u + 6 * u * u)
+
+
+def ramp_fingers(robot: Robot, opening: float, max_steps: int) -> None:
+    """Move the fingers at their speed until they are there or meet something."""
+    stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open
+    target = robot.opening()
+    resting = 0
+    for _ in range(max_steps):
+        before = robot.opening()
+        target += min(max(opening - target, -stride), stride)
+        robot.hold_opening(target)
+        robot.world.step()
+        after = robot.opening()
+        if target == opening and abs(after - opening) < 0.02:
+            return
+        resting = resting + 1 if abs(after - before) < 0.1 * stride else 0
+        if resting >= 2:
+            break
+    robot.hold_opening(opening)  # the motors stay on: they squeeze what the fingers met
