@@ -77,8 +77,9 @@ class EnvConfig(StrictModel):
 
     robot: str = "kuka"
     """The robot arm."""
-    action_sequence: str = "pxyzr"
-    """One letter per action component: p gripper, x y z displacement, r yaw."""
+    action_sequence: str | None = None
+    """One letter per action component. Close loop: p gripper, x y z displacement, r yaw; "pxyzr" by
+    default. Open loop: p primitive, x y z position, up to three r; "pxyr" by default."""
     workspace: tuple[Interval, Interval, Interval] | None = None
     """Ranges of x, y and z."""
     object_scale_range: Interval | None = None
@@ -91,6 +92,10 @@ class EnvConfig(StrictModel):
     """Pixels along each side of the image."""
     in_hand_size: int = Field(default=24, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
     """Open loop: pixels along each side of the image of what is held."""
+    in_hand_mode: str = Field(default="raw", json_schema_extra=_OPEN_LOOP)
+    """Open loop: what that image shows: "raw", "sub" or "proj"; see `ba_torchrl.sim.in_hand`."""
+    top_down_approach: bool = Field(default=False, json_schema_extra=_OPEN_LOOP)
+    """Open loop: come from straight above even where the gripper is tilted."""
     fast_mode: bool = True
     """Teleport the arm where it touches nothing; off, every centimetre is simulated."""
     render: bool = False

@@ -40,6 +40,7 @@ class EnvState:
     scale: float
     scene: SceneState
     observation: dict[str, torch.Tensor]
+    memory: dict[str, Any]
     base_seed: int
     episode: int
     step_count: int
@@ -71,11 +72,16 @@ class ManipulationEnv(EnvBase):
             self.task_class.workspace if config.workspace is None else Workspace(*config.workspace)
         )
         self.max_steps = config.max_steps or self.task_class.max_steps
+        self.action_sequence = config.action_sequence or self.default_action_sequence
+        """One letter per action component."""
+        self._configure()
         low, high = config.object_scale_range or self.task_class.scale_range
         self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._scenes: dict[float, Scene] = {}
         self._scene: Scene | None = None
         self._observation: dict[str, torch.Tensor] = {}
+        self._memory: dict[str, Any] = {}
+        """What an observation shows of earlier steps; replaced, never changed in place."""
         self._ends: dict[str, bool] = {}
         """How the last step ended, by key."""
         self._step_count = 0
@@ -92,6 +98,12 @@ class ManipulationEnv(EnvBase):
 
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine in the mode "fast"."""
+    default_action_sequence: ClassVar[str]
+    """`action_sequence` unless it is given."""
+
+    @abstractmethod
+    def _configure(self) -> None:
+        """Check the parameters that concern the control, and set up what it needs."""
 
     @abstractmethod
     def _make_motion(self, robot: Robot, task: Task) -> Motion:
@@ -103,12 +115,12 @@ class ManipulationEnv(EnvBase):
         """What one action covers."""
 
     @abstractmethod
-    def _action_size(self) -> int:
-        """Number of action components."""
+    def _make_action_spec(self) -> Bounded:
+        """Return the specification of an action."""
 
     @abstractmethod
-    def _pixel_range_m(self) -> tuple[float, float]:
-        """Least and greatest value of the image."""
+    def _image_specs(self) -> dict[str, Bounded]:
+        """Return the specifications of the images that a policy sees, by key."""
 
     @abstractmethod
     def _place_robot(self, scene: Scene) -> None:
@@ -119,8 +131,12 @@ class ManipulationEnv(EnvBase):
         """Carry out an action."""
 
     @abstractmethod
-    def _pixels(self, scene: Scene) -> np.ndarray:
-        """Return the image, [C, H, W] in metres."""
+    def _images(self, scene: Scene) -> dict[str, np.ndarray]:
+        """Return the images, [C, H, W] each, by key."""
+
+    def _is_holding(self, scene: Scene) -> bool:
+        """Whether the gripper holds something."""
+        return scene.robot.held_body() is not None
 
     @abstractmethod
     def _expert_action(self, scene: Scene) -> np.ndarray:
@@ -156,6 +172,7 @@ class ManipulationEnv(EnvBase):
             scale=next(key for key, value in self._scenes.items() if value is scene),
             scene=scene.get_state(),
             observation=self._observation,
+            memory=self._memory,
             base_seed=self.base_seed,
             episode=self._episode,
             step_count=self._step_count,
@@ -180,7 +197,7 @@ class ManipulationEnv(EnvBase):
             raise SimulationError("the state's world is gone: it is not this environment's")
         scene.set_state(state.scene)
         self._scene = scene
-        self._observation = state.observation
+        self._observation, self._memory = state.observation, state.memory
         self.base_seed, self._episode = state.base_seed, state.episode
         self._step_count = state.step_count
         self._ends = state.ends
@@ -229,7 +246,10 @@ class ManipulationEnv(EnvBase):
         else:
             self._consecutive_faults = 0
         terminated = not fault and (success or not valid)
-        truncated = fault or (not terminated and self._step_count >= self.max_steps)
+        at_limit = self._step_count >= self.max_steps
+        if at_limit and self.task_class.one_step:
+            terminated = not fault
+        truncated = fault or (at_limit and not terminated)
         self._ends = {
             keys.SUCCESS: success and not fault,
             keys.FAULT: fault,
@@ -246,15 +266,13 @@ class ManipulationEnv(EnvBase):
         def flag() -> Binary:
             return Binary(n=1, shape=(1,), dtype=torch.bool)
 
-        size = self.config.obs_size
-        action = Bounded(-1.0, 1.0, shape=(self._action_size(),), dtype=torch.float32)
+        action = self._make_action_spec()
         if self.config.obs_type == "vec":
             task = self._scene_for(float(self._scales[-1])).task
             length = 1 + 4 * (1 + len(task.landmarks))
             seen = {keys.OBSERVATION: Unbounded(shape=(length,), dtype=torch.float32)}
         else:
-            low, high = self._pixel_range_m()
-            seen = {keys.PIXELS: Bounded(low, high, shape=(1, size, size), dtype=torch.float32)}
+            seen = self._image_specs()
         observation = {
             **seen,
             keys.HOLDING: flag(),
@@ -342,12 +360,12 @@ class ManipulationEnv(EnvBase):
         return valid and success, valid
 
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
-        observation = {keys.HOLDING: torch.tensor([scene.robot.held_body() is not None])}
+        observation = {keys.HOLDING: torch.tensor([self._is_holding(scene)])}
         if self.config.obs_type == "vec":
             observation[keys.OBSERVATION] = torch.from_numpy(self._vector(scene))
         else:
-            pixels = self._pixels(scene).astype(np.float32)
-            observation[keys.PIXELS] = torch.from_numpy(pixels)
+            for key, image in self._images(scene).items():
+                observation[key] = torch.from_numpy(image.astype(np.float32))
         if self.config.expert:
             observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
         return observation
@@ -380,13 +398,13 @@ class ManipulationEnv(EnvBase):
         return TensorDict(out, batch_size=[])
 
     def _checked(self, action: torch.Tensor | None) -> np.ndarray:
-        size = self._action_size()
+        (size,) = self.action_spec.shape
         if action is None:
             raise InvalidActionError(f"the input has no {keys.ACTION!r}: write it before step()")
         if action.shape != (size,) or action.dtype != torch.float32:
             raise InvalidActionError(
                 f"{self.task_id} takes a float32 action of shape ({size},), one component per "
-                f"letter of {self.config.action_sequence!r}; got {action.dtype} of shape "
+                f"letter of {self.action_sequence!r}; got {action.dtype} of shape "
                 f"{tuple(action.shape)}"
             )
         array = action.detach().numpy()

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
+from torchrl.data import Bounded
 
 from ba_torchrl.actions import CloseLoopActions
-from ba_torchrl.config import EnvConfig
+from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.cameras import paint_square
@@ -32,9 +34,10 @@ class CloseLoopEnv(ManipulationEnv):
     stays above the tool and does not turn with it; the fingers are drawn as squares of zero.
     """
 
-    def __init__(self, task_id: str, config: EnvConfig) -> None:
-        self.actions = CloseLoopActions(config.action_sequence, config.dpos, config.drot)
-        super().__init__(task_id, config)
+    default_action_sequence = "pxyzr"
+
+    def _configure(self) -> None:
+        self.actions = CloseLoopActions(self.action_sequence, self.config.dpos, self.config.drot)
 
     @property
     def reach(self) -> Reach:
@@ -50,11 +53,18 @@ class CloseLoopEnv(ManipulationEnv):
     def _make_motion(self, robot: Robot, task: Task) -> CloseLoopMotion:
         return CloseLoopMotion(robot, teleport=self.config.fast_mode)
 
-    def _action_size(self) -> int:
-        return self.actions.size
+    def _make_action_spec(self) -> Bounded:
+        return Bounded(-1.0, 1.0, shape=(self.actions.size,), dtype=torch.float32)
 
-    def _pixel_range_m(self) -> tuple[float, float]:
-        return 0.0, self.workspace.z[1] + self.robot_class.camera_height_m + DEEPEST_DIP_M
+    @property
+    def _deepest_m(self) -> float:
+        return self.workspace.z[1] + self.robot_class.camera_height_m + DEEPEST_DIP_M
+
+    def _image_specs(self) -> dict[str, Bounded]:
+        size = self.config.obs_size
+        return {
+            keys.PIXELS: Bounded(0.0, self._deepest_m, shape=(1, size, size), dtype=torch.float32)
+        }
 
     def _place_robot(self, scene: Scene) -> None:
         x, y = self.workspace.center
@@ -71,18 +81,18 @@ class CloseLoopEnv(ManipulationEnv):
         scene.motion.move_to(target, yaw)
         scene.motion.grip(command.opening)
 
-    def _pixels(self, scene: Scene) -> np.ndarray:
+    def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         (x, y, z), yaw = scene.robot.tool_pose()
         size = self.config.obs_size
         camera_z = z + scene.robot.camera_height_m
         heights = scene.camera.heightmap((x, y), self.view_width_m, size)
-        depth = np.clip(camera_z - heights, 0.0, self._pixel_range_m()[1])
+        depth = np.clip(camera_z - heights, 0.0, self._deepest_m)
         pixel = self.view_width_m / size
         apart = scene.robot.finger_span_m * scene.robot.opening() / 2 / pixel
         for side in (-apart, apart):
             center = (size / 2 + side * math.cos(yaw), size / 2 + side * math.sin(yaw))
             paint_square(depth, center, FINGER_GLYPH_HALF_M / pixel, yaw, 0.0)
-        return depth[None]
+        return {keys.PIXELS: depth[None]}
 
     def _expert_action(self, scene: Scene) -> np.ndarray:
         return self.actions.encode(scene.task.expert_command())

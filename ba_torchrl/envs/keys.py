@@ -2,6 +2,8 @@
 
 PIXELS = "pixels"
 """[C, H, W] float32, metres. Open loop: heightmap. Close loop: depth below the camera."""
+IN_HAND = "in_hand"
+"""[1 or 3, h, w] float32. Open loop: image of what is held, zero if nothing is."""
 OBSERVATION = "observation"
 """[1 + 4 + 4 n] float32, with ``obs_type="vec"``: gripper opening in [-1, 1], then x, y, z scaled
 to [-1, 1] by the workspace and yaw over pi, of the gripper and of each of n objects."""

@@ -185,7 +185,7 @@ class PickPlace:
                 *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self._grasp)
             )
 
-    def _drop_if_lost(self) -> None:
+    def check_grasp(self) -> None:
         """Take note if what was held slipped out during a simulated move."""
         if self.held is not None:
             if self.robot.held_body() is self.held:
@@ -222,7 +222,7 @@ class PickPlace:
         else:
             self._swing(way[0])
         self._travel(self._above(end, rotation, limits.approach_m), end, rotation, None)
-        self._drop_if_lost()
+        self.check_grasp()
         return True
 
     def _leave(self, rotation: Matrix) -> None:
@@ -241,14 +241,14 @@ class PickPlace:
                 return
             self._carry(here)
         self._travel(start, self._above(start, rotation, self.limits.approach_m), rotation, None)
-        self._drop_if_lost()
+        self.check_grasp()
 
     def _go_home(self) -> None:
         if self.teleport:
             self._carry(self.robot.home_joints)
         else:
             self._swing(self.robot.home_joints)
-            self._drop_if_lost()
+            self.check_grasp()
 
     def _travel(self, start: Vector, end: Vector, rotation: Matrix, count: int | None) -> None:
         """Simulate a straight way of the tool; stop where it presses or leaves the reach.

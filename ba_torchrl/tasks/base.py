@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand
+from ba_torchrl.actions import GripperCommand, PickPlaceCommand
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.bodies import Body, Vector
 from ba_torchrl.sim.robots.base import Pose, Robot
@@ -119,6 +119,8 @@ class Task(ABC):
     """How many objects there are by default."""
     num_objects_range: ClassVar[tuple[int, int]] = (1, 1)
     """How many there may be."""
+    one_step: ClassVar[bool] = False
+    """Whether the step limit is the task: reaching it terminates the episode."""
     fits_tray: ClassVar[bool] = False
     """Whether everything has room in the tray of `close_loop_tray`."""
     parameters: ClassVar[frozenset[str]] = frozenset()
@@ -146,7 +148,7 @@ class Task(ABC):
         """Whether the goal holds in the scene as it is now."""
 
     @abstractmethod
-    def expert_command(self) -> GripperCommand:
+    def expert_command(self) -> GripperCommand | PickPlaceCommand:
         """Return what the expert does now; a function of the scene, from any state."""
 
     @property

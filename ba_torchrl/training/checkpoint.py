@@ -134,7 +134,7 @@ def build_algorithm(config: ExperimentConfig) -> Algorithm:
         pixels = env.observation_spec[keys.PIXELS]
         problem = Problem(
             image_size=pixels.shape[-1],
-            action_sequence=env.config.action_sequence,
+            action_sequence=env.action_sequence,
             max_depth_m=float(pixels.space.high.max()),
             total_updates=config.total_updates,
             seed=config.seed,

@@ -29,7 +29,7 @@ def make():
 
 def act(env, state, **components):
     """Take one step with the named components, the others zero and the gripper open."""
-    sequence = env.config.action_sequence
+    sequence = env.action_sequence
     action = torch.tensor([components.get(c, float(c == "p")) for c in sequence])
     return env.step(state.clone().set(keys.ACTION, action))[keys.NEXT]
 

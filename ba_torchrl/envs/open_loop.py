@@ -1,0 +1,176 @@
+"""Open-loop control: every action is a whole pick or place, chosen on a heightmap."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torchrl.data import Bounded
+
+from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
+from ba_torchrl.config import ConfigError, EnvConfig
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.base import CONTROLS, SETTLE_STEPS, ManipulationEnv
+from ba_torchrl.envs.scene import Scene
+from ba_torchrl.sim.in_hand import IN_HAND_MODES, PickView
+from ba_torchrl.sim.pick_place import PickPlace, tool_rotation
+from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.world import Physics
+from ba_torchrl.tasks.base import Reach, Task
+
+
+@CONTROLS.register("open_loop")
+class OpenLoopEnv(ManipulationEnv):
+    """A task under open-loop control (paper section 3.2, appendix A.1, G.1).
+
+    An action names a pose; the gripper picks there if it is empty and places there if it holds
+    something. A pick with something in hand and a place without do nothing but count as steps.
+    Without z, the height follows from the heightmap around the target; without the primitive, it
+    follows from what is held. The image is the height above the floor of all that lies in the
+    workspace; neither the arm nor what it holds is in it.
+
+    Raises:
+        ConfigError: the parameters do not fit, or the workspace is not square.
+    """
+
+    default_action_sequence = "pxyr"
+    # half a millimetre of creep in a stack of four, and at rest after three steps
+    physics = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-5)
+
+    def __init__(self, task_id: str, config: EnvConfig) -> None:
+        self._in_hand_kind = IN_HAND_MODES[config.in_hand_mode]()
+        super().__init__(task_id, config)
+
+    def _configure(self) -> None:
+        x, y, _ = self.workspace.x, self.workspace.y, self.workspace.z
+        if not math.isclose(x[1] - x[0], y[1] - y[0], rel_tol=1e-6):
+            raise ConfigError("workspace: an open-loop task needs a square one, x as wide as y")
+        self.actions = OpenLoopActions(
+            self.action_sequence,
+            (self.workspace.x, self.workspace.y, self.workspace.z),
+            half_rotation=self.config.half_rotation is not False,
+        )
+
+    @property
+    def reach(self) -> Reach:
+        """What one action covers: everything, but turns only if there is an angle."""
+        return Reach(math.inf, math.pi if "r" in self.action_sequence else 0.0)
+
+    @property
+    def pixel_m(self) -> float:
+        """Width of a pixel."""
+        return self.workspace.width / self.config.obs_size
+
+    # -- for the base class ------------------------------------------------------------------
+
+    def _make_motion(self, robot: Robot, task: Task) -> PickPlace:
+        return PickPlace(
+            robot,
+            teleport=self.config.fast_mode,
+            opening=task.finger_opening,
+            top_down=self.config.top_down_approach,
+        )
+
+    def _make_action_spec(self) -> Bounded:
+        low, high = zip(*self.actions.ranges, strict=True)
+        return Bounded(
+            torch.tensor(low), torch.tensor(high), shape=(self.actions.size,), dtype=torch.float32
+        )
+
+    def _image_specs(self) -> dict[str, Bounded]:
+        size, patch = self.config.obs_size, self.config.in_hand_size
+        channels = self._in_hand_kind.channels
+        most = patch if channels == 3 else self.workspace.z[1]
+        return {
+            keys.PIXELS: Bounded(
+                0.0, self.workspace.z[1], shape=(1, size, size), dtype=torch.float32
+            ),
+            keys.IN_HAND: Bounded(0.0, most, shape=(channels, patch, patch), dtype=torch.float32),
+        }
+
+    def _place_robot(self, scene: Scene) -> None:
+        scene.motion.reset()
+        self._memory = {}
+
+    def _act(self, scene: Scene, action: np.ndarray) -> None:
+        command = self.actions.decode(action)
+        motion = scene.motion
+        holding = motion.held is not None
+        primitive = command.primitive
+        if primitive is None:
+            primitive = PLACE if holding else PICK
+        if primitive == PICK and not holding:
+            before = self._heightmap(scene)
+            position = self._position(scene, command, before, primitive)
+            body = motion.pick(position, tool_rotation(*command[3:]))
+            scene.world.settle(max_steps=SETTLE_STEPS)
+            if body is not None:
+                self._memory = {"in_hand": self._draw_in_hand(scene, before, position, command)}
+        elif primitive == PLACE and holding:
+            position = self._position(scene, command, self._heightmap(scene), primitive)
+            motion.place(position, tool_rotation(*command[3:]))
+            scene.world.settle(max_steps=SETTLE_STEPS)
+        motion.check_grasp()
+        if motion.held is None:
+            self._memory = {}
+
+    def _images(self, scene: Scene) -> dict[str, np.ndarray]:
+        size = self.config.in_hand_size
+        empty = np.zeros((self._in_hand_kind.channels, size, size))
+        heights = np.clip(self._heightmap(scene), 0.0, self.workspace.z[1])
+        return {keys.PIXELS: heights[None], keys.IN_HAND: self._memory.get("in_hand", empty)}
+
+    def _is_holding(self, scene: Scene) -> bool:
+        return scene.motion.held is not None
+
+    def _expert_action(self, scene: Scene) -> np.ndarray:
+        return self.actions.encode(scene.task.expert_command())
+
+    # ----------------------------------------------------------------------------------------
+
+    def _heightmap(self, scene: Scene) -> np.ndarray:
+        return scene.camera.heightmap(
+            self.workspace.center, self.workspace.width, self.config.obs_size
+        )
+
+    def _pixel_of(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Return the row and column of a point; pixel (i, j) has its centre at i + 1/2, j + 1/2."""
+        return (
+            (x_m - self.workspace.x[0]) / self.pixel_m,
+            (y_m - self.workspace.y[0]) / self.pixel_m,
+        )
+
+    def _position(
+        self, scene: Scene, command: PickPlaceCommand, heights: np.ndarray, primitive: int
+    ) -> tuple[float, float, float]:
+        """Return where the tool goes, the height taken from the image if it is left open."""
+        if command.z_m is not None:
+            return command.x_m, command.y_m, command.z_m
+        task, floor = scene.task, self.workspace.z[0]
+        half = task.window_m(scene.motion.held) / self.pixel_m
+        rows, columns = (
+            slice(max(math.ceil(c - half - 0.5), 0), max(math.floor(c + half + 0.5), 1))
+            for c in self._pixel_of(command.x_m, command.y_m)
+        )
+        window = heights[rows, columns]
+        top = float(window.max()) - floor if window.size else 0.0
+        height = task.pick_height_m(top) if primitive == PICK else task.place_height_m(top)
+        return command.x_m, command.y_m, min(height + floor, self.workspace.z[1])
+
+    def _draw_in_hand(
+        self,
+        scene: Scene,
+        before: np.ndarray,
+        position: tuple[float, float, float],
+        command: PickPlaceCommand,
+    ) -> np.ndarray:
+        view = PickView(
+            before,
+            self._heightmap(scene),
+            self._pixel_of(position[0], position[1]),
+            self.pixel_m,
+            position[2],
+            *command[3:],
+        )
+        return self._in_hand_kind.draw(view, self.config.in_hand_size)
