@@ -35,6 +35,11 @@ class PickPlaceCommand(NamedTuple):
     ry_rad: float = 0.0
     rx_rad: float = 0.0
 
+    @property
+    def angles_rad(self) -> tuple[float, float, float]:
+        """The angles rz, ry and rx."""
+        return self.rz_rad, self.ry_rad, self.rx_rad
+
 
 PICK, PLACE = 0, 1
 
@@ -172,21 +177,20 @@ class OpenLoopActions:
     def decode(self, action: np.ndarray) -> PickPlaceCommand:
         """Return the command of ``action`` [size]; positions are clipped, angles wrapped.
 
-        Raises:
-            InvalidActionError: the primitive is neither 0 nor 1.
+        A primitive between 0 and 1 is rounded.
         """
         value = dict(
             zip(self.components, np.asarray(action, dtype=np.float64).tolist(), strict=True)
         )
-        primitive = value.get("p")
-        if primitive is not None and primitive not in (PICK, PLACE):
-            raise InvalidActionError(f"the primitive is 0 (pick) or 1 (place), not {primitive:g}")
+        primitive = None
+        if "p" in value:
+            primitive = PICK if value["p"] < 0.5 else PLACE
         x, y, z = (
             min(max(value[name], low), high) if name in value else None
             for name, (low, high) in zip("xyz", self.bounds_m, strict=True)
         )
         rz, ry, rx = self.wrap(*(value.get(name, 0.0) for name in ("rz", "ry", "rx")))
-        return PickPlaceCommand(None if primitive is None else int(primitive), x, y, z, rz, ry, rx)
+        return PickPlaceCommand(primitive, x, y, z, rz, ry, rx)
 
     def encode(self, command: PickPlaceCommand) -> np.ndarray:
         """Return the action [size] float32 of a command; what the sequence lacks is dropped.

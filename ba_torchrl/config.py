@@ -128,7 +128,8 @@ class EnvConfig(StrictModel):
     asset_root: str | None = Field(default=None, json_schema_extra=_SOME_TASKS)
     """Some tasks: folder of a set of objects that does not ship with the package."""
     floor_color: Rgb | None = None
-    """Colour of the floor in pictures, each component from 0 to 1; None is a chequered blue."""
+    """Colour of the floor in pictures, each component from 0 to 1; light by default, and in
+    PyBullet's window and `rgb` a chequered blue."""
     workspace_color: Rgb | None = None
     """Colour of the workspace's floor area in pictures; None leaves it unmarked."""
     physics_mode: Literal["fast", "slow", "custom"] = "fast"

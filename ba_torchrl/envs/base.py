@@ -17,10 +17,18 @@ from torchrl.envs import EnvBase
 from ba_torchrl.actions import InvalidActionError
 from ba_torchrl.config import ConfigError, EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.scene import Motion, Scene, SceneState, build_scene, check_task_parameters
+from ba_torchrl.envs.observations import ExtraObservations
+from ba_torchrl.envs.scene import (
+    Motion,
+    Scene,
+    SceneState,
+    build_scene,
+    check_reach,
+    check_task_parameters,
+)
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.cameras import render_rgb
-from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
+from ba_torchrl.sim.pictures import LIGHT_FLOOR, render_rgb
+from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.world import Physics, SimulationError
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, PlacementError, Reach, Task, Workspace
 
@@ -80,6 +88,7 @@ class ManipulationEnv(EnvBase):
         self._scenes: dict[float, Scene] = {}
         self._scene: Scene | None = None
         self._observation: dict[str, torch.Tensor] = {}
+        self._extras = ExtraObservations(config, self.workspace)
         self._memory: dict[str, Any] = {}
         """What an observation shows of earlier steps; replaced, never changed in place."""
         self._ends: dict[str, bool] = {}
@@ -113,6 +122,11 @@ class ManipulationEnv(EnvBase):
     @abstractmethod
     def reach(self) -> Reach:
         """What one action covers."""
+
+    @property
+    @abstractmethod
+    def _heights_to_reach(self) -> tuple[float, ...]:
+        """Heights of the tool that the arm must reach above every corner of the workspace."""
 
     @abstractmethod
     def _make_action_spec(self) -> Bounded:
@@ -157,7 +171,9 @@ class ManipulationEnv(EnvBase):
 
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return a picture of the scene for people, [height, width, 3] uint8."""
-        return render_rgb(self.scene.world, (*self.workspace.center, 0.12), width, height)
+        x, y = self.workspace.center
+        floor = self.config.floor_color or LIGHT_FLOOR
+        return render_rgb(self.scene.world, (x - 0.06, y, 0.2), width, height, floor_rgb=floor)
 
     def get_state(self) -> EnvState:
         """Return the whole state, to come back to with `set_state`.
@@ -267,12 +283,8 @@ class ManipulationEnv(EnvBase):
             return Binary(n=1, shape=(1,), dtype=torch.bool)
 
         action = self._make_action_spec()
-        if self.config.obs_type == "vec":
-            task = self._scene_for(float(self._scales[-1])).task
-            length = 1 + 4 * (1 + len(task.landmarks))
-            seen = {keys.OBSERVATION: Unbounded(shape=(length,), dtype=torch.float32)}
-        else:
-            seen = self._image_specs()
+        seen = self._image_specs() if self.config.obs_type == "pixel" else {}
+        seen |= self._extras.specs(self._scene_for(float(self._scales[-1])))
         observation = {
             **seen,
             keys.HOLDING: flag(),
@@ -292,15 +304,7 @@ class ManipulationEnv(EnvBase):
     def _try_out(self) -> None:
         """Fail now, not in a worker, if the objects or the robot do not fit the workspace."""
         scene = self._scene_for(float(self._scales[-1]))
-        z_low, z_high = self.workspace.z
-        for x in self.workspace.x:
-            for y in self.workspace.y:
-                for z in (z_low, z_high):
-                    if scene.robot.inverse_kinematics((x, y, z), downward(0.0)) is None:
-                        raise ConfigError(
-                            f"workspace: {self.config.robot} cannot reach its corner "
-                            f"({x:g}, {y:g}, {z:g}) m with the gripper pointing down"
-                        )
+        check_reach(scene.robot, self.workspace, self._heights_to_reach)
         try:
             scene.task.randomise(np.random.default_rng(0))
         except PlacementError as error:
@@ -331,6 +335,7 @@ class ManipulationEnv(EnvBase):
         """Return a scene at the start of an episode: with new objects, or the last one's."""
         scene = self._scene
         if scene is not None and not afresh and scene.task.continues:
+            scene.task.resume()
             self._place_robot(scene)
             scene.world.settle(max_steps=SETTLE_STEPS)
             if scene.task.is_valid() and not scene.task.is_goal():
@@ -361,26 +366,13 @@ class ManipulationEnv(EnvBase):
 
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
         observation = {keys.HOLDING: torch.tensor([self._is_holding(scene)])}
-        if self.config.obs_type == "vec":
-            observation[keys.OBSERVATION] = torch.from_numpy(self._vector(scene))
-        else:
+        if self.config.obs_type == "pixel":
             for key, image in self._images(scene).items():
                 observation[key] = torch.from_numpy(image.astype(np.float32))
+        observation |= self._extras.observe(scene)
         if self.config.expert:
             observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
         return observation
-
-    def _vector(self, scene: Scene) -> np.ndarray:
-        """Return the poses of gripper and landmarks, scaled to [-1, 1] by the workspace."""
-        axes = (self.workspace.x, self.workspace.y, self.workspace.z)
-        values = [2 * scene.robot.opening() - 1]
-        for position, yaw in (scene.robot.tool_pose(), *scene.task.landmarks):
-            values += [
-                (2 * value - low - high) / (high - low)
-                for value, (low, high) in zip(position, axes, strict=True)
-            ]
-            values.append(yaw / math.pi)
-        return np.array(values, dtype=np.float32)
 
     def _tensordict(
         self,

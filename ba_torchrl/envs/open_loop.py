@@ -14,7 +14,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, SETTLE_STEPS, ManipulationEnv
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.in_hand import IN_HAND_MODES, PickView
-from ba_torchrl.sim.pick_place import PickPlace, tool_rotation
+from ba_torchrl.sim.pick_place import PickPlace, PickPlaceLimits, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import Physics
 from ba_torchrl.tasks.base import Reach, Task
@@ -72,6 +72,11 @@ class OpenLoopEnv(ManipulationEnv):
             top_down=self.config.top_down_approach,
         )
 
+    @property
+    def _heights_to_reach(self) -> tuple[float, ...]:
+        floor = self.workspace.z[0]
+        return floor + 0.01, floor + PickPlaceLimits().approach_m + 0.01
+
     def _make_action_spec(self) -> Bounded:
         low, high = zip(*self.actions.ranges, strict=True)
         return Bounded(
@@ -103,13 +108,13 @@ class OpenLoopEnv(ManipulationEnv):
         if primitive == PICK and not holding:
             before = self._heightmap(scene)
             position = self._position(scene, command, before, primitive)
-            body = motion.pick(position, tool_rotation(*command[3:]))
+            body = motion.pick(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
             if body is not None:
                 self._memory = {"in_hand": self._draw_in_hand(scene, before, position, command)}
         elif primitive == PLACE and holding:
             position = self._position(scene, command, self._heightmap(scene), primitive)
-            motion.place(position, tool_rotation(*command[3:]))
+            motion.place(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
         motion.check_grasp()
         if motion.held is None:
@@ -171,6 +176,6 @@ class OpenLoopEnv(ManipulationEnv):
             self._pixel_of(position[0], position[1]),
             self.pixel_m,
             position[2],
-            *command[3:],
+            *command.angles_rad,
         )
         return self._in_hand_kind.draw(view, self.config.in_hand_size)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 from ba_torchrl.config import CUSTOM_PHYSICS, ConfigError, EnvConfig
 from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.cameras import HeightCamera
-from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SimulationError, Snapshot, World
 from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace
+from ba_torchrl.tasks.tray import add_tray
 
 MARK_M = 1e-3
 """Thickness of the coloured sheet that marks the workspace."""
@@ -97,8 +98,6 @@ def build_scene(
     world = _empty_world(config, workspace, physics)
     surface_z_m = 0.0
     if config.close_loop_tray:
-        from ba_torchrl.tasks.tray import add_tray
-
         surface_z_m = add_tray(world, workspace.center, workspace.width)
     task = task_class(
         TaskSettings(
@@ -138,6 +137,23 @@ def check_task_parameters(task_id: str, config: EnvConfig) -> None:
         raise ConfigError(
             f"close_loop_tray: the tray has no room for {task_id}; it is for {fitting}"
         )
+
+
+def check_reach(robot: Robot, workspace: Workspace, heights_m: Sequence[float]) -> None:
+    """Check that a robot reaches above every corner of the workspace.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    for x in workspace.x:
+        for y in workspace.y:
+            for z in heights_m:
+                if robot.inverse_kinematics((x, y, z), downward(0.0)) is None:
+                    name = next(name for name in ROBOTS if ROBOTS[name] is type(robot))
+                    raise ConfigError(
+                        f"workspace: {name} cannot reach its corner ({x:g}, {y:g}, {z:g}) m with "
+                        "the gripper pointing down"
+                    )
 
 
 def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> World:

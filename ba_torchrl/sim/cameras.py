@@ -1,96 +1,228 @@
-"""Orthographic height images from body poses, and RGB pictures for people.
+"""Depth images, height images and point clouds from body poses.
 
-The height image is rasterised here, from the triangles of the bodies' meshes. Compared on 128 x 128
-pixels with four cubes (`recipes/speed.py` prints it): PyBullet's TinyRenderer takes milliseconds,
-cannot be asked to leave out the arm cheaply, shifts edges by half a pixel and its orthographic
-depth does not read linearly; a NumPy z-buffer is correct and takes tenths of a millisecond; the
-compiled one below gives the same numbers in hundredths.
+All are rasterised here, from the triangles of the bodies' meshes. Compared on 128 x 128 pixels with
+four cubes (`recipes/speed.py` prints it): PyBullet's TinyRenderer takes milliseconds, cannot be
+asked to leave out the arm cheaply, shifts edges by half a pixel and its orthographic depth does not
+read linearly; a NumPy z-buffer is correct and takes tenths of a millisecond; the compiled one of
+`ba_torchrl.sim.raster` gives the same numbers in hundredths.
+
+All depth is linear and in metres, along the optical axis. Rows follow +x as far as the direction
+of view allows, columns +y; a pixel stands for its centre.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
-import numba
 import numpy as np
-import pybullet
 
-from ba_torchrl.sim.bodies import Body, Decal
+from ba_torchrl.sim.bodies import Decal, Quaternion, Shape, Vector
+from ba_torchrl.sim.meshes import Mesh
+from ba_torchrl.sim.pictures import render_rgb as render_rgb
+from ba_torchrl.sim.raster import (
+    floor_depth,
+    lower_depth,
+    paint_square,
+    raise_heights,
+    splat,
+    transform,
+    turn_about,
+    unproject,
+)
 
-if TYPE_CHECKING:
-    from ba_torchrl.sim.world import World
+Range = tuple[float, float]
 
-
-@numba.njit(cache=True)
-def _transform(vertices, owner, poses, out):  # noqa: ANN001, ANN202 -- compiled
-    """Move each vertex by the pose (x, y, z, qx, qy, qz, qw) of its body."""
-    for v in range(vertices.shape[0]):
-        x, y, z, qx, qy, qz, qw = poses[owner[v]]
-        a, b, c = vertices[v]
-        # t = 2 q x v; v' = v + w t + q x t
-        tx, ty, tz = 2 * (qy * c - qz * b), 2 * (qz * a - qx * c), 2 * (qx * b - qy * a)
-        out[v, 0] = x + a + qw * tx + qy * tz - qz * ty
-        out[v, 1] = y + b + qw * ty + qz * tx - qx * tz
-        out[v, 2] = z + c + qw * tz + qx * ty - qy * tx
-
-
-@numba.njit(cache=True)
-def _rasterise(vertices, faces, x0, y0, pixel, image):  # noqa: ANN001, ANN202 -- compiled
-    """Raise ``image`` to the height of the upward faces; pixels are sampled at their centres."""
-    rows, cols = image.shape
-    for f in range(faces.shape[0]):
-        a, b, c = faces[f]
-        ax, ay = (vertices[a, 0] - x0) / pixel - 0.5, (vertices[a, 1] - y0) / pixel - 0.5
-        bx, by = (vertices[b, 0] - x0) / pixel - 0.5, (vertices[b, 1] - y0) / pixel - 0.5
-        cx, cy = (vertices[c, 0] - x0) / pixel - 0.5, (vertices[c, 1] - y0) / pixel - 0.5
-        area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
-        if area <= 1e-12:
-            continue  # faces down or is edge-on
-        i0 = max(0, math.ceil(min(ax, bx, cx)))
-        i1 = min(rows - 1, math.floor(max(ax, bx, cx)))
-        j0 = max(0, math.ceil(min(ay, by, cy)))
-        j1 = min(cols - 1, math.floor(max(ay, by, cy)))
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                u = ((i - ax) * (cy - ay) - (cx - ax) * (j - ay)) / area
-                v = ((bx - ax) * (j - ay) - (i - ax) * (by - ay)) / area
-                if u >= -1e-9 and v >= -1e-9 and u + v <= 1 + 1e-9:
-                    height = (
-                        vertices[a, 2]
-                        + u * (vertices[b, 2] - vertices[a, 2])
-                        + v * (vertices[c, 2] - vertices[a, 2])
-                    )
-                    image[i, j] = max(image[i, j], height)
+NEAR_M = 0.01
+FAR_M = 10.0
+"""Perspective cameras see nothing nearer and nothing farther."""
 
 
-@numba.njit(cache=True)
-def paint_square(
-    image: np.ndarray,
-    center_px: tuple[float, float],
-    half_px: float,
-    yaw_rad: float,
-    value: float,
-) -> None:
-    """Set the pixels whose centres lie in a rotated square.
+class Visible(Protocol):
+    """What a camera needs to know of a body."""
+
+    shape: Shape
+    is_hidden: bool
+
+    @property
+    def pose(self) -> tuple[Vector, Quaternion]:
+        """Position (metres) and orientation (x, y, z, w) of the shape's frame."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A shape at a fixed pose that exists for cameras only."""
+
+    shape: Shape
+    pose: tuple[Vector, Quaternion]
+    is_hidden: bool = False
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A square perspective camera that looks from one point at another.
 
     Args:
-        image: [H, W], changed in place.
-        center_px: row and column of the square's centre; pixel (i, j) has its at (i+1/2, j+1/2).
-        half_px: half the square's edge.
-        yaw_rad: turn from rows towards columns.
-        value: what to write.
+        eye_m: where it is.
+        target_m: what it shows in the middle.
+        fov_rad: angle between opposite edges of the image.
     """
-    reach = half_px * math.sqrt(2)
-    x, y = center_px
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    limit = half_px + 1e-9
-    for i in range(max(0, math.floor(x - reach)), min(image.shape[0], math.ceil(x + reach))):
-        for j in range(max(0, math.floor(y - reach)), min(image.shape[1], math.ceil(y + reach))):
-            di, dj = i + 0.5 - x, j + 0.5 - y
-            if abs(cos * di + sin * dj) <= limit and abs(cos * dj - sin * di) <= limit:
-                image[i, j] = value
+
+    eye_m: Vector
+    target_m: Vector
+    fov_rad: float
+
+    @cached_property
+    def axes(self) -> np.ndarray:
+        """[3, 3]: directions of the rows, of the columns, and of the view."""
+        forward = np.subtract(self.target_m, self.eye_m)
+        forward = forward / np.linalg.norm(forward)
+        # rows follow +x, or lead down if that is where the camera looks
+        hint = np.array([1.0, 0.0, 0.0] if abs(forward[0]) < 0.99 else [0.0, 0.0, -1.0])
+        down = hint - (hint @ forward) * forward
+        down /= np.linalg.norm(down)
+        return np.stack([down, np.cross(down, forward), forward])
+
+    def focal_px(self, pixels: int) -> float:
+        """Return the focal length in pixels of an image of this size."""
+        return pixels / 2 / math.tan(self.fov_rad / 2)
+
+    def heights_m(self, depth: np.ndarray) -> np.ndarray:
+        """Return the height above the floor of what an image [N, N] of depths shows."""
+        pixels = len(depth)
+        offsets = (np.arange(pixels) + 0.5 - pixels / 2) / self.focal_px(pixels)
+        fall = self.axes[2, 2] + offsets[:, None] * self.axes[0, 2] + offsets * self.axes[1, 2]
+        return self.eye_m[2] + depth * fall
+
+    def plane_depth_m(self, z_m: float) -> Range:
+        """Return the least and greatest depth at which the image shows a horizontal plane.
+
+        Args:
+            z_m: height of the plane.
+        """
+        edge = math.tan(self.fov_rad / 2)
+        falls = [
+            -(self.axes[2, 2] + p * self.axes[0, 2] + q * self.axes[1, 2])
+            for p in (-edge, edge)
+            for q in (-edge, edge)
+        ]
+        above = self.eye_m[2] - z_m
+        low = above / max(falls) if max(falls) > 0 else FAR_M
+        high = above / min(falls) if min(falls) > 0 else FAR_M
+        return max(low, NEAR_M), min(max(high, NEAR_M), FAR_M)
+
+
+def oblique_lens(center_m: tuple[float, float]) -> Lens:
+    """Return the camera opposite the robot, 0.81 m from the workspace's centre, 47 degrees up."""
+    x, y = center_m
+    return Lens((x + 0.55, y, 0.6), (x, y, 0.0), math.radians(40))
+
+
+def side_lenses(center_m: tuple[float, float], width_m: float) -> tuple[Lens, Lens]:
+    """Return two cameras on either side, 0.5 m along y and 1 m up, that show a square of the floor.
+
+    Args:
+        center_m: middle of the square.
+        width_m: its edge.
+    """
+    x, y = center_m
+    # the corners of the near edge are the widest apart
+    below, aside = 1.0, 0.5 - width_m / 2
+    distance = (below + 0.5 * aside) / math.hypot(1.0, 0.5)
+    across = abs(aside - 0.5 * below) / math.hypot(1.0, 0.5)
+    edge = max(width_m / 2, across) / max(distance, 0.1)
+    fov = 2 * math.atan(edge * 1.02)
+    return tuple(Lens((x, y + side, 1.0), (x, y, 0.0), fov) for side in (-0.5, 0.5))
+
+
+class Surface:
+    """The surface of a set of bodies, wherever they are now; hidden ones do not count.
+
+    Args:
+        bodies: all that may become visible.
+    """
+
+    def __init__(self, bodies: Iterable[Visible]) -> None:
+        bodies = list(bodies)
+        self._decals = [
+            body for body in bodies if isinstance(body.shape, Decal) and body.shape.depth_m
+        ]
+        self._bodies = [body for body in bodies if not isinstance(body.shape, Decal)]
+        self._meshes: list[Mesh | None] = [None] * len(self._bodies)
+        self._shown: list[int] | None = None
+        self._vertices = self._owner = self._faces = self._poses = self._moved = np.empty(0)
+
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return vertices [V, 3] in metres and faces [F, 3]; the next call overwrites them."""
+        shown = [n for n, body in enumerate(self._bodies) if not body.is_hidden]
+        if shown != self._shown:
+            self._collect(shown)
+        for row, n in zip(self._poses, shown, strict=True):
+            row[:3], row[3:] = self._bodies[n].pose
+        transform(self._vertices, self._owner, self._poses, self._moved)
+        return self._moved, self._faces
+
+    def dips(self) -> np.ndarray:
+        """Return the dips that decals make: x, y, half edge, cos and sin of yaw, depth; [D, 6]."""
+        rows = []
+        for decal in self._decals:
+            if not decal.is_hidden:
+                (x, y, _), turn = decal.pose
+                yaw = _yaw(turn)
+                half, depth = decal.shape.size_m[0] / 2, decal.shape.depth_m
+                rows.append((x, y, half, math.cos(yaw), math.sin(yaw), depth))
+        return np.array(rows).reshape(-1, 6)
+
+    def paint_dips(
+        self, image: np.ndarray, corner_m: tuple[float, float], pixel_m: float, yaw_rad: float
+    ) -> None:
+        """Write the dips into a height image seen from straight above.
+
+        Args:
+            image: [H, W], changed in place.
+            corner_m: x and y of its first pixel's outer corner.
+            pixel_m: edge of a pixel.
+            yaw_rad: turn of the image about its centre.
+        """
+        reach_x, reach_y = (size * pixel_m / 2 for size in image.shape)
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        for decal in self._decals:
+            if decal.is_hidden:
+                continue
+            (x, y, _), turn = decal.pose
+            dx, dy = x - corner_m[0], y - corner_m[1]
+            if yaw_rad:
+                dx, dy = dx - reach_x, dy - reach_y
+                dx, dy = reach_x + cos * dx + sin * dy, reach_y + cos * dy - sin * dx
+            paint_square(
+                image,
+                (dx / pixel_m, dy / pixel_m),
+                decal.shape.size_m[0] / 2 / pixel_m,
+                _yaw(turn) - yaw_rad,
+                -decal.shape.depth_m,
+            )
+
+    def _collect(self, shown: list[int]) -> None:
+        """Gather the meshes of these bodies into one."""
+        for n in shown:
+            if self._meshes[n] is None:
+                self._meshes[n] = self._bodies[n].shape.mesh()
+        meshes = [self._meshes[n] for n in shown]
+        starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+        self._owner = np.repeat(np.arange(len(meshes)), np.diff(starts))
+        self._vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)])
+        self._faces = np.concatenate(
+            [
+                np.empty((0, 3), dtype=np.int64),
+                *(mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)),
+            ]
+        )
+        self._poses = np.empty((len(meshes), 7))
+        self._moved = np.empty_like(self._vertices)
+        self._shown = shown
 
 
 class HeightCamera:
@@ -102,26 +234,19 @@ class HeightCamera:
         bodies: what the camera sees besides the floor (height 0).
     """
 
-    def __init__(self, bodies: Sequence[Body]) -> None:
-        self._decals = [body for body in bodies if isinstance(body.shape, Decal)]
-        self._bodies = [body for body in bodies if not isinstance(body.shape, Decal)]
-        meshes = [body.shape.mesh() for body in self._bodies]
-        starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-        self._vertices = np.concatenate([mesh.vertices for mesh in meshes])
-        self._owner = np.repeat(np.arange(len(meshes)), np.diff(starts))
-        self._faces = np.concatenate(
-            [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-        )
-        self._poses = np.empty((len(meshes), 7))
-        self._moved = np.empty_like(self._vertices)
+    def __init__(self, bodies: Sequence[Visible]) -> None:
+        self.surface = Surface(bodies)
 
-    def heightmap(self, center_m: tuple[float, float], side_m: float, pixels: int) -> np.ndarray:
+    def heightmap(
+        self, center_m: tuple[float, float], side_m: float, pixels: int, yaw_rad: float = 0.0
+    ) -> np.ndarray:
         """Return the height of what is seen.
 
         Args:
             center_m: x and y of the image's centre.
             side_m: width of the image.
             pixels: number of rows and columns.
+            yaw_rad: turn of the camera: its rows run along (cos, sin) of this angle.
 
         Returns:
             [pixels, pixels] float64, metres above the floor.
@@ -129,57 +254,139 @@ class HeightCamera:
         image = np.zeros((pixels, pixels))
         pixel = side_m / pixels
         x0, y0 = center_m[0] - side_m / 2, center_m[1] - side_m / 2
-        for decal in self._decals:
-            (x, y, _), _ = decal.pose
-            paint_square(
-                image,
-                ((x - x0) / pixel, (y - y0) / pixel),
-                decal.shape.size_m[0] / 2 / pixel,
-                decal.yaw_rad,
-                -decal.shape.depth_m,
-            )
-        for row, body in zip(self._poses, self._bodies, strict=True):
-            row[:3], row[3:] = body.pose
-        _transform(self._vertices, self._owner, self._poses, self._moved)
-        _rasterise(self._moved, self._faces, x0, y0, pixel, image)
+        self.surface.paint_dips(image, (x0, y0), pixel, yaw_rad)
+        vertices, faces = self.surface.triangles()
+        if yaw_rad:
+            turn_about(vertices, float(center_m[0]), float(center_m[1]), -float(yaw_rad))
+        raise_heights(vertices, faces, x0, y0, pixel, image)
         return image
 
 
-def render_rgb(
-    world: World,
-    target_m: tuple[float, float, float],
-    width: int = 480,
-    height: int = 360,
-    distance_m: float = 0.72,
-    yaw_deg: float = 60.0,
-    pitch_deg: float = -24.0,
-) -> np.ndarray:
-    """Return a picture of the whole scene, arm included, for people to look at.
+def depth_image(surfaces: Sequence[Surface], lens: Lens, pixels: int) -> np.ndarray:
+    """Return the depth of surfaces and floor in perspective.
+
+    Through a dip of the floor one sees a floor that much lower.
 
     Args:
-        world: what to draw.
-        target_m: the point in the picture's centre.
-        width: pixels across.
-        height: pixels down.
-        distance_m: from the target to the camera.
-        yaw_deg: camera's turn about z.
-        pitch_deg: camera's pitch; negative looks down.
+        surfaces: what the camera sees besides the floor.
+        lens: the camera.
+        pixels: number of rows and columns.
 
     Returns:
-        [height, width, 3] uint8.
+        [pixels, pixels] float64, metres along the optical axis, at most `FAR_M`.
     """
-    view = pybullet.computeViewMatrixFromYawPitchRoll(
-        target_m, distance_m, yaw_deg, pitch_deg, 0, 2
+    dips = _dips(surfaces)
+    return _depth(surfaces, lens, pixels, dips)
+
+
+def _dips(surfaces: Sequence[Surface]) -> np.ndarray:
+    return np.concatenate([np.empty((0, 6)), *(surface.dips() for surface in surfaces)])
+
+
+def _depth(surfaces: Sequence[Surface], lens: Lens, pixels: int, dips: np.ndarray) -> np.ndarray:
+    image = np.empty((pixels, pixels))
+    eye, focal = np.array(lens.eye_m, dtype=float), lens.focal_px(pixels)
+    floor_depth(eye, lens.axes, focal, FAR_M, dips, image)
+    for surface in surfaces:
+        vertices, faces = surface.triangles()
+        lower_depth(vertices, faces, eye, lens.axes, focal, NEAR_M, image)
+    return image
+
+
+def visible_points(
+    surfaces: Sequence[Surface],
+    lenses: Sequence[Lens],
+    pixels: int,
+    bounds_m: tuple[Range, Range, Range],
+) -> np.ndarray:
+    """Return the points of surfaces and floor that cameras see, one for each of their pixels.
+
+    Points of the floor inside a dip are sunk straight down by its depth.
+
+    Args:
+        surfaces: what the cameras see besides the floor.
+        lenses: the cameras.
+        pixels: rows and columns of each.
+        bounds_m: ranges of x, y and z that points must lie in.
+
+    Returns:
+        [N, 3] float64, metres; camera by camera and row by row.
+    """
+    dips = _dips(surfaces)
+    low, high = np.array(bounds_m, dtype=float).T.copy()
+    points = np.empty((len(lenses) * pixels * pixels, 3))
+    count = 0
+    for lens in lenses:
+        depth = _depth(surfaces, lens, pixels, np.empty((0, 6)))
+        eye = np.array(lens.eye_m, dtype=float)
+        count = unproject(
+            depth, eye, lens.axes, lens.focal_px(pixels), dips, low, high, points, count
+        )
+    return points[:count]
+
+
+def point_cloud(
+    surfaces: Sequence[Surface],
+    lenses: Sequence[Lens],
+    count: int,
+    bounds_m: tuple[Range, Range, Range],
+    rng: np.random.Generator | None = None,
+) -> np.ndarray:
+    """Return a given number of the points that cameras see, floor included.
+
+    They are drawn without replacement; where fewer are seen than asked for, all of them are there
+    and some repeat. Without a generator the draw is always the same, so that the cloud follows
+    from the scene alone.
+
+    Args:
+        surfaces: what the cameras see besides the floor.
+        lenses: the cameras, such as `side_lenses`.
+        count: number of points.
+        bounds_m: ranges of x, y and z; what is below the range of z counts as well, such as the
+            floor of a workspace that starts above it.
+        rng: draws the points; None stands for a fixed seed.
+
+    Returns:
+        [count, 3] float32, metres.
+
+    Raises:
+        ValueError: the cameras see nothing inside the bounds.
+    """
+    pixels = min(max(math.ceil(math.sqrt(2 * count)), 128), 512)
+    x, y, z = bounds_m
+    points = visible_points(surfaces, lenses, pixels, (x, y, (-math.inf, z[1])))
+    seen = len(points)
+    if not seen:
+        raise ValueError(f"the cameras see nothing inside {bounds_m} m")
+    rng = np.random.default_rng(0) if rng is None else rng
+    whole, rest = divmod(count, seen)
+    chosen = np.concatenate(
+        [np.tile(np.arange(seen), whole), rng.choice(seen, rest, replace=False, shuffle=False)]
     )
-    projection = pybullet.computeProjectionMatrixFOV(50, width / height, 0.05, 5.0)
-    rgba = pybullet.getCameraImage(
-        width,
-        height,
-        view,
-        projection,
-        shadow=1,
-        lightDirection=(0.4, -0.6, 1.5),
-        renderer=pybullet.ER_TINY_RENDERER,
-        physicsClientId=world.client,
-    )[2]
-    return np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3].copy()
+    return points[chosen].astype(np.float32)
+
+
+def splat_heightmap(
+    points: np.ndarray, center_m: tuple[float, float], side_m: float, pixels: int
+) -> np.ndarray:
+    """Return the height of points seen from straight above; gaps take the nearest pixel's.
+
+    Args:
+        points: [N, 3] float64, metres.
+        center_m: x and y of the image's centre.
+        side_m: width of the image.
+        pixels: number of rows and columns.
+
+    Returns:
+        [pixels, pixels] float64, metres above the floor.
+    """
+    image = np.zeros((pixels, pixels))
+    x0, y0 = center_m[0] - side_m / 2, center_m[1] - side_m / 2
+    splat(points, len(points), x0, y0, side_m / pixels, image)
+    return image
+
+
+def _yaw(orientation: Quaternion) -> float:
+    """Return the heading of a frame's x axis in the plane."""
+    x, y, z, w = orientation
+    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -38,8 +38,9 @@ def test_a_state_and_its_actions_have_one_future(task):
             if state["done"]:
                 state = env.reset()
         kept = env.get_state()
-        actions = [torch.rand(5, generator=generator) * 2 - 1 for _ in range(6)]
-        others = [-action for action in actions]
+        low, high = env.action_spec.space.low, env.action_spec.space.high
+        drawn = torch.rand(12, len(low), generator=generator) * (high - low) + low
+        actions, others = drawn[:6], drawn[6:]
         first = play(env, state, actions)
         returned = env.set_state(kept)
         assert (returned == state.select(*returned.keys())).all()
