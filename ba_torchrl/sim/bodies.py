@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import pybullet
 
 from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, write_obj
@@ -61,9 +62,14 @@ class Shape(ABC):
         """Create PyBullet's visual shape and return its id."""
 
     @cached_property
+    def vertices(self) -> np.ndarray:
+        """Vertices of the surface that the depth camera sees, [V, 3] in metres."""
+        return self.mesh().vertices
+
+    @cached_property
     def bounds_m(self) -> tuple[Vector, Vector]:
         """Lower and upper corner of the geometry in its own frame."""
-        vertices = self.mesh().vertices
+        vertices = self.vertices
         return tuple(map(float, vertices.min(axis=0))), tuple(map(float, vertices.max(axis=0)))
 
     @property
@@ -213,6 +219,11 @@ class Body:
         return self.shape.mass_kg == 0
 
     @property
+    def is_free(self) -> bool:
+        """Whether a gripper can carry the body away."""
+        return not self.is_static
+
+    @property
     def pose(self) -> tuple[Vector, Quaternion]:
         """Position of the geometry's frame (metres) and orientation (x, y, z, w)."""
         pose = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
@@ -272,3 +283,45 @@ class Body:
     def bounding_box(self) -> tuple[Vector, Vector]:
         """Return the lower and upper corner of the axis-aligned bounding box."""
         return pybullet.getAABB(self.id, physicsClientId=self.client)
+
+
+def world_vertices(body: Body) -> np.ndarray:
+    """Return the vertices of a body's surface as it lies, [V, 3] in metres."""
+    position, orientation = body.pose
+    turn = np.reshape(pybullet.getMatrixFromQuaternion(orientation), (3, 3))
+    return body.shape.vertices @ turn.T + position
+
+
+def vertical_extent(body: Body) -> tuple[float, float]:
+    """Return the heights of a body's lowest and highest point, as it lies, in metres."""
+    heights = world_vertices(body)[:, 2]
+    return float(heights.min()), float(heights.max())
+
+
+def radius_m(body: Body) -> float:
+    """Return the distance of the farthest point of an upright body from its axis."""
+    low, high = body.shape.bounds_m
+    return math.hypot(*(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True)))
+
+
+def gap_m(other_id: int, body: Body, up_to_m: float = 0.1) -> float:
+    """Return the distance between a body and anything else of its client, as of now.
+
+    Args:
+        other_id: PyBullet's id of a body or robot.
+        body: the body.
+        up_to_m: farther is reported as infinite; negative distances are depths of penetration.
+    """
+    points = pybullet.getClosestPoints(other_id, body.id, up_to_m, physicsClientId=body.client)
+    return min((point[8] for point in points), default=math.inf)
+
+
+def press_n(other_id: int, body: Body) -> float:
+    """Return the force with which something bears on a body from above or below.
+
+    Args:
+        other_id: PyBullet's id of a body or robot.
+        body: the body; the force is that of the last step, in newtons.
+    """
+    points = pybullet.getContactPoints(other_id, body.id, physicsClientId=body.client)
+    return sum(point[9] for point in points if abs(point[7][2]) > 0.6)

@@ -58,3 +58,125 @@ def write_obj(path: Path, parts: Sequence[Mesh]) -> None:
         lines += [f"f {a} {b} {c}" for a, b, c in (faces + start).tolist()]
         start += len(vertices)
     path.write_text("\n".join(lines) + "\n")
+
+
+def gable_mesh(size_m: tuple[float, float, float], eaves_m: float = 0.0) -> Mesh:
+    """Return a prism with a triangular end, its ridge along y; its bounding box is centred.
+
+    Args:
+        size_m: extents along x (across the ridge), y (along it) and z.
+        eaves_m: height of upright sides below the slopes, for fingers to close on.
+    """
+    x, y, z = (extent / 2 for extent in size_m)
+    end = [(-x, -z), (x, -z), (0.0, z)]
+    if eaves_m > 0:
+        end = [(-x, -z), (x, -z), (x, eaves_m - z), (0.0, z), (-x, eaves_m - z)]
+    lying = prism_mesh(end, -y, y)  # its axis along z: turn that to -y
+    corners = lying.vertices
+    return Mesh(np.stack([corners[:, 0], -corners[:, 2], corners[:, 1]], axis=1), lying.faces)
+
+
+def rod_mesh(length_m: float, diameter_m: float, sides: int = 16) -> Mesh:
+    """Return a round rod along y, centred on the origin.
+
+    Args:
+        length_m: from end to end.
+        diameter_m: across the corners of the polygon that stands for the circle.
+        sides: of that polygon.
+    """
+    angles = 2 * np.pi * np.arange(sides) / sides
+    ring = np.stack([np.sin(angles), np.zeros(sides), np.cos(angles)], axis=1) * diameter_m / 2
+    half = np.array([0.0, length_m / 2, 0.0])
+    here, there = np.arange(sides), np.roll(np.arange(sides), -1)
+    faces = [
+        *np.stack([here, there + sides, here + sides], axis=1),
+        *np.stack([here, there, there + sides], axis=1),
+        *np.stack([np.zeros(sides - 2, int), here[2:], here[1:-1]], axis=1),
+        *np.stack([np.zeros(sides - 2, int), here[1:-1], here[2:]], axis=1) + sides,
+    ]
+    return Mesh(np.concatenate([ring - half, ring + half]), np.array(faces, dtype=np.int64))
+
+
+def prism_mesh(corners_m: Sequence[tuple[float, float]], low_m: float, high_m: float) -> Mesh:
+    """Return an upright prism.
+
+    Args:
+        corners_m: x and y of its convex base, counter-clockwise.
+        low_m: height of its lower face.
+        high_m: height of its upper face.
+    """
+    count = len(corners_m)
+    vertices = [(x, y, z) for z in (low_m, high_m) for x, y in corners_m]
+    return Mesh(np.array(vertices, dtype=np.float64), _prism_faces(count))
+
+
+def ring_parts(section_m: Sequence[tuple[float, float]], segments: int) -> list[Mesh]:
+    """Return a ring about z as convex wedges.
+
+    Args:
+        section_m: distance from the axis and height of the corners of its convex cross-section,
+            counter-clockwise with the distance to the right and the height upwards.
+        segments: how many wedges.
+    """
+    angles = np.arange(segments + 1) * (2 * np.pi / segments)
+    ends = [
+        np.array([(r * np.cos(angle), r * np.sin(angle), z) for r, z in section_m])
+        for angle in angles
+    ]
+    faces = _prism_faces(len(section_m))[:, ::-1]  # sweeping the section goes into the page
+    return [Mesh(np.concatenate(pair), faces) for pair in zip(ends[:-1], ends[1:], strict=True)]
+
+
+def bowl_parts(
+    radius_m: float,
+    height_m: float,
+    *,
+    foot_radius_m: float,
+    floor_m: float,
+    wall_m: float,
+    segments: int = 16,
+) -> list[Mesh]:
+    """Return an open bowl as convex parts, its bounding box centred on the origin.
+
+    A wall that flares out stands on a round foot, whose upper face is the bowl's floor: only one
+    part touches the ground, instead of one for each segment, which keeps physics steps cheap.
+
+    Args:
+        radius_m: of the rim, outside.
+        height_m: of the rim.
+        foot_radius_m: of the foot.
+        floor_m: height of the foot.
+        wall_m: thickness of the wall, measured horizontally.
+        segments: sides of the polygons that stand for circles.
+    """
+    inner = foot_radius_m - wall_m / 2
+    wall = [
+        (inner, floor_m),
+        (inner + wall_m, floor_m),
+        (radius_m, height_m),
+        (radius_m - wall_m, height_m),
+    ]
+    angles = np.arange(segments) * (2 * np.pi / segments)
+    circle = [(foot_radius_m * np.cos(a), foot_radius_m * np.sin(a)) for a in angles]
+    parts = [prism_mesh(circle, 0.0, floor_m), *ring_parts(wall, segments)]
+    return [moved(part, (0.0, 0.0, -height_m / 2)) for part in parts]
+
+
+def centroid(parts: Sequence[Mesh]) -> tuple[float, float, float]:
+    """Return the centre of mass of closed meshes of one density that do not overlap."""
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in parts])  # [F, 3 corners, 3]
+    # signed tetrahedra between the origin and each triangle
+    volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    center = (volumes[:, None] * corners.sum(axis=1) / 4).sum(axis=0) / volumes.sum()
+    return tuple(center.tolist())
+
+
+def _prism_faces(count: int) -> np.ndarray:
+    """Return the triangles between two congruent polygons, the second above the first."""
+    caps = [(0, i + 1, i) for i in range(1, count - 1)]
+    caps += [(count, count + i, count + i + 1) for i in range(1, count - 1)]
+    sides = []
+    for i in range(count):
+        j = (i + 1) % count
+        sides += [(i, j, count + j), (i, count + j, count + i)]
+    return np.array(caps + sides, dtype=np.int64)

@@ -45,6 +45,8 @@ class PickPlaceLimits:
     """Height above its place from which an object is lowered."""
     lower_steps: int = 2
     release_steps: int = 2
+    regrasp_steps: int = 5
+    """Steps after which a body that is not squeezed is no longer held."""
     max_press_n: float = 40.0
     """A simulated approach stops when it meets this force."""
 
@@ -186,12 +188,19 @@ class PickPlace:
             )
 
     def check_grasp(self) -> None:
-        """Take note if what was held slipped out during a simulated move."""
-        if self.held is not None:
+        """Take note if what was held slipped out.
+
+        Contacts need a step or two to be found again where body and hand were put; only a body
+        that stays lost is.
+        """
+        if self.held is None:
+            return
+        for _ in range(self.limits.regrasp_steps):
             if self.robot.held_body() is self.held:
                 self._remember_grasp()
-            else:
-                self._release()
+                return
+            self.world.step()
+        self._release()
 
     # -- ways --------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from typing import Self
 import pybullet
 import pybullet_data
 
+from ba_torchrl.sim.articulated import Articulated, Rail
 from ba_torchrl.sim.bodies import Body, Color, Shape
 
 
@@ -42,10 +43,10 @@ FINE_PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=200)
 class Snapshot:
     """A state that PyBullet keeps in memory for as long as this object lives."""
 
-    def __init__(self, client: int) -> None:
+    def __init__(self, client: int, connection: weakref.finalize) -> None:
         self.client = client
         self.id = pybullet.saveState(physicsClientId=client)
-        weakref.finalize(self, _forget, self.id, client)
+        weakref.finalize(self, _forget, self.id, client, connection)
 
 
 class World:
@@ -115,10 +116,20 @@ class World:
         Raises:
             SimulationError: the world is sealed.
         """
-        if self._pristine is not None:
-            raise SimulationError(f"cannot add {name!r}: the world is sealed")
+        self._check_open(name)
         body = Body(self.client, shape, name)
         self.bodies.append(body)
+        return body
+
+    def add_articulated(self, base: Shape, slider: Shape, rail: Rail, name: str) -> Articulated:
+        """Load a fixed body with a part that slides; both enter `bodies`. Only before `seal`.
+
+        Raises:
+            SimulationError: the world is sealed.
+        """
+        self._check_open(name)
+        body = Articulated(self.client, base, slider, rail, name)
+        self.bodies.extend(body.parts)
         return body
 
     def seal(self) -> None:
@@ -133,7 +144,7 @@ class World:
 
     def snapshot(self) -> Snapshot:
         """Keep the state of every body and contact in memory, for `restore`."""
-        return Snapshot(self.client)
+        return Snapshot(self.client, self._disconnect)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Return to a snapshot of this world; motor commands are the caller's to repeat.
@@ -193,6 +204,10 @@ class World:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _check_open(self, name: str) -> None:
+        if self._pristine is not None:
+            raise SimulationError(f"cannot add {name!r}: the world is sealed")
+
 
 def _connect_window() -> int:
     """Open PyBullet's window and return its client."""
@@ -213,8 +228,8 @@ def _connect_window() -> int:
     return client
 
 
-def _forget(state: int, client: int) -> None:
-    if pybullet.isConnected(physicsClientId=client):
+def _forget(state: int, client: int, connection: weakref.finalize) -> None:
+    if connection.alive:  # else the client's number may be another world's by now
         pybullet.removeState(state, physicsClientId=client)
 
 

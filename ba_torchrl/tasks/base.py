@@ -166,6 +166,12 @@ class Task(ABC):
         """Whether the next episode goes on with the objects as they are now."""
         return False
 
+    def resume(self) -> None:
+        """Start an episode that goes on with the objects, the arm still where the last one ended.
+
+        Called if `continues` says so, in place of `randomise`.
+        """
+
     def get_state(self) -> Any:
         """Return what the task remembers beyond the poses of its bodies."""
         return None
@@ -242,3 +248,7 @@ class Task(ABC):
         if not self.settings.random_orientation:
             return 0.0
         return float(rng.uniform(-span_rad / 2, span_rad / 2))
+
+    def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
+        """Put a body on the floor, or on the tray's."""
+        body.place((*xy, self.settings.surface_z_m - body.shape.bounds_m[0][2]), yaw_rad)

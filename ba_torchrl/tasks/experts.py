@@ -8,11 +8,14 @@ through the same bounded action space as anybody's.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import cache
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.bodies import Body, Vector, radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.base import Reach, Workspace
+from ba_torchrl.tasks.building import Building, PutDown
 
 OPEN, CLOSED = 1.0, 0.0
 ALIGNED_M = 4e-3
@@ -157,3 +160,275 @@ def _distance_to_segment(
     square = ex * ex + ey * ey
     place = min(max((px * ex + py * ey) / square, 0.0), 1.0) if square > 0 else 0.0
     return math.hypot(px - place * ex, py - place * ey)
+
+
+HOVER_M = 0.012
+"""Gap under a body, or under the fingertips, that passes over another."""
+SLACK_M = 8e-3
+"""Part of that gap that may be missing on the way."""
+TIP_BELOW_TOOL_M = 0.011
+RELEASE_GAP_M = 1e-3
+"""A body is let go this far above what it will rest on."""
+NO_ROOM_M = 1.0
+"""A piece between others is worth this much of a detour."""
+HALF_FINGER_DEPTH_M = 0.015
+"""Half the extent of a fingertip, along the direction in which the fingers open."""
+
+
+def carry_to(
+    robot: Robot,
+    body: Body,
+    position: Vector,
+    reach: Reach,
+    *,
+    yaw_rad: float | None = None,
+    obstacles: Sequence[Body] = (),
+    ceiling_m: float = math.inf,
+    hover_m: float = HOVER_M,
+) -> GripperCommand:
+    """Carry the body in the gripper to where it is to lie, and let go of it there.
+
+    It goes over everything in its way, comes down once it is above its place, and the action that
+    arrives opens the fingers.
+
+    Args:
+        robot: it holds the body.
+        body: what is held.
+        position: where the body's origin is to be.
+        reach: of an action.
+        yaw_rad: the gripper's yaw in the end, as `turned` chooses it; None keeps it.
+        obstacles: bodies to pass over, with what the body is to rest on.
+        ceiling_m: the tool never goes higher.
+        hover_m: gap that the body keeps to what it passes over, and to its place before it comes
+            down; more is needed where its place has a rim.
+    """
+    tool, yaw = robot.tool_pose()
+    turn = 0.0 if yaw_rad is None else wrap_angle(yaw_rad - yaw)
+    x, y, z = body.position
+    cos, sin = math.cos(turn), math.sin(turn)
+    ox, oy = x - tool[0], y - tool[1]
+    target = (
+        position[0] - (cos * ox - sin * oy),
+        position[1] - (sin * ox + cos * oy),
+        tool[2] + position[2] + RELEASE_GAP_M - z,
+    )
+    is_beside = max(abs(position[0] - x), abs(position[1] - y)) <= ALIGNED_M
+    if is_beside and abs(turn) <= ALIGNED_RAD:
+        arrives = tool[2] - target[2] <= reach.step_m
+        return towards(robot, target, yaw + turn, OPEN if arrives else CLOSED)
+    over = (*target[:2], min(target[2] + hover_m, ceiling_m))
+    return travel(
+        robot,
+        over,
+        yaw + turn,
+        CLOSED,
+        reach,
+        below_m=tool[2] - min(vertical_extent(body)[0], tool[2] - TIP_BELOW_TOOL_M),
+        obstacles=[other for other in obstacles if other is not body],
+        ceiling_m=ceiling_m,
+        hover_m=hover_m,
+    )
+
+
+def pick_up(
+    robot: Robot,
+    body: Body,
+    reach: Reach,
+    *,
+    yaws_rad: Sequence[float],
+    obstacles: Sequence[Body] = (),
+    ceiling_m: float = math.inf,
+) -> GripperCommand:
+    """Go over everything in the way to a body and close the fingers on it.
+
+    Args:
+        robot: its gripper is empty.
+        body: what to grasp, at its origin.
+        reach: of an action.
+        yaws_rad: yaws of the gripper at which the fingers close on it; each stands for its
+            reverse too. Of these the nearest one at which nothing stands where the fingers go.
+        obstacles: bodies to keep clear of.
+        ceiling_m: the tool never goes higher.
+    """
+    (x, y, z), yaw = robot.tool_pose()
+    bx, by, bz = body.position
+    others = [other for other in obstacles if other is not body]
+    target_yaw = min(
+        (turned(yaw, wanted, reach, math.pi) for wanted in yaws_rad),
+        key=lambda wanted: (
+            finger_room(robot, body, wanted, others) <= 0,
+            abs(wrap_angle(wanted - yaw)),
+        ),
+    )
+    is_beside = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
+    is_aligned = is_beside and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
+    if robot.opening() < 0.9 and math.dist((x, y), (bx, by)) < radius_m(body):
+        return lift(5e-3, OPEN)  # the body may stand between the fingers
+    if is_aligned and robot.opening() >= 0.9:
+        return towards(robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= reach.step_m else OPEN)
+    over_z = min(vertical_extent(body)[1] + TIP_BELOW_TOOL_M + HOVER_M, ceiling_m)
+    return travel(
+        robot,
+        (bx, by, over_z),
+        target_yaw,
+        OPEN,
+        reach,
+        below_m=TIP_BELOW_TOOL_M,
+        obstacles=[body, *others],
+        ceiling_m=ceiling_m,
+    )
+
+
+def travel(
+    robot: Robot,
+    target: Vector,
+    yaw_rad: float,
+    opening: float,
+    reach: Reach,
+    *,
+    below_m: float,
+    obstacles: Sequence[Body],
+    ceiling_m: float = math.inf,
+    hover_m: float = HOVER_M,
+) -> GripperCommand:
+    """Go to a pose: straight where the next action touches nothing, else level, else up first.
+
+    Args:
+        robot: the robot.
+        target: where the tool goes.
+        yaw_rad: yaw in the end.
+        opening: of the gripper on the way.
+        reach: of an action.
+        below_m: how far hand and load hang below the tool.
+        obstacles: bodies to pass over.
+        ceiling_m: the tool never goes higher.
+        hover_m: gap kept above the obstacles.
+    """
+    start = robot.tool_pose()[0]
+    end = tuple(
+        s + min(max(t - s, -reach.step_m), reach.step_m) for s, t in zip(start, target, strict=True)
+    )
+    hand = robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
+    zones = [
+        (body.position, hand + radius_m(body), vertical_extent(body)[1] + below_m + hover_m)
+        for body in obstacles
+    ]
+    if _height_needed(start, end, zones) is None:
+        return towards(robot, target, yaw_rad, opening)
+    needed = _height_needed(start, (end[0], end[1], start[2]), zones)
+    if needed is None or start[2] >= ceiling_m - 1e-3:
+        return towards(robot, (target[0], target[1], start[2]), yaw_rad, opening)
+    return lift(min(needed + 1e-3, ceiling_m) - start[2], opening)
+
+
+def finger_room(robot: Robot, body: Body, yaw_rad: float, others: Sequence[Body]) -> float:
+    """Return the gap between the fingers, open around a body, and what stands beside it.
+
+    It is in metres, negative where something stands in their way.
+
+    Args:
+        robot: whose fingers.
+        body: what they are to close on.
+        yaw_rad: the gripper's.
+        others: bodies that may stand in their way.
+    """
+    bx, by, bz = body.position
+    ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
+    gap = math.inf
+    for other in others:
+        corners = world_vertices(other)
+        if corners[:, 2].max() < bz - TIP_BELOW_TOOL_M:
+            continue
+        px, py = corners[:, 0] - bx, corners[:, 1] - by
+        along, across = px * ux + py * uy, py * ux - px * uy
+        for side in (-1.0, 1.0):
+            center = side * robot.finger_span_m / 2
+            gap = min(
+                gap,
+                max(
+                    along.min() - center - HALF_FINGER_DEPTH_M,
+                    center - HALF_FINGER_DEPTH_M - along.max(),
+                    across.min() - FINGER_HALF_M,
+                    -FINGER_HALF_M - across.max(),
+                ),
+            )
+    return float(gap)
+
+
+def assemble(
+    robot: Robot, building: Building, workspace: Workspace, reach: Reach, surface_z_m: float = 0.0
+) -> GripperCommand:
+    """Build a structure: pick the piece that comes next and place it, from any state.
+
+    Args:
+        robot: the robot.
+        building: what is to be built.
+        workspace: where pieces may be put down.
+        reach: of an action.
+        surface_z_m: height of the ground.
+    """
+    (x, y, _), yaw = robot.tool_pose()
+    held = robot.held_body() if robot.opening() < 0.9 else None
+    pieces = list(building.pieces)
+
+    def yaws(body: Body) -> list[float]:
+        return building.pieces[body].grasp_yaws(body) if reach.turn_rad else [yaw]
+
+    @cache
+    def effort(body: Body) -> float:
+        others = [other for other in pieces if other is not body]
+        room = max(finger_room(robot, body, option, others) for option in yaws(body))
+        return math.dist((x, y), body.position[:2]) + (0.0 if room > 0 else NO_ROOM_M)
+
+    border = 1.2 * building.block_m
+    put_down = PutDown(
+        (workspace.x[0] + border, workspace.x[1] - border),
+        (workspace.y[0] + border, workspace.y[1] - border),
+        gap_m=building.block_m,
+        z_m=surface_z_m,
+    )
+    move = building.next_move(put_down, held, effort)
+    if move is None:
+        return lift(reach.step_m, OPEN)
+    ceiling_m = workspace.z[1]
+    if move.body is not held:
+        return pick_up(
+            robot,
+            move.body,
+            reach,
+            yaws_rad=yaws(move.body),
+            obstacles=pieces,
+            ceiling_m=ceiling_m,
+        )
+    target_yaw = None
+    if move.yaw_rad is not None:
+        ahead = move.yaw_rad - move.piece.yaw_rad(held)
+        target_yaw = turned(yaw, yaw + ahead, reach, move.yaw_period_rad)
+    return carry_to(
+        robot,
+        held,
+        move.position,
+        reach,
+        yaw_rad=target_yaw,
+        obstacles=pieces,
+        ceiling_m=ceiling_m,
+    )
+
+
+def _height_needed(
+    start: Vector, end: Vector, zones: Sequence[tuple[Vector, float, float]]
+) -> float | None:
+    """Return how high the tool must be on a straight way, or None if it is high enough.
+
+    Args:
+        start: the tool's place now.
+        end: its next place.
+        zones: center, radius and least height of what the way may lead over.
+    """
+    needed = None
+    for i in range(5):
+        x, y, z = (s + (e - s) * i / 4 for s, e in zip(start, end, strict=True))
+        for center, radius, height in zones:
+            if z < height - SLACK_M and math.dist((x, y), center[:2]) < radius:
+                needed = height if needed is None else max(needed, height)
+    return needed

@@ -21,6 +21,8 @@ OPPOSED_COSINE = 0.8
 """Two fingers hold a body if they press on it from opposite sides, within the friction cone. An
 edge pushed into the wedge between them meets their surfaces at twice that angle: it is not held."""
 
+_FAR_M = 10.0
+
 QUERY_M = 2e-3
 """Distance up to which a fresh query looks for the surfaces in contact."""
 
@@ -47,19 +49,27 @@ class Robot(ABC):
     finger_joints: ClassVar[tuple[int, ...]]
     """The two driven joints of the gripper, left and right."""
     finger_signs: ClassVar[tuple[float, float]]
-    """Joint position of each finger per unit of opening angle or distance."""
+    """Sign of each finger's joint position when open."""
     finger_open: ClassVar[float]
-    """Joint position, up to the sign, of the fully open gripper."""
+    """Joint position, up to the sign, of the fully open gripper: radians or metres, as are the
+    finger speed and force below. Closed is zero."""
     finger_links: ClassVar[tuple[frozenset[int], frozenset[int]]]
     """Links that belong to the left and to the right finger."""
     closing_sign: ClassVar[tuple[float, float]]
-    """Sign along the hand's x axis in which each finger is pushed back by what it holds."""
+    """Sign along the tool's x axis in which each finger is pushed back by what it holds."""
     passive_links: ClassVar[tuple[int, ...]]
     """Links that collide with nothing: the arm, which stays above everything it works on."""
     hand_link: ClassVar[int]
     """The link that the tool point is fixed to."""
     tool_offset_m: ClassVar[Vector]
     """Tool point between the fingertips, in the frame of the hand link."""
+    tool_orientation: ClassVar[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+    """Orientation of the tool in the frame of the hand link (x, y, z, w): the fingers open along
+    its x axis, its z axis is the direction of approach."""
+    home_joints: ClassVar[tuple[float, ...]]
+    """Arm joints with which hand and arm are beside and above the workspace, out of any picture."""
+    has_flat_pads: ClassVar[bool] = True
+    """The fingers touch a face by several points at once, which grow stale as the hand turns."""
     camera_height_m: ClassVar[float]
     """The close-loop camera hangs this far above the tool point."""
     finger_span_m: ClassVar[float]
@@ -67,6 +77,7 @@ class Robot(ABC):
 
     arm_force: ClassVar[float] = 300.0
     finger_force: ClassVar[float] = 2.0
+    """Largest torque or force of a finger's motor; 5 to 10 N at the tip."""
     finger_speed: ClassVar[float] = 2.0
     """Speed of the finger joints per second: 4 mm per step at the tips. Twice as fast, they sink a
     centimetre into what they meet."""
@@ -94,9 +105,41 @@ class Robot(ABC):
 
         Args:
             position: tool point in metres.
-            rotation: orientation of the hand; `downward` makes those of top-down grasps.
+            rotation: orientation of the tool; `downward` makes those of top-down grasps.
             near: joints to stay close to where several solutions exist.
         """
+
+    # -- for subclasses ----------------------------------------------------------------------
+
+    def _free_limits(self, robot: int) -> None:
+        """Widen the arm's joint limits: a joint put beyond one is flung back by its constraint."""
+        for joint in self.arm_joints:
+            pybullet.changeDynamics(
+                robot,
+                joint,
+                jointLowerLimit=-10,
+                jointUpperLimit=10,
+                physicsClientId=self.client,
+            )
+
+    def _gear(
+        self, robot: int, first: int, second: int, ratio: float, max_force: float = 50
+    ) -> None:
+        """Couple two joints: the first moves by minus ``ratio`` times what the second does."""
+        gear = pybullet.createConstraint(
+            robot,
+            first,
+            robot,
+            second,
+            pybullet.JOINT_GEAR,
+            (0, 1, 0),
+            (0, 0, 0),
+            (0, 0, 0),
+            physicsClientId=self.client,
+        )
+        pybullet.changeConstraint(
+            gear, gearRatio=ratio, maxForce=max_force, erp=0.5, physicsClientId=self.client
+        )
 
     # -- arm ---------------------------------------------------------------------------------
 
@@ -135,13 +178,13 @@ class Robot(ABC):
             self.id, self.hand_link, computeForwardKinematics=1, physicsClientId=self.client
         )
         return pybullet.multiplyTransforms(
-            state[4], state[5], self.tool_offset_m, (0.0, 0.0, 0.0, 1.0)
+            state[4], state[5], self.tool_offset_m, self.tool_orientation
         )
 
     def tool_pose(self) -> Pose:
         """Return the tool point and the gripper's yaw in [-pi, pi)."""
         position, (x, y, z, w) = self.tool_transform()
-        # direction of the hand's x axis, along which the fingers open
+        # direction of the tool's x axis, along which the fingers open
         return position, math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
     # -- gripper -----------------------------------------------------------------------------
@@ -161,10 +204,13 @@ class Robot(ABC):
             [[0.0]] * len(self.finger_joints),
             physicsClientId=self.client,
         )
+        self.commanded_opening = opening
         self.hold_opening(opening)
 
     def hold_opening(self, opening: float) -> None:
         """Command the fingers to an opening."""
+        if self.has_flat_pads and self.commanded_opening < min(opening, self.opening()) - 1e-3:
+            self._renew_contacts()  # they squeezed, now they let go
         pybullet.setJointMotorControlArray(
             self.id,
             self.finger_joints,
@@ -176,6 +222,30 @@ class Robot(ABC):
         )
         self.commanded_opening = opening
 
+    def _renew_contacts(self) -> None:
+        """Have what the fingers touch lose and find its contacts anew, without moving it.
+
+        Bullet keeps the normals of lasting contacts as they were in the world. Once the hand has
+        turned by half a turn, those of a flat face point the wrong way, and instead of pushing
+        the opening fingers off they would pull the body along.
+        """
+        points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
+        touched = {point[2] for point in points if point[3] in self._side}
+        bodies = [body.id for body in self.world.bodies if body.id in touched and body.is_free]
+        kept = []
+        for i, body in enumerate(bodies):
+            pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=self.client)
+            velocity = pybullet.getBaseVelocity(body, physicsClientId=self.client)
+            kept.append((body, pose, velocity))
+            pybullet.resetBasePositionAndOrientation(
+                body, (_FAR_M, i * _FAR_M, _FAR_M), pose[1], physicsClientId=self.client
+            )
+        if kept:
+            self.world.detect_collisions()
+        for body, pose, velocity in kept:
+            pybullet.resetBasePositionAndOrientation(body, *pose, physicsClientId=self.client)
+            pybullet.resetBaseVelocity(body, *velocity, physicsClientId=self.client)
+
     # -- state -------------------------------------------------------------------------------
 
     def get_state(self) -> tuple[list[float], float]:
@@ -184,9 +254,9 @@ class Robot(ABC):
 
     def set_state(self, state: tuple[list[float], float]) -> None:
         """Repeat the commands that `get_state` returned."""
-        joints, opening = state
+        joints, self.commanded_opening = state
         self.command(joints)
-        self.hold_opening(opening)
+        self.hold_opening(self.commanded_opening)
 
     # -- contacts ----------------------------------------------------------------------------
 
@@ -204,7 +274,7 @@ class Robot(ABC):
                 touching[side].add((point[2], point[3]))
         both = {body for body, _ in touching[0]} & {body for body, _ in touching[1]}
         for body in self.world.bodies:
-            if body.id in both and not body.is_static and self._is_squeezed(body, touching):
+            if body.id in both and body.is_free and self._is_squeezed(body, touching):
                 return body
         return None
 

@@ -31,6 +31,8 @@ class Kuka(Robot):
     passive_links = tuple(range(-1, 7))
     hand_link = 7
     tool_offset_m = (0.0, 0.0218, 0.222)
+    home_joints = (1.128, 0.187, 0.0, -1.146, 0.0, 1.809, -2.014)
+    has_flat_pads = False
     camera_height_m = 0.12
     finger_span_m = 45 * 0.3 / 128
 
@@ -48,15 +50,7 @@ class Kuka(Robot):
             (0, 0, 0, 1),
             physicsClientId=self.client,
         )
-        for joint in self.arm_joints:
-            # a joint put beyond its limit is flung back by the limit's constraint
-            pybullet.changeDynamics(
-                robot,
-                joint,
-                jointLowerLimit=-10,
-                jointUpperLimit=10,
-                physicsClientId=self.client,
-            )
+        self._free_limits(robot)
         for joint in (7, *self._tip_joints):
             pybullet.setJointMotorControl2(
                 robot,
@@ -68,20 +62,7 @@ class Kuka(Robot):
                 physicsClientId=self.client,
             )
         # two force-limited fingers have no stiffness along their common axis: held bodies slide
-        gear = pybullet.createConstraint(
-            robot,
-            self.finger_joints[0],
-            robot,
-            self.finger_joints[1],
-            pybullet.JOINT_GEAR,
-            (0, 1, 0),
-            (0, 0, 0),
-            (0, 0, 0),
-            physicsClientId=self.client,
-        )
-        pybullet.changeConstraint(
-            gear, gearRatio=1, maxForce=50, erp=0.5, physicsClientId=self.client
-        )
+        self._gear(robot, *self.finger_joints, ratio=1)
         return robot
 
     def set_opening(self, opening: float) -> None:

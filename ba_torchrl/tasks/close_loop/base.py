@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, Box, Color
+from ba_torchrl.sim.bodies import Box, Color
 from ba_torchrl.tasks.base import BLOCK_M, PlacementError, Task, Workspace
 
 RED: Color = (0.82, 0.22, 0.2, 1.0)
@@ -52,7 +52,3 @@ class CloseLoopTask(Task):
             f"no room for two things {apart_m:.3f} m apart: enlarge `workspace` or lower "
             "`object_scale_range`"
         )
-
-    def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
-        """Put a body on the floor, or on the tray's."""
-        body.place((*xy, self.settings.surface_z_m - body.shape.bounds_m[0][2]), yaw_rad)

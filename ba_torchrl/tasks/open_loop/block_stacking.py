@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ba_torchrl.sim.bodies import Box
-from ba_torchrl.tasks.base import TASKS, Spot
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.open_loop.pieces import cube
 from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
 from ba_torchrl.tasks.structures import CUBE, Blueprint, tower
 
@@ -24,6 +24,4 @@ class BlockStacking(StructureTask):
 
     def parts(self) -> Sequence[Part]:
         """Return the cubes."""
-        edge = self.block_m
-        cube = Part(CUBE, Box(size_m=(edge,) * 3), Spot(2.4 * edge, 2.4 * edge))
-        return [cube] * self.settings.num_objects
+        return [cube(self.block_m)] * self.settings.num_objects

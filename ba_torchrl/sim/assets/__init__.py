@@ -1,0 +1,1 @@
+"""Sets of objects: PyBullet's random shapes, procedural household items, folders of meshes."""

@@ -1,0 +1,192 @@
+"""A folder of the user's meshes, such as the models of GraspNet-1Billion (appendix, figure 16)."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pybullet
+
+from ba_torchrl.config import ConfigError
+from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
+from ba_torchrl.sim.assets.cache import cached_parts
+from ba_torchrl.sim.assets.hulls import convex_hull, volume_and_center
+from ba_torchrl.sim.meshes import Mesh, write_obj
+
+logger = logging.getLogger(__name__)
+
+PREFERRED = ("nontextured_simplified.obj", "nontextured.obj")
+"""Taken first where a folder holds several mesh files."""
+EXPECTED = "expected one sub-folder for each object, with a mesh file (.obj, metres) in each"
+
+WIDEST_M, WIDER = 0.15, 0.8
+LARGEST_M3, LARGER = 6e-4, 0.85
+THINNEST_M, THINNER = 0.014, 1 / 0.95
+
+CONVEX_FILL = 0.95
+"""A mesh that fills this share of its hull is taken for convex."""
+VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}
+RECIPE = f"graspnet 1 {CONVEX_FILL} {VHACD}"
+
+
+@OBJECT_SETS.register("graspnet")
+class GraspNet(ObjectSet):
+    """One object for each sub-folder of ``asset_root``, scaled to what a gripper can grasp.
+
+    Meshes are cut into convex parts the first time they are used, which takes seconds each, and
+    kept on disk.
+    """
+
+    def __init__(self, asset_root: str | None = None) -> None:
+        super().__init__()
+        if asset_root is None:
+            raise ConfigError(f"object_set='graspnet' needs asset_root, a folder: {EXPECTED}")
+        root = Path(asset_root).expanduser()
+        if not root.is_dir():
+            raise ConfigError(f"asset_root: there is no folder {str(root)!r}: {EXPECTED}")
+        folders = sorted(
+            path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
+        )
+        if not folders:
+            raise ConfigError(f"asset_root: {str(root)!r} has no sub-folders: {EXPECTED}")
+        self.paths = [_mesh_file(folder) for folder in folders]
+
+    @cached_property
+    def names(self) -> Sequence[str]:
+        """Names of the sub-folders."""
+        return [path.parent.name for path in self.paths]
+
+    def parts(self, index: int) -> tuple[Mesh, ...]:
+        """Return the convex parts of a mesh, scaled.
+
+        Raises:
+            ConfigError: the file is no mesh with a volume.
+        """
+        path = self.paths[index]
+
+        def decompose() -> list[Mesh]:
+            return convex_parts(read_mesh(path), path)
+
+        parts = cached_parts(path.read_bytes(), RECIPE, decompose)
+        points = np.concatenate([part.vertices for part in parts])
+        scale = graspable_scale(np.ptp(points, axis=0))
+        return tuple(Mesh(part.vertices * scale, part.faces) for part in parts)
+
+
+def graspable_scale(extents_m: Sequence[float]) -> float:
+    """Return the factor that makes a mesh graspable.
+
+    Shrunk by 0.8 until its second-largest extent is at most 15 cm, then by 0.85 until its bounding
+    box is at most 0.6 litres, then enlarged by 1 / 0.95 until its smallest extent is 1.4 cm.
+
+    Args:
+        extents_m: of the axis-aligned bounding box.
+    """
+    smallest, middle, _ = sorted(extents_m)
+    scale = WIDER ** _times(middle / WIDEST_M, 1 / WIDER)
+    scale *= LARGER ** _times(float(np.prod(extents_m)) * scale**3 / LARGEST_M3, LARGER**-3)
+    return scale * THINNER ** _times(THINNEST_M / (smallest * scale), THINNER)
+
+
+def _times(excess: float, step: float) -> int:
+    """Return how often to divide ``excess`` by ``step`` until it is at most 1."""
+    return max(0, math.ceil(math.log(excess) / math.log(step) - 1e-9))
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a mesh file.
+
+    Raises:
+        ConfigError: it holds no triangles, or values that are not finite.
+    """
+    import trimesh  # most of a second, and only this set needs it
+
+    try:
+        loaded = trimesh.load(path, process=False, force="mesh", skip_materials=True)
+        vertices = np.asarray(loaded.vertices, dtype=np.float64)
+        faces = np.asarray(loaded.faces, dtype=np.int64)
+    except Exception as error:  # the parser fails in many ways on what is no mesh
+        raise ConfigError(f"asset_root: cannot read {str(path)!r} as a mesh: {error}") from error
+    if len(faces) < 4 or not np.isfinite(vertices).all():
+        raise ConfigError(
+            f"asset_root: {str(path)!r} has {len(faces)} triangles and "
+            f"{'in' if not np.isfinite(vertices).all() else ''}finite coordinates: it is no solid"
+        )
+    return Mesh(vertices, faces)
+
+
+def convex_parts(mesh: Mesh, path: Path) -> list[Mesh]:
+    """Cut a mesh into convex parts.
+
+    Args:
+        mesh: metres.
+        path: where it is from, for messages.
+
+    Raises:
+        ConfigError: it has no volume.
+    """
+    try:
+        hull = convex_hull(mesh.vertices)
+    except ValueError as error:
+        raise ConfigError(f"asset_root: {str(path)!r} has no volume: {error}") from None
+    if volume_and_center(mesh)[0] >= CONVEX_FILL * volume_and_center(hull)[0]:
+        return [hull]
+    logger.info("cutting %s into convex parts; this happens once", path)
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder, "mesh.obj"), Path(folder, "parts.obj")
+        write_obj(source, [mesh])
+        with _silent_stdout():
+            pybullet.vhacd(str(source), str(target), str(Path(folder, "log.txt")), **VHACD)
+        clouds = _objects_of(target) if target.exists() else []
+    parts = []
+    for cloud in clouds:
+        with contextlib.suppress(ValueError):  # a sliver without volume holds nothing up
+            parts.append(convex_hull(cloud))
+    if not parts:
+        logger.warning("%s could not be cut into convex parts: its hull stands for it", path)
+        return [hull]
+    return parts
+
+
+def _mesh_file(folder: Path) -> Path:
+    files = {path.name: path for path in sorted(folder.glob("*.obj"))}
+    for name in PREFERRED:
+        if name in files:
+            return files[name]
+    if not files:
+        raise ConfigError(f"asset_root: {str(folder)!r} has no mesh file: {EXPECTED}")
+    return next(iter(files.values()))
+
+
+def _objects_of(path: Path) -> list[np.ndarray]:
+    """Return the vertices [N, 3] of each object of an OBJ file."""
+    clouds: list[list[list[float]]] = []
+    for line in path.read_text().splitlines():
+        kind, *values = line.split() or [""]
+        if kind == "o":
+            clouds.append([])
+        elif kind == "v":
+            clouds[-1].append([float(value) for value in values[:3]])
+    return [np.array(cloud) for cloud in clouds if cloud]
+
+
+@contextlib.contextmanager
+def _silent_stdout() -> Iterator[None]:
+    """Keep what C code prints away from the user: hundreds of lines of progress."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)

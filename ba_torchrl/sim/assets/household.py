@@ -1,0 +1,153 @@
+"""Household items made of convex parts: no file is needed, and what is hollow stays hollow."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
+from ba_torchrl.sim.assets.hulls import convex_hull
+from ba_torchrl.sim.meshes import Mesh, box_mesh, moved
+
+SIDES = 16
+"""Corners of what is round."""
+WALLS = 10
+"""Pieces of a hollow wall."""
+
+Profile = Sequence[tuple[float, float]]
+"""Radii and heights, from the bottom up, metres."""
+
+
+def lathe(profile: Profile) -> list[Mesh]:
+    """Return a solid of revolution, one convex part for each pair of neighbouring rings."""
+    return [
+        convex_hull(np.concatenate([_ring(*low, SIDES), _ring(*high, SIDES)]))
+        for low, high in zip(profile, profile[1:], strict=False)
+    ]
+
+
+def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
+    """Return a hollow solid of revolution with a bottom, open on top.
+
+    Args:
+        profile: outer surface, metres; its height grows.
+        wall_m: thickness of the wall.
+        bottom_m: thickness of the bottom.
+    """
+    (radius, z), (next_radius, next_z) = profile[0], profile[1]
+    inside = radius + (next_radius - radius) * bottom_m / (next_z - z)
+    bottom = convex_hull(
+        np.concatenate([_ring(radius, z, WALLS), _ring(inside, z + bottom_m, WALLS)])
+    )
+    parts = [bottom]
+    for low, high in zip(profile, profile[1:], strict=False):
+        corners = [
+            _ring(r, z, WALLS) for ring_r, z in (low, high) for r in (ring_r, ring_r - wall_m)
+        ]
+        parts += [
+            convex_hull(np.concatenate([ring[[i, (i + 1) % WALLS]] for ring in corners]))
+            for i in range(WALLS)
+        ]
+    return parts
+
+
+def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
+    """Return a box with its centre at a point, metres."""
+    return moved(box_mesh(size), at)
+
+
+def mug(radius_m: float, height_m: float) -> list[Mesh]:
+    """Return a mug with a handle that fingers fit through."""
+    grip_x, top, bottom = radius_m + 0.022, 0.8 * height_m, 0.25 * height_m
+    bar = 0.008
+    return [
+        *vessel([(radius_m, 0.0), (radius_m, height_m)], 0.005, 0.006),
+        box((bar, bar, top - bottom + bar), (grip_x, 0, (top + bottom) / 2)),
+        *(box((0.022, bar, bar), (radius_m + 0.011, 0, z)) for z in (top, bottom)),
+    ]
+
+
+def spoon() -> list[Mesh]:
+    """Return a wooden spoon: a round handle and a thick, oval bowl."""
+    oval = _ring(0.02, 0.0, SIDES) * (1.3, 1.0, 1.0)
+    bowl = convex_hull(
+        np.concatenate([oval + (0.065, 0, 0.009), 0.7 * oval + (0.065, 0, -0.009)])
+    )
+    ring = _ring(0.009, 0.0, 8)
+    ends = [ring[:, [2, 0, 1]] + (x, 0, 0) for x in (-0.055, 0.05)]
+    return [convex_hull(np.concatenate(ends)), bowl]
+
+
+def banana() -> list[Mesh]:
+    """Return a bent fruit of four tapered pieces."""
+    rings = []
+    for turn, radius in zip(np.linspace(-0.75, 0.75, 5), (0.008, 0.015, 0.017, 0.015, 0.007)):
+        ring = _ring(radius, 0.0, 8)[:, [0, 2, 1]]  # in the plane of x and z
+        cos, sin = math.cos(turn), math.sin(turn)
+        turned = ring @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+        rings.append(turned + (0.065 * cos - 0.065, 0.065 * sin, 0))
+    return [
+        convex_hull(np.concatenate([low, high]))
+        for low, high in zip(rings, rings[1:], strict=False)
+    ]
+
+
+ITEMS: dict[str, Callable[[], Sequence[Mesh]]] = {
+    "bottle": lambda: lathe(
+        [(0.023, 0.0), (0.025, 0.004), (0.025, 0.07), (0.011, 0.092), (0.011, 0.115)]
+    ),
+    "flask": lambda: lathe([(0.026, 0.0), (0.026, 0.03), (0.012, 0.055), (0.014, 0.08)]),
+    "can": lambda: lathe([(0.024, 0.0), (0.026, 0.003), (0.026, 0.077), (0.024, 0.08)]),
+    "jar": lambda: lathe([(0.027, 0.0), (0.027, 0.045), (0.022, 0.05), (0.022, 0.062)]),
+    "mug": lambda: mug(0.028, 0.07),
+    "espresso cup": lambda: mug(0.024, 0.045),
+    "tumbler": lambda: vessel([(0.021, 0.0), (0.028, 0.08)], 0.004, 0.006),
+    "bowl": lambda: vessel([(0.025, 0.0), (0.043, 0.018), (0.05, 0.045)], 0.006, 0.006),
+    "plate": lambda: vessel([(0.05, 0.0), (0.055, 0.022)], 0.006, 0.005),
+    "tea box": lambda: [box((0.05, 0.075, 0.03))],
+    "carton": lambda: [box((0.045, 0.045, 0.095))],
+    "soap": lambda: [box((0.08, 0.05, 0.025))],
+    "brick": lambda: [box((0.04, 0.09, 0.04))],
+    "bar": lambda: [box((0.022, 0.11, 0.022))],
+    "spoon": spoon,
+    "brush": lambda: [
+        box((0.1, 0.02, 0.018), (-0.02, 0, 0)),
+        box((0.055, 0.03, 0.026), (0.055, 0, -0.004)),
+    ],
+    "hammer": lambda: [
+        box((0.018, 0.1, 0.018), (0, -0.03, 0)),
+        box((0.065, 0.024, 0.024), (0, 0.03, 0)),
+    ],
+    "banana": banana,
+    "lemon": lambda: lathe(
+        [(0.004, -0.034), (0.018, -0.022), (0.025, 0.0), (0.018, 0.022), (0.004, 0.034)]
+    ),
+    "cheese": lambda: [
+        convex_hull(np.array([(x, y, z) for x, y in _WEDGE for z in (-0.018, 0.018)]))
+    ],
+}
+_WEDGE = ((-0.035, -0.025), (-0.035, 0.025), (0.045, 0.0))
+
+
+@OBJECT_SETS.register("household")
+class Household(ObjectSet):
+    """Bottles, cups, bowls, boxes and tools, small enough for a two-finger gripper."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What the items are."""
+        return list(ITEMS)
+
+    def parts(self, index: int) -> tuple[Mesh, ...]:
+        """Return an item's convex parts."""
+        return tuple(list(ITEMS.values())[index]())
+
+
+def _ring(radius_m: float, z_m: float, corners: int) -> np.ndarray:
+    """Return points [corners, 3] on a horizontal circle."""
+    turns = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    return np.stack(
+        [radius_m * np.cos(turns), radius_m * np.sin(turns), np.full(corners, z_m)], axis=1
+    )

@@ -1,0 +1,196 @@
+"""UR5 with a parallel jaw or with a Robotiq 2F-85: closed-form inverse kinematics."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+from xml.etree import ElementTree
+
+import pybullet
+
+from ba_torchrl.sim.bodies import Vector
+from ba_torchrl.sim.robots.base import ROBOTS, Matrix, Robot
+
+_MODELS = Path(__file__).parent / "models"
+
+_SHOULDER_HEIGHT_M = 0.089159
+_UPPER_ARM_M = 0.425
+_FOREARM_M = 0.39225
+_WRIST_1_M = 0.10915
+_WRIST_2_M = 0.09465
+_WRIST_3_M = 0.0823
+_BASE_M = (-0.05, 0.0, 0.1)
+
+
+class UR5(Robot):
+    """Six-joint arm on a base behind the workspace (paper section 3.4), without a gripper.
+
+    Subclasses name a gripper's model, which is joined to the arm's at the link "flange".
+    """
+
+    gripper_model: ClassVar[str]
+
+    arm_joints = tuple(range(6))
+    passive_links = tuple(range(-1, 6))
+    hand_link = 6
+    finger_span_m = 42 * 0.3 / 128
+
+    def load(self) -> int:
+        """Load arm and gripper as one model and widen the arm's joint limits."""
+        robot = _load_joined(
+            (_MODELS / "ur5_arm.urdf", _MODELS / self.gripper_model), _BASE_M, self.client
+        )
+        self._free_limits(robot)
+        return robot
+
+    def inverse_kinematics(
+        self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
+    ) -> list[float] | None:
+        """Solve in closed form: arm to the front, elbow up, wrist 2 pointing outwards.
+
+        Of the eight solutions this one is smooth all over the workspace as long as the gripper
+        does not point sideways.
+        """
+        finger, _, approach = zip(*rotation, strict=True)
+        reach = _WRIST_3_M + self.tool_offset_m[2]
+        x, y, z = (p - reach * a - b for p, a, b in zip(position, approach, _BASE_M, strict=True))
+        radius = math.hypot(x, y)
+        if radius < _WRIST_1_M:
+            return None
+        # the arm's vertical plane passes beside the wrist
+        turn = math.atan2(y, x) - math.asin(_WRIST_1_M / radius)
+        c1, s1 = math.cos(turn), math.sin(turn)
+        front, side = (c1, s1, 0.0), (-s1, c1, 0.0)
+        cos5 = min(max(_dot(approach, side), -1.0), 1.0)
+        q5 = -math.acos(cos5)
+        sin5 = math.sqrt(1 - cos5 * cos5)
+        if sin5 < 1e-6:
+            return None  # the last axis parallel to those of the arm: the wrist is free to spin
+        across = tuple((a - cos5 * s) / sin5 for a, s in zip(approach, side, strict=True))
+        wrist_2 = _cross(across, side)  # axis of joint 5
+        total = math.atan2(across[2], -_dot(across, front))  # sum of joints 2, 3 and 4
+        # what is left is two links in the plane
+        u = math.sqrt(radius**2 - _WRIST_1_M**2) - _WRIST_2_M * _dot(wrist_2, front)
+        v = z - _WRIST_2_M * wrist_2[2] - _SHOULDER_HEIGHT_M
+        cos3 = (u**2 + v**2 - _UPPER_ARM_M**2 - _FOREARM_M**2) / (2 * _UPPER_ARM_M * _FOREARM_M)
+        if abs(cos3) > 1:
+            return None
+        q3 = math.acos(cos3)
+        q2 = -math.atan2(v, u) - math.atan2(
+            _FOREARM_M * math.sin(q3), _UPPER_ARM_M + _FOREARM_M * cos3
+        )
+        axis_x = tuple(cos5 * a - sin5 * s for a, s in zip(across, side, strict=True))
+        q6 = math.atan2(-_dot(finger, wrist_2), _dot(finger, axis_x))
+        if near is not None:
+            q6 += 2 * math.pi * round((near[5] - q6) / (2 * math.pi))
+        return [turn, q2, q3, total - q2 - q3, q5, q6]
+
+
+@ROBOTS.register("ur5")
+class UR5ParallelJaw(UR5):
+    """UR5 with two fingers that slide on a rail."""
+
+    gripper_model = "parallel_jaw.urdf"
+
+    finger_joints = (7, 8)
+    finger_signs = (1.0, 1.0)
+    finger_open = 0.04
+    finger_links = (frozenset({7}), frozenset({8}))
+    closing_sign = (1.0, -1.0)
+    tool_offset_m = (0.0, 0.0, 0.1425)
+    home_joints = (0.954, -1.732, 1.566, -1.404, -1.571, -0.617)
+    camera_height_m = 0.06
+
+    finger_force = 10.0
+    finger_speed = 0.4
+
+    def load(self) -> int:
+        """Load the robot with a gear between its fingers."""
+        robot = super().load()
+        # two force-limited fingers have no stiffness along their common axis: held bodies slide
+        self._gear(robot, *self.finger_joints, ratio=-1)
+        return robot
+
+
+@ROBOTS.register("ur5_robotiq")
+class UR5Robotiq(UR5):
+    """UR5 with a Robotiq 2F-85, whose pads swing on an arc and stay parallel."""
+
+    gripper_model = "robotiq_2f85.urdf"
+
+    finger_joints = (7, 10)
+    finger_signs = (1.0, 1.0)
+    finger_open = 0.8
+    finger_links = (frozenset({7, 8, 9}), frozenset({10, 11, 12}))
+    closing_sign = (1.0, -1.0)
+    tool_offset_m = (0.0, 0.0, 0.1555)
+    home_joints = (0.954, -1.727, 1.529, -1.372, -1.571, -0.617)
+    camera_height_m = 0.04
+
+    finger_force = 0.6
+    finger_speed = 7.5
+
+    _followers: ClassVar[dict[int, int]] = {8: 7, 9: 7, 11: 10, 12: 10}
+    """Finger and inner knuckle of each side, and the driving joint whose angle they take."""
+
+    def load(self) -> int:
+        """Load the robot and close its linkage by gears."""
+        robot = super().load()
+        for joint in self._followers:
+            pybullet.setJointMotorControl2(
+                robot, joint, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=self.client
+            )
+        for joint, driver in self._followers.items():
+            self._gear(robot, driver, joint, ratio=-1)
+        self._gear(robot, *self.finger_joints, ratio=-1)
+        return robot
+
+    def set_opening(self, opening: float) -> None:
+        """Put the whole linkage at rest at an opening."""
+        pybullet.resetJointStatesMultiDof(
+            self.id,
+            list(self._followers),
+            [[opening * self.finger_open]] * len(self._followers),
+            [[0.0]] * len(self._followers),
+            physicsClientId=self.client,
+        )
+        super().set_opening(opening)
+
+
+def _load_joined(models: Sequence[Path], base_m: Vector, client: int) -> int:
+    """Load URDF files, whose links refer to each other's, as one body."""
+    joined = ElementTree.Element("robot", name="+".join(model.stem for model in models))
+    materials = set()
+    for model in models:
+        for part in ElementTree.parse(model).getroot():
+            if part.tag == "material" and part.get("name") in materials:
+                continue
+            materials.add(part.get("name"))
+            for mesh in part.iter("mesh"):
+                mesh.set("filename", str(model.with_name(mesh.get("filename"))))
+            joined.append(part)
+    file, name = tempfile.mkstemp(suffix=".urdf")  # PyBullet reads from files only
+    try:
+        with os.fdopen(file, "wb") as out:
+            ElementTree.ElementTree(joined).write(out)
+        return pybullet.loadURDF(
+            name,
+            base_m,
+            useFixedBase=True,
+            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+            physicsClientId=client,
+        )
+    finally:
+        os.unlink(name)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

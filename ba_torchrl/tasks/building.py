@@ -1,0 +1,415 @@
+"""Building: the pieces of a blueprint in a world, whether they stand as they should, what is next.
+
+The bodies are matched to the slots by their kind, in whatever way suits the scene best, so that
+every question is answered from any state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import pybullet
+
+from ba_torchrl.sim.bodies import CONTACT_M, Body, Vector, radius_m, vertical_extent
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.structures import UPRIGHT_RAD, Blueprint, Piece
+
+LYING_COSINE = 0.5
+"""A piece lies on another if the surfaces that touch are within 60 degrees of level."""
+SPOT_STEP_M = 0.02
+BEARINGS = 16
+"""Spots on the ground are looked for in steps of this length, or in this many of a half turn."""
+
+
+class Move(NamedTuple):
+    """What to pick and where to place it."""
+
+    body: Body
+    piece: Piece
+    position: Vector
+    """Where its origin goes."""
+    yaw_rad: float | None
+    """Its heading up to multiples of the period; None if any will do."""
+    yaw_period_rad: float
+    onto: tuple[Body, ...]
+    """What it will rest on; nothing stands for the ground."""
+
+
+class PutDown(NamedTuple):
+    """Where on the ground pieces may be put."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    gap_m: float
+    """Room wanted around a piece."""
+    z_m: float = 0.0
+
+
+class _View(NamedTuple):
+    """A piece as it lies now."""
+
+    position: Vector
+    tilt_rad: float
+    on_ground: bool
+    on_floor: bool
+    below: frozenset[Body]
+    """The pieces that it rests on."""
+
+
+Filling = tuple[Body | None, ...]
+"""The body in each slot."""
+
+
+class Building:
+    """The pieces of a blueprint in a world; contacts are those of the last step.
+
+    Args:
+        blueprint: what is to be built.
+        world: where.
+        bodies: the bodies of each kind; there may be more than the blueprint needs.
+        block_m: edge of a block, the measure of what counts as on top.
+        ground: PyBullet ids of what the lowest pieces stand on; the floor if not given.
+
+    Raises:
+        ValueError: there are too few bodies of a kind.
+    """
+
+    def __init__(
+        self,
+        blueprint: Blueprint,
+        world: World,
+        bodies: Mapping[str, Sequence[Body]],
+        block_m: float,
+        ground: Sequence[int] | None = None,
+    ) -> None:
+        self.blueprint = blueprint
+        self.world = world
+        self.block_m = block_m
+        self.ground = frozenset((world.floor,) if ground is None else ground)
+        self.pieces: dict[Body, Piece] = {}
+        for piece in {slot.piece for slot in blueprint.slots}:
+            needed = sum(slot.piece == piece for slot in blueprint.slots)
+            found = bodies.get(piece.kind, ())
+            if len(found) < needed:
+                raise ValueError(f"the blueprint needs {needed} of {piece.kind!r}")
+            self.pieces |= dict.fromkeys(found, piece)
+        self._by_id = {body.id: body for body in self.pieces}
+
+    def is_built(self, held: Body | None = None) -> bool:
+        """Whether the structure stands, with none of its pieces in the gripper.
+
+        Args:
+            held: what the gripper holds.
+        """
+        if held in self.pieces:
+            return False
+        views = self._views()
+        return any(
+            not self._strays(filling, views)
+            for filling in self._fillings(views, held, complete=True)
+        )
+
+    def has_tipped(self, held: Body | None = None) -> bool:
+        """Whether a piece that must stay upright does not, and is not in the gripper either."""
+        return any(
+            piece.stays_upright and body is not held and piece.tilt_rad(body) >= UPRIGHT_RAD
+            for body, piece in self.pieces.items()
+        )
+
+    def next_move(
+        self,
+        put_down: PutDown,
+        held: Body | None = None,
+        effort: Callable[[Body], float] = lambda body: 0.0,
+    ) -> Move | None:
+        """Return the move that brings the structure on, or None if it stands.
+
+        What lies where it belongs stays; what is in the way, or on a piece that is needed, goes
+        to the ground first, from the top down.
+
+        Args:
+            put_down: where on the ground there is room.
+            held: what the gripper holds: it is placed before anything else is picked.
+            effort: metres to add to the way of a piece for picking it, to choose among equals.
+        """
+        views = self._views()
+        fillings = list(self._fillings(views, held))
+        most = max(sum(body is not None for body in filling) for filling in fillings)
+        fillings = [f for f in fillings if sum(body is not None for body in f) == most]
+        if most == len(self.blueprint.slots):
+            if held in self.pieces:
+                return self._to_ground(held, put_down)
+            strays = min((self._strays(filling, views) for filling in fillings), key=len)
+            return self._to_ground(min(strays, key=effort), put_down) if strays else None
+        best: tuple[tuple[int, float], Move | Body] | None = None
+        for filling in fillings:
+            for detour, body, number in self._choices(filling, views, held):
+                if held in self.pieces and body is not held:
+                    detour, body, number = detour + 1, held, None
+                move, way = body, 0.0
+                if number is not None:
+                    move = self._into_slot(body, number, filling, put_down)
+                    way = math.dist(body.position[:2], move.position[:2])
+                cost = (detour, way + (0.0 if body is held else effort(body)))
+                if best is None or cost < best[0]:
+                    best = cost, move
+        assert best is not None  # the lowest empty slot can always be worked at
+        move = best[1]
+        return move if isinstance(move, Move) else self._to_ground(move, put_down)
+
+    # -- reading the scene -------------------------------------------------------------------
+
+    def _views(self) -> dict[Body, _View]:
+        """Return how every piece lies."""
+        heights = {body: body.position[2] for body in self.pieces}
+        views = {}
+        for body, piece in self.pieces.items():
+            touched, below = set(), set()
+            for point in pybullet.getContactPoints(body.id, physicsClientId=self.world.client):
+                if point[8] >= CONTACT_M:
+                    continue
+                touched.add(point[2])
+                other = self._by_id.get(point[2])
+                if (
+                    other is not None
+                    and point[7][2] > LYING_COSINE
+                    and heights[body] - heights[other] >= self.block_m / 2
+                ):
+                    below.add(other)
+            views[body] = _View(
+                body.position,
+                piece.tilt_rad(body),
+                not self.ground.isdisjoint(touched),
+                self.world.floor in touched,
+                frozenset(below),
+            )
+        return views
+
+    def _fillings(
+        self, views: Mapping[Body, _View], held: Body | None, *, complete: bool = False
+    ) -> Iterator[Filling]:
+        """Yield every way to see bodies in the slots; ``complete``: with none left empty."""
+
+        def fill(filling: Filling) -> Iterator[Filling]:
+            number = len(filling)
+            if number == len(self.blueprint.slots):
+                yield filling
+                return
+            for body, piece in self.pieces.items():
+                if (
+                    piece == self.blueprint.slots[number].piece
+                    and body is not held
+                    and body not in filling
+                    and self._fits(body, number, filling, views)
+                ):
+                    yield from fill((*filling, body))
+            if not complete:
+                yield from fill((*filling, None))
+
+        return fill(())
+
+    def _fits(self, body: Body, number: int, filling: Filling, views: Mapping[Body, _View]) -> bool:
+        """Whether a body lies as it must to fill a slot."""
+        slot, view = self.blueprint.slots[number], views[body]
+        supports = [filling[i] for i in slot.on]
+        if view.tilt_rad >= UPRIGHT_RAD or None in supports:
+            return False
+        partner = self.blueprint.partner(number)
+        if supports:
+            if view.on_floor or not view.below.issuperset(supports):
+                return False
+        elif not view.on_ground or view.below:
+            return False
+        if partner is not None:
+            return partner > number or self._is_pair(body, number, partner, filling, views)
+        if not supports:
+            return True
+        over = [filling[i] for i in slot.over or slot.on]
+        if None in over:
+            return False
+        dx, dy = (view.position[i] - _middle(views[o].position for o in over)[i] for i in (0, 1))
+        if len(over) == 1:
+            return max(abs(dx), abs(dy)) <= self.block_m / 2
+        return math.hypot(dx, dy) < self.block_m
+
+    def _is_pair(
+        self,
+        body: Body,
+        number: int,
+        partner: int,
+        filling: Filling,
+        views: Mapping[Body, _View],
+    ) -> bool:
+        """Whether a body stands right beside the one in a slot for a bridge to lie on both."""
+        other = filling[partner]
+        if other is None:
+            return False
+        on = self.blueprint.slots[number].on
+        here, there = views[body].position, views[other].position
+        if on:
+            middle = views[filling[on[0]]].position
+            if math.dist(_middle((here, there))[:2], middle[:2]) >= self.block_m:
+                return False
+        bridge = self.blueprint.slots[self.blueprint.bridge_on(number)]
+        if bridge.span.least_m <= math.dist(here[:2], there[:2]) <= bridge.span.most_m:
+            return True
+        return any(
+            piece == bridge.piece and views[candidate].below.issuperset((body, other))
+            for candidate, piece in self.pieces.items()
+        )
+
+    def _strays(
+        self,
+        filling: Filling,
+        views: Mapping[Body, _View],
+        numbers: Sequence[int] | None = None,
+    ) -> list[Body]:
+        """Return what lies on the bodies in some slots and does not belong there.
+
+        Args:
+            filling: the body in each slot.
+            views: how the pieces lie.
+            numbers: the slots; those that must stay free if not given.
+        """
+        slots = self.blueprint.slots
+        if numbers is None:
+            numbers = [i for i, slot in enumerate(slots) if slot.stays_free]
+        strays = []
+        for number in numbers:
+            own = {filling[i] for i, slot in enumerate(slots) if number in slot.on}
+            strays += [
+                body
+                for body, view in views.items()
+                if filling[number] in view.below and body not in own
+            ]
+        return strays
+
+    # -- choosing ----------------------------------------------------------------------------
+
+    def _choices(
+        self, filling: Filling, views: Mapping[Body, _View], held: Body | None
+    ) -> Iterator[tuple[int, Body, int | None]]:
+        """Yield what could be done next.
+
+        Yields:
+            How many pieces must go to the ground first, the body to move, and the slot that it
+            goes to; None for the ground.
+        """
+        for number, slot in enumerate(self.blueprint.slots):
+            partner = self.blueprint.partner(number)
+            if filling[number] is not None or any(filling[i] is None for i in slot.on):
+                continue
+            if partner is not None and partner < number and filling[partner] is None:
+                continue
+            beside = () if partner is None or filling[partner] is None else (partner,)
+            strays = self._strays(filling, views, (*slot.on, *beside))
+            for body, piece in self.pieces.items():
+                if piece != slot.piece or body in filling:
+                    continue
+                in_the_way = {stray for stray in strays if stray is not body}
+                for _ in self.pieces:  # with all that lies on them
+                    in_the_way |= {
+                        other
+                        for other, view in views.items()
+                        if other is not held and view.below & {body, *in_the_way}
+                    }
+                in_the_way -= {body, held}
+                if not in_the_way:
+                    yield 0, body, number
+                for top in in_the_way:
+                    if not any(top in views[other].below for other in in_the_way):
+                        yield len(in_the_way), top, None
+
+    def _into_slot(self, body: Body, number: int, filling: Filling, put_down: PutDown) -> Move:
+        """Return the move that fills a slot."""
+        slots, slot, piece = self.blueprint.slots, self.blueprint.slots[number], self.pieces[body]
+        supports = [filling[i] for i in slot.on]
+        partner = self.blueprint.partner(number)
+        beside = None if partner is None else filling[partner]
+        span = None if partner is None else slots[self.blueprint.bridge_on(number)].span
+        if not supports:
+            ring = None if beside is None else (beside, span.aim_m)
+            return self._to_ground(body, put_down, ring)
+        x, y, _ = _middle(filling[i].position for i in slot.over or slot.on)
+        z = max(vertical_extent(support)[1] for support in supports)
+        z += body.position[2] - vertical_extent(body)[0]
+        yaw, period = None, piece.yaw_period_rad
+        if len(supports) == 2:
+            (ax, ay, _), (bx, by, _) = (support.position for support in supports)
+            yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
+        else:
+            support = self.pieces[supports[0]]
+            yaw = support.yaw_rad(supports[0])
+            if span is not None:
+                x, y = self._along(body, supports[0], beside, span.aim_m)
+            period = min(period, support.yaw_period_rad)
+        if not slot.inherits_yaw:
+            yaw = None
+        return Move(body, piece, (x, y, z), yaw, period, tuple(supports))
+
+    def _along(
+        self, body: Body, support: Body, beside: Body | None, apart_m: float
+    ) -> tuple[float, float]:
+        """Return where on a long support one of two pieces goes."""
+        heading = self.pieces[support].yaw_rad(support) + math.pi / 2
+        ux, uy = math.cos(heading), math.sin(heading)
+        sx, sy, _ = support.position
+
+        def along(other: Body) -> float:
+            x, y, _ = other.position
+            return (x - sx) * ux + (y - sy) * uy
+
+        if beside is None:
+            place = math.copysign(apart_m / 2, along(body))
+        else:
+            place = along(beside) - math.copysign(apart_m, along(beside))
+        return sx + place * ux, sy + place * uy
+
+    def _to_ground(
+        self, body: Body, put_down: PutDown, ring: tuple[Body, float] | None = None
+    ) -> Move:
+        """Return the move to a spot on the ground with room around it, the nearest such.
+
+        Args:
+            body: what to move.
+            put_down: where there is room.
+            ring: the body beside which it goes, and how far from it.
+        """
+        x, y, z = body.position
+        others = [other for other in self.pieces if other is not body]
+        if ring is None:
+            spots = [
+                (spot_x, spot_y) for spot_x in _steps(*put_down.x) for spot_y in _steps(*put_down.y)
+            ]
+        else:
+            others.remove(ring[0])
+            (cx, cy, _), radius = ring[0].position, ring[1]
+            bearing = math.atan2(y - cy, x - cx)
+            turns = [bearing + math.pi * i / BEARINGS for i in range(2 * BEARINGS)]
+            spots = [(cx + radius * math.cos(t), cy + radius * math.sin(t)) for t in turns]
+        standing = [(other.position[:2], radius_m(other)) for other in others]
+
+        def cost(spot: tuple[float, float]) -> tuple[float, float]:
+            outside = max(
+                max(low - value, value - high, 0.0)
+                for value, (low, high) in zip(spot, (put_down.x, put_down.y), strict=True)
+            )
+            room = min((math.dist(spot, at) - r for at, r in standing), default=math.inf)
+            return (
+                outside + max(put_down.gap_m + radius_m(body) - room, 0.0),
+                math.dist(spot, (x, y)),
+            )
+
+        place = (*min(spots, key=cost), put_down.z_m + z - vertical_extent(body)[0])
+        return Move(body, self.pieces[body], place, None, self.pieces[body].yaw_period_rad, ())
+
+
+def _middle(points: Iterable[Vector]) -> Vector:
+    return tuple(sum(values) / len(values) for values in zip(*points, strict=True))
+
+
+def _steps(low: float, high: float) -> list[float]:
+    count = max(1, round((high - low) / SPOT_STEP_M))
+    return [low + (high - low) * i / count for i in range(count + 1)]

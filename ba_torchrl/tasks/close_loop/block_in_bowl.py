@@ -1,0 +1,125 @@
+"""Block in Bowl: pick up a block and place it inside a bowl (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand
+from ba_torchrl.sim.bodies import Body, Solid, vertical_extent
+from ba_torchrl.sim.meshes import bowl_parts, centroid
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS, Spot
+from ba_torchrl.tasks.close_loop.base import BLUE, CloseLoopTask
+from ba_torchrl.tasks.experts import CLOSED, OPEN, pick_up, towards, travel
+
+RELEASE_GAP_M = 4e-3
+"""The block is let go of this far above the bowl's floor; it lands before the action ends."""
+
+
+@TASKS.register("close_loop/block_in_bowl")
+class BlockInBowl(CloseLoopTask):
+    """A 5 cm block and a bowl of 16 x 16 x 7 cm; success when the block lies inside the bowl.
+
+    Placing includes letting go: a block that the gripper still holds inside the bowl could leave
+    it with the next action. A bowl that has tipped over ends the episode.
+    """
+
+    bowl_radius_m: ClassVar[float] = 0.08
+    bowl_height_m: ClassVar[float] = 0.07
+    floor_m: ClassVar[float] = 0.016
+    inside_m: ClassVar[float] = 0.03
+    upright_rad: ClassVar[float] = math.pi / 9
+    tipped_rad: ClassVar[float] = math.pi / 3
+    """Beyond this the bowl does not fall back onto its foot."""
+    clearance_m: ClassVar[float] = 8e-3
+    """Gap between the block and the rim that it passes over."""
+    within_rim_m: ClassVar[float] = 0.03
+    """This close to the bowl's axis, a block at any yaw has room between the walls."""
+
+    def build(self, world: World) -> None:
+        """Load the block and the bowl."""
+        scale = self.settings.scale
+        parts = tuple(
+            bowl_parts(
+                self.bowl_radius_m * scale,
+                self.bowl_height_m * scale,
+                foot_radius_m=0.045 * scale,
+                floor_m=self.floor_m * scale,
+                wall_m=0.006 * scale,
+            )
+        )
+        self.block = world.add(self.cube(), "block")
+        self.bowl = world.add(
+            Solid(parts=parts, color=BLUE, center_of_mass_m=centroid(parts)), "bowl"
+        )
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put block and bowl anywhere, 17 cm apart or more."""
+        block = 2.4 * self.block_m
+        bowl = 0.17 * self.settings.scale
+        points = self.random_points(rng, (Spot(block, block), Spot(bowl, bowl)))
+        for body, xy in zip((self.block, self.bowl), points, strict=True):
+            self.stand(body, xy, self.random_yaw(rng, math.pi))
+
+    def is_goal(self) -> bool:
+        """Whether the block was let go of and touches the upright bowl, close to its middle."""
+        (x, y, z), (bowl_x, bowl_y, bowl_z) = self.block.position, self.bowl.position
+        floor_z = bowl_z - self.bowl.shape.height_m / 2 + self.floor_m * self.settings.scale
+        return (
+            math.dist((x, y), (bowl_x, bowl_y)) < self.inside_m * self.settings.scale
+            and z > floor_z  # not below a bowl that stands on it
+            and self.bowl.tilt_rad < self.upright_rad
+            and self.bowl.touches(self.block)
+            and self.robot.held_body() is not self.block
+        )
+
+    def is_valid(self) -> bool:
+        """Whether both are inside the workspace and the bowl has not tipped over."""
+        return super().is_valid() and self.bowl.tilt_rad < self.tipped_rad
+
+    def expert_command(self) -> GripperCommand:
+        """Grasp the block, carry it over the rim and let go of it inside."""
+        if self.robot.held_body() is self.block and self.robot.opening() < 0.9:
+            return self._carry()
+        return pick_up(
+            self.robot,
+            self.block,
+            self.reach,
+            yaws_rad=(self.block.yaw_rad, self.block.yaw_rad + math.pi / 2),
+            obstacles=(self.bowl,),
+            ceiling_m=self.settings.workspace.z[1],
+        )
+
+    def _carry(self) -> GripperCommand:
+        """Carry the block over the rim, lower it between the walls and let go of it."""
+        (x, y, z), yaw = self.robot.tool_pose()
+        block_x, block_y, _ = self.block.position
+        bowl_x, bowl_y, bowl_z = self.bowl.position
+        dx, dy = bowl_x - block_x, bowl_y - block_y
+        low, _ = vertical_extent(self.block)
+        floor_z = bowl_z - self.bowl.shape.height_m / 2 + self.floor_m * self.settings.scale
+        if math.hypot(dx, dy) <= self.within_rim_m * self.settings.scale:
+            down = low - floor_z - RELEASE_GAP_M
+            arrives = max(down, abs(dx), abs(dy)) <= self.reach.step_m
+            return towards(self.robot, (x + dx, y + dy, z - down), yaw, OPEN if arrives else CLOSED)
+        top = vertical_extent(self.bowl)[1]
+        return travel(
+            self.robot,
+            (x + dx, y + dy, z - low + top + self.clearance_m),
+            yaw,
+            CLOSED,
+            self.reach,
+            below_m=z - low,
+            obstacles=(self.bowl,),
+            ceiling_m=self.settings.workspace.z[1],
+            hover_m=self.clearance_m,
+        )
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """Block and bowl."""
+        return (self.block, self.bowl)

@@ -1,0 +1,211 @@
+"""Corner Picking: nudge a block out of a corner, then grasp and lift it (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, press_n, vertical_extent
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.base import CloseLoopTask
+from ba_torchrl.tasks.experts import (
+    CLOSED,
+    FINGER_HALF_M,
+    HALF_FINGER_DEPTH_M,
+    HOVER_M,
+    OPEN,
+    TIP_BELOW_TOOL_M,
+    lift,
+    pick_up,
+    towards,
+    turned,
+)
+
+WALL: Color = (0.72, 0.7, 0.66, 1.0)
+BASE: Color = (0.86, 0.85, 0.82, 1.0)
+
+SEAM_M = 1e-4
+"""Gap between block and walls: bodies that overlap by a rounding error push each other off, and
+nothing on the smooth base would stop the block."""
+
+ROOM_M = 2e-3
+"""Room beside the open fingers with which a block counts as nudged out."""
+DRAG_ROOM_M = 22e-3
+"""Room with which a drag ends; more, so that the next look does not start another."""
+OUT_M = 0.0
+"""A drag leads to this place along both axes of the corner's frame."""
+FIRM_N = 2.0
+"""Fingers that press this hard take the block along."""
+PRESS_M = 5e-3
+"""How far below the block's top the fingers are sent to press; the guard stops them earlier."""
+NEAR_M = 5e-4
+"""Fingers come down to this gap above the block before they press: what starts closer than a
+millimetre creeps, and does not hit the block."""
+TOUCH_M = 3e-3
+"""Gap above the block at which the approach ends."""
+PRESS_ASIDE_M = 5e-3
+"""The place to press on is met within this distance."""
+PRESS_TURN_RAD = 0.15
+HAND_HALF_M = 0.042
+"""Half the closed hand's width along the fingers, with a few millimetres to spare."""
+TIP_HALF_M = 8e-3
+"""The middle of the fingertips stays this far from the edge of the block's top."""
+OPENING_HEIGHT_M = TIP_BELOW_TOOL_M + 6e-3
+"""Height of the tool above the block's top at which the fingers open."""
+
+
+@TASKS.register("close_loop/corner_picking")
+class CornerPicking(CloseLoopTask):
+    """A 5 cm block flush with two walls; success when it is held with the tool 15 cm above ground.
+
+    The walls stand over two edges of a smooth square base. Between block and walls there is no
+    room for a finger; pressed from above, the block slides out.
+    """
+
+    base_m: ClassVar[float] = 0.2
+    base_height_m: ClassVar[float] = 2e-3
+    base_friction: ClassVar[float] = 1e-3
+    wall_m: ClassVar[float] = 0.02
+    wall_height_m: ClassVar[float] = 0.1
+    lift_height_m: ClassVar[float] = 0.15
+
+    def build(self, world: World) -> None:
+        """Load the block, the base and the walls."""
+        self.block = world.add(self.cube(), "block")
+        size = (self.base_m, self.base_m, self.base_height_m)
+        self.base = world.add(
+            Box(size_m=size, mass_kg=0, friction=self.base_friction, color=BASE), "base"
+        )
+        # the second wall ends at the first
+        length = self.base_m + self.wall_m
+        self.walls = [
+            world.add(Box(size_m=(*size, self.wall_height_m), mass_kg=0, color=WALL), name)
+            for size, name in (
+                ((self.wall_m, length), "wall across x"),
+                ((length - self.wall_m, self.wall_m), "wall across y"),
+            )
+        ]
+
+    @property
+    def corner(self) -> tuple[float, float, float]:
+        """x, y and yaw of the corner; its walls are at negative x and y of its frame."""
+        return (*self.base.position[:2], self.base.yaw_rad)
+
+    def to_world(self, x: float, y: float) -> tuple[float, float]:
+        """Return the place of a point given in the corner's frame."""
+        cx, cy, yaw = self.corner
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return cx + cos * x - sin * y, cy + sin * x + cos * y
+
+    def to_corner(self, x: float, y: float) -> tuple[float, float]:
+        """Return the place of a point in the corner's frame."""
+        cx, cy, yaw = self.corner
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return cos * (x - cx) + sin * (y - cy), cos * (y - cy) - sin * (x - cx)
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put the corner anywhere, 10 cm from the border, with the block in it."""
+        xy = self.random_point(rng, self.base_m)
+        self.put_corner(xy, self.random_yaw(rng, 2 * math.pi))
+
+    def put_corner(self, xy: tuple[float, float], yaw_rad: float) -> None:
+        """Put the corner at a pose, with the block in it."""
+        edge, wall = self.base_m / 2, self.wall_m
+        self.stand(self.base, xy, yaw_rad)
+        self.stand(self.walls[0], self.to_world(-edge, -wall / 2), yaw_rad)
+        self.stand(self.walls[1], self.to_world(wall / 2, -edge), yaw_rad)
+        flush = -edge + wall / 2 + self.block_m / 2 + SEAM_M
+        z = self.settings.surface_z_m + self.base_height_m + self.block_m / 2
+        self.block.place((*self.to_world(flush, flush), z), yaw_rad)
+
+    def is_goal(self) -> bool:
+        """Whether the block is held and the tool higher than 15 cm."""
+        if self.robot.held_body() is not self.block:
+            return False
+        return self.robot.tool_pose()[0][2] > self.lift_height_m
+
+    def expert_command(self) -> GripperCommand:
+        """Nudge the block out of the corner until fingers fit beside it, then grasp and lift it."""
+        robot, block, reach = self.robot, self.block, self.reach
+        if robot.held_body() is block and robot.opening() < 0.9:
+            return lift(reach.step_m)
+        position, yaw = robot.tool_pose()
+        is_pressing = robot.opening() < 0.5 and press_n(robot.id, block) > FIRM_N
+        yaws = [turned(yaw, block.yaw_rad + k * math.pi / 2, reach, math.pi) for k in (0, 1)]
+        needed = DRAG_ROOM_M if is_pressing else ROOM_M
+        yaws = [wanted for wanted in yaws if self.room_m(wanted) >= needed]
+        if not yaws:
+            return self._drag() if is_pressing else self._press()
+        if is_pressing:  # no turn yet: it would spin the block
+            x, y, z = block.position
+            return towards(robot, (x, y, z + self.block_m / 2 + OPENING_HEIGHT_M), yaw, OPEN)
+        ceiling = self.settings.workspace.z[1]
+        return pick_up(robot, block, reach, yaws_rad=yaws, ceiling_m=ceiling)
+
+    def room_m(self, yaw_rad: float) -> float:
+        """Return the gap between open fingers around the block and the walls.
+
+        Args:
+            yaw_rad: the gripper's; the gap is in metres, negative where there is none.
+        """
+        turn = yaw_rad - self.corner[2]
+        along = self.robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
+        cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
+        reaches = (along * cos + FINGER_HALF_M * sin, along * sin + FINGER_HALF_M * cos)
+        place = self.to_corner(*self.block.position[:2])
+        inner = (self.wall_m - self.base_m) / 2
+        outer = inner - self.wall_m
+        return min(
+            max(b - reach - inner, outer - b - reach)
+            for b, reach in zip(place, reaches, strict=True)
+        )
+
+    def _press(self) -> GripperCommand:
+        """Go over the block with closed fingers, come down to it, and press."""
+        robot, reach = self.robot, self.reach
+        (x, y, z), yaw = robot.tool_pose()
+        target_yaw = turned(yaw, self.corner[2], reach, math.pi / 2)
+        turn = wrap_angle(target_yaw - yaw)
+        # the hand is wider than the block along the fingers, and has the wall beside it
+        px, py = self.to_corner(*self.block.position[:2])
+        away = min(HAND_HALF_M - self.block_m / 2, self.block_m / 2 - TIP_HALF_M)
+        if abs(math.cos(target_yaw - self.corner[2])) > 0.7:
+            px += away
+        else:
+            py += away
+        tool_x, tool_y = self.to_corner(x, y)
+        top = vertical_extent(self.block)[1]
+        low_z = top + TIP_BELOW_TOOL_M + TOUCH_M
+        aside = max(abs(tool_x - px), abs(tool_y - py))
+        target = self.to_world(px, py)
+        if robot.opening() < 0.1 and aside < PRESS_ASIDE_M and abs(turn) < PRESS_TURN_RAD:
+            gap = gap_m(robot.id, self.block)
+            if gap <= 2 * NEAR_M:
+                return lift(-PRESS_M)
+            if gap <= reach.step_m:
+                return lift(NEAR_M - gap)
+        if z < low_z - TOUCH_M / 2 and aside > PRESS_ASIDE_M:
+            return lift(low_z + TOUCH_M - z)  # not from the side: that pushes the block back
+        is_clear = min(tool_x - px, tool_y - py) > -PRESS_ASIDE_M and abs(turn) < PRESS_TURN_RAD
+        if not is_clear or robot.opening() >= 0.1:
+            low_z = vertical_extent(self.walls[0])[1] + TIP_BELOW_TOOL_M + HOVER_M
+            if z < low_z - 1e-3:
+                return lift(low_z - z)
+        return towards(robot, (*target, low_z), target_yaw, CLOSED)
+
+    def _drag(self) -> GripperCommand:
+        """Drag the block away from both walls, straight towards its place."""
+        goal = self.to_world(*(max(b, OUT_M) for b in self.to_corner(*self.block.position[:2])))
+        dx, dy = (g - b for g, b in zip(goal, self.block.position, strict=False))
+        share = min(1.0, self.reach.step_m / max(abs(dx), abs(dy), 1e-6))
+        return GripperCommand(CLOSED, share * dx, share * dy, 0.0, 0.0)
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The block; the corner is fixed."""
+        return (self.block,)

@@ -1,0 +1,244 @@
+"""Drawer Opening: pull a drawer open by its handle (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.sim.articulated import Rail
+from ba_torchrl.sim.bodies import Body, Color, Solid, Vector
+from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
+from ba_torchrl.sim.robots.base import Pose
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import LAYOUT_ATTEMPTS, TASKS, PlacementError
+from ba_torchrl.tasks.close_loop.base import CloseLoopTask
+from ba_torchrl.tasks.experts import (
+    ALIGNED_M,
+    ALIGNED_RAD,
+    CLEARANCE_M,
+    CLOSED,
+    FINGER_HALF_M,
+    lift,
+    towards,
+    turned,
+)
+
+CABINET_M: Vector = (0.22, 0.23, 0.11)
+"""Depth along x, width, height; the open front looks towards +x."""
+WALL_M = 0.01
+DRAWER_WALL_M = 0.006
+PLAY_M = 0.003
+"""Gap between drawer and cabinet on each side."""
+RIM_M = 0.085
+"""Height of the drawer's sides above the floor."""
+ROD_LENGTH_M, ROD_DIAMETER_M = 0.1, 0.015
+ROD_OFFSET_M, ROD_HEIGHT_M = 0.05, 0.08
+"""Of the rod's axis: off the front, and above the floor."""
+POST_M = 0.008
+POST_GAP_M = 0.07
+"""Free width between the handle's posts; closed fingers are 6 cm wide where they pass it."""
+
+WOOD: Color = (0.72, 0.55, 0.38, 1.0)
+LIGHT_WOOD: Color = (0.9, 0.78, 0.6, 1.0)
+
+HOOK_DEPTH_M = 0.01
+"""The expert's tool below the rod's axis; the fingertips reach another 1.5 cm down."""
+PLAY_BEHIND_M = 0.0085
+"""Gap between rod and fingers when they come down behind it, in the middle of the room there."""
+SLIGHT_TURN_RAD = 0.4
+"""Turned farther than this, the gripper needs room for its open fingers in front of the cabinet."""
+SPAN_HALF_M = 0.07
+"""Half the width of the gripper, across its open fingers."""
+MARGIN_M = 0.01
+"""The expert pulls this much farther than the goal asks."""
+
+
+@TASKS.register("close_loop/drawer_opening")
+class DrawerOpening(CloseLoopTask):
+    """A cabinet with one drawer at a random pose; success when it is open by more than 15 cm."""
+
+    goal_travel_m: ClassVar[float] = 0.15
+    travel_range_m: ClassVar[tuple[float, float]] = (0.0, 0.2)
+    friction_n: ClassVar[float] = 3.0
+    """Stops the drawer, 0.5 kg, faster than the fingers that pull it slow down."""
+
+    def build(self, world: World) -> None:
+        """Load the cabinet with its drawer."""
+        scale = self.settings.scale
+        low, high = self.travel_range_m
+        self.cabinet = world.add_articulated(
+            Solid(parts=_scaled(cabinet_parts(), scale), mass_kg=0.0, color=WOOD),
+            Solid(
+                parts=_scaled(drawer_parts(), scale),
+                mass_kg=0.5,
+                color=LIGHT_WOOD,
+            ),
+            Rail(range_m=(low * scale, high * scale), friction_n=self.friction_n),
+            "cabinet",
+        )
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put the cabinet beside the workspace, opening towards its centre.
+
+        Layouts whose handle leaves the workspace on the way to the goal, where no gripper can
+        follow it, are drawn again: one in five.
+
+        Raises:
+            PlacementError: no layout suits the workspace.
+        """
+        scale = self.settings.scale
+        x, y = self.settings.workspace.center
+        for _ in range(LAYOUT_ATTEMPTS):
+            if self.settings.random_orientation:
+                yaw = float(rng.uniform(0.0, 2 * math.pi))
+            else:
+                yaw = float(rng.choice((math.pi / 2, 3 * math.pi / 2)))
+            back, aside = scale * float(rng.uniform(0.15, 0.2)), float(rng.uniform(-0.1, 0.1))
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            self.cabinet.place(
+                (x - back * cos - aside * sin, y - back * sin + aside * cos, 0.0), yaw
+            )
+            if self._can_be_opened():
+                return
+        raise PlacementError(
+            "no place for the cabinet lets its handle move inside the workspace: enlarge "
+            "`workspace` or lower `object_scale_range`"
+        )
+
+    def is_goal(self) -> bool:
+        """Whether the drawer is open by more than 15 cm."""
+        return self.cabinet.travel_m > self._goal_m
+
+    def expert_command(self) -> GripperCommand:
+        """Come down behind the handle with closed fingers and pull it along.
+
+        Behind and below the rod, between the posts, the fingers pull; straight above that place
+        they go down; from anywhere else they go there, over whatever stands in the way.
+        """
+        robot, reach, scale = self.robot, self.reach, self.settings.scale
+        (x, y, z), yaw = robot.tool_pose()
+        (rx, ry, rz), heading = self.handle_pose
+        ux, uy = math.cos(heading), math.sin(heading)
+        ahead = (x - rx) * ux + (y - ry) * uy
+        aside = abs((y - ry) * ux - (x - rx) * uy)
+        target_yaw = turned(yaw, heading + math.pi / 2, reach, math.pi)
+        turn = abs(wrap_angle(target_yaw - yaw))
+        radius = ROD_DIAMETER_M / 2 * scale
+        front = -ROD_OFFSET_M * scale
+        hook_z = rz - HOOK_DEPTH_M * scale
+        is_closed = robot.opening() < 0.1
+
+        if (
+            z < rz
+            and front < ahead < -radius
+            and aside < POST_GAP_M / 2 * scale - FINGER_HALF_M
+            and turn < SLIGHT_TURN_RAD
+            and is_closed
+        ):
+            slack = -ahead - radius - FINGER_HALF_M
+            farther = self._goal_m + MARGIN_M - self.cabinet.travel_m + slack
+            advance = ahead + min(farther, reach.step_m / max(abs(ux), abs(uy)))
+            target = (rx + advance * ux, ry + advance * uy, hook_z)
+            return towards(robot, target, target_yaw, CLOSED)
+
+        behind = -radius - FINGER_HALF_M - PLAY_BEHIND_M
+        hx, hy = rx + behind * ux, ry + behind * uy
+        is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
+        if is_beside and turn <= ALIGNED_RAD and is_closed:
+            return towards(robot, (hx, hy, hook_z), target_yaw, CLOSED)
+        across = 2 * FINGER_HALF_M if turn < SLIGHT_TURN_RAD else SPAN_HALF_M
+        is_over_cabinet = ahead < front + across
+        top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
+        if z < top + CLEARANCE_M - 1e-3:
+            return lift(top + CLEARANCE_M - z, robot.opening())
+        return towards(robot, (hx, hy, top + CLEARANCE_M), target_yaw, CLOSED)
+
+    @property
+    def handle_pose(self) -> Pose:
+        """Middle of the handle's rod, and the direction in which the drawer opens."""
+        slider, scale = self.cabinet.slider, self.settings.scale
+        (x, y, z), heading = slider.position, slider.yaw_rad
+        out = (CABINET_M[0] / 2 + ROD_OFFSET_M) * scale
+        middle = (x + out * math.cos(heading), y + out * math.sin(heading))
+        return (*middle, z + ROD_HEIGHT_M * scale), heading
+
+    @property
+    def landmarks(self) -> Sequence[Pose]:
+        """Cabinet and handle."""
+        base = self.cabinet.base
+        return [(base.position, base.yaw_rad), self.handle_pose]
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """None: what moves here stays on its rail."""
+        return ()
+
+    @property
+    def _goal_m(self) -> float:
+        return self.goal_travel_m * self.settings.scale
+
+    def _can_be_opened(self) -> bool:
+        """Whether the handle of the closed drawer stays in the workspace on its way to the goal."""
+        (x, y, z), heading = self.handle_pose
+        ux, uy = math.cos(heading), math.sin(heading)
+        behind = -ROD_DIAMETER_M - FINGER_HALF_M
+        return all(
+            self.settings.workspace.contains((x + s * ux, y + s * uy, z - HOOK_DEPTH_M))
+            for s in (behind, self._goal_m)
+        )
+
+
+def cabinet_parts() -> tuple[Mesh, ...]:
+    """Return the cabinet's five walls; the origin is on the floor below its middle."""
+    depth, width, height = CABINET_M
+    side = (depth, WALL_M, height - 2 * WALL_M)
+    y = (width - WALL_M) / 2
+    return (
+        moved(box_mesh((depth, width, WALL_M)), (0.0, 0.0, WALL_M / 2)),
+        moved(box_mesh((depth, width, WALL_M)), (0.0, 0.0, height - WALL_M / 2)),
+        moved(box_mesh(side), (0.0, y, height / 2)),
+        moved(box_mesh(side), (0.0, -y, height / 2)),
+        moved(
+            box_mesh((WALL_M, width - 2 * WALL_M, height - 2 * WALL_M)),
+            ((WALL_M - depth) / 2, 0.0, height / 2),
+        ),
+    )
+
+
+def drawer_parts() -> tuple[Mesh, ...]:
+    """Return the closed drawer in the cabinet's frame: floor, sides, front, and the handle."""
+    depth, width, height = CABINET_M
+    front_x = depth / 2
+    back_x = -depth / 2 + WALL_M + PLAY_M
+    low, high = WALL_M + PLAY_M, height - WALL_M - PLAY_M
+    outer = width - 2 * WALL_M - 2 * PLAY_M
+    length = front_x - WALL_M - back_x
+    middle = (back_x + front_x - WALL_M) / 2
+    rise = RIM_M - low - DRAWER_WALL_M
+    rim_z = low + DRAWER_WALL_M + rise / 2
+    side_y = (outer - DRAWER_WALL_M) / 2
+    reach = ROD_OFFSET_M
+    post_y = (POST_GAP_M + POST_M) / 2
+    post = box_mesh((reach, POST_M, POST_M))
+    rod = rod_mesh(ROD_LENGTH_M, ROD_DIAMETER_M)
+    return (
+        moved(box_mesh((length, outer, DRAWER_WALL_M)), (middle, 0.0, low + DRAWER_WALL_M / 2)),
+        moved(box_mesh((length, DRAWER_WALL_M, rise)), (middle, side_y, rim_z)),
+        moved(box_mesh((length, DRAWER_WALL_M, rise)), (middle, -side_y, rim_z)),
+        moved(
+            box_mesh((DRAWER_WALL_M, outer - 2 * DRAWER_WALL_M, rise)),
+            (back_x + DRAWER_WALL_M / 2, 0.0, rim_z),
+        ),
+        moved(box_mesh((WALL_M, outer, high - low)), (front_x - WALL_M / 2, 0.0, (low + high) / 2)),
+        moved(post, (front_x + reach / 2, post_y, ROD_HEIGHT_M)),
+        moved(post, (front_x + reach / 2, -post_y, ROD_HEIGHT_M)),
+        moved(rod, (front_x + reach, 0.0, ROD_HEIGHT_M)),
+    )
+
+
+def _scaled(parts: Sequence[Mesh], scale: float) -> tuple[Mesh, ...]:
+    return tuple(Mesh(vertices * scale, faces) for vertices, faces in parts)

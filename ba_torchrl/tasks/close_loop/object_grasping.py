@@ -1,0 +1,150 @@
+"""Object Grasping: take any object out of a heap in a tray (appendix A.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.sim.assets.base import load_object_set
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.cameras import HeightCamera
+from ba_torchrl.sim.robots.base import Pose
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.base import CloseLoopTask
+from ba_torchrl.tasks.clutter import Clutter
+from ba_torchrl.tasks.experts import ALIGNED_M, ALIGNED_RAD, CLOSED, OPEN, lift, towards
+from ba_torchrl.tasks.grasps import GraspPlanner
+from ba_torchrl.tasks.tray import MARGIN_M, add_tray
+
+
+@TASKS.register("close_loop/object_grasping")
+class ObjectGrasping(CloseLoopTask):
+    """Random objects in a tray; success when one is held with the tool 15 cm above ground.
+
+    An episode goes on with what the last one left, less what it lifted, until the tray is empty,
+    an object left the workspace, or `failures_allowed` episodes in a row came to nothing: then
+    new objects fall in.
+    """
+
+    num_objects = 5
+    num_objects_range = (1, 15)
+    fits_tray = True
+    parameters = frozenset({"object_set", "asset_root"})
+
+    lift_height_m: ClassVar[float] = 0.15
+    failures_allowed: ClassVar[int] = 3
+
+    def build(self, world: World) -> None:
+        """Load the tray and every shape of the object set."""
+        settings = self.settings
+        if not settings.surface_z_m:
+            add_tray(world, settings.workspace.center, settings.workspace.width)
+        shapes = load_object_set(**{
+            "name": settings.parameters["object_set"],
+            "asset_root": settings.parameters["asset_root"],
+        })
+        self.clutter = Clutter(world, shapes, shapes.names, settings.num_objects)
+        self._planner: GraspPlanner | None = None
+        self._failures = 0
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Let new objects fall into the tray."""
+        workspace = self.settings.workspace
+        self._failures = 0
+        self.clutter.drop(
+            rng,
+            self.settings.num_objects,
+            center_xy=workspace.center,
+            spread_m=(workspace.width - MARGIN_M) / 2 - 0.03,
+            random_orientation=self.settings.random_orientation,
+            robot=self.robot,
+        )
+
+    @property
+    def continues(self) -> bool:
+        """Whether something is left that is worth another try."""
+        if self.is_goal():
+            return len(self.clutter.present) > 1
+        return bool(self.clutter.present) and self._failures + 1 < self.failures_allowed
+
+    def resume(self) -> None:
+        """Put what was lifted aside."""
+        if self.is_goal():
+            self.clutter.put_aside(self.robot.held_body())
+            self._failures = 0
+        else:
+            self._failures += 1
+
+    def is_goal(self) -> bool:
+        """Whether any object is held and the tool higher than 15 cm."""
+        if self.robot.tool_pose()[0][2] <= self.lift_height_m:
+            return False
+        return self.robot.held_body() is not None
+
+    def expert_command(self) -> GripperCommand:
+        """Close the fingers around the object that takes fewest actions, then go up."""
+        robot, reach = self.robot, self.reach
+        (x, y, z), yaw = robot.tool_pose()
+        if robot.opening() < 0.9:
+            return lift(reach.step_m, CLOSED if robot.held_body() is not None else OPEN)
+        if self._planner is None:
+            camera = HeightCamera(self.world.bodies)
+            self._planner = GraspPlanner(self.clutter.bodies, camera, self.settings.workspace)
+        heights = self._planner.heights()
+        plan = self._planner.plan(self.clutter.present, (robot.tool_pose()), reach, heights)
+        if plan is None:
+            return lift(reach.step_m, OPEN)
+        gx, gy, gz = plan.position
+        aside = max(abs(gx - x), abs(gy - y))
+        turn = abs(wrap_angle(plan.yaw_rad - yaw))
+        if aside <= ALIGNED_M and turn <= ALIGNED_RAD:
+            return towards(
+                robot, plan.position, plan.yaw_rad, CLOSED if z - gz <= reach.step_m else OPEN
+            )
+        above_z = float(heights[20:-20, 20:-20].max()) + 0.02
+        if z < above_z - 1e-3:
+            return lift(above_z - z, OPEN)
+        return towards(robot, (gx, gy, above_z), plan.yaw_rad, OPEN)
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """What is in the tray."""
+        return self.clutter.present
+
+    @property
+    def landmarks(self) -> Sequence[Pose]:
+        """The objects; in place of those that are gone, the workspace's upper corner."""
+        poses = list(super().landmarks)
+        workspace = self.settings.workspace
+        corner = (workspace.x[1], workspace.y[1], workspace.z[1])
+        return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
+
+    def get_state(self) -> Any:
+        """Return which objects are in use, and the failures in a row."""
+        return self.clutter.get_state(), self._failures
+
+    def set_state(self, state: Any) -> None:
+        """Take up what `get_state` returned."""
+        present, self._failures = state
+        self.clutter.set_state(present)
+
+    def _is_inside(self, body: Body) -> bool:
+        # thin objects lie lower than the workspace begins: the floor bounds them
+        workspace = self.settings.workspace
+        if self.settings.bounding_box_check:
+            (x0, y0, _), (x1, y1, top) = body.bounding_box()
+        else:
+            x0, y0, top = x1, y1, _ = body.position
+        return (
+            workspace.x[0] < x0
+            and x1 < workspace.x[1]
+            and workspace.y[0] < y0
+            and y1 < workspace.y[1]
+            and math.isfinite(top)
+            and top < workspace.z[1]
+        )

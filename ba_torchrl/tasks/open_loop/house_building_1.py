@@ -1,0 +1,27 @@
+"""House Building 1: a stack of blocks with a triangle on top (appendix A.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.open_loop.pieces import cube, triangle
+from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
+from ba_torchrl.tasks.structures import CUBE, TRIANGLE, Blueprint, tower
+
+
+@TASKS.register("open_loop/house_building_1")
+class HouseBuilding1(StructureTask):
+    """Cubes of 3 cm and a triangle of that size; success when it tops their stack."""
+
+    max_steps = 10
+    num_objects = 4
+    num_objects_range = (2, 6)
+
+    def blueprint(self) -> Blueprint:
+        """Return the stack with the triangle."""
+        return tower(*[CUBE] * (self.settings.num_objects - 1), TRIANGLE)
+
+    def parts(self) -> Sequence[Part]:
+        """Return the triangle and the cubes."""
+        return [triangle(self.block_m), *[cube(self.block_m)] * (self.settings.num_objects - 1)]

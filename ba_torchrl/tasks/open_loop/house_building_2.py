@@ -1,0 +1,29 @@
+"""House Building 2: a roof on two blocks (appendix A.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.open_loop.pieces import cube, pair_span, roof
+from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
+from ba_torchrl.tasks.structures import CUBE, ROOF, Blueprint, Slot
+
+
+@TASKS.register("open_loop/house_building_2")
+class HouseBuilding2(StructureTask):
+    """Two cubes of 3 cm and a roof 12 cm long; success when it lies on both."""
+
+    max_steps = 10
+    num_objects = 3
+    num_objects_range = (3, 3)
+
+    def blueprint(self) -> Blueprint:
+        """Return two cubes with the roof across."""
+        return Blueprint(
+            (Slot(CUBE), Slot(CUBE), Slot(ROOF, on=(0, 1), span=pair_span(self.block_m, 2.0)))
+        )
+
+    def parts(self) -> Sequence[Part]:
+        """Return the roof and the cubes."""
+        return [roof(self.block_m), *[cube(self.block_m)] * 2]

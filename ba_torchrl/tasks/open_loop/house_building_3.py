@@ -1,0 +1,37 @@
+"""House Building 3: a cuboid and a roof on two blocks (appendix A.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.open_loop.pieces import cube, cuboid, pair_span, roof
+from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
+from ba_torchrl.tasks.structures import CUBE, CUBOID, ROOF, Blueprint, Slot
+
+
+@TASKS.register("open_loop/house_building_3")
+class HouseBuilding3(StructureTask):
+    """Two cubes of 3 cm, a cuboid and a roof 12 cm long; success when roof, cuboid and cubes stand.
+
+    The cuboid lies across the cubes, the roof on the cuboid, both above the cubes' middle.
+    """
+
+    max_steps = 10
+    num_objects = 4
+    num_objects_range = (4, 4)
+
+    def blueprint(self) -> Blueprint:
+        """Return two cubes with cuboid and roof across."""
+        return Blueprint(
+            (
+                Slot(CUBE),
+                Slot(CUBE),
+                Slot(CUBOID, on=(0, 1), span=pair_span(self.block_m, 2.2)),
+                Slot(ROOF, on=(2,), over=(0, 1)),
+            )
+        )
+
+    def parts(self) -> Sequence[Part]:
+        """Return roof, cuboid and cubes."""
+        return [roof(self.block_m), cuboid(self.block_m), *[cube(self.block_m)] * 2]

@@ -1,0 +1,39 @@
+"""House Building 4: two storeys of blocks, a cuboid between them, a roof (appendix A.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.open_loop.pieces import cube, cuboid, pair_span, roof
+from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
+from ba_torchrl.tasks.structures import CUBE, CUBOID, ROOF, Blueprint, Slot
+
+
+@TASKS.register("open_loop/house_building_4")
+class HouseBuilding4(StructureTask):
+    """Four cubes of 3 cm, a cuboid and a roof 12 cm long; success when the house stands.
+
+    Two cubes carry the cuboid, which carries the other two, which carry the roof.
+    """
+
+    max_steps = 20
+    num_objects = 6
+    num_objects_range = (6, 6)
+
+    def blueprint(self) -> Blueprint:
+        """Return the two storeys and the roof."""
+        return Blueprint(
+            (
+                Slot(CUBE),
+                Slot(CUBE),
+                Slot(CUBOID, on=(0, 1), span=pair_span(self.block_m, 2.3)),
+                Slot(CUBE, on=(2,)),
+                Slot(CUBE, on=(2,)),
+                Slot(ROOF, on=(3, 4), span=pair_span(self.block_m, 2.3)),
+            )
+        )
+
+    def parts(self) -> Sequence[Part]:
+        """Return roof, cuboid and cubes."""
+        return [roof(self.block_m), cuboid(self.block_m), *[cube(self.block_m)] * 4]
