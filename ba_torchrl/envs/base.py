@@ -254,6 +254,7 @@ class ManipulationEnv(EnvBase):
         fault = False
         try:
             self._act(scene, action)
+            scene.task.after_action()
             success, valid = self._judge(scene)
             self._observation = self._observe(scene)
         except Exception:

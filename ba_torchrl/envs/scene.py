@@ -37,6 +37,8 @@ class SceneState:
     robot: Any
     motion: Any
     task: Any
+    hidden: tuple[bool, ...]
+    """Of each body, whether it is put aside."""
 
 
 @dataclass
@@ -56,6 +58,7 @@ class Scene:
             self.robot.get_state(),
             self.motion.get_state(),
             self.task.get_state(),
+            tuple(body.is_hidden for body in self.world.bodies),
         )
 
     def set_state(self, state: SceneState) -> None:
@@ -68,6 +71,8 @@ class Scene:
         self.task.set_state(state.task)
         self.robot.set_state(state.robot)
         self.motion.set_state(state.motion)
+        for body, is_hidden in zip(self.world.bodies, state.hidden, strict=True):
+            body.is_hidden = is_hidden
 
 
 def build_scene(
@@ -127,8 +132,11 @@ def check_task_parameters(task_id: str, config: EnvConfig) -> None:
     task_class = TASKS[task_id]
     config.check_for(task_id, task_class.control, task_class.parameters)
     least, most = task_class.num_objects_range
-    if config.num_objects is not None and not least <= config.num_objects <= most:
+    numbers = range(least, most + 1, task_class.num_objects_step)
+    if config.num_objects is not None and config.num_objects not in numbers:
         allowed = str(least) if least == most else f"{least} to {most}"
+        if numbers.step > 1:
+            allowed = f"{', '.join(map(str, numbers[:-1]))} or {numbers[-1]}"
         raise ConfigError(
             f"num_objects: {task_id} takes {allowed} objects, not {config.num_objects}"
         )

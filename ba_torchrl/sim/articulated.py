@@ -118,6 +118,15 @@ class Part(Body):
         points = pybullet.getContactPoints(self.id, other.id, physicsClientId=self.client)
         return any(point[3] in self.links and point[8] < CONTACT_M for point in points)
 
+    def forget_pairs(self) -> None:
+        """Let the engine look afresh at what is near the part."""
+        # PyBullet's own groups: what is static meets all but its like
+        group, mask = (2, ~2) if self.is_static else (1, -1)
+        for link in self.links:
+            pybullet.setCollisionFilterGroupMask(
+                self.id, link, group, mask, physicsClientId=self.client
+            )
+
     def bounding_box(self) -> tuple[Vector, Vector]:
         """Return the lower and upper corner of the axis-aligned bounding box."""
         boxes = [

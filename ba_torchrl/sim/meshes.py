@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -124,7 +125,7 @@ def ring_parts(section_m: Sequence[tuple[float, float]], segments: int) -> list[
         for angle in angles
     ]
     faces = _prism_faces(len(section_m))[:, ::-1]  # sweeping the section goes into the page
-    return [Mesh(np.concatenate(pair), faces) for pair in zip(ends[:-1], ends[1:], strict=True)]
+    return [Mesh(np.concatenate(pair), faces) for pair in pairwise(ends)]
 
 
 def bowl_parts(
@@ -180,3 +181,19 @@ def _prism_faces(count: int) -> np.ndarray:
         j = (i + 1) % count
         sides += [(i, j, count + j), (i, count + j, count + i)]
     return np.array(caps + sides, dtype=np.int64)
+
+
+def frame_parts(size_m: tuple[float, float, float], wall_m: float) -> list[Mesh]:
+    """Return four upright walls around a rectangle, their bounding box centred on the origin.
+
+    Args:
+        size_m: outer extents.
+        wall_m: thickness of the walls.
+    """
+    x, y, z = size_m
+    along_x, along_y = box_mesh((x - 2 * wall_m, wall_m, z)), box_mesh((wall_m, y, z))
+    parts = []
+    for side in (-0.5, 0.5):
+        parts.append(moved(along_x, (0.0, side * (y - wall_m), 0.0)))
+        parts.append(moved(along_y, (side * (x - wall_m), 0.0, 0.0)))
+    return parts

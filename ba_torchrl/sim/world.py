@@ -11,7 +11,7 @@ from typing import Self
 import pybullet
 import pybullet_data
 
-from ba_torchrl.sim.articulated import Articulated, Rail
+from ba_torchrl.sim.articulated import Articulated, Part, Rail
 from ba_torchrl.sim.bodies import Body, Color, Shape
 
 
@@ -141,6 +141,7 @@ class World:
         if self._pristine is None:
             raise SimulationError("seal() the world before resetting it")
         self.restore(self._pristine)
+        self._forget_pairs()
 
     def snapshot(self) -> Snapshot:
         """Keep the state of every body and contact in memory, for `restore`."""
@@ -152,7 +153,7 @@ class World:
         Raises:
             SimulationError: the snapshot is of another world, or of one that was closed.
         """
-        if snapshot.client != self.client or self.is_closed:
+        if not snapshot.is_of(self):
             raise SimulationError("the state is of another world: that one was closed or rebuilt")
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
 
@@ -203,6 +204,23 @@ class World:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _forget_pairs(self) -> None:
+        """Let the engine look afresh at what is near each other, if convex hulls are among it.
+
+        It keeps its last guess at how two hulls are apart, which no saved state holds; from
+        another guess the same scene goes on differently.
+        """
+        if all(body.shape.collision_margin_m is None for body in self.bodies):
+            return
+        for body in self.bodies:
+            if isinstance(body, Part):
+                body.forget_pairs()
+            elif not body.is_static:
+                # the same groups as before; what counts is that the pairs are made anew
+                pybullet.setCollisionFilterGroupMask(
+                    body.id, -1, 1, -1, physicsClientId=self.client
+                )
 
     def _check_open(self, name: str) -> None:
         if self._pristine is not None:

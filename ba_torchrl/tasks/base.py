@@ -119,6 +119,8 @@ class Task(ABC):
     """How many objects there are by default."""
     num_objects_range: ClassVar[tuple[int, int]] = (1, 1)
     """How many there may be."""
+    num_objects_step: ClassVar[int] = 1
+    """They come in the least number and this many more, again and again."""
     one_step: ClassVar[bool] = False
     """Whether the step limit is the task: reaching it terminates the episode."""
     fits_tray: ClassVar[bool] = False
@@ -170,6 +172,12 @@ class Task(ABC):
         """Start an episode that goes on with the objects, the arm still where the last one ended.
 
         Called if `continues` says so, in place of `randomise`.
+        """
+
+    def after_action(self) -> None:  # noqa: B027 -- most tasks have nothing to do
+        """Let the task's own events happen, such as a new object: an action has just settled.
+
+        Goal and validity are judged after it, and the observation shows what it did.
         """
 
     def get_state(self) -> Any:

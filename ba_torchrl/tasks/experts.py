@@ -321,7 +321,9 @@ def travel(
     return lift(min(needed + 1e-3, ceiling_m) - start[2], opening)
 
 
-def finger_room(robot: Robot, body: Body, yaw_rad: float, others: Sequence[Body]) -> float:
+def finger_room(
+    robot: Robot, body: Body, yaw_rad: float, others: Sequence[Body], opening: float = 1.0
+) -> float:
     """Return the gap between the fingers, open around a body, and what stands beside it.
 
     It is in metres, negative where something stands in their way.
@@ -331,7 +333,9 @@ def finger_room(robot: Robot, body: Body, yaw_rad: float, others: Sequence[Body]
         body: what they are to close on.
         yaw_rad: the gripper's.
         others: bodies that may stand in their way.
+        opening: of the gripper, 0 to 1.
     """
+    apart = HALF_FINGER_DEPTH_M + opening * (robot.finger_span_m / 2 - HALF_FINGER_DEPTH_M)
     bx, by, bz = body.position
     ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
     gap = math.inf
@@ -342,7 +346,7 @@ def finger_room(robot: Robot, body: Body, yaw_rad: float, others: Sequence[Body]
         px, py = corners[:, 0] - bx, corners[:, 1] - by
         along, across = px * ux + py * uy, py * ux - px * uy
         for side in (-1.0, 1.0):
-            center = side * robot.finger_span_m / 2
+            center = side * apart
             gap = min(
                 gap,
                 max(

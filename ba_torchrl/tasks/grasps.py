@@ -20,18 +20,21 @@ from ba_torchrl.tasks.experts import turned
 HALF_GAP_M = 0.04
 """Half the distance between the open fingers."""
 SPARE_M = 0.007
-"""Room between an open finger and what it closes on."""
+"""Room between an open finger and what it closes on; less is a risk."""
+LEAST_SPARE_M = 0.002
 BAND_HALF_M = 0.0125
 """Half the fingers' width."""
 TIP_M = 0.0107
 """The fingertips end this far below the tool point."""
 OUTLINE = ((0.038, -TIP_M), (0.044, -TIP_M), (0.051, -0.004), (0.058, 0.01), (0.065, 0.03))
 """Half distances at which an open finger's lower side is at a height above the tool point."""
-CLEARANCE_M = 2e-3
+CLEARANCE_M = 4.5e-3
 DEEPEST_M = 0.035
 """Height of what is grasped above the tool point at most: more would meet the palm."""
-SHALLOWEST_M = 0.011
+SHALLOWEST_M = 0.006
 """Least height of what is between the fingers above their tips."""
+LEAST_SQUARE = 0.3
+"""How nearly opposite the surfaces that the fingers meet are at least."""
 
 YAWS = 16
 SAMPLES = 256
@@ -170,6 +173,7 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
     n = samples.shape[0]
     u = np.empty(n)
     v = np.empty(n)
+    left_n, right_n = np.empty(4), np.empty(4)
     top = samples[:, 2].max()
     for yaw in yaws:
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -185,7 +189,7 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
                     if abs(v[k] - v0) <= BAND_HALF_M and abs(u[k] - u0) < HALF_GAP_M:
                         lowest_u, highest_u = min(lowest_u, u[k]), max(highest_u, u[k])
                         peak = max(peak, samples[k, 2])
-                if highest_u < lowest_u or highest_u - lowest_u > 2 * (HALF_GAP_M - SPARE_M):
+                if highest_u < lowest_u or highest_u - lowest_u > 2 * (HALF_GAP_M - LEAST_SPARE_M):
                     continue
                 middle = (highest_u + lowest_u) / 2
                 if u0 != 0.0 and abs(middle - u0) > 0.012:
@@ -223,25 +227,30 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
                             left, right = min(left, u[k]), max(right, u[k])
                 if right < left:
                     continue
-                left_n, right_n, left_c, right_c = 0.0, 0.0, 0, 0
+                left_n[:] = 0.0
+                right_n[:] = 0.0
                 for k in range(n):
                     if abs(v[k] - v0) <= BAND_HALF_M and samples[k, 2] > z - TIP_M:
                         if abs(u[k] - middle) < HALF_GAP_M:
-                            along = cos * samples[k, 3] + sin * samples[k, 4]
                             if u[k] < left + 0.003:
-                                left_n -= along
-                                left_c += 1
+                                left_n[:3] += samples[k, 3:]
+                                left_n[3] += 1.0
                             if u[k] > right - 0.003:
-                                right_n += along
-                                right_c += 1
-                square = min(left_n / left_c, right_n / right_c)
-                if square < 0.75:
+                                right_n[:3] += samples[k, 3:]
+                                right_n[3] += 1.0
+                left_n /= left_n[3]
+                right_n /= right_n[3]
+                square = -(left_n[0] * right_n[0] + left_n[1] * right_n[1] + left_n[2] * right_n[2])
+                facing = min(cos * right_n[0] + sin * right_n[1], -cos * left_n[0] - sin * left_n[1])
+                if square < LEAST_SQUARE or facing < LEAST_SQUARE:
                     continue
-                risk = 2.0 * (1 - square)
+                risk = 2.5 * (1 - square) + 1.5 * max(0.0, 0.75 - facing)
+                spare = HALF_GAP_M - (highest_u - lowest_u) / 2
+                risk += 0.4 * max(0.0, SPARE_M - spare) / SPARE_M
                 risk += 0.3 * max(0.0, 0.025 - depth) / 0.015
                 risk += 6 * (abs(v0) + 0.5 * abs(middle))
                 risk += 0.5 * max(0.0, top - peak) / 0.02
                 found[count, 0], found[count, 1], found[count, 2] = x, y, z
-                found[count, 3], found[count, 4] = yaw, min(risk, 1.0)
+                found[count, 3], found[count, 4] = yaw, risk
                 count += 1
     return found[:count]

@@ -68,7 +68,7 @@ CUBOID = Piece("cuboid", math.pi, (0.0,), _both(_X, _Z))
 ROOF = Piece("roof", math.pi, (0.0,), stays_upright=True)
 """A long gable, its ridge along y, held by the eaves."""
 TRIANGLE = Piece("triangle", math.pi, (math.pi / 2,), stays_upright=True)
-"""A short gable, its ridge along y. Its slopes slip out of the fingers: it is held by its ends."""
+"""A short gable, its ridge along y. Fingers hold it best by its ends, which are upright."""
 
 
 class Span(NamedTuple):

@@ -260,8 +260,8 @@ def test_pressing_on_top_holds_nothing_and_hurts_nothing(world, robot_class, ope
     world.settle()
     assert robot.tool_pose()[0][2] > 0.045
     assert math.dist(block.position[:2], (0.45, 0.0)) < 5e-3
-    # no deeper than the one stride of 3.3 mm in which the hand meets the block
-    assert block.position[2] == pytest.approx(0.025, abs=3.6e-3)
+    # no deeper than the stride of 3.3 mm in which the hand meets the block and one of creeping
+    assert block.position[2] == pytest.approx(0.025, abs=3.9e-3)
 
 
 def test_pushing_with_a_finger_holds_nothing(world, robot_class):

@@ -123,3 +123,17 @@ def test_two_thousand_resets_do_not_grow():
     assert resident_mb() - before < 5
     assert pybullet.getNumBodies(physicsClientId=env.scene.world.client) == bodies
     env.close()
+
+
+def test_snapshots_of_a_closed_world_do_no_harm_to_the_next():
+    first = World()
+    first.seal()
+    kept = first.snapshot()
+    first.close()
+    with World() as second:  # it has the same client number
+        second.seal()
+        assert second.client == kept.client
+        with pytest.raises(SimulationError, match="another world"):
+            second.restore(kept)
+        del kept, first
+        second.restore_pristine()

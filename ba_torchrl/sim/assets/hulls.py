@@ -27,8 +27,8 @@ class Rest(NamedTuple):
     width_m: float
     """Of the narrowest gap between two vertical walls that the body fits into."""
     squareness: float
-    """Cosine between the surface's normal and the line on which two fingers close, on the side
-    where it is worse, for the best direction: 1 for parallel upright sides."""
+    """How nearly opposite the surfaces are that two closing fingers meet, for the best direction:
+    1 for parallel upright sides, the cosine of the angle between the sides of a wedge."""
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
@@ -122,9 +122,9 @@ def _squareness(standing: Mesh, center_xy: np.ndarray) -> float:
         met = (np.abs(across) < FINGER_HALF_M) & (points[:, 2] > low) & (points[:, 2] < high)
         if not met.any():
             continue
-        facing = normals[met, :2] @ axis
         left, right = along[met] < along[met].min() + 2e-3, along[met] > along[met].max() - 2e-3
-        best = max(best, min(-float(facing[left].mean()), float(facing[right].mean())))
+        first, second = (normals[met][side].mean(axis=0) for side in (left, right))
+        best = max(best, -float(first @ second))
     return best
 
 

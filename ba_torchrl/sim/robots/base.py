@@ -18,8 +18,9 @@ ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
 CLOSING_COSINE = 0.7
 """A finger squeezes what it touches within 45 degrees of the line it closes on."""
 OPPOSED_COSINE = 0.8
-"""Two fingers hold a body if they press on it from opposite sides, within the friction cone. An
-edge pushed into the wedge between them meets their surfaces at twice that angle: it is not held."""
+"""Two fingers hold a body if they press on it from opposite sides, within the friction cone, as
+seen along the approach: the sides of a roof may slope. An edge pushed into the wedge between them
+meets their surfaces at twice that angle: it is not held."""
 
 _FAR_M = 10.0
 
@@ -282,6 +283,7 @@ class Robot(ABC):
         """Whether a link of each finger pushes the body towards the other finger."""
         _, (x, y, z, w) = self.tool_transform()
         axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+        approach = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
         left, right = (
             [
                 point[7]
@@ -295,13 +297,25 @@ class Robot(ABC):
             ]
             for sign, links in zip(self.closing_sign, touching, strict=True)
         )
-        return any(_dot(a, b) < -OPPOSED_COSINE for a in left for b in right)
+        return any(
+            _dot(_across(a, approach), _across(b, approach)) < -OPPOSED_COSINE
+            for a in left
+            for b in right
+        )
 
     def is_near_anything(self, margin_m: float = 1e-3) -> bool:
         """Whether the hand is closer than ``margin_m`` to a body or the floor, as of now."""
         self.world.detect_collisions()
         points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
         return any(point[8] < margin_m for point in points)
+
+
+def _across(vector: Vector, axis: Vector) -> Vector:
+    """Return the direction of ``vector`` as seen along the unit vector ``axis``."""
+    along = _dot(vector, axis)
+    rest = tuple(v - along * a for v, a in zip(vector, axis, strict=True))
+    norm = math.sqrt(_dot(rest, rest))
+    return tuple(r / norm for r in rest)
 
 
 def _dot(a: Vector, b: Vector) -> float:

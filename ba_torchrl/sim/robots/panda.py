@@ -18,7 +18,7 @@ _FOREARM_M = 0.384
 _ELBOW_OFFSET_M = 0.0825
 _WRIST_OFFSET_M = 0.088
 _FLANGE_M = 0.107
-_TOOL_M = 0.1045
+_TOOL_M = 0.1035
 """From the flange to the tool point; the fingertips end at 0.1122 m."""
 _BASE_M = (-0.05, 0.0, 0.0)
 
@@ -193,7 +193,7 @@ def _solve(center: Vector, approach: Vector, offset: Vector) -> _Arm | None:
     )
     back = tuple(-w / distance for w in wrist)
     along, down = _dot(back, offset), _dot(back, approach)
-    cos_rest = math.cos(slant) / math.hypot(along, down)
+    cos_rest = math.cos(slant) / max(math.hypot(along, down), 1e-9)
     if abs(cos_rest) > 1:
         return None
     angle = math.acos(cos_rest) + math.pi - math.atan2(-along, -down)

@@ -101,7 +101,7 @@ class UR5ParallelJaw(UR5):
     finger_open = 0.04
     finger_links = (frozenset({7}), frozenset({8}))
     closing_sign = (1.0, -1.0)
-    tool_offset_m = (0.0, 0.0, 0.1425)
+    tool_offset_m = (0.0, 0.0, 0.1413)
     home_joints = (0.954, -1.732, 1.566, -1.404, -1.571, -0.617)
     camera_height_m = 0.06
 
@@ -127,7 +127,7 @@ class UR5Robotiq(UR5):
     finger_open = 0.8
     finger_links = (frozenset({7, 8, 9}), frozenset({10, 11, 12}))
     closing_sign = (1.0, -1.0)
-    tool_offset_m = (0.0, 0.0, 0.1555)
+    tool_offset_m = (0.0, 0.0, 0.1543)
     home_joints = (0.954, -1.727, 1.529, -1.372, -1.571, -0.617)
     camera_height_m = 0.04
 

@@ -9,7 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, press_n, vertical_extent
+from ba_torchrl.sim.bodies import Body, Box, Color, Solid, gap_m, press_n, vertical_extent
+from ba_torchrl.sim.meshes import box_mesh, moved
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.base import CloseLoopTask
@@ -29,13 +30,13 @@ from ba_torchrl.tasks.experts import (
 WALL: Color = (0.72, 0.7, 0.66, 1.0)
 BASE: Color = (0.86, 0.85, 0.82, 1.0)
 
-SEAM_M = 1e-4
-"""Gap between block and walls: bodies that overlap by a rounding error push each other off, and
-nothing on the smooth base would stop the block."""
+SEAM_M = 3e-4
+"""Gap between block and walls, wider than the walls' collision margin: bodies that overlap push
+each other off, and nothing on the smooth base would stop the block."""
 
 ROOM_M = 2e-3
 """Room beside the open fingers with which a block counts as nudged out."""
-DRAG_ROOM_M = 22e-3
+DRAG_ROOM_M = 15e-3
 """Room with which a drag ends; more, so that the next look does not start another."""
 OUT_M = 0.0
 """A drag leads to this place along both axes of the corner's frame."""
@@ -51,11 +52,13 @@ TOUCH_M = 3e-3
 PRESS_ASIDE_M = 5e-3
 """The place to press on is met within this distance."""
 PRESS_TURN_RAD = 0.15
-HAND_HALF_M = 0.042
-"""Half the closed hand's width along the fingers, with a few millimetres to spare."""
+"""The fingers stand along a wall within this angle."""
+HAND_HALF_M = 0.04
+"""Half the closed hand's width along the fingers, with 2 mm to spare; with more, the press would be
+farther from the block's middle and tilt it."""
 TIP_HALF_M = 8e-3
 """The middle of the fingertips stays this far from the edge of the block's top."""
-OPENING_HEIGHT_M = TIP_BELOW_TOOL_M + 6e-3
+OPENING_HEIGHT_M = TIP_BELOW_TOOL_M + HOVER_M
 """Height of the tool above the block's top at which the fingers open."""
 
 
@@ -81,15 +84,13 @@ class CornerPicking(CloseLoopTask):
         self.base = world.add(
             Box(size_m=size, mass_kg=0, friction=self.base_friction, color=BASE), "base"
         )
-        # the second wall ends at the first
-        length = self.base_m + self.wall_m
-        self.walls = [
-            world.add(Box(size_m=(*size, self.wall_height_m), mass_kg=0, color=WALL), name)
-            for size, name in (
-                ((self.wall_m, length), "wall across x"),
-                ((length - self.wall_m, self.wall_m), "wall across y"),
-            )
-        ]
+        # centred on the edges of the base; the second wall ends at the first
+        edge, wall, height = self.base_m / 2, self.wall_m, self.wall_height_m
+        parts = (
+            moved(box_mesh((wall, 2 * edge + wall / 2, height)), (-edge, -wall / 4, 0.0)),
+            moved(box_mesh((2 * edge - wall / 2, wall, height)), (wall / 4, -edge, 0.0)),
+        )
+        self.walls = world.add(Solid(parts=parts, mass_kg=0, color=WALL), "walls")
 
     @property
     def corner(self) -> tuple[float, float, float]:
@@ -115,11 +116,9 @@ class CornerPicking(CloseLoopTask):
 
     def put_corner(self, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put the corner at a pose, with the block in it."""
-        edge, wall = self.base_m / 2, self.wall_m
         self.stand(self.base, xy, yaw_rad)
-        self.stand(self.walls[0], self.to_world(-edge, -wall / 2), yaw_rad)
-        self.stand(self.walls[1], self.to_world(wall / 2, -edge), yaw_rad)
-        flush = -edge + wall / 2 + self.block_m / 2 + SEAM_M
+        self.stand(self.walls, xy, yaw_rad)
+        flush = (self.wall_m - self.base_m) / 2 + self.block_m / 2 + SEAM_M
         z = self.settings.surface_z_m + self.base_height_m + self.block_m / 2
         self.block.place((*self.to_world(flush, flush), z), yaw_rad)
 
@@ -134,14 +133,14 @@ class CornerPicking(CloseLoopTask):
         robot, block, reach = self.robot, self.block, self.reach
         if robot.held_body() is block and robot.opening() < 0.9:
             return lift(reach.step_m)
-        position, yaw = robot.tool_pose()
+        yaw = robot.tool_pose()[1]
         is_pressing = robot.opening() < 0.5 and press_n(robot.id, block) > FIRM_N
         yaws = [turned(yaw, block.yaw_rad + k * math.pi / 2, reach, math.pi) for k in (0, 1)]
         needed = DRAG_ROOM_M if is_pressing else ROOM_M
         yaws = [wanted for wanted in yaws if self.room_m(wanted) >= needed]
         if not yaws:
             return self._drag() if is_pressing else self._press()
-        if is_pressing:  # no turn yet: it would spin the block
+        if is_pressing:  # no turn yet, and steeply up: else the fingers would take the block along
             x, y, z = block.position
             return towards(robot, (x, y, z + self.block_m / 2 + OPENING_HEIGHT_M), yaw, OPEN)
         ceiling = self.settings.workspace.z[1]
@@ -193,7 +192,7 @@ class CornerPicking(CloseLoopTask):
             return lift(low_z + TOUCH_M - z)  # not from the side: that pushes the block back
         is_clear = min(tool_x - px, tool_y - py) > -PRESS_ASIDE_M and abs(turn) < PRESS_TURN_RAD
         if not is_clear or robot.opening() >= 0.1:
-            low_z = vertical_extent(self.walls[0])[1] + TIP_BELOW_TOOL_M + HOVER_M
+            low_z = vertical_extent(self.walls)[1] + TIP_BELOW_TOOL_M + HOVER_M
             if z < low_z - 1e-3:
                 return lift(low_z - z)
         return towards(robot, (*target, low_z), target_yaw, CLOSED)

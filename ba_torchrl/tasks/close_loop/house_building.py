@@ -23,8 +23,8 @@ from ba_torchrl.tasks.structures import CUBE, TRIANGLE, tower
 class HouseBuilding(CloseLoopTask):
     """Cubes of 5 cm and a triangle of that size; success when it tops the stack, let go of.
 
-    A triangle that has tipped over ends the episode: on its slope it offers no two sides to the
-    fingers that would bring it upright again.
+    A triangle that has tipped over ends the episode: a gripper that points down can lift it, but
+    not turn it upright.
     """
 
     num_objects = 2

@@ -55,10 +55,14 @@ class StructureTask(OpenLoopTask):
         self.building = Building(self.blueprint(), world, kinds, self.block_m)
 
     def randomise(self, rng: np.random.Generator) -> None:
-        """Put the pieces anywhere apart from each other."""
+        """Put the pieces anywhere apart from each other.
+
+        Fixed orientations are those at which a gripper that does not turn can grasp them.
+        """
         points = self.random_points(rng, [part.spot for part in self._parts])
-        for body, xy in zip(self.bodies, points, strict=True):
-            self.stand(body, xy, self.random_yaw(rng, 2 * math.pi))
+        for part, body, xy in zip(self._parts, self.bodies, points, strict=True):
+            yaw = self.random_yaw(rng, 2 * math.pi) - part.piece.grasp_yaws_rad[0]
+            self.stand(body, xy, yaw)
 
     def is_goal(self) -> bool:
         """Whether the structure stands, let go of."""
@@ -93,7 +97,7 @@ class StructureTask(OpenLoopTask):
     def _put_down(self) -> PutDown:
         border = 1.5 * self.block_m
         (x0, x1), (y0, y1) = self.settings.workspace.x, self.settings.workspace.y
-        return PutDown((x0 + border, x1 - border), (y0 + border, y1 - border), self.block_m)
+        return PutDown((x0 + border, x1 - border), (y0 + border, y1 - border), 2.0 * self.block_m)
 
     def _grasp_yaws(self, body: Body) -> list[float]:
         """Return the yaws to grasp a body at; a gripper that does not turn has one."""

@@ -1,0 +1,392 @@
+"""Covid Test: present a swab and a tube, three times, and collect the used tubes (appendix A.1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.sim.bodies import Body, Box, Color, Solid, gap_m, vertical_extent
+from ba_torchrl.sim.meshes import frame_parts
+from ba_torchrl.sim.robots.base import Pose
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS, PlacementError
+from ba_torchrl.tasks.experts import RELEASE_GAP_M, TIP_BELOW_TOOL_M, finger_room
+from ba_torchrl.tasks.open_loop.base import OpenLoopTask
+
+PURPLE: Color = (0.6, 0.45, 0.78, 1.0)
+GRAY: Color = (0.6, 0.6, 0.6, 1.0)
+YELLOW: Color = (0.93, 0.8, 0.3, 1.0)
+GLASS: Color = (0.35, 0.7, 0.85, 1.0)
+WHITE: Color = (0.97, 0.95, 0.92, 1.0)
+
+SHEET_M = 2e-3
+"""Height of the test area and of the floors of both boxes."""
+WALL_M = 4e-3
+SUNK_M = 0.05
+"""Boxes reach down below the ground: what falls fast passes through a thin sheet."""
+HALF_LAYOUT_M = 0.15
+"""The three areas together fill a square of twice this."""
+GRASP_M = TIP_BELOW_TOOL_M + 5e-4
+"""Height of the tool above what an object lies on, at which the fingertips just clear that."""
+COLUMN_M = 0.05
+"""Distance of neighbours in the box of new tubes; the fingers pass between them."""
+WINDOW_M = 0.01
+RIM_WINDOW_M = 0.052
+"""From the middle of the box of used tubes, the next wall is within this."""
+
+SPOT_ATTEMPTS = 50
+APART_M = 3e-3
+"""Gap between a tube that a test was made with and all else."""
+REST_STEPS = 20
+ASIDE_M = (5.0, 0.0, 1e6)
+ASIDE_SPACING_M = 0.3
+"""Used swabs fall freely, from a height that takes days, each in its own column: see `Clutter`."""
+
+
+class Area(NamedTuple):
+    """One of the three areas."""
+
+    name: str
+    color: Color
+    center: tuple[float, float]
+    """In the frame of the layout, metres."""
+    size: tuple[float, float, float]
+
+
+NEW_BOX = Area("box of new tubes", PURPLE, (-0.06, 0.055), (0.18, 0.19, 0.01))
+USED_BOX = Area("box of used tubes", YELLOW, (-0.09, -0.1), (0.12, 0.1, 0.04))
+TEST_AREA = Area("test area", GRAY, (0.0925, 0.0), (0.115, 0.3, SHEET_M))
+
+TEST_SPOTS = tuple((0.0, y) for y in (0.0, 0.085, -0.085, 0.0425, -0.0425))
+"""Where the expert presents, in the frame of the test area; the first free one."""
+USED_ROWS = tuple((0.0, y) for y in (0.0, 0.024, -0.024))
+"""Where it drops used tubes that lie along the box, in the box's frame."""
+USED_COLUMNS = tuple((x, 0.0) for x in (0.0, 0.03, -0.03))
+"""The same for tubes that lie across it."""
+
+
+class CovidState(NamedTuple):
+    """What the task remembers."""
+
+    seed: int
+    used: tuple[int, ...]
+    """Tubes that a test was made with, by their index."""
+    spent: tuple[int, ...]
+    """Swabs that are gone."""
+    has_failed: bool
+
+
+@TASKS.register("open_loop/covid_test")
+class CovidTest(OpenLoopTask):
+    """Three tests for Covid; success when all tubes are in the box for used ones, the swabs gone.
+
+    A tube and a swab, presented together in the test area, become one test: the swab disappears in
+    the tube, and the tube lies anywhere in the test area. Before the next test it must be in the
+    box for used tubes. What breaks this order ends the episode: a second tube or a second swab in
+    the test area, or a swab and a tube there before the last tube was collected.
+    """
+
+    max_steps = 30
+    num_objects = 6
+    num_objects_range = (6, 6)
+    rounds: ClassVar[int] = 3
+    finger_opening = 0.35
+
+    tube_m: ClassVar[tuple[float, float]] = (0.08, 0.017)
+    """Length and width at the default scale."""
+    swab_m: ClassVar[tuple[float, float]] = (0.07, 0.01)
+    turn_rad: ClassVar[float] = math.radians(18.5)
+    """The layout deviates by at most this from right angles to the workspace; it still fits."""
+    skew_rad: ClassVar[float] = math.radians(20)
+    """Tubes and swabs in their box deviate by at most this from its long side."""
+    spot_m: ClassVar[tuple[float, float]] = (0.0125, 0.1)
+    """A used tube turns up within this of the middle of the test area."""
+
+    def build(self, world: World) -> None:
+        """Load the three areas, the tubes and the swabs."""
+        self.new_box, self.used_box, self.test_area = (
+            world.add(_floor(area), area.name) for area in (NEW_BOX, USED_BOX, TEST_AREA)
+        )
+        self._rims = [
+            world.add(_rim(area), f"rim of the {area.name}") for area in (NEW_BOX, USED_BOX)
+        ]
+        factor = self.settings.scale / self.scale_range[0]
+        self._tube_m, self._swab_m = (
+            (factor * length, factor * width) for length, width in (self.tube_m, self.swab_m)
+        )
+        (tube_m, tube_width_m), (swab_m, swab_width_m) = self._tube_m, self._swab_m
+        tube = Box(size_m=(tube_m, tube_width_m, tube_width_m), mass_kg=0.05, color=GLASS)
+        swab = Box(size_m=(swab_m, swab_width_m, swab_width_m), mass_kg=0.03, color=WHITE)
+        self.tubes = [world.add(tube, f"tube {i + 1}") for i in range(self.rounds)]
+        self.swabs = [world.add(swab, f"swab {i + 1}") for i in range(self.rounds)]
+        self._used: list[Body] = []
+        self._spent: list[Body] = []
+        self._seed = 0
+        self.has_failed = False
+        """Whether the order of the test was broken."""
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put the layout anywhere, mirrored or not, with all tubes and swabs in their box.
+
+        With fixed orientations the layout is turned by 0 or 180 degrees, and all lies along y.
+        """
+        self._used, self._spent, self.has_failed = [], [], False
+        self._seed = int(rng.integers(2**63))
+        is_turned = self.settings.random_orientation
+        yaw = math.pi / 2 * float(rng.integers(4) if is_turned else 2 * rng.integers(2))
+        yaw += self.random_yaw(rng, 2 * self.turn_rad)
+        mirror = 1.0 if rng.random() < 0.5 else -1.0
+        half = HALF_LAYOUT_M * (abs(math.cos(yaw)) + abs(math.sin(yaw)))
+        center = self.random_point(rng, 2 * half)
+        for area, *bodies in (
+            (NEW_BOX, self.new_box, self._rims[0]),
+            (USED_BOX, self.used_box, self._rims[1]),
+            (TEST_AREA, self.test_area),
+        ):
+            x, y = area.center
+            xy = _turned((mirror * x, y), center, yaw)
+            for body in bodies:
+                body.place((*xy, -SUNK_M - body.shape.bounds_m[0][2]), yaw)
+        rows = self._rows()
+        for bodies, row in ((self.tubes, rows[0]), (self.swabs, rows[1])):
+            for column, body in zip(self._columns(), bodies, strict=True):
+                body.is_hidden = False
+                along = self.new_box.yaw_rad if is_turned else 0.0
+                along += math.pi / 2 + self.random_yaw(rng, 2 * self.skew_rad)
+                if is_turned:
+                    along += math.pi * float(rng.integers(2))
+                self._lay(body, self._to_world(self.new_box, (column, row)), along)
+
+    def after_action(self) -> None:
+        """Make the test that was asked for, if any, or take note that the order was broken."""
+        tubes = [tube for tube in self.tubes if self._is_presented(tube)]
+        swabs = [swab for swab in self.swabs if self._is_presented(swab)]
+        if len(tubes) == len(swabs) == 1:
+            if self._uncollected():
+                self.has_failed = True
+            else:
+                self._test(tubes[0], swabs[0])
+        elif max(len(tubes), len(swabs)) > 1:
+            self.has_failed = True
+
+    def is_goal(self) -> bool:
+        """Whether all tubes are in the box for used ones, and no swab is left."""
+        return len(self._spent) == self.rounds and all(map(self.is_collected, self.tubes))
+
+    def is_valid(self) -> bool:
+        """Whether the order of the test was kept and all is inside the workspace."""
+        return not self.has_failed and super().is_valid()
+
+    def is_collected(self, tube: Body) -> bool:
+        """Whether a tube lies in the box for used ones, below its rim."""
+        length, width, rim = USED_BOX.size
+        inner = (length - 2 * WALL_M, width - 2 * WALL_M)
+        return tube.position[2] < rim and self._is_on(self.used_box, inner, tube)
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The tubes, and the swabs that are left."""
+        return [*self.tubes, *(swab for swab in self.swabs if swab not in self._spent)]
+
+    @property
+    def landmarks(self) -> Sequence[Pose]:
+        """Areas, tubes and swabs; in place of swabs that are gone, the workspace's upper corner."""
+        workspace = self.settings.workspace
+        gone = ((workspace.x[1], workspace.y[1], workspace.z[1]), 0.0)
+        return [
+            gone if body in self._spent else (body.position, body.yaw_rad)
+            for body in (self.new_box, self.used_box, self.test_area, *self.tubes, *self.swabs)
+        ]
+
+    def get_state(self) -> CovidState:
+        """Return how far the tests are, and what the coming ones follow from."""
+        return CovidState(
+            self._seed,
+            tuple(self.tubes.index(tube) for tube in self._used),
+            tuple(self.swabs.index(swab) for swab in self._spent),
+            self.has_failed,
+        )
+
+    def set_state(self, state: CovidState) -> None:
+        """Take up what `get_state` returned; which bodies are hidden is the scene's to restore."""
+        self._seed, used, spent, self.has_failed = state
+        self._used = [self.tubes[i] for i in used]
+        self._spent = [self.swabs[i] for i in spent]
+
+    # -- heights that an action leaves open --------------------------------------------------
+
+    def pick_height_m(self, top_m: float) -> float:
+        """Return the height of the tool at which the fingers close on what lies highest there."""
+        return max(top_m - self._tube_m[1] / 2, SHEET_M + GRASP_M)
+
+    def place_height_m(self, top_m: float) -> float:
+        """Return the height of the tool at which what was picked like this is let go."""
+        return top_m + GRASP_M + RELEASE_GAP_M
+
+    def window_m(self, held: Body | None) -> float:
+        """Return half the width of the square that is searched for the highest point.
+
+        With a tube in the hand it takes in the rim of a box: fingers and tube stay above.
+        """
+        return RIM_WINDOW_M if held in self.tubes else WINDOW_M
+
+    # -- the test ----------------------------------------------------------------------------
+
+    def _test(self, tube: Body, swab: Body) -> None:
+        """Put the swab into the tube: it is gone, and the tube lies anywhere in the test area."""
+        x, y, z = ASIDE_M
+        swab.place((x + ASIDE_SPACING_M * self.swabs.index(swab), y, z))
+        swab.is_hidden = True
+        self._spent.append(swab)
+        self._used.append(tube)
+        # keyed on the round: what happened before has no part in it
+        rng = np.random.default_rng([self._seed, len(self._used)])
+        others = [other for other in self.objects if other is not tube]
+        for _ in range(SPOT_ATTEMPTS):
+            spot = tuple(float(rng.uniform(-reach, reach)) for reach in self.spot_m)
+            yaw = math.pi / 2 + self.random_yaw(rng, 2 * math.pi)
+            self._lay(tube, self._to_world(self.test_area, spot), yaw)
+            if all(gap_m(other.id, tube) > APART_M for other in others):
+                break
+        self.world.settle(max_steps=REST_STEPS)
+
+    def _uncollected(self) -> list[Body]:
+        return [tube for tube in self._used if not self.is_collected(tube)]
+
+    def _is_presented(self, body: Body) -> bool:
+        return body not in self._spent and self._is_on(self.test_area, TEST_AREA.size, body)
+
+    def _is_on(self, area: Body, size_m: Sequence[float], body: Body) -> bool:
+        """Whether a body, let go of, has its centre above a rectangle about an area's centre."""
+        if body is self.robot.held_body():
+            return False
+        (ax, ay, _), (bx, by, _), yaw = area.position, body.position, area.yaw_rad
+        local = _turned((bx - ax, by - ay), (0.0, 0.0), -yaw)
+        return all(abs(place) < extent / 2 for place, extent in zip(local, size_m, strict=False))
+
+    # -- the expert --------------------------------------------------------------------------
+
+    def expert_command(self) -> PickPlaceCommand:
+        """Collect a used tube, else present what is missing for a test, from any state."""
+        held = self.robot.held_body()
+        if held is not None:
+            return self._place(held)
+        wanted = self._wanted()
+        if not wanted:  # all is done: a pick from the bare corner changes nothing
+            workspace = self.settings.workspace
+            return PickPlaceCommand(PICK, workspace.x[0], workspace.y[0], 0.1)
+        body = max(wanted, key=self._room)
+        x, y, _ = body.position
+        z = vertical_extent(body)[0] + GRASP_M
+        return PickPlaceCommand(PICK, x, y, z, self._grasp_yaw(body))
+
+    def _wanted(self) -> list[Body]:
+        """Return the bodies any of which is to be picked next."""
+        uncollected = self._uncollected()
+        if uncollected:
+            return uncollected
+        if any(map(self._is_presented, self.tubes)):
+            return [swab for swab in self.swabs if swab not in self._spent]
+        fresh = [tube for tube in self.tubes if tube not in self._used]
+        return [tube for tube in fresh if not self.is_collected(tube)] or fresh
+
+    def _place(self, held: Body) -> PickPlaceCommand:
+        """Return the place that brings what is held to where it goes."""
+        if held in self._used:
+            turns = bool(self.reach.turn_rad)
+            spots = USED_ROWS if turns else USED_COLUMNS
+            return self._place_on(held, self.used_box, spots, 0.0, rim_m=USED_BOX.size[2])
+        kin = self.tubes if held in self.tubes else self.swabs
+        if self._uncollected() or any(map(self._is_presented, kin)):
+            row = self._rows()[0 if kin is self.tubes else 1]
+            spots = [(column, row) for column in self._columns()]
+            return self._place_on(held, self.new_box, spots, math.pi / 2)
+        return self._place_on(held, self.test_area, TEST_SPOTS, math.pi / 2)
+
+    def _place_on(
+        self,
+        held: Body,
+        area: Body,
+        spots: Sequence[tuple[float, float]],
+        along_rad: float,
+        rim_m: float = -math.inf,
+    ) -> PickPlaceCommand:
+        """Return the place of what is held on the spot of an area that has most room.
+
+        Args:
+            held: what is in the gripper.
+            area: where it goes.
+            spots: in the frame of the area.
+            along_rad: how it is to lie in that frame; a gripper that cannot turn leaves it.
+            rim_m: height that the fingertips stay above.
+        """
+        tool, tool_yaw = self.robot.tool_pose()
+        others = [other.position for other in self.objects if other is not held]
+        x, y = max(
+            (self._to_world(area, spot) for spot in spots),
+            key=lambda spot: min(math.dist(spot, other[:2]) for other in others),
+        )
+        turn = -tool_yaw
+        if self.reach.turn_rad:
+            turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
+        ox, oy = (b - t for b, t in zip(held.position[:2], tool[:2], strict=True))
+        dx, dy = _turned((ox, oy), (0.0, 0.0), turn)
+        z = SHEET_M + RELEASE_GAP_M + tool[2] - vertical_extent(held)[0]
+        z = max(z, rim_m + TIP_BELOW_TOOL_M + RELEASE_GAP_M)
+        return PickPlaceCommand(PLACE, x - dx, y - dy, z, tool_yaw + turn)
+
+    def _grasp_yaw(self, body: Body) -> float:
+        return body.yaw_rad + math.pi / 2 if self.reach.turn_rad else 0.0
+
+    def _room(self, body: Body) -> float:
+        others = [other for other in self.objects if other is not body]
+        yaw = self._grasp_yaw(body)
+        return finger_room(self.robot, body, yaw, others, self.finger_opening)
+
+    # -- places ------------------------------------------------------------------------------
+
+    def _rows(self) -> tuple[float, float]:
+        """Return where along the box of new tubes the tubes and the swabs have their middle."""
+        inner = NEW_BOX.size[1] / 2 - WALL_M
+        tube, swab = self._tube_m[0], self._swab_m[0]
+        gap = (2 * inner - tube - swab) / 3
+        if gap < APART_M:
+            raise PlacementError(
+                f"tubes of {tube:.3f} m and swabs of {swab:.3f} m do not fit into their box: lower "
+                "`object_scale_range`"
+            )
+        return inner - gap - tube / 2, gap + swab / 2 - inner
+
+    def _columns(self) -> list[float]:
+        return [(i - (self.rounds - 1) / 2) * COLUMN_M for i in range(self.rounds)]
+
+    def _to_world(self, area: Body, spot: tuple[float, float]) -> tuple[float, float]:
+        return _turned(spot, area.position[:2], area.yaw_rad)
+
+    def _lay(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
+        """Put a tube or swab on the floor of an area."""
+        body.place((*xy, SHEET_M - body.shape.bounds_m[0][2]), yaw_rad)
+
+
+def _turned(
+    point: tuple[float, float], center: tuple[float, float], yaw_rad: float
+) -> tuple[float, float]:
+    """Return where a point of a frame lies whose origin and heading are given."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    x, y = point
+    return center[0] + cos * x - sin * y, center[1] + sin * x + cos * y
+
+
+def _floor(area: Area) -> Box:
+    length, width, _ = area.size
+    return Box(size_m=(length, width, SHEET_M + SUNK_M), mass_kg=0, color=area.color)
+
+
+def _rim(area: Area) -> Solid:
+    length, width, height = area.size
+    size = (length, width, height + SUNK_M)
+    return Solid(parts=tuple(frame_parts(size, WALL_M)), mass_kg=0, color=area.color)

@@ -1,0 +1,208 @@
+"""Block in Bowl: a hollow bowl, a goal that means inside, and an expert that recovers."""
+
+import math
+
+import numpy as np
+import pybullet
+import pytest
+
+import ba_torchrl
+from ba_torchrl.sim.bodies import Box, Solid
+from ba_torchrl.sim.meshes import bowl_parts, box_mesh, centroid, moved, prism_mesh, ring_parts
+from ba_torchrl.sim.world import World
+
+TASK = "close_loop/block_in_bowl"
+FLOOR_M = 0.016
+BOWL = {"foot_radius_m": 0.045, "floor_m": FLOOR_M, "wall_m": 0.006}
+
+
+@pytest.fixture
+def env():
+    env = ba_torchrl.make(TASK, obs_size=64, seed=0, expert=True)
+    env.reset()
+    yield env
+    env.close()
+
+
+def volume(mesh):
+    corners = mesh.vertices[mesh.faces]
+    return np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+
+
+def test_parts_of_the_bowl_are_convex_closed_and_face_outwards():
+    for part in bowl_parts(0.08, 0.07, **BOWL):
+        middle = part.vertices.mean(axis=0)
+        for a, b, c in part.vertices[part.faces]:
+            normal = np.cross(b - a, c - a)
+            assert normal @ (a - middle) > 0
+            assert ((part.vertices - a) @ normal).max() < 1e-12
+        edges = {(i, j) for face in part.faces for i, j in zip(face, np.roll(face, -1))}  # noqa: B905
+        assert edges == {(j, i) for i, j in edges}
+
+
+def test_volumes_and_centroid_against_formulas():
+    # a regular polygon with 64 sides is a circle to 0.2 %
+    angles = np.arange(64) * math.pi / 32
+    disc = prism_mesh([(0.1 * math.cos(a), 0.1 * math.sin(a)) for a in angles], 0.2, 0.5)
+    assert volume(disc) == pytest.approx(math.pi * 0.01 * 0.3, rel=2e-3)
+    ring = ring_parts([(0.1, 0.0), (0.2, 0.0), (0.2, 0.3), (0.1, 0.3)], 64)
+    assert sum(map(volume, ring)) == pytest.approx(math.pi * 0.03 * 0.3, rel=2e-3)
+    boxes = [moved(box_mesh((1, 1, 1)), (0, 0, 0.5)), moved(box_mesh((1, 1, 3)), (2, 0, 1.5))]
+    np.testing.assert_allclose(centroid(boxes), (1.5, 0.0, 1.25), atol=1e-12)
+
+
+def test_the_bowl_has_its_size_and_stands_upright(env):
+    low, high = env.scene.task.bowl.shape.bounds_m
+    np.testing.assert_allclose(np.subtract(high, low), (0.16, 0.16, 0.07), atol=1e-9)
+    bowl = env.scene.task.bowl
+    assert bowl.position[2] == pytest.approx(0.035, abs=5e-4)
+    assert bowl.tilt_rad < 5e-3
+    mass = pybullet.getDynamicsInfo(bowl.id, -1, physicsClientId=bowl.client)[0]
+    assert mass == 0.1
+
+
+def test_the_bowl_is_hollow_for_collisions():
+    with World() as world:
+        parts = tuple(bowl_parts(0.08, 0.07, **BOWL))
+        bowl = world.add(Solid(parts=parts, center_of_mass_m=centroid(parts)), "bowl")
+        crumb = world.add(Box(size_m=(0.02, 0.02, 0.02), mass_kg=0.02), "crumb")
+        for x, height in ((0.0, FLOOR_M), (0.03, FLOOR_M)):
+            bowl.place((0.5, 0.0, 0.035))
+            crumb.place((0.5 + x, 0.0, 0.08))
+            assert world.settle()
+            assert crumb.position[2] == pytest.approx(height + 0.01, abs=1e-3)
+            assert crumb.touches(bowl)
+            assert bowl.tilt_rad < 0.01
+
+
+def test_the_camera_sees_the_cavity(env):
+    task, camera = env.scene.task, env.scene.camera
+    task.block.place((0.55, 0.12, 0.025))
+    task.bowl.place((0.4, 0.0, 0.035))
+    image = camera.heightmap((0.4, 0.0), 0.2, 100)
+    assert image[50, 50] == pytest.approx(FLOOR_M, abs=1e-4)
+    assert image.max() == pytest.approx(0.07, abs=1e-4)
+    assert image[50, 50 + 42] == 0  # 8.4 cm from the axis
+
+
+def test_layouts_keep_their_distances_and_are_cheap(env):
+    task, rng = env.scene.task, np.random.default_rng(0)
+    for _ in range(200):
+        task.randomise(rng)
+        (x, y, _), (bowl_x, bowl_y, _) = task.block.position, task.bowl.position
+        assert math.dist((x, y), (bowl_x, bowl_y)) >= 0.17
+        assert max(abs(bowl_x - 0.45), abs(bowl_y)) <= 0.065 + 1e-9
+        assert max(abs(x - 0.45), abs(y)) <= 0.09 + 1e-9
+
+
+def lay(env, offset, z, yaw=0.3):
+    """Put the block near the bowl's axis and let it come to rest."""
+    task, world = env.scene.task, env.scene.world
+    env.scene.motion.reset(((0.45, 0.1, 0.24), 0.0))
+    task.bowl.place((0.45, -0.05, 0.035))
+    task.block.place((0.45 + offset, -0.05, z), yaw)
+    assert world.settle(400)
+
+
+def test_the_goal_is_a_block_that_lies_inside(env):
+    task = env.scene.task
+    lay(env, 0.0, FLOOR_M + 0.03)
+    assert task.is_goal()
+    lay(env, 0.12, 0.025)
+    assert not task.is_goal()  # beside the bowl
+    task.block.place((0.45, -0.05, 0.2))
+    env.scene.world.step(2)
+    assert not task.is_goal()  # falls towards it
+
+
+def test_a_block_under_the_bowl_does_not_count(env):
+    task = env.scene.task
+    task.block.place((0.45, -0.05, 0.025))
+    task.bowl.place((0.45, -0.05, 0.05 + 0.0355))
+    env.scene.world.step(20)
+    assert task.bowl.touches(task.block)
+    assert task.bowl.tilt_rad < task.upright_rad
+    assert not task.is_goal()
+
+
+def test_a_block_on_the_rim_does_not_count(env):
+    lay(env, 0.07, 0.11)
+    task = env.scene.task
+    if math.dist(task.block.position[:2], task.bowl.position[:2]) >= 0.03:
+        assert not task.is_goal()
+    task.block.place((0.45 + 0.075, -0.05, 0.095 + 2e-4))
+    env.scene.world.step()
+    assert not task.is_goal()
+
+
+def test_a_held_block_does_not_count(env):
+    scene, task = env.scene, env.scene.task
+    lay(env, 0.0, FLOOR_M + 0.03, yaw=0.0)
+    x, y, z = task.block.position
+    scene.motion.reset(((x, y, z + 0.05), 0.0))
+    scene.motion.move_to((x, y, z), 0.0)
+    assert task.is_goal()
+    scene.motion.grip(0.0)
+    assert scene.robot.held_body() is task.block
+    assert task.bowl.touches(task.block)
+    assert not task.is_goal()
+
+
+def test_a_tipped_bowl_ends_the_episode(env):
+    task = env.scene.task
+    env.scene.motion.reset(((0.45, 0.1, 0.24), 0.0))
+    task.bowl.move_to((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((2.5, 0.0, 0.0)))
+    env.scene.world.settle(400)
+    assert task.bowl.tilt_rad > task.tipped_rad
+    outcome = env._step(env.full_action_spec.zero())
+    assert outcome["terminated"]
+    assert not outcome["success"]
+
+
+def test_a_bowl_nudged_up_on_one_side_falls_back(env):
+    task = env.scene.task
+    env.scene.motion.reset(((0.45, 0.1, 0.24), 0.0))
+    task.bowl.move_to((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((0.6, 0.0, 0.0)))
+    env.scene.world.settle(400)
+    assert task.bowl.tilt_rad < 0.02
+
+
+def play(env, state):
+    steps = 0
+    while not state["done"]:
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+        steps += 1
+    return bool(state["success"]), steps
+
+
+def restart(env):
+    """Return the state after an action that does nothing."""
+    return env._step(env.full_action_spec.zero())
+
+
+@pytest.mark.parametrize("bearing", np.arange(8) * math.pi / 4)
+def test_the_expert_takes_a_block_from_beside_the_bowl(env, bearing):
+    env.reset()
+    task = env.scene.task
+    x, y = 0.45, 0.0
+    task.bowl.place((x, y, 0.035))
+    away = 0.118
+    task.block.place((x + away * math.cos(bearing), y + away * math.sin(bearing), 0.025), bearing)
+    env.scene.world.settle()
+    success, steps = play(env, restart(env))
+    assert success
+    assert steps < 25
+
+
+def test_grasping_does_not_drag_the_bowl_along(env):
+    state = env.reset()
+    before = env.scene.task.bowl.position
+    while not env.scene.task.robot.held_body():
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+    assert math.dist(before, env.scene.task.bowl.position) < 1e-3
+
+
+def test_the_expert_is_as_fast_as_published(env):
+    outcomes = [play(env, env.reset()) for _ in range(20)]
+    assert all(success for success, _ in outcomes)
+    assert np.mean([steps for _, steps in outcomes]) <= 1.1 * 11.2

@@ -1,0 +1,182 @@
+"""Corner Picking: no room for fingers in the corner, a drag by friction, then the grasp."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ba_torchrl
+
+TASK = "close_loop/corner_picking"
+
+
+@pytest.fixture
+def env():
+    env = ba_torchrl.make(TASK, obs_size=64, seed=0, expert=True)
+    env.reset()
+    yield env
+    env.close()
+
+
+def test_the_block_is_flush_with_both_walls(env):
+    task = env.scene.task
+    for _ in range(10):
+        env.reset()
+        x, y = task.to_corner(*task.block.position[:2])
+        assert x == pytest.approx(-0.065, abs=5e-4)
+        assert y == pytest.approx(-0.065, abs=5e-4)
+        turn = (task.block.yaw_rad - task.corner[2] + math.pi) % (2 * math.pi) - math.pi
+        assert abs(turn) < 1e-3
+        assert task.block.position[2] == pytest.approx(0.027, abs=5e-4)
+
+
+def test_the_corner_has_its_sizes(env):
+    task, camera = env.scene.task, env.scene.camera
+    task.put_corner((0.45, 0.0), 0.0)
+    image = camera.heightmap((0.45, 0.0), 0.24, 120)  # pixels of 2 mm
+    walls = image > 0.09
+    rows, columns = np.nonzero(walls)
+    assert image.max() == pytest.approx(0.1, abs=1e-6)
+    # centred on the edges of the base: inner faces at -9 cm, outer ones at -11 cm
+    assert rows.min() == columns.min() == 5
+    assert rows.max() == columns.max() == 109
+    assert walls[:, 60].sum() == walls[60, :].sum() == 10  # 2 cm thick
+    assert image[60, 60] == pytest.approx(0.002, abs=1e-6)
+    assert image[15 + 12, 15 + 12] == pytest.approx(0.052, abs=5e-4)
+
+
+def test_the_corner_is_fixed_and_the_base_smooth(env):
+    task, scene = env.scene.task, env.scene
+    before = [body.pose for body in (task.base, task.walls)]
+    assert all(body.is_static for body in (task.base, task.walls))
+    assert task.base.shape.friction == 0.001
+    task.put_corner((0.45, 0.0), 0.0)
+    scene.motion.reset(((0.42, 0.0, 0.05), 0.0), 0.0)
+    scene.motion.move_to((0.3, 0.0, 0.05), 0.0)  # into the wall
+    assert scene.robot.tool_pose()[0][0] > 0.36
+    assert before != [body.pose for body in (task.base, task.walls)]
+    task.put_corner((0.45, 0.0), 0.0)
+    at_rest = [body.pose for body in (task.base, task.walls)]
+    scene.world.step(50)
+    assert at_rest == [body.pose for body in (task.base, task.walls)]
+
+
+def test_the_block_stays_in_the_corner_when_left_alone(env):
+    task = env.scene.task
+    for _ in range(5):
+        env.reset()
+        env.scene.world.step(600)
+        x, y = task.to_corner(*task.block.position[:2])
+        assert math.dist((x, y), (-0.065, -0.065)) < 1e-3
+
+
+def test_all_headings_occur_and_fixed_ones_are_zero(env):
+    yaws = []
+    for _ in range(60):
+        env.reset()
+        yaws.append(env.scene.task.corner[2])
+    assert min(yaws) < -2.5
+    assert max(yaws) > 2.5
+    fixed = ba_torchrl.make(TASK, obs_size=16, seed=0, random_orientation=False)
+    for _ in range(5):
+        fixed.reset()
+        assert fixed.scene.task.corner[2] == 0
+    fixed.close()
+
+
+@pytest.mark.parametrize("turn", [0.0, math.pi / 4, math.pi / 2])
+def test_the_block_cannot_be_grasped_in_the_corner(env, turn):
+    scene, task = env.scene, env.scene.task
+    task.put_corner((0.45, 0.0), 0.0)
+    assert task.room_m(turn) < 0
+    x, y, z = task.block.position
+    scene.motion.reset(((x, y, 0.2), turn))
+    for height in (0.15, 0.1, z, z):
+        scene.motion.move_to((x, y, height), turn)
+    scene.motion.grip(0.0)
+    scene.motion.move_to((x, y, 0.18), turn)
+    assert not task.is_goal()
+
+
+def test_the_goal_needs_the_grasp_and_fifteen_centimetres(env):
+    scene, task = env.scene, env.scene.task
+    task.put_corner((0.45, 0.0), 0.0)
+    task.block.place((0.45, 0.0, 0.027))
+    assert task.room_m(0.0) > 0
+    scene.motion.reset(((0.45, 0.0, 0.16), 0.0))
+    assert not task.is_goal()  # high, but empty
+    scene.motion.move_to((0.45, 0.0, 0.027), 0.0)
+    scene.motion.grip(0.0)
+    scene.motion.move_to((0.45, 0.0, 0.145), 0.0)
+    assert not task.is_goal()  # held, but low
+    scene.motion.move_to((0.45, 0.0, 0.155), 0.0)
+    assert task.is_goal()
+
+
+def test_room_beside_the_fingers_against_arithmetic(env):
+    task = env.scene.task
+    task.put_corner((0.45, 0.0), 0.7)
+    task.block.place((*task.to_world(0.01, -0.02), 0.027), 0.7)
+    along = task.robot.finger_span_m / 2 + 0.015
+    assert task.room_m(0.7) == pytest.approx(min(0.1 - along, 0.07 - 0.0095), abs=1e-6)
+    assert task.room_m(0.7 + math.pi / 2) == pytest.approx(0.07 - along, abs=1e-6)
+
+
+def test_the_block_is_dragged_by_friction_alone(env):
+    """The expert's fingers stay above the block until it is out of the corner."""
+    for _ in range(5):
+        state = env.reset()
+        scene, task = env.scene, env.scene.task
+        while (
+            task.room_m(task.block.yaw_rad) < 0
+            and task.room_m(task.block.yaw_rad + math.pi / 2) < 0
+        ):
+            state = env.step(state.set("action", state["expert_action"]))["next"]
+            assert not state["done"]
+            if scene.robot.opening() < 0.5:
+                top = task.block.position[2] + 0.025
+                assert scene.robot.tool_pose()[0][2] > top + 5e-3
+            assert task.block.tilt_rad < 0.12
+
+
+def test_asked_twice_in_any_phase_the_expert_says_the_same(env):
+    state = env.reset()
+    while not state["done"]:
+        commands = [env.scene.task.expert_command() for _ in range(2)]
+        assert commands[0] == commands[1]
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+    assert state["success"]
+
+
+@pytest.mark.parametrize(
+    "variant",
+    [{}, {"random_orientation": False, "action_sequence": "pxyz"}],
+    ids=["random orientations", "fixed, without yaw"],
+)
+def test_the_expert_needs_at_most_seventeen_steps(variant):
+    env = ba_torchrl.make(TASK, obs_size=16, seed=3, expert=True, **variant)
+    lengths = []
+    for _ in range(30):
+        state = env.reset()
+        while not state["done"]:
+            state = env.step(state.set("action", state["expert_action"]))["next"]
+        assert state["success"]
+        lengths.append(int(state["step_count"]))
+    env.close()
+    assert np.mean(lengths) <= 15.3  # 1.1 times the published planner's, which lifts half as high
+
+
+def test_the_expert_starts_from_a_block_turned_in_the_corner(env):
+    solved = 0
+    for turn in np.linspace(0.1, 1.4, 10):
+        env.reset()
+        task = env.scene.task
+        yaw = task.corner[2]
+        half = 0.025 * (math.cos(turn) + math.sin(turn)) + 1e-3
+        task.block.place((*task.to_world(-0.09 + half, -0.09 + half), 0.027), yaw + turn)
+        env.scene.world.settle()
+        state = env._step(env.full_action_spec.zero())
+        while not state["done"]:
+            state = env.step(state.set("action", state["expert_action"]))["next"]
+        solved += bool(state["success"])
+    assert solved >= 9
