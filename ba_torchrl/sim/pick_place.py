@@ -35,8 +35,10 @@ class PickPlaceLimits:
     lift_m: float = 0.005
     lift_steps: int = 4
     """Least number of steps of a simulated way."""
-    swing_step_rad: float = 0.03
+    swing_step_rad: float = 0.008
     """Greatest turn of a joint per step of a simulated swing."""
+    transit_z_m: float = 0.3
+    """Height of the tool at which simulated swings start and end."""
     margin_m: float = 5e-4
     """Closer than this, a way is not free."""
     carry_step_m: float = 0.004
@@ -44,7 +46,9 @@ class PickPlaceLimits:
     hover_m: float = 0.003
     """Height above its place from which an object is lowered."""
     lower_steps: int = 2
-    release_steps: int = 2
+    release_opening: float = 0.12
+    """Share of the opening by which fingers part to let go."""
+    release_steps: int = 10
     regrasp_steps: int = 5
     """Steps after which a body that is not squeezed is no longer held."""
     max_press_n: float = 40.0
@@ -209,6 +213,10 @@ class PickPlace:
         up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
         return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
 
+    def _tool_rotation(self) -> Matrix:
+        turn = pybullet.getMatrixFromQuaternion(self.robot.tool_transform()[1])
+        return tuple(zip(*[iter(turn)] * 3, strict=True))
+
     def _joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
 
@@ -229,7 +237,7 @@ class PickPlace:
                 return True
             self._carry(way[0])
         else:
-            self._swing(way[0])
+            self._swing_above(end, rotation)
         self._travel(self._above(end, rotation, limits.approach_m), end, rotation, None)
         self.check_grasp()
         return True
@@ -252,10 +260,24 @@ class PickPlace:
         self._travel(start, self._above(start, rotation, self.limits.approach_m), rotation, None)
         self.check_grasp()
 
+    def _swing_above(self, end: Vector, rotation: Matrix) -> None:
+        """Swing high above everything, then come down to where the approach starts."""
+        start = self._above(end, rotation, self.limits.approach_m)
+        high = (*start[:2], max(self.limits.transit_z_m, start[2]))
+        joints = self._joints(high, rotation)
+        if joints is None:
+            high, joints = start, self._joints(start, rotation)
+        self._swing(joints)
+        self._travel(high, start, rotation, None)
+
     def _go_home(self) -> None:
         if self.teleport:
             self._carry(self.robot.home_joints)
         else:
+            x, y, z = self.robot.tool_transform()[0]
+            rotation = self._tool_rotation()
+            if z < self.limits.transit_z_m:
+                self._travel((x, y, z), (x, y, self.limits.transit_z_m), rotation, None)
             self._swing(self.robot.home_joints)
             self.check_grasp()
 
@@ -333,9 +355,10 @@ class PickPlace:
         ramp_fingers(self.robot, 0.0, self.limits.closing_steps)
 
     def _open(self) -> None:
-        """Let go of what is between the fingers."""
-        count = self.limits.release_steps if self.teleport else self.limits.closing_steps
-        ramp_fingers(self.robot, self.opening, count)
+        """Let go of what is between the fingers, without pushing what stands beside it."""
+        limits = self.limits
+        wanted = min(self.robot.opening() + limits.release_opening, self.opening)
+        ramp_fingers(self.robot, wanted, limits.release_steps)
 
 
 def smooth_step(u: float) -> float:

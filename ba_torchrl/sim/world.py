@@ -45,6 +45,7 @@ class Snapshot:
 
     def __init__(self, client: int, connection: weakref.finalize) -> None:
         self.client = client
+        self.connection = connection
         self.id = pybullet.saveState(physicsClientId=client)
         weakref.finalize(self, _forget, self.id, client, connection)
 
@@ -141,11 +142,16 @@ class World:
         if self._pristine is None:
             raise SimulationError("seal() the world before resetting it")
         self.restore(self._pristine)
-        self._forget_pairs()
 
     def snapshot(self) -> Snapshot:
-        """Keep the state of every body and contact in memory, for `restore`."""
-        return Snapshot(self.client, self._disconnect)
+        """Keep the state of every body and contact in memory, for `restore`.
+
+        The world goes on from it as it will after each `restore`: what the engine remembers beyond
+        what it saves is given up here and there.
+        """
+        snapshot = Snapshot(self.client, self._disconnect)
+        self.restore(snapshot)
+        return snapshot
 
     def restore(self, snapshot: Snapshot) -> None:
         """Return to a snapshot of this world; motor commands are the caller's to repeat.
@@ -153,8 +159,10 @@ class World:
         Raises:
             SimulationError: the snapshot is of another world, or of one that was closed.
         """
-        if not snapshot.is_of(self):
+        # client numbers are used again, connections are not
+        if snapshot.connection is not self._disconnect or self.is_closed:
             raise SimulationError("the state is of another world: that one was closed or rebuilt")
+        self._forget_pairs()
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
 
     def step(self, count: int = 1) -> None:
@@ -206,25 +214,27 @@ class World:
         self.close()
 
     def _forget_pairs(self) -> None:
-        """Let the engine look afresh at what is near each other, if convex hulls are among it.
+        """Let the engine look afresh at what is near each other.
 
-        It keeps its last guess at how two hulls are apart, which no saved state holds; from
-        another guess the same scene goes on differently.
+        It keeps its last guess at how two convex hulls, such as a finger and a block, are apart,
+        which no saved state holds; from another guess the same scene goes on differently.
         """
-        if all(body.shape.collision_margin_m is None for body in self.bodies):
-            return
+        _renew_pairs(self.client, self.floor, is_static=True)
         for body in self.bodies:
             if isinstance(body, Part):
                 body.forget_pairs()
-            elif not body.is_static:
-                # the same groups as before; what counts is that the pairs are made anew
-                pybullet.setCollisionFilterGroupMask(
-                    body.id, -1, 1, -1, physicsClientId=self.client
-                )
+            else:
+                _renew_pairs(self.client, body.id, body.is_static)
 
     def _check_open(self, name: str) -> None:
         if self._pristine is not None:
             raise SimulationError(f"cannot add {name!r}: the world is sealed")
+
+
+def _renew_pairs(client: int, body: int, is_static: bool) -> None:
+    # PyBullet's own groups: what is static meets all but its like
+    group, mask = (2, ~2) if is_static else (1, -1)
+    pybullet.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=client)
 
 
 def _connect_window() -> int:

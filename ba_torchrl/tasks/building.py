@@ -123,6 +123,7 @@ class Building:
         put_down: PutDown,
         held: Body | None = None,
         effort: Callable[[Body], float] = lambda body: 0.0,
+        crowding: Callable[[Body, Vector], float] = lambda body, position: 0.0,
     ) -> Move | None:
         """Return the move that brings the structure on, or None if it stands.
 
@@ -133,6 +134,7 @@ class Building:
             put_down: where on the ground there is room.
             held: what the gripper holds: it is placed before anything else is picked.
             effort: metres to add to the way of a piece for picking it, to choose among equals.
+            crowding: metres to add for placing a piece somewhere.
         """
         views = self._views()
         fillings = list(self._fillings(views, held))
@@ -152,6 +154,7 @@ class Building:
                 if number is not None:
                     move = self._into_slot(body, number, filling, put_down)
                     way = math.dist(body.position[:2], move.position[:2])
+                    way += crowding(body, move.position)
                 cost = (detour, way + (0.0 if body is held else effort(body)))
                 if best is None or cost < best[0]:
                     best = cost, move

@@ -14,6 +14,9 @@ DROP_Z_M = 0.2
 DROP_INTERVAL_S = 0.15
 """Time between objects: each falls 11 cm, out of the next one's way."""
 SETTLE_S = 4.0
+LOW_DROP_M = 5e-3
+APART_M = 0.085
+LAYOUT_ATTEMPTS = 500
 DROP_ATTEMPTS = 3
 """Heaps tried until one comes to rest inside its area; round objects may roll for long."""
 
@@ -67,6 +70,7 @@ class Clutter:
         *,
         center_xy: tuple[float, float],
         spread_m: float,
+        surface_z_m: float,
         random_orientation: bool,
         robot: Robot,
     ) -> None:
@@ -77,7 +81,9 @@ class Clutter:
             count: of objects.
             center_xy: middle of the area, metres.
             spread_m: objects start this far from the middle at most, along x and along y.
-            random_orientation: any orientation; else upright and with yaw 0.
+            surface_z_m: height of what they fall on.
+            random_orientation: any orientation; else upright and with yaw 0. If there is room,
+                these objects come down apart and from close above, so that they stay so.
             robot: to keep away.
         """
         joints = robot.joints
@@ -93,10 +99,16 @@ class Clutter:
             self.world.step(2)
             chosen = rng.choice(len(self.bodies), size=count, replace=False)
             self.present = [self.bodies[i] for i in chosen]
-            for body in self.present:
-                x, y = (c + rng.uniform(-spread_m, spread_m) for c in center_xy)
+            points = rng.uniform(-spread_m, spread_m, (count, 2))
+            apart = None if random_orientation else _points_apart(rng, count, spread_m)
+            for i, body in enumerate(self.present):
+                x, y = center_xy + (points[i] if apart is None else apart[i])
+                if apart is None:
+                    z = DROP_Z_M
+                else:
+                    z = surface_z_m + LOW_DROP_M - body.shape.bounds_m[0][2]
                 turn = _random_turn(rng) if random_orientation else (0.0, 0.0, 0.0, 1.0)
-                body.move_to((x, y, DROP_Z_M), turn)
+                body.move_to((x, y, z), turn)
                 body.is_hidden = False
                 self.world.step(pause)
             if self.world.settle(round(SETTLE_S / self.world.physics.time_step_s)):
@@ -118,6 +130,16 @@ class Clutter:
         x, y = ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row
         body.place((x, y, ASIDE_Z_M))
         body.is_hidden = True
+
+
+def _points_apart(rng: np.random.Generator, count: int, spread_m: float) -> np.ndarray | None:
+    """Return random points [count, 2] of a square about zero, apart from each other, or None."""
+    for _ in range(LAYOUT_ATTEMPTS):
+        points = rng.uniform(-spread_m, spread_m, (count, 2))
+        gaps = np.linalg.norm(points[:, None] - points[None], axis=2) + APART_M * np.eye(count)
+        if (gaps >= APART_M).all():
+            return points
+    return None
 
 
 def _random_turn(rng: np.random.Generator) -> Quaternion:

@@ -322,7 +322,12 @@ def travel(
 
 
 def finger_room(
-    robot: Robot, body: Body, yaw_rad: float, others: Sequence[Body], opening: float = 1.0
+    robot: Robot,
+    body: Body,
+    yaw_rad: float,
+    others: Sequence[Body],
+    opening: float = 1.0,
+    at: Vector | None = None,
 ) -> float:
     """Return the gap between the fingers, open around a body, and what stands beside it.
 
@@ -334,9 +339,10 @@ def finger_room(
         yaw_rad: the gripper's.
         others: bodies that may stand in their way.
         opening: of the gripper, 0 to 1.
+        at: where the body is, if not where it is now.
     """
     apart = HALF_FINGER_DEPTH_M + opening * (robot.finger_span_m / 2 - HALF_FINGER_DEPTH_M)
-    bx, by, bz = body.position
+    bx, by, bz = body.position if at is None else at
     ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
     gap = math.inf
     for other in others:

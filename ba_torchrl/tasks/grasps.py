@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numba
@@ -16,6 +16,7 @@ from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.tasks.base import Reach, Workspace
 from ba_torchrl.tasks.experts import turned
+from ba_torchrl.tasks.tray import MARGIN_M
 
 HALF_GAP_M = 0.04
 """Half the distance between the open fingers."""
@@ -36,19 +37,45 @@ SHALLOWEST_M = 0.006
 LEAST_SQUARE = 0.3
 """How nearly opposite the surfaces that the fingers meet are at least."""
 
+CLOSED_HALF_M = 0.024
+"""A push starts this far from the surface: half the closed fingers and some room."""
+CLOSED_TIP_M = 0.0136
+"""Closed fingers end this far below the tool point, deeper than open ones."""
+PRESS_M = 1.5e-3
+OBJECT_HALF_M = 0.045
+WALL_ROOM_M = 0.05
+"""Objects this near to a wall leave no room for a finger behind them."""
+LOW_M = 0.01
+"""Height of the tool above the workspace's lower end while it pushes."""
+NEAR_M = 0.018
+"""Fingers this near to the start of a push are there."""
+
 YAWS = 16
 SAMPLES = 256
 PIXEL_M = 0.003
-MARGIN_M = 0.06
+BORDER_M = 0.06
 """The height image reaches this far beyond the workspace."""
 
 
 class Grasp(NamedTuple):
-    """A tool pose around an object, and how many actions it costs, failures counted in."""
+    """A tool pose around an object."""
 
     body: Body
     position: Vector
     yaw_rad: float
+    risk: float
+    """0 for parallel sides in easy reach; beyond 1, rather not."""
+    cost: float
+    """Actions it takes, failures counted in."""
+
+
+class Nudge(NamedTuple):
+    """A way with closed fingers that turns or moves an object, pushing its side or its top."""
+
+    start: Vector
+    end: Vector
+    slack_m: float
+    """Fingers this far above the start are there."""
     cost: float
 
 
@@ -68,7 +95,7 @@ class GraspPlanner:
         self._pool = pool
         x, y = workspace.center
         self._side_m = max(workspace.x[1] - workspace.x[0], workspace.y[1] - workspace.y[0])
-        self._side_m += 2 * MARGIN_M
+        self._side_m += 2 * BORDER_M
         self._corner = (x - self._side_m / 2, y - self._side_m / 2)
 
     def heights(self) -> np.ndarray:
@@ -121,8 +148,92 @@ class GraspPlanner:
                     travel += max(0.1 - z, 0.0) / reach.step_m  # up first
                 cost = travel + 12 * risk
                 if best is None or cost < best.cost:
-                    best = Grasp(body, (gx, gy, gz), target_yaw, float(cost))
+                    best = Grasp(body, (gx, gy, gz), target_yaw, float(risk), float(cost))
         return best
+
+    def nudge(
+        self, bodies: Sequence[Body], tool: Pose, reach: Reach, heights: np.ndarray
+    ) -> Nudge | None:
+        """Return the handiest nudge of any of the bodies, or None if there is none.
+
+        Args:
+            bodies: to choose from.
+            tool: where the gripper is.
+            reach: of one action.
+            heights: from `heights`.
+        """
+        nudges = [nudge for body in bodies for nudge in self._pushes(body, tool, reach, heights)]
+        nudges += [nudge for body in bodies for nudge in self._drags(body, tool, reach, heights)]
+        return min(nudges, key=lambda nudge: nudge.cost, default=None)
+
+    def _pushes(
+        self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray
+    ) -> Iterator[Nudge]:
+        """Yield pushes against a body's side, away from the walls.
+
+        A gripper that cannot turn rather pushes an end, so that the body turns.
+        """
+        middle = np.array(self._workspace.center)
+        points = self._placed_samples(body)[:, :2]
+        center = points.mean(axis=0)
+        for turn in np.arange(8) * np.pi / 4:
+            ahead = np.array([math.cos(turn), math.sin(turn)])
+            side = np.array([-ahead[1], ahead[0]])
+            along, across = (points - center) @ ahead, (points - center) @ side
+            pushed = center + reach.step_m * ahead
+            if not self._is_on_floor(pushed, OBJECT_HALF_M):
+                continue
+            inward = math.dist(center, middle) - math.dist(pushed, middle)
+            for offset in np.array([0.0, -0.7, 0.7]) * np.abs(across).max():
+                met = np.abs(across - offset) < BAND_HALF_M
+                if not met.any():
+                    continue
+                start = center + (along[met].min() - CLOSED_HALF_M) * ahead + offset * side
+                if self._is_free(start, heights):
+                    low = self._workspace.z[0] + LOW_M
+                    end = start + reach.step_m * ahead
+                    lever = 0.0 if reach.turn_rad else abs(offset)
+                    cost = _travel(start, low + NEAR_M, tool, reach)
+                    cost -= (inward + lever) / reach.step_m
+                    yield Nudge((*start, low), (*end, low), NEAR_M, cost)
+
+    def _drags(self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray) -> Iterator[Nudge]:
+        """Yield a pull at the top of a body by a wall towards the middle.
+
+        Fingers stick better than the floor, and the walls are without friction.
+        """
+        middle = np.array(self._workspace.center)
+        points = self._placed_samples(body)
+        center = points[:, :2].mean(axis=0)
+        if self._is_on_floor(center, WALL_ROOM_M):
+            return
+        near = np.linalg.norm(points[:, :2] - center, axis=1) < 0.01
+        top = float(points[near, 2].max() if near.any() else points[:, 2].max())
+        if self._height_at(center, heights) > top + 0.005:
+            return  # something lies on it
+        touching = top + CLOSED_TIP_M
+        start = (*center, touching - PRESS_M)
+        way = (middle - center) / np.abs(middle - center).max() * reach.step_m
+        cost = 1.0 + _travel(center, touching + PRESS_M, tool, reach)
+        yield Nudge(start, (*(center + way), touching - 2 * PRESS_M), 3 * PRESS_M, cost)
+
+    def _height_at(self, point: np.ndarray, heights: np.ndarray) -> float:
+        i, j = ((point - self._corner) / PIXEL_M).astype(int)
+        return float(heights[i, j])
+
+    def _is_free(self, point: np.ndarray, heights: np.ndarray) -> bool:
+        """Whether closed fingers fit at a point of the floor."""
+        if not self._is_on_floor(point, BAND_HALF_M):
+            return False
+        i, j = ((point - self._corner) / PIXEL_M).astype(int)
+        reach = round(CLOSED_HALF_M / PIXEL_M) - 2
+        window = heights[i - reach : i + reach + 1, j - reach : j + reach + 1]
+        return float(window.max()) < LOW_M
+
+    def _is_on_floor(self, point: np.ndarray, margin_m: float) -> bool:
+        """Whether a point is off the tray's walls by a margin."""
+        half = (self._workspace.width - MARGIN_M) / 2 - margin_m
+        return float(np.abs(point - self._workspace.center).max()) < half
 
     def _placed_samples(self, body: Body) -> np.ndarray:
         """Return points on a body's surface and their normals as it lies now, [N, 6]."""
@@ -136,6 +247,13 @@ class GraspPlanner:
         placed[:, :3] = local[:, :3] @ rotation.T + position
         placed[:, 3:] = local[:, 3:] @ rotation.T
         return placed
+
+
+def _travel(start: np.ndarray, low_z: float, tool: Pose, reach: Reach) -> float:
+    """Return about how many actions it takes to get closed fingers to the start of a nudge."""
+    (x, y, z), _ = tool
+    aside = float(np.abs(start - (x, y)).max())
+    return 0.0 if aside <= NEAR_M and z <= low_z else 2.0 + aside / reach.step_m
 
 
 def _rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:

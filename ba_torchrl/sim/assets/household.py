@@ -77,7 +77,7 @@ def spoon() -> list[Mesh]:
     )
     ring = _ring(0.009, 0.0, 8)
     ends = [ring[:, [2, 0, 1]] + (x, 0, 0) for x in (-0.055, 0.05)]
-    return [convex_hull(np.concatenate(ends)), bowl]
+    return [moved(part, (0, 0, 0), np.pi / 2) for part in (convex_hull(np.concatenate(ends)), bowl)]
 
 
 def banana() -> list[Mesh]:
@@ -104,17 +104,17 @@ ITEMS: dict[str, Callable[[], Sequence[Mesh]]] = {
     "mug": lambda: mug(0.028, 0.07),
     "espresso cup": lambda: mug(0.024, 0.045),
     "tumbler": lambda: vessel([(0.021, 0.0), (0.028, 0.08)], 0.004, 0.006),
-    "bowl": lambda: vessel([(0.025, 0.0), (0.043, 0.018), (0.05, 0.045)], 0.006, 0.006),
-    "plate": lambda: vessel([(0.05, 0.0), (0.055, 0.022)], 0.006, 0.005),
+    "bowl": lambda: vessel([(0.018, 0.0), (0.028, 0.014), (0.03, 0.04)], 0.004, 0.005),
+    "plate": lambda: vessel([(0.028, 0.0), (0.031, 0.022)], 0.004, 0.005),
     "tea box": lambda: [box((0.05, 0.075, 0.03))],
     "carton": lambda: [box((0.045, 0.045, 0.095))],
-    "soap": lambda: [box((0.08, 0.05, 0.025))],
+    "soap": lambda: [box((0.05, 0.08, 0.025))],
     "brick": lambda: [box((0.04, 0.09, 0.04))],
     "bar": lambda: [box((0.022, 0.11, 0.022))],
     "spoon": spoon,
     "brush": lambda: [
-        box((0.1, 0.02, 0.018), (-0.02, 0, 0)),
-        box((0.055, 0.03, 0.026), (0.055, 0, -0.004)),
+        box((0.02, 0.1, 0.018), (0, -0.02, 0)),
+        box((0.03, 0.055, 0.026), (0, 0.055, -0.004)),
     ],
     "hammer": lambda: [
         box((0.018, 0.1, 0.018), (0, -0.03, 0)),

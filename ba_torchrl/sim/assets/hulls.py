@@ -16,6 +16,8 @@ ROUNDING_M = 1e-3
 SAME_REST_COSINE = math.cos(math.radians(10))
 SAMPLES = 2000
 FINGER_HALF_M = 0.0125
+GAP_M = 0.066
+"""Open fingers take no more, with some room to either side."""
 GRIPPED_Z_M = (0.004, 0.04)
 """Heights above the ground that fingers cover."""
 
@@ -29,6 +31,8 @@ class Rest(NamedTuple):
     squareness: float
     """How nearly opposite the surfaces are that two closing fingers meet, for the best direction:
     1 for parallel upright sides, the cosine of the angle between the sides of a wedge."""
+    turn: np.ndarray
+    """[3, 3] rotation into this pose, with that direction along x."""
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
@@ -75,14 +79,18 @@ def rests(hull: Mesh) -> list[Rest]:
         if (normals @ normal > SAME_REST_COSINE).any():
             continue
         heights = hull.vertices @ -normal
-        plane = _plane(hull.vertices, normal)
+        plane = hull.vertices @ _axes(normal)
         facet = plane[heights < heights.min() + ROUNDING_M]
-        if _depth_inside(facet, _plane(center[None], normal)[0]) >= REST_MARGIN_M:
-            # the plane's axes in this order, with the height, keep faces the right side out
-            standing = np.column_stack([plane[:, ::-1], heights - heights.min()])
-            middle = _plane(center[None], normal)[0, ::-1]
-            squareness = _squareness(Mesh(standing, hull.faces), middle)
-            found.append(Rest(float(np.ptp(heights)), narrowest_width(plane), squareness))
+        if _depth_inside(facet, center @ _axes(normal)) >= REST_MARGIN_M:
+            # the plane's axes in this order, with the height, make a right-handed frame
+            axes = _axes(normal)[:, ::-1]
+            standing = np.column_stack([hull.vertices @ axes, heights - heights.min()])
+            squareness, yaw = _squareness(Mesh(standing, hull.faces), center @ axes)
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+            turn = turn @ np.column_stack([axes, -normal]).T
+            width = narrowest_width(plane)
+            found.append(Rest(float(np.ptp(heights)), width, squareness, turn))
             normals = np.vstack([normals, normal])
     return found
 
@@ -110,30 +118,30 @@ def narrowest_width(points: np.ndarray) -> float:
     return float(np.ptp(points @ axes, axis=0).min())
 
 
-def _squareness(standing: Mesh, center_xy: np.ndarray) -> float:
-    """Return `Rest.squareness` of a body that stands on z = 0."""
+def _squareness(standing: Mesh, center_xy: np.ndarray) -> tuple[float, float]:
+    """Return `Rest.squareness` of a body that stands on z = 0, and the yaw of its direction."""
     points, normals = surface_samples(standing, SAMPLES)
     low, high = GRIPPED_Z_M
-    best = 0.0
-    for turn in np.linspace(0, np.pi, 24, endpoint=False):
+    best = (0.0, 0.0)
+    for turn in np.linspace(0, np.pi, 24, endpoint=False).tolist():
         axis = np.array([math.cos(turn), math.sin(turn)])
         along = (points[:, :2] - center_xy) @ axis
         across = (points[:, :2] - center_xy) @ np.array([-axis[1], axis[0]])
         met = (np.abs(across) < FINGER_HALF_M) & (points[:, 2] > low) & (points[:, 2] < high)
-        if not met.any():
+        if not met.any() or np.ptp(along[met]) > GAP_M:
             continue
         left, right = along[met] < along[met].min() + 2e-3, along[met] > along[met].max() - 2e-3
         first, second = (normals[met][side].mean(axis=0) for side in (left, right))
-        best = max(best, -float(first @ second))
+        best = max(best, (-float(first @ second), turn))
     return best
 
 
-def _plane(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the coordinates [N, 2] of points in a plane across ``normal``."""
+def _axes(normal: np.ndarray) -> np.ndarray:
+    """Return two axes [3, 2] across ``normal``, which follows them in a right-handed frame."""
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     u = np.cross(normal, helper)
     u /= np.linalg.norm(u)
-    return points @ np.stack([u, np.cross(normal, u)], axis=1)
+    return np.stack([u, np.cross(normal, u)], axis=1)
 
 
 def _depth_inside(points: np.ndarray, target: np.ndarray) -> float:

@@ -53,6 +53,8 @@ PRESS_ASIDE_M = 5e-3
 """The place to press on is met within this distance."""
 PRESS_TURN_RAD = 0.15
 """The fingers stand along a wall within this angle."""
+WALL_GAP_M = 1.5e-3
+"""The low hand comes this much closer to a wall than where it presses, and no more."""
 HAND_HALF_M = 0.04
 """Half the closed hand's width along the fingers, with 2 mm to spare; with more, the press would be
 farther from the block's middle and tilt it."""
@@ -74,7 +76,7 @@ class CornerPicking(CloseLoopTask):
     base_height_m: ClassVar[float] = 2e-3
     base_friction: ClassVar[float] = 1e-3
     wall_m: ClassVar[float] = 0.02
-    wall_height_m: ClassVar[float] = 0.1
+    wall_height_m: ClassVar[float] = 0.08
     lift_height_m: ClassVar[float] = 0.15
 
     def build(self, world: World) -> None:
@@ -181,8 +183,9 @@ class CornerPicking(CloseLoopTask):
         top = vertical_extent(self.block)[1]
         low_z = top + TIP_BELOW_TOOL_M + TOUCH_M
         aside = max(abs(tool_x - px), abs(tool_y - py))
+        is_clear = min(tool_x - px, tool_y - py) > -WALL_GAP_M and abs(turn) < PRESS_TURN_RAD
         target = self.to_world(px, py)
-        if robot.opening() < 0.1 and aside < PRESS_ASIDE_M and abs(turn) < PRESS_TURN_RAD:
+        if robot.opening() < 0.1 and aside < PRESS_ASIDE_M and is_clear:
             gap = gap_m(robot.id, self.block)
             if gap <= 2 * NEAR_M:
                 return lift(-PRESS_M)
@@ -190,7 +193,6 @@ class CornerPicking(CloseLoopTask):
                 return lift(NEAR_M - gap)
         if z < low_z - TOUCH_M / 2 and aside > PRESS_ASIDE_M:
             return lift(low_z + TOUCH_M - z)  # not from the side: that pushes the block back
-        is_clear = min(tool_x - px, tool_y - py) > -PRESS_ASIDE_M and abs(turn) < PRESS_TURN_RAD
         if not is_clear or robot.opening() >= 0.1:
             low_z = vertical_extent(self.walls)[1] + TIP_BELOW_TOOL_M + HOVER_M
             if z < low_z - 1e-3:

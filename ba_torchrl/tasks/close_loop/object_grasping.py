@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,8 +19,11 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.base import CloseLoopTask
 from ba_torchrl.tasks.clutter import Clutter
 from ba_torchrl.tasks.experts import ALIGNED_M, ALIGNED_RAD, CLOSED, OPEN, lift, towards
-from ba_torchrl.tasks.grasps import GraspPlanner
-from ba_torchrl.tasks.tray import MARGIN_M, add_tray
+from ba_torchrl.tasks.grasps import NEAR_M, GraspPlanner, Nudge
+from ba_torchrl.tasks.tray import FLOOR_Z_M, MARGIN_M, add_tray
+
+WALL_PIXELS = 25
+"""Border of the planner's height image that shows the tray's walls."""
 
 
 @TASKS.register("close_loop/object_grasping")
@@ -38,6 +42,7 @@ class ObjectGrasping(CloseLoopTask):
 
     lift_height_m: ClassVar[float] = 0.15
     failures_allowed: ClassVar[int] = 3
+    risk_allowed: ClassVar[float] = 1.6
 
     def build(self, world: World) -> None:
         """Load the tray and every shape of the object set."""
@@ -49,7 +54,6 @@ class ObjectGrasping(CloseLoopTask):
             "asset_root": settings.parameters["asset_root"],
         })
         self.clutter = Clutter(world, shapes, shapes.names, settings.num_objects)
-        self._planner: GraspPlanner | None = None
         self._failures = 0
 
     def randomise(self, rng: np.random.Generator) -> None:
@@ -61,6 +65,7 @@ class ObjectGrasping(CloseLoopTask):
             self.settings.num_objects,
             center_xy=workspace.center,
             spread_m=(workspace.width - MARGIN_M) / 2 - 0.03,
+            surface_z_m=FLOOR_Z_M,
             random_orientation=self.settings.random_orientation,
             robot=self.robot,
         )
@@ -87,29 +92,58 @@ class ObjectGrasping(CloseLoopTask):
         return self.robot.held_body() is not None
 
     def expert_command(self) -> GripperCommand:
-        """Close the fingers around the object that takes fewest actions, then go up."""
-        robot, reach = self.robot, self.reach
-        (x, y, z), yaw = robot.tool_pose()
+        """Close the fingers around the object that takes fewest actions, then go up.
+
+        What cannot be grasped as it lies is pushed until it can.
+        """
+        robot, reach, planner = self.robot, self.reach, self.planner
+        if robot.opening() < 0.9 and robot.held_body() is not None:
+            return lift(reach.step_m)
+        heights = planner.heights()
+        tool = robot.tool_pose()
+        # above everything, the walls' upper parts left out, which the way never crosses
+        over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
+        over_z = min(over_z + 0.02, self.settings.workspace.z[1])
+        grasp = planner.plan(self.clutter.present, tool, reach, heights)
+        if grasp is None or grasp.risk > self.risk_allowed:
+            nudge = planner.nudge(self.clutter.present, tool, reach, heights)
+            if nudge is not None:
+                return self._push(nudge, over_z)
         if robot.opening() < 0.9:
-            return lift(reach.step_m, CLOSED if robot.held_body() is not None else OPEN)
-        if self._planner is None:
-            camera = HeightCamera(self.world.bodies)
-            self._planner = GraspPlanner(self.clutter.bodies, camera, self.settings.workspace)
-        heights = self._planner.heights()
-        plan = self._planner.plan(self.clutter.present, (robot.tool_pose()), reach, heights)
-        if plan is None:
             return lift(reach.step_m, OPEN)
-        gx, gy, gz = plan.position
+        if grasp is None:
+            return lift(reach.step_m, OPEN)
+        (x, y, z), yaw = tool
+        gx, gy, gz = grasp.position
         aside = max(abs(gx - x), abs(gy - y))
-        turn = abs(wrap_angle(plan.yaw_rad - yaw))
+        turn = abs(wrap_angle(grasp.yaw_rad - yaw))
         if aside <= ALIGNED_M and turn <= ALIGNED_RAD:
-            return towards(
-                robot, plan.position, plan.yaw_rad, CLOSED if z - gz <= reach.step_m else OPEN
-            )
-        above_z = float(heights[20:-20, 20:-20].max()) + 0.02
-        if z < above_z - 1e-3:
-            return lift(above_z - z, OPEN)
-        return towards(robot, (gx, gy, above_z), plan.yaw_rad, OPEN)
+            opening = CLOSED if z - gz <= reach.step_m else OPEN
+            return towards(robot, grasp.position, grasp.yaw_rad, opening)
+        if z < over_z - 1e-3:
+            return lift(over_z - z, OPEN)
+        return towards(robot, (gx, gy, over_z), grasp.yaw_rad, OPEN)
+
+    def _push(self, nudge: Nudge, over_z: float) -> GripperCommand:
+        """Go down beside an object with closed fingers, then against it."""
+        robot = self.robot
+        (x, y, z), yaw = robot.tool_pose()
+        sx, sy, sz = nudge.start
+        aside = max(abs(sx - x), abs(sy - y))
+        is_closed = robot.opening() < 0.1
+        if is_closed and z <= sz + nudge.slack_m and aside <= NEAR_M:
+            return towards(robot, nudge.end, yaw, CLOSED)
+        if is_closed and aside <= ALIGNED_M:
+            return towards(robot, nudge.start, yaw, CLOSED)
+        if z < over_z - 1e-3:
+            return lift(over_z - z, CLOSED)
+        return towards(robot, (sx, sy, over_z), yaw, CLOSED)
+
+    @cached_property
+    def planner(self) -> GraspPlanner:
+        """What finds grasps; made when an expert is first asked."""
+        camera = HeightCamera(self.world.bodies)
+        return GraspPlanner(self.clutter.bodies, camera, self.settings.workspace)
 
     @property
     def objects(self) -> Sequence[Body]:

@@ -14,7 +14,7 @@ from ba_torchrl.sim.meshes import frame_parts
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, PlacementError
-from ba_torchrl.tasks.experts import RELEASE_GAP_M, TIP_BELOW_TOOL_M, finger_room
+from ba_torchrl.tasks.experts import RELEASE_GAP_M, finger_room
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
 
 PURPLE: Color = (0.6, 0.45, 0.78, 1.0)
@@ -30,8 +30,9 @@ SUNK_M = 0.05
 """Boxes reach down below the ground: what falls fast passes through a thin sheet."""
 HALF_LAYOUT_M = 0.15
 """The three areas together fill a square of twice this."""
-GRASP_M = TIP_BELOW_TOOL_M + 5e-4
-"""Height of the tool above what an object lies on, at which the fingertips just clear that."""
+GRASP_M = 0.0145
+"""Height of the tool above what an object lies on. The tips of closed fingers reach down to 13.6 mm
+below the tool: they just clear the floor, and close on the lower part of a swab."""
 COLUMN_M = 0.05
 """Distance of neighbours in the box of new tubes; the fingers pass between them."""
 WINDOW_M = 0.01
@@ -336,7 +337,7 @@ class CovidTest(OpenLoopTask):
         ox, oy = (b - t for b, t in zip(held.position[:2], tool[:2], strict=True))
         dx, dy = _turned((ox, oy), (0.0, 0.0), turn)
         z = SHEET_M + RELEASE_GAP_M + tool[2] - vertical_extent(held)[0]
-        z = max(z, rim_m + TIP_BELOW_TOOL_M + RELEASE_GAP_M)
+        z = max(z, rim_m + GRASP_M + RELEASE_GAP_M)
         return PickPlaceCommand(PLACE, x - dx, y - dy, z, tool_yaw + turn)
 
     def _grasp_yaw(self, body: Body) -> float:

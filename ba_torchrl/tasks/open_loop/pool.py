@@ -33,9 +33,7 @@ class Pool:
         self.present = []
         for i, body in enumerate(self.bodies):
             row, column = divmod(i, 10)
-            body.place(
-                (ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row, ASIDE_Z_M)
-            )
+            body.place((ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row, ASIDE_Z_M))
             body.is_hidden = True
 
     def bring(self, body: Body) -> None:

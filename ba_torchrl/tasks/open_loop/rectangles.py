@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, vertical_extent, world_vertices
+from ba_torchrl.sim.bodies import Body, world_vertices
 from ba_torchrl.tasks.base import PlacementError, Task, Workspace
 
 LAYOUTS = 50
@@ -155,11 +155,6 @@ def finger_gap_m(
     return min((gap_m(hand, other) for other in others for hand in hands), default=math.inf)
 
 
-def reaches_above(body: Body, z_m: float) -> bool:
-    """Whether a body's highest point, as it lies, is above a height."""
-    return vertical_extent(body)[1] > z_m
-
-
 class Room(NamedTuple):
     """The room that an upright object needs on the floor, metres."""
 
@@ -233,8 +228,7 @@ def random_rectangle(
     Raises:
         PlacementError: the workspace is too small.
     """
-    span = task.random_yaw(rng, 2 * math.pi)
-    yaw = span if task.settings.random_orientation else fixed_yaw_rad
+    yaw = fixed_yaw_rad + task.random_yaw(rng, 2 * math.pi)
     ex, ey = Rectangle(0.0, 0.0, yaw, half_x, half_y)._extent(0.0)
     point = []
     for (low, high), extent in (
@@ -255,8 +249,6 @@ def _around(corners: np.ndarray, yaw_rad: float) -> Rectangle:
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     along = corners[:, 0] * cos + corners[:, 1] * sin
     across = corners[:, 1] * cos - corners[:, 0] * sin
-    (x0, x1), (y0, y1) = (
-        (float(values.min()), float(values.max())) for values in (along, across)
-    )
+    (x0, x1), (y0, y1) = ((float(values.min()), float(values.max())) for values in (along, across))
     middle = Rectangle(0.0, 0.0, yaw_rad, 0.0, 0.0).at((x0 + x1) / 2, (y0 + y1) / 2)
     return Rectangle(*middle, yaw_rad, (x1 - x0) / 2, (y1 - y0) / 2)

@@ -10,13 +10,22 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Shape
+from ba_torchrl.sim.bodies import Body, Shape, Vector, radius_m
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.building import Building, Move, PutDown
 from ba_torchrl.tasks.experts import finger_room
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
 from ba_torchrl.tasks.structures import Blueprint, Piece
+
+HAND_M = 0.07
+"""From the middle of the open gripper to its outermost part, and a little more."""
+CROWDED = 10.0
+"""What a metre too near is worth in metres of way."""
+FREE_YAWS = 8
+"""Yaws of a half turn that are tried where any will do."""
+AMPLE_M = 0.02
+"""More room than this is no better."""
 
 
 class Part(NamedTuple):
@@ -82,7 +91,7 @@ class StructureTask(OpenLoopTask):
     def expert_command(self) -> PickPlaceCommand:
         """Move the piece that comes next, from any state."""
         held = self.robot.held_body()
-        move = self.building.next_move(self._put_down(), held, self._effort)
+        move = self.building.next_move(self._put_down(), held, self._effort, self._crowding)
         if move is None:  # it stands: a pick from the bare corner changes nothing
             x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
             return PickPlaceCommand(PLACE if held is not None else PICK, x, y, 0.1)
@@ -91,6 +100,17 @@ class StructureTask(OpenLoopTask):
         yaw = max(self._grasp_yaws(move.body), key=lambda yaw: self._room(move.body, yaw))
         x, y, z = move.body.position
         return PickPlaceCommand(PICK, x, y, z, yaw)
+
+    def window_m(self, held: Body | None) -> float:
+        """Return half the width of the square searched for the highest point.
+
+        A long piece may rest on what is far from its middle.
+        """
+        if held is None:
+            return super().window_m(held)
+        low, high = held.shape.bounds_m
+        longest = max(high[0] - low[0], high[1] - low[1])
+        return max(super().window_m(held), 0.375 * longest)
 
     # ----------------------------------------------------------------------------------------
 
@@ -105,9 +125,17 @@ class StructureTask(OpenLoopTask):
             return [0.0]
         return self.building.pieces[body].grasp_yaws(body)
 
-    def _room(self, body: Body, yaw_rad: float) -> float:
+    def _room(self, body: Body, yaw_rad: float, at: Vector | None = None) -> float:
         others = [other for other in self.bodies if other is not body]
-        return finger_room(self.robot, body, yaw_rad, others)
+        return finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
+
+    def _crowding(self, body: Body, position: Vector) -> float:
+        """Prefer sites at which the hand will not meet the structure when it fetches the rest."""
+        return CROWDED * sum(
+            max(radius_m(other) + HAND_M - math.dist(other.position[:2], position[:2]), 0.0)
+            for other in self.bodies
+            if self.building.pieces[other] != self.building.pieces[body]
+        )
 
     def _effort(self, body: Body) -> float:
         """Prefer pieces that stand free."""
@@ -117,15 +145,24 @@ class StructureTask(OpenLoopTask):
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
         tool, tool_yaw = self.robot.tool_pose()
-        body_yaw = move.piece.yaw_rad(move.body)
         yaw = tool_yaw
-        if move.yaw_rad is not None:
-            yaw += wrap_angle(move.yaw_rad - body_yaw, move.yaw_period_rad)
         if not self.reach.turn_rad:
             yaw = 0.0
+        elif move.yaw_rad is None:
+            turns = [math.pi * i / FREE_YAWS for i in range(FREE_YAWS)]
+            yaw = self._roomiest(move, turns)
+        else:
+            ahead = tool_yaw + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
+            count = max(1, round(math.pi / move.yaw_period_rad))  # a half turn swaps the fingers
+            yaw = self._roomiest(move, [ahead + move.yaw_period_rad * i for i in range(count)])
         cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
         ox, oy, oz = (b - t for b, t in zip(move.body.position, tool, strict=True))
         x, y, z = move.position
         return PickPlaceCommand(
             PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
         )
+
+    def _roomiest(self, move: Move, yaws_rad: Sequence[float]) -> float:
+        """Return the first of the yaws at which the fingers can part most freely."""
+        rooms = [min(self._room(move.body, yaw, move.position), AMPLE_M) for yaw in yaws_rad]
+        return yaws_rad[rooms.index(max(rooms))]

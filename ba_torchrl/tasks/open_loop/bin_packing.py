@@ -1,0 +1,293 @@
+"""Bin Packing: put all objects into a bin (appendix A.1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.sim.bodies import Body, Box, Color, Shape, Solid, vertical_extent, world_vertices
+from ba_torchrl.sim.cameras import HeightCamera
+from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_mesh
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS, PlacementError
+from ba_torchrl.tasks.open_loop.packing import RELEASE_GAP_M, PackingTask, open_box
+from ba_torchrl.tasks.open_loop.pool import Pool
+from ba_torchrl.tasks.open_loop.rectangles import (
+    Rectangle,
+    Room,
+    narrowest,
+    outline,
+    random_rectangle,
+    scatter,
+)
+
+BIN_M = (0.176, 0.144, 0.08)
+WALL_M = 0.004
+FLOOR_M = 0.004
+OVER_RIM_M = 0.012
+"""The tool lets go this far above the bin's rim, so that the fingers stay out of it."""
+INSIDE_M = 1e-3
+"""An object may lean out of the bin's inside by this much."""
+PICK_BELOW_M = 0.011
+"""Objects are held this far below their top: the fingers stay out of what a flat one lies on."""
+LOWEST_PICK_M = 0.012
+EAVES_M = 0.026
+HAND_M = (0.06, 0.016)
+"""Half the room of the hand as it picks an object."""
+LAYOUTS = 20
+
+PIXEL_M = 0.002
+GAP_M = 0.002
+"""Room left around an object in the bin."""
+RING_M = 0.008
+TALLER_M = 0.01
+"""What surrounds a place is within this distance and this much higher."""
+LEVEL_M = 0.004
+"""Steps in which heights are compared with their surroundings."""
+UNEVEN_COST = 0.5
+OPEN_COST_M = 0.01
+"""What is lost by a place that nothing surrounds, as a height."""
+
+
+def pieces(unit: float) -> dict[str, Shape]:
+    """Return the kinds of objects, their length along y, centred on the origin.
+
+    Args:
+        unit: sizes as a multiple of the appendix's.
+    """
+    wide, long, flat = 0.04 * unit, 0.08 * unit, 0.02 * unit
+    angles = 2 * np.pi * np.arange(16) / 16
+    circle = (wide / 2 * np.stack([np.cos(angles), np.sin(angles)], axis=1)).tolist()
+    turn = 2 * np.pi / 16  # a rod of eight sides that lies on one of them
+    rod = rod_mesh(long, wide / math.cos(np.pi / 8), sides=8)
+    cos, sin = math.cos(turn), math.sin(turn)
+    x, y, z = rod.vertices.T
+    lying = Mesh(np.stack([cos * x + sin * z, y, cos * z - sin * x], axis=1), rod.faces)
+
+    def solid(mesh: Mesh, color: Color) -> Solid:
+        return Solid(parts=(mesh,), color=color, center_of_mass_m=centroid([mesh]))
+
+    return {
+        "brick": Box(size_m=(wide, long, wide), color=(0.75, 0.3, 0.25, 1.0)),
+        "plank": Box(size_m=(wide, long, flat), color=(0.85, 0.65, 0.35, 1.0)),
+        "cube": Box(size_m=(wide, wide, wide), color=(0.3, 0.5, 0.8, 1.0)),
+        "tile": Box(size_m=(wide, wide, flat), color=(0.4, 0.7, 0.45, 1.0)),
+        "disc": solid(prism_mesh(circle, -flat / 2, flat / 2), (0.55, 0.4, 0.7, 1.0)),
+        "gable": solid(
+            gable_mesh((wide, long, wide), eaves_m=EAVES_M * unit), (0.35, 0.7, 0.7, 1.0)
+        ),
+        "rod": solid(lying, (0.8, 0.45, 0.6, 1.0)),
+    }
+
+
+@TASKS.register("open_loop/bin_packing")
+class BinPacking(PackingTask):
+    """Objects of seven shapes, from 4 x 4 x 2 to 8 x 4 x 4 cm, and a bin; success when all lie in
+    the bin, none of them over its rim.
+    """
+
+    max_steps = 20
+    num_objects = 8
+    num_objects_range = (1, 10)
+
+    def build(self, world: World) -> None:
+        """Load the bin, and as many objects of each shape as may be drawn."""
+        size = tuple(extent * self.unit for extent in BIN_M)
+        wall, floor = WALL_M * self.unit, FLOOR_M * self.unit
+        self.container = world.add(open_box(size, wall, floor, (0.6, 0.62, 0.66, 1.0)), "bin")
+        kinds = pieces(self.unit)
+        copies = self.settings.num_objects
+        self.pool = Pool(
+            world,
+            [shape for shape in kinds.values() for _ in range(copies)],
+            [f"{name} {i + 1}" for name in kinds for i in range(copies)],
+        )
+        self._camera = HeightCamera(world.bodies)
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Put the bin anywhere, and random objects around it."""
+        count = self.settings.num_objects
+        half_x, half_y, _ = (size * self.unit / 2 for size in BIN_M)
+        hand = tuple(size * self.unit for size in HAND_M)
+        for attempt in range(LAYOUTS):
+            # fixed orientations: two by three of the largest objects lie side by side
+            around = random_rectangle(self, rng, half_x, half_y, fixed_yaw_rad=math.pi / 2)
+            kinds = rng.integers(len(self.pool.bodies) // count, size=count).tolist()
+            chosen = [self.pool.bodies[kind * count + i] for i, kind in enumerate(kinds)]
+            rooms = [Room(*body.shape.bounds_m[1][:2], *hand) for body in chosen]
+            try:
+                places = scatter(self, rng, rooms, [around])
+                break
+            except PlacementError:
+                if attempt == LAYOUTS - 1:
+                    raise
+        self.stand(self.container, (around.x, around.y), around.yaw_rad)
+        self.pool.clear()
+        for body, (xy, yaw) in zip(chosen, places, strict=True):
+            self.pool.bring(body)
+            self.stand(body, xy, yaw)
+
+    def is_goal(self) -> bool:
+        """Whether every object lies in the bin, let go of."""
+        held = self.robot.held_body()
+        return held not in self.objects and all(map(self.is_packed, self.objects))
+
+    def is_packed(self, body: Body) -> bool:
+        """Whether an object is within the bin's walls, its middle lower than the rim."""
+        return body.position[2] < self._rim_m() and self._inside(-INSIDE_M).contains(
+            world_vertices(body)
+        )
+
+    def pick_height_m(self, top_m: float) -> float:
+        """Return the height at which an object is held: just below its top."""
+        return max(top_m - PICK_BELOW_M * self.unit, LOWEST_PICK_M * self.unit)
+
+    def place_height_m(self, top_m: float) -> float:
+        """Return the height at which to let go: over the bin's rim, or gently on the ground."""
+        if top_m < FLOOR_M * self.unit / 2:
+            return super().place_height_m(top_m)
+        return max(super().place_height_m(top_m), self._release_m())
+
+    def obstacles(self, body: Body | None, above_m: float) -> list[Rectangle]:
+        """Return the outlines of what fingers may meet at a height, the bin's walls one by one."""
+        held = self.robot.held_body()
+        found = [
+            outline(other)
+            for other in self.pool.present
+            if other is not body and other is not held and vertical_extent(other)[1] > above_m
+        ]
+        return found + self._walls() if self._rim_m() > above_m else found
+
+    def expert_command(self) -> PickPlaceCommand:
+        """Drop the largest object that can be grasped to the lowest place that has room for it."""
+        held = self.robot.held_body()
+        if held is not None:
+            return self._drop(held)
+        outside = [body for body in self.objects if not self.is_packed(body)]
+        if not outside:
+            return self.stay()
+        grasps = {body: self.grasp(body) for body in outside}
+
+        def order(body: Body) -> tuple[bool, float, float]:
+            size = np.ptp(body.shape.vertices, axis=0).prod()
+            return grasps[body].room_m > 0, round(float(size), 7), grasps[body].room_m
+
+        body = max(outside, key=order)
+        return self.pick(body, grasps[body])
+
+    # ----------------------------------------------------------------------------------------
+
+    def _rim_m(self) -> float:
+        return self.container.position[2] + BIN_M[2] * self.unit / 2
+
+    def _release_m(self) -> float:
+        """Return the height of the tool, above the workspace's floor, as it lets go."""
+        return self._rim_m() - self.floor_m + OVER_RIM_M
+
+    def _inside(self, margin_m: float = 0.0) -> Rectangle:
+        """Return the bin's inside, less a margin."""
+        x, y, _ = self.container.position
+        length, width, _ = (size * self.unit / 2 for size in BIN_M)
+        taken = WALL_M * self.unit + margin_m
+        return Rectangle(x, y, self.container.yaw_rad, length - taken, width - taken)
+
+    def _walls(self) -> list[Rectangle]:
+        inside, thin = self._inside(), WALL_M * self.unit / 2
+        x, y = inside.half_x + thin, inside.half_y + thin
+        ends = [(side * x, 0.0, thin, y) for side in (-1, 1)]
+        sides = [(0.0, side * y, x, thin) for side in (-1, 1)]
+        return [
+            Rectangle(*inside.at(along, across), inside.yaw_rad, *half)
+            for along, across, *half in ends + sides
+        ]
+
+    def _drop(self, held: Body) -> PickPlaceCommand:
+        """Return the place that lets an object fall where it comes to lie lowest."""
+        tool_yaw = self.robot.tool_pose()[1]
+        own = narrowest(held, None if self.reach.turn_rad else tool_yaw)
+        heights = self._heights()
+        best: tuple[float, tuple[float, float], float, float] | None = None
+        for quarter in (0, 1):
+            half = (own.half_x, own.half_y) if quarter == 0 else (own.half_y, own.half_x)
+            turn = self._inside().yaw_rad + quarter * math.pi / 2 - own.yaw_rad
+            if not self.reach.turn_rad:
+                if abs(wrap_angle(turn + tool_yaw, math.pi)) > math.pi / 4:
+                    continue  # the nearest of the two is what a gripper that does not turn has
+                turn = -tool_yaw
+            found = _lowest(heights, half)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = (*found, turn)
+        if best is None:  # too large for the bin as it is held
+            best = (0.0, (0.0, 0.0), 0.0, 0.0)
+        _, spot, top, turn = best
+        x, y = self._inside().at(*spot)
+        depth = self.depth_m(held)
+        z = max(self._release_m() + self.floor_m, top + depth + RELEASE_GAP_M)
+        # the middle of the outline goes there, which need not be the body's origin
+        ox, oy = held.position[0] - own.x, held.position[1] - own.y
+        cos, sin = math.cos(turn), math.sin(turn)
+        at = (x + cos * ox - sin * oy, y + sin * ox + cos * oy)
+        command = self.place(held, (*at, held.position[2]), turn)
+        return command._replace(z_m=z)
+
+    def _heights(self) -> np.ndarray:
+        """Return the height of what is in the bin, rows along its length, walls included."""
+        inside = self._inside()
+        count = round(2 * inside.half_x / PIXEL_M) + 2
+        return self._camera.heightmap((inside.x, inside.y), count * PIXEL_M, count, inside.yaw_rad)
+
+
+def _lowest(
+    heights: np.ndarray, half_m: tuple[float, float]
+) -> tuple[float, tuple[float, float], float] | None:
+    """Return the place where a box comes to lie lowest, flattest and best surrounded.
+
+    Args:
+        heights: [N, N] in metres, pixels of `PIXEL_M`.
+        half_m: half the extents of the box along rows and columns.
+
+    Returns:
+        Its cost, the middle of the place from the middle of the image, and the height of what
+        the box comes to rest on; None if the box is larger than the image.
+    """
+    size = [math.ceil(2 * (half + GAP_M) / PIXEL_M) for half in half_m]
+    ring = round(RING_M / PIXEL_M)
+    if max(size) > min(heights.shape):
+        return None
+    tops = sliding_window_view(
+        sliding_window_view(heights, size[0], axis=0).max(-1), size[1], axis=1
+    ).max(-1)
+    means = _window_sums(heights, size) / (size[0] * size[1])
+    wide = [extent + 2 * ring for extent in size]
+    around = np.pad(heights, ring, mode="edge")
+    taller = np.zeros(tops.shape)
+    levels = np.round(tops / LEVEL_M)
+    for level in np.unique(levels):
+        is_taller = around > level * LEVEL_M + TALLER_M
+        at = levels == level
+        taller[at] = _window_sums(is_taller, wide)[at]
+    surrounded = taller / (wide[0] * wide[1] - size[0] * size[1])
+    costs = tops + UNEVEN_COST * (tops - means) + OPEN_COST_M * (1 - surrounded)
+    row, column = np.unravel_index(int(costs.argmin()), costs.shape)
+    middle = [
+        (first + extent / 2 - count / 2) * PIXEL_M
+        for first, extent, count in zip((row, column), size, heights.shape, strict=True)
+    ]
+    return float(costs[row, column]), tuple(map(float, middle)), float(tops[row, column])
+
+
+def _window_sums(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
+    """Return the sum over each window [size] of an array [N, M]."""
+    sums = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
+    sums[1:, 1:] = values.cumsum(axis=0).cumsum(axis=1)
+    rows, columns = size
+    return (
+        sums[rows:, columns:]
+        - sums[:-rows, columns:]
+        - sums[rows:, :-columns]
+        + sums[:-rows, :-columns]
+    )
