@@ -196,7 +196,7 @@ class EnvConfig(StrictModel):
         return self
 
     def check_for(self, task_id: str, control: str, task_parameters: Iterable[str]) -> None:
-        """Check that the parameters that were given have a meaning for a task.
+        """Check that the parameters that differ from their defaults have a meaning for a task.
 
         Args:
             task_id: for the message.
@@ -206,8 +206,10 @@ class EnvConfig(StrictModel):
         Raises:
             ConfigError: one has none.
         """
-        for name in sorted(self.model_fields_set):
-            marks = type(self).model_fields[name].json_schema_extra or {}
+        for name, field in type(self).model_fields.items():
+            if getattr(self, name) == field.default:
+                continue
+            marks = field.json_schema_extra or {}
             if marks.get("control", control) != control:
                 kind = marks["control"].replace("_", "-")
                 raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -70,6 +70,9 @@ class Algorithm(ABC):
 
 class AlgorithmConfig(StrictModel, ABC):
     """Hyper-parameters of an algorithm; building it needs a network and the problem."""
+
+    control: ClassVar[Literal["open_loop", "close_loop"]]
+    """Which tasks it learns."""
 
     def check(self, network: NetworkConfig) -> None:
         """Refuse a network that the algorithm does not go with.

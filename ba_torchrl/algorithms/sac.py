@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -27,6 +27,8 @@ class SACConfig(AlgorithmConfig):
 
     The defaults are the paper's (appendix G.2).
     """
+
+    control: ClassVar[Literal["open_loop", "close_loop"]] = "close_loop"
 
     learning_rate: float = Field(default=1e-3, gt=0)
     """Adam's, for actor, critic and temperature."""

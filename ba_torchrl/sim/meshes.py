@@ -199,27 +199,6 @@ def frame_parts(size_m: tuple[float, float, float], wall_m: float) -> list[Mesh]
     return parts
 
 
-def open_box_parts(
-    size_m: tuple[float, float, float], *, wall_m: float, floor_m: float, sunk_m: float
-) -> list[Mesh]:
-    """Return a box without a lid as convex parts; its origin is the middle of its base.
-
-    Args:
-        size_m: outer extents.
-        wall_m: thickness of the walls.
-        floor_m: thickness of the floor.
-        sunk_m: how far floor and walls go on below the base: what falls fast passes through a
-            thin sheet.
-    """
-    x, y, height = size_m
-    floor = box_mesh((x - 2 * wall_m, y - 2 * wall_m, floor_m + sunk_m))
-    walls = frame_parts((x, y, height + sunk_m), wall_m)
-    return [
-        moved(floor, (0.0, 0.0, (floor_m - sunk_m) / 2)),
-        *(moved(wall, (0.0, 0.0, (height - sunk_m) / 2)) for wall in walls),
-    ]
-
-
 def lathe_parts(profile_m: Sequence[tuple[float, float]], sides: int = 16) -> list[Mesh]:
     """Return a turned solid about z as convex parts, one above the other.
 

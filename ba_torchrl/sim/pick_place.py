@@ -187,6 +187,7 @@ class PickPlace:
         """Teleport the arm, and rigidly with it what is held."""
         self.robot.teleport(joints)
         if self.held is not None:
+            self.world.detect_collisions()  # contacts end: Bullet would not turn their normals
             self.held.move_to(
                 *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self._grasp)
             )

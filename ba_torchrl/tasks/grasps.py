@@ -50,6 +50,9 @@ LOW_M = 0.01
 NEAR_M = 0.018
 """Fingers this near to the start of a push are there."""
 
+MET_M = 3e-3
+"""Fingers meet what is this near to the outermost point between them."""
+
 YAWS = 16
 SAMPLES = 256
 PIXEL_M = 0.003
@@ -115,10 +118,7 @@ class GraspPlanner:
             heights: from `heights`.
         """
         (x, y, z), yaw = tool
-        if reach.turn_rad:
-            yaws = np.arange(YAWS) * np.pi / YAWS
-        else:
-            yaws = np.array([yaw])
+        yaws = np.arange(YAWS) * np.pi / YAWS if reach.turn_rad else np.array([yaw])
         best = None
         low, high = self._workspace.z
         for body in bodies:
@@ -166,9 +166,7 @@ class GraspPlanner:
         nudges += [nudge for body in bodies for nudge in self._drags(body, tool, reach, heights)]
         return min(nudges, key=lambda nudge: nudge.cost, default=None)
 
-    def _pushes(
-        self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray
-    ) -> Iterator[Nudge]:
+    def _pushes(self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray) -> Iterator[Nudge]:
         """Yield pushes against a body's side, away from the walls.
 
         A gripper that cannot turn rather pushes an end, so that the body turns.
@@ -291,6 +289,7 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
     n = samples.shape[0]
     u = np.empty(n)
     v = np.empty(n)
+    met = np.empty(n, dtype=np.bool_)
     left_n, right_n = np.empty(4), np.empty(4)
     top = samples[:, 2].max()
     for yaw in yaws:
@@ -320,7 +319,9 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
                     for m in range(_OUTLINE_U.shape[0]):
                         for w in _BAND:
                             fu = s * _OUTLINE_U[m]
-                            h = _height(heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w)
+                            h = _height(
+                                heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w
+                            )
                             z = max(z, h - _OUTLINE_Z[m] + CLEARANCE_M)
                 depth = peak - (z - TIP_M)
                 if depth < SHALLOWEST_M or z > high_z:
@@ -340,26 +341,30 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
                 # surfaces that the fingers meet
                 left, right = 1.0, -1.0
                 for k in range(n):
-                    if abs(v[k] - v0) <= BAND_HALF_M and samples[k, 2] > z - TIP_M:
-                        if abs(u[k] - middle) < HALF_GAP_M:
-                            left, right = min(left, u[k]), max(right, u[k])
+                    met[k] = (
+                        abs(v[k] - v0) <= BAND_HALF_M
+                        and abs(u[k] - middle) < HALF_GAP_M
+                        and samples[k, 2] > z - TIP_M
+                    )
+                    if met[k]:
+                        left, right = min(left, u[k]), max(right, u[k])
                 if right < left:
                     continue
                 left_n[:] = 0.0
                 right_n[:] = 0.0
                 for k in range(n):
-                    if abs(v[k] - v0) <= BAND_HALF_M and samples[k, 2] > z - TIP_M:
-                        if abs(u[k] - middle) < HALF_GAP_M:
-                            if u[k] < left + 0.003:
-                                left_n[:3] += samples[k, 3:]
-                                left_n[3] += 1.0
-                            if u[k] > right - 0.003:
-                                right_n[:3] += samples[k, 3:]
-                                right_n[3] += 1.0
+                    if met[k] and u[k] < left + MET_M:
+                        left_n[:3] += samples[k, 3:]
+                        left_n[3] += 1.0
+                    if met[k] and u[k] > right - MET_M:
+                        right_n[:3] += samples[k, 3:]
+                        right_n[3] += 1.0
                 left_n /= left_n[3]
                 right_n /= right_n[3]
                 square = -(left_n[0] * right_n[0] + left_n[1] * right_n[1] + left_n[2] * right_n[2])
-                facing = min(cos * right_n[0] + sin * right_n[1], -cos * left_n[0] - sin * left_n[1])
+                facing = min(
+                    cos * right_n[0] + sin * right_n[1], -cos * left_n[0] - sin * left_n[1]
+                )
                 if square < LEAST_SQUARE or facing < LEAST_SQUARE:
                     continue
                 risk = 2.5 * (1 - square) + 1.5 * max(0.0, 0.75 - facing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -55,11 +56,7 @@ def add_tray(world: World, center_xy: tuple[float, float], width_m: float) -> fl
     corners = profile(width_m)
     inner = corners[0][0]
     base = _slab(np.array([[s * inner, t * inner] for s, t in _SIGNS]), [FLOOR_Z_M] * 4)
-    walls = [
-        _wall(start, end, side)
-        for side in range(4)
-        for start, end in zip(corners, corners[1:], strict=False)
-    ]
+    walls = [_wall(start, end, side) for side in range(4) for start, end in pairwise(corners)]
     for name, parts, friction, color in (
         ("tray floor", (base,), FLOOR_FRICTION, FLOOR_COLOR),
         ("tray walls", tuple(walls), WALL_FRICTION, COLOR),
@@ -89,6 +86,8 @@ def _slab(outline: np.ndarray, heights: list[float]) -> Mesh:
     """
     bottom = np.column_stack([outline, np.full(4, -UNDERGROUND_M)])
     top = np.column_stack([outline, heights])
-    quads = [(3, 2, 1, 0), (4, 5, 6, 7)] + [(i, (i + 1) % 4, (i + 1) % 4 + 4, i + 4) for i in range(4)]
+    quads = [(3, 2, 1, 0), (4, 5, 6, 7)] + [
+        (i, (i + 1) % 4, (i + 1) % 4 + 4, i + 4) for i in range(4)
+    ]
     faces = [tri for a, b, c, d in quads for tri in ((a, b, c), (a, c, d))]
     return Mesh(np.vstack([bottom, top]), np.array(faces, dtype=np.int64))

@@ -132,6 +132,11 @@ def build_algorithm(config: ExperimentConfig) -> Algorithm:
     env = make_env(config.task, **config.env)
     try:
         pixels = env.observation_spec[keys.PIXELS]
+        if pixels.shape[0] != 1 or float(pixels.space.low.min()) < 0:
+            raise ConfigError(
+                f"env.view_type {config.env_config.view_type!r}: the networks take depth or height "
+                "in one channel, nothing below zero"
+            )
         problem = Problem(
             image_size=pixels.shape[-1],
             action_sequence=env.action_sequence,

@@ -125,12 +125,19 @@ class ExperimentConfig(StrictModel):
             ConfigError: a name is unknown, a type wrong, or parts do not go together.
         """
         config = parse(cls, values, what)
-        TASKS[config.task]  # raises with the known names
+        control = TASKS[config.task].control  # raises with the known names
         for reserved in ("seed", "expert"):
             if reserved in config.env:
                 raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
         _ = config.env_config
+        if config.env_config.obs_type != "pixel":
+            raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
         config.algorithm_config.check(config.network_config)
+        if config.algorithm_config.control != control:
+            raise ConfigError(
+                f"algorithm {config.algorithm['name']!r} learns "
+                f"{config.algorithm_config.control} tasks, not {config.task}"
+            )
         if config.pretrain_updates > config.total_updates:
             raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
         if config.pretrain_updates and not config.demonstrations:

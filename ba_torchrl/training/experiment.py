@@ -58,8 +58,8 @@ class Experiment:
         self.progress = progress
         if config.threads is not None:
             torch.set_num_threads(config.threads)
-        write_config(config)
         self.algorithm = build_algorithm(config)
+        write_config(config)
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)
         self.checkpoints = Checkpoints(config.folder, self.algorithm, config.torch_device)
         self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))

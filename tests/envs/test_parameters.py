@@ -234,8 +234,8 @@ def test_render_needs_a_display(monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"in_hand_size": 24}, "open-loop"),
-        ({"object_set": "random"}, "no meaning"),
+        ({"in_hand_size": 40}, "open-loop"),
+        ({"object_set": "household"}, "no meaning"),
         ({"asset_root": "somewhere"}, "no meaning"),
         ({"num_objects": 2}, "takes 1 "),
         ({"solver_iterations": 10}, "physics_mode='custom'"),

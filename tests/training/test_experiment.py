@@ -155,6 +155,8 @@ def test_a_missing_checkpoint_says_what_is_needed(tmp_path):
         ({"task": "close_loop/flying"}, "Known: .*block_picking"),
         ({"env": {"obs_sise": 64}}, "Did you mean 'obs_size'"),
         ({"env": {"seed": 3}}, "set by the experiment"),
+        ({"env": {"obs_type": "vec"}}, "obs_type"),
+        ({"task": "open_loop/block_stacking"}, "'sac' learns close_loop tasks"),
         ({"algorithm": {"name": "ppo"}}, "unknown algorithm 'ppo'.*sac"),
         ({"algorithm": {"name": "sac", "gama": 0.9}}, "Did you mean 'gamma'"),
         ({"algorithm": {"batch_size": 3}}, "algorithm.name is missing"),
@@ -171,6 +173,19 @@ def test_wrong_configurations_fail_before_anything_starts(tmp_path, changes, mes
     with pytest.raises(ConfigError, match=message):
         tiny(tmp_path, **changes)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("view", ["camera_side_rgbd", "camera_center_xy"])
+def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view):
+    config = tiny(tmp_path, env={**TINY["env"], "view_type": view})
+    with pytest.raises(ConfigError, match=view):
+        Experiment(config, progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_another_view_can_be_learnt_from(tmp_path):
+    config = tiny(tmp_path, env={**TINY["env"], "view_type": "camera_center_xyzr"})
+    assert Experiment(config, progress=False).run().updates == 6
 
 
 def test_seeds_of_different_uses_and_runs_do_not_meet(tmp_path):

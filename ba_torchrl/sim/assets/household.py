@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
 from ba_torchrl.sim.assets.hulls import convex_hull
-from ba_torchrl.sim.meshes import Mesh, box_mesh, moved
+from ba_torchrl.sim.meshes import Mesh, box_mesh, lathe_parts, moved, ring_parts
 
 SIDES = 16
 """Corners of what is round."""
@@ -18,14 +19,6 @@ WALLS = 10
 
 Profile = Sequence[tuple[float, float]]
 """Radii and heights, from the bottom up, metres."""
-
-
-def lathe(profile: Profile) -> list[Mesh]:
-    """Return a solid of revolution, one convex part for each pair of neighbouring rings."""
-    return [
-        convex_hull(np.concatenate([_ring(*low, SIDES), _ring(*high, SIDES)]))
-        for low, high in zip(profile, profile[1:], strict=False)
-    ]
 
 
 def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
@@ -38,19 +31,14 @@ def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
     """
     (radius, z), (next_radius, next_z) = profile[0], profile[1]
     inside = radius + (next_radius - radius) * bottom_m / (next_z - z)
-    bottom = convex_hull(
-        np.concatenate([_ring(radius, z, WALLS), _ring(inside, z + bottom_m, WALLS)])
-    )
-    parts = [bottom]
-    for low, high in zip(profile, profile[1:], strict=False):
-        corners = [
-            _ring(r, z, WALLS) for ring_r, z in (low, high) for r in (ring_r, ring_r - wall_m)
-        ]
-        parts += [
-            convex_hull(np.concatenate([ring[[i, (i + 1) % WALLS]] for ring in corners]))
-            for i in range(WALLS)
-        ]
-    return parts
+    walls = [
+        part
+        for (low, z0), (high, z1) in pairwise(profile)
+        for part in ring_parts(
+            [(low - wall_m, z0), (low, z0), (high, z1), (high - wall_m, z1)], WALLS
+        )
+    ]
+    return lathe_parts([(radius, z), (inside, z + bottom_m)], WALLS) + walls
 
 
 def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
@@ -71,36 +59,35 @@ def mug(radius_m: float, height_m: float) -> list[Mesh]:
 
 def spoon() -> list[Mesh]:
     """Return a wooden spoon: a round handle and a thick, oval bowl."""
-    oval = _ring(0.02, 0.0, SIDES) * (1.3, 1.0, 1.0)
-    bowl = convex_hull(
-        np.concatenate([oval + (0.065, 0, 0.009), 0.7 * oval + (0.065, 0, -0.009)])
-    )
-    ring = _ring(0.009, 0.0, 8)
-    ends = [ring[:, [2, 0, 1]] + (x, 0, 0) for x in (-0.055, 0.05)]
-    return [moved(part, (0, 0, 0), np.pi / 2) for part in (convex_hull(np.concatenate(ends)), bowl)]
+    oval = _ring(0.02, SIDES) * (1.3, 1.0, 1.0)
+    tip = np.array([0.065, 0.0, 0.0])
+    deep = np.array([0.0, 0.0, 0.009])
+    bowl = convex_hull(np.concatenate([oval + tip + deep, 0.7 * oval + tip - deep]))
+    ring = _ring(0.009, 8)[:, [2, 0, 1]]
+    ends = np.array([[[-0.055, 0.0, 0.0]], [[0.05, 0.0, 0.0]]])
+    handle = convex_hull((ring + ends).reshape(-1, 3))
+    return [moved(part, (0, 0, 0), np.pi / 2) for part in (handle, bowl)]
 
 
 def banana() -> list[Mesh]:
     """Return a bent fruit of four tapered pieces."""
     rings = []
-    for turn, radius in zip(np.linspace(-0.75, 0.75, 5), (0.008, 0.015, 0.017, 0.015, 0.007)):
-        ring = _ring(radius, 0.0, 8)[:, [0, 2, 1]]  # in the plane of x and z
+    turns, radii = np.linspace(-0.75, 0.75, 5).tolist(), (0.008, 0.015, 0.017, 0.015, 0.007)
+    for turn, radius in zip(turns, radii, strict=True):
+        ring = _ring(radius, 8)[:, [0, 2, 1]]  # in the plane of x and z
         cos, sin = math.cos(turn), math.sin(turn)
         turned = ring @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-        rings.append(turned + (0.065 * cos - 0.065, 0.065 * sin, 0))
-    return [
-        convex_hull(np.concatenate([low, high]))
-        for low, high in zip(rings, rings[1:], strict=False)
-    ]
+        rings.append(turned + np.array([0.065 * cos - 0.065, 0.065 * sin, 0]))
+    return [convex_hull(np.concatenate(ends)) for ends in pairwise(rings)]
 
 
 ITEMS: dict[str, Callable[[], Sequence[Mesh]]] = {
-    "bottle": lambda: lathe(
+    "bottle": lambda: lathe_parts(
         [(0.023, 0.0), (0.025, 0.004), (0.025, 0.07), (0.011, 0.092), (0.011, 0.115)]
     ),
-    "flask": lambda: lathe([(0.026, 0.0), (0.026, 0.03), (0.012, 0.055), (0.014, 0.08)]),
-    "can": lambda: lathe([(0.024, 0.0), (0.026, 0.003), (0.026, 0.077), (0.024, 0.08)]),
-    "jar": lambda: lathe([(0.027, 0.0), (0.027, 0.045), (0.022, 0.05), (0.022, 0.062)]),
+    "flask": lambda: lathe_parts([(0.026, 0.0), (0.026, 0.03), (0.012, 0.055), (0.014, 0.08)]),
+    "can": lambda: lathe_parts([(0.024, 0.0), (0.026, 0.003), (0.026, 0.077), (0.024, 0.08)]),
+    "jar": lambda: lathe_parts([(0.027, 0.0), (0.027, 0.045), (0.022, 0.05), (0.022, 0.062)]),
     "mug": lambda: mug(0.028, 0.07),
     "espresso cup": lambda: mug(0.024, 0.045),
     "tumbler": lambda: vessel([(0.021, 0.0), (0.028, 0.08)], 0.004, 0.006),
@@ -121,7 +108,7 @@ ITEMS: dict[str, Callable[[], Sequence[Mesh]]] = {
         box((0.065, 0.024, 0.024), (0, 0.03, 0)),
     ],
     "banana": banana,
-    "lemon": lambda: lathe(
+    "lemon": lambda: lathe_parts(
         [(0.004, -0.034), (0.018, -0.022), (0.025, 0.0), (0.018, 0.022), (0.004, 0.034)]
     ),
     "cheese": lambda: [
@@ -145,9 +132,7 @@ class Household(ObjectSet):
         return tuple(list(ITEMS.values())[index]())
 
 
-def _ring(radius_m: float, z_m: float, corners: int) -> np.ndarray:
-    """Return points [corners, 3] on a horizontal circle."""
+def _ring(radius_m: float, corners: int) -> np.ndarray:
+    """Return points [corners, 3] on a horizontal circle about the origin."""
     turns = np.linspace(0, 2 * np.pi, corners, endpoint=False)
-    return np.stack(
-        [radius_m * np.cos(turns), radius_m * np.sin(turns), np.full(corners, z_m)], axis=1
-    )
+    return radius_m * np.stack([np.cos(turns), np.sin(turns), np.zeros(corners)], axis=1)

@@ -29,8 +29,9 @@ class Rest(NamedTuple):
     width_m: float
     """Of the narrowest gap between two vertical walls that the body fits into."""
     squareness: float
-    """How nearly opposite the surfaces are that two closing fingers meet, for the best direction:
-    1 for parallel upright sides, the cosine of the angle between the sides of a wedge."""
+    """How nearly opposite the surfaces are that two closing fingers meet, and how nearly across
+    the line on which they close, for the best line: 1 for parallel upright sides, less for the
+    sides of a wedge."""
     turn: np.ndarray
     """[3, 3] rotation into this pose, with that direction along x."""
 
@@ -132,7 +133,8 @@ def _squareness(standing: Mesh, center_xy: np.ndarray) -> tuple[float, float]:
             continue
         left, right = along[met] < along[met].min() + 2e-3, along[met] > along[met].max() - 2e-3
         first, second = (normals[met][side].mean(axis=0) for side in (left, right))
-        best = max(best, (-float(first @ second), turn))
+        facing = min(-float(first[:2] @ axis), float(second[:2] @ axis))
+        best = max(best, (-float(first @ second) * max(facing, 0.0), turn))
     return best
 
 

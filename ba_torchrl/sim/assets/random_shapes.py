@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,7 +78,7 @@ class RandomShapes(ObjectSet):
             best = max(rests(Mesh(vertices, faces)), key=lambda rest: rest.squareness)
             return [Mesh(vertices @ best.turn.T, faces)]
 
-        return cached_parts(shape_path(number).read_bytes(), f"random shape 1 {scale}", hull)
+        return cached_parts(shape_path(number).read_bytes(), f"random shape 2 {scale}", hull)
 
 
 def shape_path(number: int) -> Path:
@@ -94,7 +95,7 @@ def read_shape(number: int) -> Mesh:
             vertices.append([float(value) for value in values[:3]])
         elif kind == "f":
             corners = [int(value.split("/")[0]) - 1 for value in values]
-            faces += [(corners[0], b, c) for b, c in zip(corners[1:], corners[2:], strict=False)]
+            faces += [(corners[0], b, c) for b, c in pairwise(corners[1:])]
     return Mesh(np.array(vertices) * UNIT_M, np.array(faces, dtype=np.int64))
 
 

@@ -40,8 +40,8 @@ HAND_M = (0.06, 0.016)
 """Half the room of the hand as it picks an object."""
 LAYOUTS = 20
 
-PIXEL_M = 0.002
-GAP_M = 0.002
+PIXEL_M = 0.001
+GAP_M = 0.0015
 """Room left around an object in the bin."""
 RING_M = 0.008
 TALLER_M = 0.01
@@ -254,7 +254,7 @@ def _lowest(
         Its cost, the middle of the place from the middle of the image, and the height of what
         the box comes to rest on; None if the box is larger than the image.
     """
-    size = [math.ceil(2 * (half + GAP_M) / PIXEL_M) for half in half_m]
+    size = [round(2 * (half + GAP_M) / PIXEL_M) for half in half_m]
     ring = round(RING_M / PIXEL_M)
     if max(size) > min(heights.shape):
         return None

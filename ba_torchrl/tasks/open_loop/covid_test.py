@@ -9,8 +9,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Box, Color, Solid, gap_m, vertical_extent
-from ba_torchrl.sim.meshes import frame_parts
+from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, vertical_extent
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, PlacementError
@@ -61,6 +60,7 @@ class Area(NamedTuple):
 NEW_BOX = Area("box of new tubes", PURPLE, (-0.06, 0.055), (0.18, 0.19, 0.01))
 USED_BOX = Area("box of used tubes", YELLOW, (-0.09, -0.1), (0.12, 0.1, 0.04))
 TEST_AREA = Area("test area", GRAY, (0.0925, 0.0), (0.115, 0.3, SHEET_M))
+AREAS = (NEW_BOX, USED_BOX, TEST_AREA)
 
 TEST_SPOTS = tuple((0.0, y) for y in (0.0, 0.085, -0.085, 0.0425, -0.0425))
 """Where the expert presents, in the frame of the test area; the first free one."""
@@ -110,10 +110,12 @@ class CovidTest(OpenLoopTask):
     def build(self, world: World) -> None:
         """Load the three areas, the tubes and the swabs."""
         self.new_box, self.used_box, self.test_area = (
-            world.add(_floor(area), area.name) for area in (NEW_BOX, USED_BOX, TEST_AREA)
+            world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS
         )
-        self._rims = [
-            world.add(_rim(area), f"rim of the {area.name}") for area in (NEW_BOX, USED_BOX)
+        self._walls = [
+            (area, place, world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}"))
+            for area in (NEW_BOX, USED_BOX)
+            for place, size in _walls(area)
         ]
         factor = self.settings.scale / self.scale_range[0]
         self._tube_m, self._swab_m = (
@@ -143,15 +145,14 @@ class CovidTest(OpenLoopTask):
         mirror = 1.0 if rng.random() < 0.5 else -1.0
         half = HALF_LAYOUT_M * (abs(math.cos(yaw)) + abs(math.sin(yaw)))
         center = self.random_point(rng, 2 * half)
-        for area, *bodies in (
-            (NEW_BOX, self.new_box, self._rims[0]),
-            (USED_BOX, self.used_box, self._rims[1]),
-            (TEST_AREA, self.test_area),
+        floors = zip(AREAS, (self.new_box, self.used_box, self.test_area), strict=True)
+        for area, place, body in (
+            *((area, (0.0, 0.0), floor) for area, floor in floors),
+            *self._walls,
         ):
             x, y = area.center
-            xy = _turned((mirror * x, y), center, yaw)
-            for body in bodies:
-                body.place((*xy, -SUNK_M - body.shape.bounds_m[0][2]), yaw)
+            middle = _turned((mirror * x, y), center, yaw)
+            body.place((*_turned(place, middle, yaw), -SUNK_M - body.shape.bounds_m[0][2]), yaw)
         rows = self._rows()
         for bodies, row in ((self.tubes, rows[0]), (self.swabs, rows[1])):
             for column, body in zip(self._columns(), bodies, strict=True):
@@ -382,12 +383,16 @@ def _turned(
     return center[0] + cos * x - sin * y, center[1] + sin * x + cos * y
 
 
-def _floor(area: Area) -> Box:
-    length, width, _ = area.size
-    return Box(size_m=(length, width, SHEET_M + SUNK_M), mass_kg=0, color=area.color)
+def _slab(area: Area, size_m: tuple[float, float], top_m: float) -> Box:
+    return Box(size_m=(*size_m, top_m + SUNK_M), mass_kg=0, color=area.color)
 
 
-def _rim(area: Area) -> Solid:
-    length, width, height = area.size
-    size = (length, width, height + SUNK_M)
-    return Solid(parts=tuple(frame_parts(size, WALL_M)), mass_kg=0, color=area.color)
+def _walls(area: Area) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Return the place, in the area's frame, and the size of each wall of a box.
+
+    They are bodies of their own: a state with contacts of a body of several parts is not restored
+    to the last bit.
+    """
+    (x, y, _), wall = area.size, WALL_M
+    sides = [((0.0, (y - wall) / 2), (x - 2 * wall, wall)), (((x - wall) / 2, 0.0), (wall, y))]
+    return [((sign * px, sign * py), size) for (px, py), size in sides for sign in (-1.0, 1.0)]

@@ -1,0 +1,346 @@
+"""Object sets: what is in them, what a folder of meshes must look like, the cache on disk."""
+
+import logging
+import math
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ba_torchrl.config import ConfigError
+from ba_torchrl.sim.assets import cache, graspnet, hulls, random_shapes
+from ba_torchrl.sim.assets.base import OBJECT_SETS, load_object_set
+from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
+from ba_torchrl.sim.assets.graspnet import graspable_scale
+from ba_torchrl.sim.assets.household import ITEMS
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, moved, write_obj
+from ba_torchrl.sim.world import World
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def write_objects(root, **meshes):
+    for name, mesh in meshes.items():
+        (root / name).mkdir(parents=True)
+        write_obj(root / name / "textured.obj", [mesh])
+    return str(root)
+
+
+def angle_iron(size=0.08):
+    """An L of two slabs: its hull is half air."""
+    return joined(
+        [
+            moved(box_mesh((size, 0.03, 0.02)), (size / 2, 0, 0.01)),
+            moved(box_mesh((0.02, 0.03, size)), (0.01, 0, size / 2)),
+        ]
+    )
+
+
+# -- hulls ---------------------------------------------------------------------------------------
+
+
+def test_hull_of_a_box_with_points_inside_is_the_box():
+    points = np.vstack([box_mesh((0.1, 0.2, 0.3)).vertices, [[0.01, 0.02, 0.03]]]) + 1.0
+    hull = hulls.convex_hull(points)
+    assert len(hull.vertices) == 8
+    volume, center = hulls.volume_and_center(hull)
+    assert volume == pytest.approx(0.1 * 0.2 * 0.3)  # negative if faces pointed inwards
+    np.testing.assert_allclose(center, [1, 1, 1], atol=1e-12)
+
+
+def test_center_of_a_cone_is_at_a_quarter_of_its_height():
+    turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    base = np.stack([np.cos(turns), np.sin(turns), 0 * turns], axis=1)
+    hull = hulls.convex_hull(np.vstack([base, [[0, 0, 2.0]]]))
+    np.testing.assert_allclose(hulls.volume_and_center(hull)[1], [0, 0, 0.5], atol=1e-9)
+
+
+@pytest.mark.parametrize("points", [np.zeros((9, 3)), np.full((9, 3), np.nan), np.eye(3)])
+def test_points_without_volume_have_no_hull(points):
+    with pytest.raises(ValueError, match="no convex hull"):
+        hulls.convex_hull(points)
+
+
+def test_rests_of_a_box_are_its_six_faces():
+    size = (0.03, 0.05, 0.07)
+    found = hulls.rests(hulls.convex_hull(box_mesh(size).vertices))
+    assert sorted(round(rest.height_m, 6) for rest in found) == sorted(size * 2)
+    for rest in found:
+        least = min(set(size) - {round(rest.height_m, 6)})
+        assert rest.width_m == pytest.approx(least, abs=1e-6)
+        assert rest.squareness > 0.9
+        # in this pose the fingers' line is along x, the height along z
+        extents = np.ptp(box_mesh(size).vertices @ rest.turn.T, axis=0)
+        assert extents[2] == pytest.approx(rest.height_m)
+        assert extents[0] <= hulls.GAP_M
+        assert np.linalg.det(rest.turn) == pytest.approx(1)
+
+
+def test_a_wedge_is_less_square_than_a_box():
+    wedge = np.array([(x, y, z) for x, y in ((0, -0.03), (0, 0.03), (0.04, 0)) for z in (0, 0.03)])
+    flat = [rest for rest in hulls.rests(hulls.convex_hull(wedge)) if rest.height_m < 0.031]
+    assert flat
+    assert all(rest.squareness < 0.8 for rest in flat)
+
+
+def test_a_body_does_not_rest_on_an_end_it_would_topple_from():
+    leaning = box_mesh((0.02, 0.02, 0.1)).vertices.copy()
+    leaning[leaning[:, 2] > 0, 0] += 0.06
+    heights = [rest.height_m for rest in hulls.rests(hulls.convex_hull(leaning))]
+    assert heights
+    assert max(heights) < 0.05
+
+
+def test_samples_lie_on_the_surface_evenly():
+    points, normals = hulls.surface_samples(box_mesh((0.1, 0.1, 0.2)), 1000)
+    assert np.all(np.abs(points) <= np.array([0.05, 0.05, 0.1]) + 1e-12)
+    outer = np.abs(points) > np.array([0.05, 0.05, 0.1]) - 1e-12
+    assert np.all(outer.any(axis=1))
+    assert np.all(np.einsum("ij,ij->i", points, normals) > 0)
+    assert (np.abs(normals[:, 2]) > 0.5).mean() == pytest.approx(0.2, abs=0.02)
+
+
+# -- the sets that come with the package --------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "least"), [("random", 86), ("household", 12)])
+def test_sets_hold_named_shapes_of_one_material(name, least):
+    shapes = load_object_set(name)
+    assert len(shapes) == len(set(shapes.names)) >= least
+    for shape in shapes:
+        assert shape.mass_kg == 0.15
+        assert shape.friction == 0.6
+        volumes, centers = zip(*map(hulls.volume_and_center, shape.parts), strict=True)
+        assert min(volumes) > 0
+        center = np.average(centers, axis=0, weights=volumes)
+        np.testing.assert_allclose(center, 0, atol=1e-9)
+        extents = np.sort(np.ptp(shape.mesh().vertices, axis=0))
+        assert 0.012 < extents[0] < 0.066  # a gripper takes 8 cm
+        assert extents[2] <= 0.15
+
+
+def test_shapes_are_made_when_asked_for(monkeypatch):
+    shapes = load_object_set("random")
+    asked = []
+    parts = type(shapes).parts
+    monkeypatch.setattr(type(shapes), "parts", lambda self, i: asked.append(i) or parts(self, i))
+    assert shapes[-1] is shapes[85]
+    assert [shapes[85]] == shapes[85:]
+    assert asked == [85]
+    with pytest.raises(IndexError):
+        shapes[86]
+
+
+def test_random_shapes_suit_as_they_say():
+    for number, scale in random_shapes.CHOICE[::8]:
+        found = random_shapes.examine(number)
+        assert found is not None
+        assert found.scale == scale
+
+
+def test_unsuitable_random_shapes_are_refused(monkeypatch):
+    assert random_shapes.examine(168) is None  # its file holds numbers that are none
+    number, _ = random_shapes.CHOICE[0]
+    for limit, value in (("LONGEST_M", 0.01), ("FLATTEST_M", 0.2), ("LEAST_FILL", 1.01)):
+        with monkeypatch.context() as patch:
+            patch.setattr(random_shapes, limit, value)
+            assert random_shapes.examine(number) is None
+
+
+@pytest.mark.slow
+def test_the_choice_of_random_shapes_follows_from_the_criterion():
+    assert random_shapes.choose() == random_shapes.CHOICE
+
+
+def test_random_shapes_stand_so_that_fingers_at_yaw_zero_fit():
+    for shape in load_object_set("random"):
+        low, high = shape.bounds_m
+        vertices = shape.mesh().vertices
+        across = vertices[np.abs(vertices[:, 1]) < hulls.FINGER_HALF_M]
+        assert len(across) == 0 or np.ptp(across[:, 0]) <= hulls.GAP_M + 1e-3
+        assert high[2] - low[2] >= random_shapes.FLATTEST_M - 1e-6
+
+
+def test_what_is_hollow_takes_something_in():
+    shapes = load_object_set("household")
+    for name in ("mug", "tumbler", "bowl"):
+        shape = shapes[shapes.names.index(name)]
+        with World() as world:
+            vessel = world.add(shape, name)
+            vessel.place((0.0, 0.0, -shape.bounds_m[0][2]))
+            pea = world.add(Box(size_m=(0.012, 0.012, 0.012), mass_kg=0.01), "pea")
+            pea.place((0.0, 0.0, shape.height_m + 0.01))
+            assert world.settle(400)
+            assert pea.position[2] < 0.5 * shape.height_m
+            assert pea.touches(vessel)
+
+
+def test_every_item_comes_to_rest_on_the_floor():
+    shapes = load_object_set("household")
+    with World() as world:
+        for i, (name, shape) in enumerate(zip(shapes.names, shapes, strict=True)):
+            world.add(shape, name).place((0.3 * i, 0.0, 0.005 - shape.bounds_m[0][2]))
+        world.step(240)
+        for body in world.bodies:
+            assert -1e-3 < body.bounding_box()[0][2] < 3e-3, body.name
+    assert list(ITEMS) == list(shapes.names)
+
+
+def test_an_unknown_set_and_a_needless_folder_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="household"):
+        load_object_set("houshold")
+    for name in set(OBJECT_SETS) - {"graspnet"}:
+        with pytest.raises(ConfigError, match="asset_root"):
+            load_object_set(name, str(tmp_path))
+
+
+# -- a folder of meshes -------------------------------------------------------------------------
+
+
+def test_graspnet_takes_one_object_from_each_folder(tmp_path):
+    root = write_objects(tmp_path / "models", b=box_mesh((0.05, 0.05, 0.1)), a=angle_iron())
+    (tmp_path / "models" / ".hidden").mkdir()
+    (tmp_path / "models" / "readme.txt").write_text("not an object")
+    shapes = load_object_set("graspnet", root)
+    assert list(shapes.names) == ["a", "b"]
+    assert len(shapes[1].parts) == 1
+    np.testing.assert_allclose(np.ptp(shapes[1].mesh().vertices, axis=0), (0.05, 0.05, 0.1))
+    assert len(shapes[0].parts) > 1  # the corner of the L stays open
+    volume = sum(hulls.volume_and_center(part)[0] for part in shapes[0].parts)
+    assert volume == pytest.approx(0.02 * 0.03 * (0.08 + 0.06), rel=0.2)
+
+
+def test_of_several_files_the_plain_one_is_taken(tmp_path):
+    root = write_objects(tmp_path / "models", a=box_mesh((0.05, 0.05, 0.05)))
+    write_obj(tmp_path / "models/a/nontextured.obj", [box_mesh((0.04, 0.04, 0.04))])
+    extents = np.ptp(load_object_set("graspnet", root)[0].mesh().vertices, axis=0)
+    np.testing.assert_allclose(extents, 0.04)
+
+
+def test_a_folder_is_needed_and_must_hold_meshes(tmp_path):
+    with pytest.raises(ConfigError, match=r"asset_root.*sub-folder"):
+        load_object_set("graspnet")
+    with pytest.raises(ConfigError, match=r"no folder .*nowhere.*\.obj"):
+        load_object_set("graspnet", str(tmp_path / "nowhere"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match=r"empty' has no sub-folders.*\.obj"):
+        load_object_set("graspnet", str(tmp_path / "empty"))
+    (tmp_path / "bare" / "000").mkdir(parents=True)
+    with pytest.raises(ConfigError, match=r"000' has no mesh file.*\.obj"):
+        load_object_set("graspnet", str(tmp_path / "bare"))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "this is no mesh",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n",
+    ],
+    ids=["empty", "prose", "one triangle", "not a number", "flat"],
+)
+def test_a_broken_mesh_is_named(tmp_path, content):
+    (tmp_path / "models" / "007").mkdir(parents=True)
+    (tmp_path / "models" / "007" / "textured.obj").write_text(content)
+    shapes = load_object_set("graspnet", str(tmp_path / "models"))
+    with pytest.raises(ConfigError, match="007"):
+        shapes[0]
+
+
+def stepwise_scale(extents):
+    """The rules as they are stated, step by step."""
+    e = np.array(extents, dtype=float)
+    while sorted(e)[1] > 0.15:
+        e *= 0.8
+    while np.prod(e) > 0.0006:
+        e *= 0.85
+    while e.min() < 0.014:
+        e /= 0.95
+    return float(e[0] / extents[0])
+
+
+def test_scales_follow_the_rules():
+    rng = np.random.default_rng(0)
+    for extents in rng.uniform(0.002, 0.5, (300, 3)):
+        assert graspable_scale(extents) == pytest.approx(stepwise_scale(extents))
+    assert graspable_scale((0.05, 0.05, 0.1)) == 1.0
+    assert math.isfinite(graspable_scale((1e-9, 1.0, 1e6)))
+
+
+# -- cache --------------------------------------------------------------------------------------
+
+
+def test_parts_are_worked_out_once(own_cache):
+    made = []
+
+    def make():
+        made.append(1)
+        return [box_mesh((1.0, 2.0, 3.0)), moved(box_mesh((1.0, 1.0, 1.0)), (5.0, 0.0, 0.0))]
+
+    first, second = (cached_parts(b"content", "recipe", make) for _ in range(2))
+    assert len(made) == 1
+    assert len(second) == 2
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+        np.testing.assert_array_equal(a.faces, b.faces)
+    cached_parts(b"other content", "recipe", make)
+    cached_parts(b"content", "other recipe", make)
+    assert len(made) == 3
+    assert not list(own_cache.rglob("*.tmp"))
+
+
+def test_a_damaged_entry_is_made_anew(own_cache, caplog):
+    make = lambda: [box_mesh((1.0, 1.0, 1.0))]  # noqa: E731
+    cached_parts(b"content", "recipe", make)
+    (path,) = own_cache.rglob("*.npz")
+    whole = path.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"not an archive"):
+        path.write_bytes(damaged)
+        with caplog.at_level(logging.WARNING):
+            (part,) = cached_parts(b"content", "recipe", make)
+        np.testing.assert_array_equal(part.vertices, box_mesh((1.0, 1.0, 1.0)).vertices)
+        assert path.read_bytes() == whole
+    assert "made anew" in caplog.text
+
+
+def test_a_cache_that_cannot_be_written_is_reported_and_done_without(monkeypatch, tmp_path, caplog):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
+    with caplog.at_level(logging.WARNING):
+        (part,) = cached_parts(b"content", "recipe", lambda: [box_mesh((1.0, 1.0, 1.0))])
+    assert isinstance(part, Mesh)
+    assert CACHE_VARIABLE in caplog.text
+
+
+def test_without_the_variable_the_cache_is_the_users(monkeypatch):
+    monkeypatch.delenv(CACHE_VARIABLE)
+    monkeypatch.setattr(cache, "user_cache_path", lambda name: Path("/users/cache") / name)
+    assert cache.cache_folder() == Path("/users/cache/ba_torchrl/parts")
+
+
+def _write_the_same(seed):
+    vertices = np.random.default_rng(seed % 3).random((2000, 3))
+    parts = cached_parts(
+        bytes([seed % 3]), "recipe", lambda: [Mesh(vertices, np.array([[0, 1, 2]]))]
+    )
+    return float(np.abs(parts[0].vertices - vertices).max())
+
+
+def test_processes_that_write_at_once_do_no_harm(own_cache):
+    with multiprocessing.get_context("fork").Pool(6) as pool:
+        assert set(pool.map(_write_the_same, range(60), chunksize=1)) == {0.0}
+    assert len(list(own_cache.rglob("*.npz"))) == 3
+    assert not list(own_cache.rglob("*.tmp"))
+
+
+def test_the_recipe_names_what_the_parts_depend_on():
+    assert str(graspnet.CONVEX_FILL) in graspnet.RECIPE
+    assert all(str(value) in graspnet.RECIPE for value in graspnet.VHACD.values())
