@@ -8,19 +8,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from typing import NamedTuple
 
+import numpy as np
 import pybullet
 
-from ba_torchrl.sim.bodies import CONTACT_M, Body, Vector, radius_m, vertical_extent
+from ba_torchrl.sim.bodies import (
+    CONTACT_M,
+    Body,
+    Vector,
+    radius_m,
+    vertical_extent,
+    world_vertices,
+)
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.structures import UPRIGHT_RAD, Blueprint, Piece
+from ba_torchrl.tasks.structures import UPRIGHT_RAD, Blueprint, Piece, Slot
 
 LYING_COSINE = 0.5
 """A piece lies on another if the surfaces that touch are within 60 degrees of level."""
 SPOT_STEP_M = 0.02
 BEARINGS = 16
 """Spots on the ground are looked for in steps of this length, or in this many of a half turn."""
+SITE_POINTS = 7
+"""What a structure will take up on the ground is told by this many points along a bridge."""
+CROWDED = 10.0
+"""What a metre too near is worth in metres of way."""
+
+Crowding = Callable[[np.ndarray, Sequence[Body]], np.ndarray]
+"""From sites [S, P, 2], each so many points on the ground that a structure will stand on, and the
+pieces that are still to be fetched then, to how many metres each site is too near them, [S]."""
 
 
 class Move(NamedTuple):
@@ -45,6 +62,8 @@ class PutDown(NamedTuple):
     gap_m: float
     """Room wanted around a piece."""
     z_m: float = 0.0
+    line_yaw_rad: float | None = None
+    """Direction in which two pieces for a bridge must stand; None if any will do."""
 
 
 class _View(NamedTuple):
@@ -71,6 +90,8 @@ class Building:
         bodies: the bodies of each kind; there may be more than the blueprint needs.
         block_m: edge of a block, the measure of what counts as on top.
         ground: PyBullet ids of what the lowest pieces stand on; the floor if not given.
+        own_pieces: what is known of some bodies, where it differs from the blueprint's piece of
+            that kind.
 
     Raises:
         ValueError: there are too few bodies of a kind.
@@ -83,6 +104,7 @@ class Building:
         bodies: Mapping[str, Sequence[Body]],
         block_m: float,
         ground: Sequence[int] | None = None,
+        own_pieces: Mapping[Body, Piece] | None = None,
     ) -> None:
         self.blueprint = blueprint
         self.world = world
@@ -95,6 +117,7 @@ class Building:
             if len(found) < needed:
                 raise ValueError(f"the blueprint needs {needed} of {piece.kind!r}")
             self.pieces |= dict.fromkeys(found, piece)
+        self.pieces |= own_pieces or {}
         self._by_id = {body.id: body for body in self.pieces}
 
     def is_built(self, held: Body | None = None) -> bool:
@@ -108,7 +131,7 @@ class Building:
         views = self._views()
         return any(
             not self._strays(filling, views)
-            for filling in self._fillings(views, held, complete=True)
+            for filling in self._fillings(views, held)
         )
 
     def has_tipped(self, held: Body | None = None) -> bool:
@@ -123,7 +146,7 @@ class Building:
         put_down: PutDown,
         held: Body | None = None,
         effort: Callable[[Body], float] = lambda body: 0.0,
-        crowding: Callable[[Body, Vector], float] = lambda body, position: 0.0,
+        crowding: Crowding | None = None,
     ) -> Move | None:
         """Return the move that brings the structure on, or None if it stands.
 
@@ -134,27 +157,29 @@ class Building:
             put_down: where on the ground there is room.
             held: what the gripper holds: it is placed before anything else is picked.
             effort: metres to add to the way of a piece for picking it, to choose among equals.
-            crowding: metres to add for placing a piece somewhere.
+            crowding: how much a site is too near to pieces; only free room counts if not given.
         """
         views = self._views()
-        fillings = list(self._fillings(views, held))
-        most = max(sum(body is not None for body in filling) for filling in fillings)
-        fillings = [f for f in fillings if sum(body is not None for body in f) == most]
+        fillings, most = self._fullest(views, held)
         if most == len(self.blueprint.slots):
             if held in self.pieces:
                 return self._to_ground(held, put_down)
             strays = min((self._strays(filling, views) for filling in fillings), key=len)
             return self._to_ground(min(strays, key=effort), put_down) if strays else None
+        effort = cache(effort)
+        piles = self._piles(views, held)
         best: tuple[tuple[int, float], Move | Body] | None = None
         for filling in fillings:
-            for detour, body, number in self._choices(filling, views, held):
+            for detour, body, number in self._choices(filling, views, piles, held):
                 if held in self.pieces and body is not held:
                     detour, body, number = detour + 1, held, None
+                if best is not None and detour > best[0][0]:
+                    continue
                 move, way = body, 0.0
                 if number is not None:
-                    move = self._into_slot(body, number, filling, put_down)
-                    way = math.dist(body.position[:2], move.position[:2])
-                    way += crowding(body, move.position)
+                    move, crowd_m = self._into_slot(body, number, filling, put_down, crowding)
+                    way = math.dist(views[body].position[:2], move.position[:2])
+                    way += CROWDED * crowd_m
                 cost = (detour, way + (0.0 if body is held else effort(body)))
                 if best is None or cost < best[0]:
                     best = cost, move
@@ -190,34 +215,64 @@ class Building:
             )
         return views
 
-    def _fillings(
-        self, views: Mapping[Body, _View], held: Body | None, *, complete: bool = False
-    ) -> Iterator[Filling]:
-        """Yield every way to see bodies in the slots; ``complete``: with none left empty."""
+    def _fillings(self, views: Mapping[Body, _View], held: Body | None) -> Iterator[Filling]:
+        """Yield every way to see a body in each of the slots."""
 
         def fill(filling: Filling) -> Iterator[Filling]:
-            number = len(filling)
-            if number == len(self.blueprint.slots):
+            if len(filling) == len(self.blueprint.slots):
                 yield filling
                 return
-            for body, piece in self.pieces.items():
-                if (
-                    piece == self.blueprint.slots[number].piece
-                    and body is not held
-                    and body not in filling
-                    and self._fits(body, number, filling, views)
-                ):
-                    yield from fill((*filling, body))
-            if not complete:
-                yield from fill((*filling, None))
+            for body in self._candidates(filling, views, held):
+                yield from fill((*filling, body))
 
         return fill(())
+
+    def _fullest(
+        self, views: Mapping[Body, _View], held: Body | None
+    ) -> tuple[list[Filling], int]:
+        """Return all ways to see bodies in as many slots as possible, and how many these are."""
+        count = len(self.blueprint.slots)
+        found: list[Filling] = []
+        most = 0
+
+        def fill(filling: Filling, filled: int) -> None:
+            nonlocal found, most
+            if filled + count - len(filling) < most:
+                return
+            if len(filling) == count:
+                if filled > most:
+                    found, most = [], filled
+                found.append(filling)
+                return
+            for body in self._candidates(filling, views, held):
+                fill((*filling, body), filled + 1)
+            fill((*filling, None), filled)
+
+        fill((), 0)
+        return found, most
+
+    def _candidates(
+        self, filling: Filling, views: Mapping[Body, _View], held: Body | None
+    ) -> Iterator[Body]:
+        """Yield the bodies that lie as they must for the next slot."""
+        number = len(filling)
+        slot = self.blueprint.slots[number]
+        if any(filling[i] is None for i in slot.on):
+            return
+        for body, piece in self.pieces.items():
+            if (
+                piece.kind == slot.piece.kind
+                and body is not held
+                and body not in filling
+                and self._fits(body, number, filling, views)
+            ):
+                yield body
 
     def _fits(self, body: Body, number: int, filling: Filling, views: Mapping[Body, _View]) -> bool:
         """Whether a body lies as it must to fill a slot."""
         slot, view = self.blueprint.slots[number], views[body]
         supports = [filling[i] for i in slot.on]
-        if view.tilt_rad >= UPRIGHT_RAD or None in supports:
+        if view.tilt_rad >= UPRIGHT_RAD:
             return False
         partner = self.blueprint.partner(number)
         if supports:
@@ -259,7 +314,7 @@ class Building:
         if bridge.span.least_m <= math.dist(here[:2], there[:2]) <= bridge.span.most_m:
             return True
         return any(
-            piece == bridge.piece and views[candidate].below.issuperset((body, other))
+            piece.kind == bridge.piece.kind and views[candidate].below.issuperset((body, other))
             for candidate, piece in self.pieces.items()
         )
 
@@ -289,10 +344,25 @@ class Building:
             ]
         return strays
 
+    def _piles(
+        self, views: Mapping[Body, _View], held: Body | None
+    ) -> dict[Body, frozenset[Body]]:
+        """Return all that lies on each piece, right on it or on what does."""
+        piles: dict[Body, frozenset[Body]] = {}
+        # from the top down: what lies on a piece is higher than it
+        for body in sorted(self.pieces, key=lambda piece: -views[piece].position[2]):
+            upon = {b for b, view in views.items() if b is not held and body in view.below}
+            piles[body] = frozenset(upon.union(*(piles[b] for b in upon)))
+        return piles
+
     # -- choosing ----------------------------------------------------------------------------
 
     def _choices(
-        self, filling: Filling, views: Mapping[Body, _View], held: Body | None
+        self,
+        filling: Filling,
+        views: Mapping[Body, _View],
+        piles: Mapping[Body, frozenset[Body]],
+        held: Body | None,
     ) -> Iterator[tuple[int, Body, int | None]]:
         """Yield what could be done next.
 
@@ -309,15 +379,10 @@ class Building:
             beside = () if partner is None or filling[partner] is None else (partner,)
             strays = self._strays(filling, views, (*slot.on, *beside))
             for body, piece in self.pieces.items():
-                if piece != slot.piece or body in filling:
+                if piece.kind != slot.piece.kind or body in filling:
                     continue
-                in_the_way = {stray for stray in strays if stray is not body}
-                for _ in self.pieces:  # with all that lies on them
-                    in_the_way |= {
-                        other
-                        for other, view in views.items()
-                        if other is not held and view.below & {body, *in_the_way}
-                    }
+                others = [stray for stray in strays if stray is not body]
+                in_the_way = set(others).union(piles[body], *(piles[stray] for stray in others))
                 in_the_way -= {body, held}
                 if not in_the_way:
                     yield 0, body, number
@@ -325,16 +390,25 @@ class Building:
                     if not any(top in views[other].below for other in in_the_way):
                         yield len(in_the_way), top, None
 
-    def _into_slot(self, body: Body, number: int, filling: Filling, put_down: PutDown) -> Move:
-        """Return the move that fills a slot."""
+    def _into_slot(
+        self,
+        body: Body,
+        number: int,
+        filling: Filling,
+        put_down: PutDown,
+        crowding: Crowding | None,
+    ) -> tuple[Move, float]:
+        """Return the move that fills a slot, and by how much its place is too near to others."""
         slots, slot, piece = self.blueprint.slots, self.blueprint.slots[number], self.pieces[body]
         supports = [filling[i] for i in slot.on]
         partner = self.blueprint.partner(number)
         beside = None if partner is None else filling[partner]
-        span = None if partner is None else slots[self.blueprint.bridge_on(number)].span
+        bridge = None if partner is None else slots[self.blueprint.bridge_on(number)]
+        rest = [other for other in self.pieces if other is not body and other not in filling]
         if not supports:
-            ring = None if beside is None else (beside, span.aim_m)
-            return self._to_ground(body, put_down, ring)
+            if beside is None:
+                return self._to_ground(body, put_down), 0.0
+            return self._beside(body, beside, bridge, put_down, rest, crowding)
         x, y, _ = _middle(filling[i].position for i in slot.over or slot.on)
         z = max(vertical_extent(support)[1] for support in supports)
         z += body.position[2] - vertical_extent(body)[0]
@@ -345,12 +419,15 @@ class Building:
         else:
             support = self.pieces[supports[0]]
             yaw = support.yaw_rad(supports[0])
-            if span is not None:
-                x, y = self._along(body, supports[0], beside, span.aim_m)
+            if bridge is not None:
+                x, y = self._along(body, supports[0], beside, bridge.span.aim_m)
             period = min(period, support.yaw_period_rad)
         if not slot.inherits_yaw:
             yaw = None
-        return Move(body, piece, (x, y, z), yaw, period, tuple(supports))
+        crowd_m = 0.0
+        if crowding is not None and sum(other is not None for other in filling) == 1:
+            crowd_m = float(crowding(np.array([[(x, y)]]), rest)[0])
+        return Move(body, piece, (x, y, z), yaw, period, tuple(supports)), crowd_m
 
     def _along(
         self, body: Body, support: Body, beside: Body | None, apart_m: float
@@ -370,43 +447,84 @@ class Building:
             place = along(beside) - math.copysign(apart_m, along(beside))
         return sx + place * ux, sy + place * uy
 
-    def _to_ground(
-        self, body: Body, put_down: PutDown, ring: tuple[Body, float] | None = None
-    ) -> Move:
-        """Return the move to a spot on the ground with room around it, the nearest such.
+    def _beside(
+        self,
+        body: Body,
+        anchor: Body,
+        bridge: Slot,
+        put_down: PutDown,
+        rest: Sequence[Body],
+        crowding: Crowding | None,
+    ) -> tuple[Move, float]:
+        """Return the move to the ground beside a piece, and by how much that is too near others.
 
         Args:
             body: what to move.
+            anchor: the piece.
+            bridge: the slot of what will lie on both.
             put_down: where there is room.
-            ring: the body beside which it goes, and how far from it.
+            rest: the pieces that are still to be fetched then.
+            crowding: as for `next_move`.
         """
+        piece = self.pieces[body]
         x, y, z = body.position
-        others = [other for other in self.pieces if other is not body]
-        if ring is None:
-            spots = [
-                (spot_x, spot_y) for spot_x in _steps(*put_down.x) for spot_y in _steps(*put_down.y)
-            ]
+        center = np.array(anchor.position[:2])
+        start = math.atan2(y - center[1], x - center[0])
+        if put_down.line_yaw_rad is None:
+            bearings = start + math.pi / BEARINGS * np.arange(2 * BEARINGS)
         else:
-            others.remove(ring[0])
-            (cx, cy, _), radius = ring[0].position, ring[1]
-            bearing = math.atan2(y - cy, x - cx)
-            turns = [bearing + math.pi * i / BEARINGS for i in range(2 * BEARINGS)]
-            spots = [(cx + radius * math.cos(t), cy + radius * math.sin(t)) for t in turns]
-        standing = [(other.position[:2], radius_m(other)) for other in others]
-
-        def cost(spot: tuple[float, float]) -> tuple[float, float]:
-            outside = max(
-                max(low - value, value - high, 0.0)
-                for value, (low, high) in zip(spot, (put_down.x, put_down.y), strict=True)
+            bearings = put_down.line_yaw_rad + np.array([0.0, math.pi])
+        ways = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+        radii = np.full(len(ways), bridge.span.aim_m)
+        yaw = None
+        if bridge.span.gap_m is not None:
+            # it will point at its neighbour the side that the fingers do not close on
+            side = piece.grasp_yaws_rad[0] + math.pi / 2
+            cos, sin = math.cos(side), math.sin(side)
+            far = (body.shape.vertices[:, :2] @ [cos, sin]).max()
+            near = (body.shape.vertices[:, :2] @ [-cos, -sin]).max()
+            reach = ((world_vertices(anchor)[:, :2] - center) @ ways.T).max(axis=0)
+            radii = reach + max(far, near) + bridge.span.gap_m
+            yaw = -side
+        spots = center + radii[:, None] * ways
+        others = [other for other in self.pieces if other is not body and other is not anchor]
+        cost = self._shortage(spots, body, others, put_down)
+        if crowding is not None:
+            length = max(
+                (np.ptp(b.shape.vertices[:, 1]) for b, p in self.pieces.items() if p == bridge.piece),
+                default=0.0,
             )
-            room = min((math.dist(spot, at) - r for at, r in standing), default=math.inf)
-            return (
-                outside + max(put_down.gap_m + radius_m(body) - room, 0.0),
-                math.dist(spot, (x, y)),
-            )
+            along = radii[:, None] / 2 + length / 2 * np.linspace(-1.0, 1.0, SITE_POINTS)
+            cost = cost + crowding(center + along[:, :, None] * ways[:, None], rest)
+        aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
+        best = int(np.lexsort((radii + aways, cost.round(6)))[0])
+        place = (*spots[best].tolist(), put_down.z_m + z - vertical_extent(body)[0])
+        heading = None if yaw is None else float(yaw + bearings[best])
+        return Move(body, piece, place, heading, piece.yaw_period_rad, ()), float(cost[best])
 
-        place = (*min(spots, key=cost), put_down.z_m + z - vertical_extent(body)[0])
+    def _to_ground(self, body: Body, put_down: PutDown) -> Move:
+        """Return the move to a spot on the ground with room around it, the nearest such."""
+        x, y, z = body.position
+        spots = np.array([(a, b) for a in _steps(*put_down.x) for b in _steps(*put_down.y)])
+        others = [other for other in self.pieces if other is not body]
+        cost = self._shortage(spots, body, others, put_down)
+        aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
+        best = np.lexsort((aways, cost))[0]
+        place = (*spots[best].tolist(), put_down.z_m + z - vertical_extent(body)[0])
         return Move(body, self.pieces[body], place, None, self.pieces[body].yaw_period_rad, ())
+
+    def _shortage(
+        self, spots: np.ndarray, body: Body, others: Sequence[Body], put_down: PutDown
+    ) -> np.ndarray:
+        """Return how much room is wanting at spots [S, 2]: outside the area, or beside others."""
+        low, high = np.array([put_down.x, put_down.y]).T
+        outside = np.maximum(np.maximum(low - spots, spots - high), 0.0).max(axis=1)
+        if not others:
+            return outside
+        at = np.array([other.position[:2] for other in others])
+        gaps = np.hypot(*(spots[:, None] - at).transpose(2, 0, 1))
+        room = (gaps - [radius_m(other) for other in others]).min(axis=1)
+        return outside + np.maximum(put_down.gap_m + radius_m(body) - room, 0.0)
 
 
 def _middle(points: Iterable[Vector]) -> Vector:

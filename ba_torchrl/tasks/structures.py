@@ -77,6 +77,8 @@ class Span(NamedTuple):
     least_m: float
     aim_m: float
     most_m: float
+    gap_m: float | None = None
+    """Where given, an expert aims for this gap between their surfaces instead."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Every parameter of `EnvConfig` does what it says (appendix B, table 4)."""
 
+import itertools
 import math
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 import ba_torchrl
 from ba_torchrl.config import ConfigError, EnvConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.views import VIEWS
 
 PICKING = "close_loop/block_picking"
 
@@ -108,6 +111,31 @@ def test_random_orientation(make):
         assert (np.std(yaws) > spread) if random else np.allclose(yaws, 0.0, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("task", "number"), [("close_loop/block_stacking", 3), ("close_loop/object_grasping", 2)]
+)
+def test_num_objects(make, task, number):
+    env = make(task, num_objects=number)
+    env.reset()
+    assert len(env.scene.task.objects) == number
+
+
+@pytest.mark.parametrize("robot", list(ROBOTS))
+def test_robot(make, robot):
+    env = make(robot=robot)
+    env.reset()
+    assert type(env.scene.robot) is ROBOTS[robot]
+
+
+def test_object_set_chooses_the_shapes(make):
+    names = {}
+    for chosen in ("random", "household"):
+        env = make("close_loop/object_grasping", object_set=chosen)
+        env.reset()
+        names[chosen] = {body.name for body in env.scene.task.objects}
+    assert not names["random"] & names["household"]
+
+
 def test_half_rotation_keeps_the_yaw_within_a_half_turn(make):
     reached = {}
     for half in (False, True):
@@ -191,6 +219,54 @@ def test_obs_type_vec_lists_scaled_poses(make):
     np.testing.assert_allclose(state[keys.OBSERVATION], expected, atol=1e-6)
     moved = act(env, state, x=1.0)[keys.OBSERVATION] - state[keys.OBSERVATION]
     assert moved[1] == pytest.approx(0.05 / 0.15, abs=5e-3)
+
+
+def test_view_types_show_the_same_scene_differently(make):
+    images = {}
+    for view in VIEWS:
+        env = make("close_loop/block_pushing", view_type=view)
+        spec = env.observation_spec[keys.PIXELS]
+        state = act(env, env.reset(), x=0.6, r=0.7)
+        assert state[keys.PIXELS].shape == (VIEWS[view].channels, 32, 32)
+        assert spec.is_in(state[keys.PIXELS])
+        images[view] = state[keys.PIXELS]
+    # what lies on the floor is as high seen from a fixed camera as from one on the gripper
+    depths = [image for name, image in images.items() if not name.endswith("_height")]
+    heights = [images[f"camera_center_{axes}_height"] for axes in ("xyz", "xyzr", "z")]
+    for group in (depths, heights):
+        for first, second in itertools.combinations(group, 2):
+            assert first.shape != second.shape or not torch.equal(first, second)
+
+
+def test_rgb_adds_a_picture_and_its_depth(make):
+    plain, env = make(), make(rgb=True, obs_size=48)
+    assert keys.RGB not in plain.reset()
+    state = env.reset()
+    rgb, depth = state[keys.RGB], state[keys.RGB_DEPTH]
+    assert rgb.shape == (3, 48, 48)
+    assert rgb.dtype == torch.uint8
+    assert depth.shape == (1, 48, 48)
+    red = (rgb[0].int() - rgb[1].int() > 60) & (rgb[0].int() - rgb[2].int() > 60)
+    assert red.sum() >= 4  # the block
+    assert 0.4 < depth.min() < depth.max() < 5.0
+    moved = act(env, state, x=1.0, y=1.0)
+    assert not torch.equal(moved[keys.RGB], rgb)  # the arm is in it
+
+
+def test_point_cloud_adds_points_on_the_surfaces(make):
+    env = make(point_cloud=512)
+    points = env.reset()[keys.POINT_CLOUD]
+    assert points.shape == (512, 3)
+    assert points.dtype == torch.float32
+    block = torch.tensor(env.scene.task.block.position)
+    near = (points[:, :2] - block[:2]).norm(dim=1) < 0.02
+    top = near & (points[:, 2] > 0.04)
+    assert top.any()
+    torch.testing.assert_close(
+        points[top, 2], torch.full((int(top.sum()),), 0.05), atol=2e-3, rtol=0
+    )
+    floor = points[points[:, 2] < 0.01]
+    assert len(floor) > 100
 
 
 @pytest.mark.parametrize(

@@ -410,35 +410,52 @@ def poses(env):
     return [body.pose for body in env.scene.world.bodies]
 
 
+def go_on(env, state, count):
+    """Let the expert act from a state on; return every state."""
+    states = [state]
+    for _ in range(count):
+        states.append(step(env, states[-1]["expert_action"]))
+    return states[1:]
+
+
 def test_a_state_keeps_the_task_the_hidden_swabs_and_the_future(make):
     env = make(seed=4)
-    follow(env, 3)  # a tube is presented, a swab held
-    task = env.scene.task
-    swab = task.robot.held_body()
+    state = follow(env, 3)  # a tube is presented, a swab held
+    task, motion = env.scene.task, env.scene.motion
+    swab = motion.held
     assert swab in task.swabs
     kept = env.get_state()
-    first = follow(env, 3)
+    first = go_on(env, state, 3)
     assert swab.is_hidden
     assert task.get_state().spent == (task.swabs.index(swab),)
     later = env.get_state()
-    here = poses(env)
+    there = poses(env), task.get_state()
     env.set_state(kept)
-    assert task.robot.held_body() is swab
+    assert motion.held is swab
+    assert swab.is_hidden
     assert task.get_state().spent == ()
-    assert env.scene.motion.held is swab
     assert swab in task.objects
-    env.set_state(later)  # while it is held again
+    env.set_state(later)  # while it is in the gripper
+    assert motion.held is not swab
     assert swab.is_hidden
     assert swab not in task.objects
-    assert poses(env) == here
-    env.set_state(kept)
-    second = follow(env, 3)
-    assert torch.equal(first["pixels"], second["pixels"])
-    assert poses(env) == here
+    assert (poses(env), task.get_state()) == there
+    for before in (kept, later):  # back from before the test, and from after it
+        env.set_state(before)
+        second = go_on(env, env.set_state(kept), 3)
+        for one, other in zip(first, second, strict=True):
+            torch.testing.assert_close(one["pixels"], other["pixels"], atol=1e-3, rtol=0)
+        assert task.get_state() == there[1]
+        where = [body.position for body in task.objects]
+        assert where == [
+            pytest.approx(pose[0], abs=1e-3)
+            for body, pose in zip(env.scene.world.bodies, there[0], strict=True)
+            if body in task.objects
+        ]
     env.reset()
     assert not any(body.is_hidden for body in env.scene.world.bodies)
     returned = env.set_state(later)
-    assert torch.equal(returned["pixels"], first["pixels"])
+    assert torch.equal(returned["pixels"], first[-1]["pixels"])
     assert swab.is_hidden
 
 

@@ -75,6 +75,9 @@ class Robot(ABC):
     """The close-loop camera hangs this far above the tool point."""
     finger_span_m: ClassVar[float]
     """Distance between the finger squares in the close-loop image when fully open."""
+    hand_half_m: ClassVar[tuple[float, float]] = (0.07, 0.03)
+    """Half the extents of the open hand above its fingertips, along the line on which it closes and
+    across."""
 
     arm_force: ClassVar[float] = 300.0
     finger_force: ClassVar[float] = 2.0

@@ -53,6 +53,7 @@ class Panda(Robot):
     home_joints = (1.212, -0.42, 0.0, -2.188, 0.0, 1.768, 0.427)
     camera_height_m = 0.04
     finger_span_m = 42 * 0.3 / 128
+    hand_half_m = (0.105, 0.035)
 
     finger_force = 10.0
     finger_speed = 0.4

@@ -38,6 +38,9 @@ LOWEST_PICK_M = 0.012
 EAVES_M = 0.026
 HAND_M = (0.06, 0.016)
 """Half the room of the hand as it picks an object."""
+TALL_WALL_M = 0.03
+WIDER_M = 0.012
+"""Beside walls taller than that above the fingertips, a hand needs more room by this much."""
 LAYOUTS = 20
 
 PIXEL_M = 0.001
@@ -160,7 +163,12 @@ class BinPacking(PackingTask):
             for other in self.pool.present
             if other is not body and other is not held and vertical_extent(other)[1] > above_m
         ]
-        return found + self._walls() if self._rim_m() > above_m else found
+        if self._rim_m() <= above_m:
+            return found
+        wide = WIDER_M if self._rim_m() - above_m > TALL_WALL_M else 0.0
+        return found + [
+            wall.resized(wall.half_x + wide, wall.half_y + wide) for wall in self._walls()
+        ]
 
     def expert_command(self) -> PickPlaceCommand:
         """Drop the largest object that can be grasped to the lowest place that has room for it."""
@@ -173,8 +181,9 @@ class BinPacking(PackingTask):
         grasps = {body: self.grasp(body) for body in outside}
 
         def order(body: Body) -> tuple[bool, float, float]:
-            size = np.ptp(body.shape.vertices, axis=0).prod()
-            return grasps[body].room_m > 0, round(float(size), 7), grasps[body].room_m
+            room = grasps[body].room_m
+            size = float(np.ptp(body.shape.vertices, axis=0).prod()) if room > 0 else 0.0
+            return room > 0, round(size, 7), room
 
         body = max(outside, key=order)
         return self.pick(body, grasps[body])
@@ -208,7 +217,7 @@ class BinPacking(PackingTask):
     def _drop(self, held: Body) -> PickPlaceCommand:
         """Return the place that lets an object fall where it comes to lie lowest."""
         tool_yaw = self.robot.tool_pose()[1]
-        own = narrowest(held, None if self.reach.turn_rad else tool_yaw)
+        own = narrowest(held, None if self.reach.turn_rad else tool_yaw)[0]
         heights = self._heights()
         best: tuple[float, tuple[float, float], float, float] | None = None
         for quarter in (0, 1):

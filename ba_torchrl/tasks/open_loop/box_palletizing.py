@@ -11,12 +11,13 @@ from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, Box, vertical_extent
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, PlacementError
-from ba_torchrl.tasks.open_loop.packing import RELEASE_GAP_M, PackingTask
+from ba_torchrl.tasks.open_loop.packing import ENOUGH_M, RELEASE_GAP_M, PackingTask
 from ba_torchrl.tasks.open_loop.pool import Pool
 from ba_torchrl.tasks.open_loop.rectangles import (
     Rectangle,
     Room,
     gap_m,
+    narrowest,
     outline,
     random_rectangle,
     scatter,
@@ -40,6 +41,9 @@ FINGER_GAP_M = 0.019
 """Between boxes side by side a finger fits that lets go."""
 SHIFTS = (0.0, 0.3, -0.3, 0.6, -0.6)
 """Where in a slot a box may go, as a multiple of what is tolerated."""
+TIP_OVER_M = 0.008
+"""A box that stands on its end is set down with its middle this far beyond the pallet's edge."""
+TIP_PLACES = 2
 HAND_M = (0.056, 0.016)
 """Half the room of the hand as it picks a box."""
 SETTLE_STEPS = 100
@@ -200,6 +204,8 @@ class BoxPalletizing(PackingTask):
 
     def _place_in_slot(self, held: Body, filled: dict[tuple[int, int], Body]) -> PickPlaceCommand:
         """Return the place into the first slot that is free; else onto the floor."""
+        if CUBOID.tilt_rad(held) > math.pi / 4:
+            return self._tip_over(held)
         layer = min(len(filled) // PER_LAYER, self.settings.num_objects // PER_LAYER - 1)
         pallet, heading = self._pallet(), CUBOID.yaw_rad(held)
         width, length, height = (size * self.unit / 2 for size in BOX_M)
@@ -232,6 +238,33 @@ class BoxPalletizing(PackingTask):
                 return self.place(held, (spot.x, spot.y, z), spot.yaw_rad - heading)
         (x, y), yaw = max(self._arrivals, key=lambda arrival: self._room_at(arrival, held))
         return self.place(held, (x, y, self.floor_m + height + RELEASE_GAP_M), yaw - heading)
+
+    def _tip_over(self, held: Body) -> PickPlaceCommand:
+        """Return the place at the pallet's edge from which a box that stands on its end falls."""
+        pallet, own = self._pallet(), narrowest(held, self.robot.tool_pose()[1])[0]
+        width, length, _ = (size * self.unit / 2 for size in BOX_M)
+        others = [outline(body) for body in self.pool.present if body is not held]
+        workspace = self.settings.workspace
+        best: tuple[float, tuple[float, float]] | None = None
+        for side in (-1, 1):
+            for along in range(-TIP_PLACES, TIP_PLACES + 1):
+                across = along / (TIP_PLACES + 1) * (pallet.half_y - width)
+                edge = side * pallet.half_x
+                falls = Rectangle(
+                    *pallet.at(edge + side * (length + 2 * TIP_OVER_M), across),
+                    pallet.yaw_rad,
+                    length + 2 * TIP_OVER_M,
+                    width,
+                )
+                room = min((gap_m(falls, other) for other in others), default=ENOUGH_M)
+                inside = 1.0 if falls.is_inside(workspace) else 0.0
+                spot = pallet.at(edge + side * TIP_OVER_M, across)
+                if best is None or inside + min(room, ENOUGH_M) > best[0]:
+                    best = (inside + min(room, ENOUGH_M), spot)
+        z = self._level_z_m(0) - BOX_M[2] * self.unit / 2 + RELEASE_GAP_M
+        z += held.position[2] - vertical_extent(held)[0]
+        # the fingers close along the edge, out of its way
+        return self.place(held, (*best[1], z), pallet.yaw_rad + math.pi / 2 - own.yaw_rad)
 
     def _room_at(self, arrival: tuple[tuple[float, float], float], held: Body) -> float:
         """Return the gap between a place on the floor and the boxes that are there."""

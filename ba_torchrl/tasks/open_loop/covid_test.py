@@ -109,14 +109,13 @@ class CovidTest(OpenLoopTask):
 
     def build(self, world: World) -> None:
         """Load the three areas, the tubes and the swabs."""
-        self.new_box, self.used_box, self.test_area = (
-            world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS
-        )
-        self._walls = [
-            (area, place, world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}"))
-            for area in (NEW_BOX, USED_BOX)
-            for place, size in _walls(area)
-        ]
+        floors = [world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS]
+        self.new_box, self.used_box, self.test_area = floors
+        self._slabs = [(area, (0.0, 0.0), floor) for area, floor in zip(AREAS, floors, strict=True)]
+        for area in (NEW_BOX, USED_BOX):
+            for place, size in _walls(area):
+                wall = world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}")
+                self._slabs.append((area, place, wall))
         factor = self.settings.scale / self.scale_range[0]
         self._tube_m, self._swab_m = (
             (factor * length, factor * width) for length, width in (self.tube_m, self.swab_m)
@@ -145,11 +144,7 @@ class CovidTest(OpenLoopTask):
         mirror = 1.0 if rng.random() < 0.5 else -1.0
         half = HALF_LAYOUT_M * (abs(math.cos(yaw)) + abs(math.sin(yaw)))
         center = self.random_point(rng, 2 * half)
-        floors = zip(AREAS, (self.new_box, self.used_box, self.test_area), strict=True)
-        for area, place, body in (
-            *((area, (0.0, 0.0), floor) for area, floor in floors),
-            *self._walls,
-        ):
+        for area, place, body in self._slabs:
             x, y = area.center
             middle = _turned((mirror * x, y), center, yaw)
             body.place((*_turned(place, middle, yaw), -SUNK_M - body.shape.bounds_m[0][2]), yaw)
@@ -390,8 +385,7 @@ def _slab(area: Area, size_m: tuple[float, float], top_m: float) -> Box:
 def _walls(area: Area) -> list[tuple[tuple[float, float], tuple[float, float]]]:
     """Return the place, in the area's frame, and the size of each wall of a box.
 
-    They are bodies of their own: a state with contacts of a body of several parts is not restored
-    to the last bit.
+    They are boxes, each a body of its own: things creep on a body of several convex hulls.
     """
     (x, y, _), wall = area.size, WALL_M
     sides = [((0.0, (y - wall) / 2), (x - 2 * wall, wall)), (((x - wall) / 2, 0.0), (wall, y))]

@@ -88,7 +88,7 @@ class PackingTask(OpenLoopTask):
     scale_range = (SCALE, SCALE)
     finger_opening = 0.7
 
-    grasp_offsets_m: ClassVar[tuple[float, ...]] = (0.0, 0.012, -0.012, 0.022, -0.022)
+    grasp_offsets_m: ClassVar[tuple[float, ...]] = (0.0, 0.008, -0.008, 0.022, -0.022)
     """How far from its middle a long object may be held, at scale `SCALE`."""
 
     container: Body
@@ -159,13 +159,8 @@ class PackingTask(OpenLoopTask):
         height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
         others = self.obstacles(body, height - TIP_M)
         half_open = self.finger_opening * OPEN_M / 2
-        first = narrowest(body, None if self.reach.turn_rad else 0.0)
-        sides = [first]
-        if self.reach.turn_rad and first.half_y < half_open - 2e-3:
-            turned = first.yaw_rad + math.pi / 2
-            sides.append(Rectangle(first.x, first.y, turned, first.half_y, first.half_x))
         choices = []
-        for side in sides:
+        for side in narrowest(body, None if self.reach.turn_rad else 0.0):
             for offset in self.grasp_offsets_m:
                 if abs(offset * self.unit) > max(side.half_y - 0.012, 0.0):
                     continue

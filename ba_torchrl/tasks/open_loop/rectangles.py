@@ -15,7 +15,8 @@ LAYOUTS = 50
 TRIES = 100
 """Random layouts, and places for each thing in one, before giving up."""
 WIDTH_YAWS = 12
-"""Directions in which an object is measured, besides those of its axes."""
+"""Directions in which an object is measured."""
+AS_NARROW_M = 5e-4
 FINGER_M = (0.02, 0.024)
 """Room of a fingertip: along the line on which it closes, where it is a centimetre or two above
 its end, and across."""
@@ -99,22 +100,25 @@ def outline(body: Body, yaw_rad: float | None = None) -> Rectangle:
     return _around(world_vertices(body), yaw)
 
 
-def narrowest(body: Body, yaw_rad: float | None = None) -> Rectangle:
-    """Return the rectangle around a body whose x axis is where the body is narrowest.
+def narrowest(body: Body, yaw_rad: float | None = None) -> list[Rectangle]:
+    """Return the rectangles around a body along whose x axis it is narrowest.
 
     Args:
         body: the body.
         yaw_rad: measure along this direction only.
+
+    Returns:
+        One, or as many as there are directions in which the body is as narrow.
     """
     corners = world_vertices(body)
     if yaw_rad is not None:
-        return _around(corners, yaw_rad)
-    own = body.yaw_rad
-    # its own axes first: of equal widths, the first counts
-    yaws = [own, own + math.pi / 2]
-    yaws += [own + math.pi * i / WIDTH_YAWS for i in range(WIDTH_YAWS) if i % (WIDTH_YAWS // 2)]
+        return [_around(corners, yaw_rad)]
+    # its own axes first: they fit best
+    yaws = [body.yaw_rad + math.pi * i / WIDTH_YAWS for i in range(WIDTH_YAWS)]
+    yaws.sort(key=lambda yaw: round((yaw - body.yaw_rad) / (math.pi / 2), 6) % 1 > 0)
     found = [_around(corners, yaw) for yaw in yaws]
-    return min(found, key=lambda rectangle: round(rectangle.half_x, 4))
+    least = min(rectangle.half_x for rectangle in found)
+    return [rectangle for rectangle in found if rectangle.half_x <= least + AS_NARROW_M]
 
 
 def fingers(

@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Shape, Vector, radius_m
+from ba_torchrl.sim.bodies import Body, Shape, Vector, world_vertices
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.building import Building, Move, PutDown
@@ -18,10 +18,10 @@ from ba_torchrl.tasks.experts import finger_room
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
 from ba_torchrl.tasks.structures import Blueprint, Piece
 
-HAND_M = 0.07
-"""From the middle of the open gripper to its outermost part, and a little more."""
-CROWDED = 10.0
-"""What a metre too near is worth in metres of way."""
+HAND_OVER_TOOL_M = 0.018
+"""What reaches higher than this above the tool point must keep clear of the whole hand."""
+SITE_GAP_M = 0.01
+"""Gap wanted between a structure and the hand that fetches a piece beside it."""
 FREE_YAWS = 8
 """Yaws of a half turn that are tried where any will do."""
 AMPLE_M = 0.02
@@ -117,7 +117,13 @@ class StructureTask(OpenLoopTask):
     def _put_down(self) -> PutDown:
         border = 1.5 * self.block_m
         (x0, x1), (y0, y1) = self.settings.workspace.x, self.settings.workspace.y
-        return PutDown((x0 + border, x1 - border), (y0 + border, y1 - border), 2.0 * self.block_m)
+        return PutDown(
+            (x0 + border, x1 - border),
+            (y0 + border, y1 - border),
+            2.0 * self.block_m,
+            # fingers that do not turn close along x, on what lies along y
+            line_yaw_rad=None if self.reach.turn_rad else math.pi / 2,
+        )
 
     def _grasp_yaws(self, body: Body) -> list[float]:
         """Return the yaws to grasp a body at; a gripper that does not turn has one."""
@@ -126,16 +132,38 @@ class StructureTask(OpenLoopTask):
         return self.building.pieces[body].grasp_yaws(body)
 
     def _room(self, body: Body, yaw_rad: float, at: Vector | None = None) -> float:
+        """Return the gap between the hand, open around a body, and what stands beside it."""
         others = [other for other in self.bodies if other is not body]
-        return finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
+        room = finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
+        x, y, z = body.position if at is None else at
+        for other in others:
+            corners = world_vertices(other)
+            if corners[:, 2].max() > z + HAND_OVER_TOOL_M:
+                along_across = _turned(corners[:, :2] - (x, y), -yaw_rad)
+                low, high = along_across.min(axis=0), along_across.max(axis=0)
+                gaps = np.maximum(low, -high) - self.robot.hand_half_m
+                room = min(room, float(gaps.max()))
+        return room
 
-    def _crowding(self, body: Body, position: Vector) -> float:
-        """Prefer sites at which the hand will not meet the structure when it fetches the rest."""
-        return CROWDED * sum(
-            max(radius_m(other) + HAND_M - math.dist(other.position[:2], position[:2]), 0.0)
-            for other in self.bodies
-            if self.building.pieces[other] != self.building.pieces[body]
-        )
+    def _crowding(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
+        """Return by how much the hand would come too near to sites when it fetches the rest.
+
+        Args:
+            sites: [S, P, 2] points that a structure will stand on.
+            rest: what is to be fetched then.
+        """
+        crowd_m = np.zeros(len(sites))
+        wanted = SITE_GAP_M + self.block_m / 2
+        for other in rest:
+            yaws = self._grasp_yaws(other)
+            points = sites - other.position[:2]
+            # for each yaw, the gap between the hand and the nearest point
+            gaps = [
+                (np.abs(_turned(points, -yaw)) - self.robot.hand_half_m).max(axis=2).min(axis=1)
+                for yaw in yaws
+            ]
+            crowd_m += np.maximum(wanted - np.max(gaps, axis=0), 0.0)
+        return crowd_m
 
     def _effort(self, body: Body) -> float:
         """Prefer pieces that stand free."""
@@ -166,3 +194,9 @@ class StructureTask(OpenLoopTask):
         """Return the first of the yaws at which the fingers can part most freely."""
         rooms = [min(self._room(move.body, yaw, move.position), AMPLE_M) for yaw in yaws_rad]
         return yaws_rad[rooms.index(max(rooms))]
+
+
+def _turned(points: np.ndarray, yaw_rad: float) -> np.ndarray:
+    """Return points [..., 2] turned about the origin."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return points @ np.array([[cos, sin], [-sin, cos]])
