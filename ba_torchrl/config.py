@@ -127,6 +127,9 @@ class EnvConfig(StrictModel):
     """Some tasks: which shapes the objects have; see `ba_torchrl.sim.assets`."""
     asset_root: str | None = Field(default=None, json_schema_extra=_SOME_TASKS)
     """Some tasks: folder of a set of objects that does not ship with the package."""
+    deconstruct: bool = Field(default=False, json_schema_extra=_SOME_TASKS)
+    """Some tasks: start with the structure standing and take it apart; every observation says how
+    to undo the last action. See `ba_torchrl.data.deconstruction`."""
     floor_color: Rgb | None = None
     """Colour of the floor in pictures, each component from 0 to 1; light by default, and in
     PyBullet's window and `rgb` a chequered blue."""
@@ -140,7 +143,8 @@ class EnvConfig(StrictModel):
     solver_iterations: int | None = Field(default=None, ge=1)
     """Custom physics: iterations of the contact solver in each step."""
     solver_residual: float | None = Field(default=None, ge=0)
-    """Custom physics: residual at which the solver stops early."""
+    """Custom physics: residual at which the solver stops early; 0, the default, keeps episodes and
+    restored states exact to the last bit."""
     expert: bool = False
     """Add what the expert would do to every observation."""
     seed: int | None = Field(default=None, ge=0)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
-from torchrl.data import Bounded
+from torchrl.data import Binary, Bounded, Unbounded
 
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
 from ba_torchrl.config import ConfigError, EnvConfig
@@ -18,6 +19,7 @@ from ba_torchrl.sim.pick_place import PickPlace, PickPlaceLimits, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import Physics
 from ba_torchrl.tasks.base import Reach, Task
+from ba_torchrl.tasks.deconstruction import Watch, watch
 
 
 @CONTROLS.register("open_loop")
@@ -36,7 +38,7 @@ class OpenLoopEnv(ManipulationEnv):
 
     default_action_sequence = "pxyr"
     # half a millimetre of creep in a stack of four, and at rest after three steps
-    physics = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-5)
+    physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 
     def __init__(self, task_id: str, config: EnvConfig) -> None:
         self._in_hand_kind = IN_HAND_MODES[config.in_hand_mode]()
@@ -83,6 +85,17 @@ class OpenLoopEnv(ManipulationEnv):
             torch.tensor(low), torch.tensor(high), shape=(self.actions.size,), dtype=torch.float32
         )
 
+    def _make_specs(self) -> None:
+        super()._make_specs()
+        if self.config.deconstruct:
+            undo = {
+                keys.UNDO_ACTION: Unbounded(shape=self.action_spec.shape, dtype=torch.float32),
+                keys.CAN_UNDO: Binary(n=1, shape=(1,), dtype=torch.bool),
+            }
+            if self.config.obs_type == "pixel":
+                undo[keys.UNDO_IN_HAND] = self.observation_spec[keys.IN_HAND].clone()
+            self.observation_spec.update(undo)
+
     def _image_specs(self) -> dict[str, Bounded]:
         size, patch = self.config.obs_size, self.config.in_hand_size
         channels = self._in_hand_kind.channels
@@ -101,6 +114,7 @@ class OpenLoopEnv(ManipulationEnv):
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         command = self.actions.decode(action)
         motion = scene.motion
+        watched = self._watch(scene)
         holding = motion.held is not None
         primitive = command.primitive
         if primitive is None:
@@ -111,7 +125,8 @@ class OpenLoopEnv(ManipulationEnv):
             body = motion.pick(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
             if body is not None:
-                self._memory = {"in_hand": self._draw_in_hand(scene, before, position, command)}
+                after = self._heightmap(scene)
+                self._memory = {"in_hand": self._draw_in_hand(before, after, position, command)}
         elif primitive == PLACE and holding:
             position = self._position(scene, command, self._heightmap(scene), primitive)
             motion.place(position, tool_rotation(*command.angles_rad))
@@ -119,12 +134,28 @@ class OpenLoopEnv(ManipulationEnv):
         motion.check_grasp()
         if motion.held is None:
             self._memory = {}
+        if watched is not None:
+            self._memory = self._remember_undo(scene, *watched)
 
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         size = self.config.in_hand_size
         empty = np.zeros((self._in_hand_kind.channels, size, size))
         heights = np.clip(self._heightmap(scene), 0.0, self.workspace.z[1])
         return {keys.PIXELS: heights[None], keys.IN_HAND: self._memory.get("in_hand", empty)}
+
+    def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
+        observation = super()._observe(scene)
+        if self.config.deconstruct:
+            undo, image = self._memory.get("undo", (None, None))
+            observation[keys.CAN_UNDO] = torch.tensor([undo is not None])
+            observation[keys.UNDO_ACTION] = torch.zeros(self.actions.size)
+            if undo is not None:
+                observation[keys.UNDO_ACTION] = torch.from_numpy(undo)
+            if self.config.obs_type == "pixel":
+                observation[keys.UNDO_IN_HAND] = torch.zeros_like(observation[keys.IN_HAND])
+                if image is not None:
+                    observation[keys.UNDO_IN_HAND] = torch.from_numpy(image.astype(np.float32))
+        return observation
 
     def _is_holding(self, scene: Scene) -> bool:
         return scene.motion.held is not None
@@ -133,6 +164,32 @@ class OpenLoopEnv(ManipulationEnv):
         return self.actions.encode(scene.task.expert_command())
 
     # ----------------------------------------------------------------------------------------
+
+    def _watch(self, scene: Scene) -> tuple[Watch, np.ndarray] | None:
+        """Return how things lie before an action, if it will be asked what undoes it."""
+        if not self.config.deconstruct:
+            return None
+        return watch(scene.task.objects, *scene.motion.get_state()), self._heightmap(scene)
+
+    def _remember_undo(self, scene: Scene, before: Watch, heights: np.ndarray) -> dict[str, Any]:
+        """Return the memory with what undoes an action that has just settled.
+
+        Args:
+            scene: as it is now.
+            before: how things lay before it.
+            heights: the heightmap before it.
+        """
+        memory = {name: value for name, value in self._memory.items() if name != "undo"}
+        command = before.undo(*scene.motion.get_state())
+        if command is None:
+            return memory
+        action = self.actions.encode(command)
+        command, image = self.actions.decode(action), None
+        if before.held is not None:  # the pick that undoes a place: as it will be seen
+            now = self._heightmap(scene)
+            position = self._position(scene, command, now, PICK)
+            image = self._draw_in_hand(now, heights, position, command)
+        return {**memory, "undo": (action, image)}
 
     def _heightmap(self, scene: Scene) -> np.ndarray:
         return scene.camera.heightmap(
@@ -165,14 +222,14 @@ class OpenLoopEnv(ManipulationEnv):
 
     def _draw_in_hand(
         self,
-        scene: Scene,
         before: np.ndarray,
+        after: np.ndarray,
         position: tuple[float, float, float],
         command: PickPlaceCommand,
     ) -> np.ndarray:
         view = PickView(
             before,
-            self._heightmap(scene),
+            after,
             self._pixel_of(position[0], position[1]),
             self.pixel_m,
             position[2],

@@ -13,6 +13,7 @@ from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SimulationError, Snapshot, World
 from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace
+from ba_torchrl.tasks.deconstruction import Deconstruction
 from ba_torchrl.tasks.tray import add_tray
 
 MARK_M = 1e-3
@@ -116,6 +117,8 @@ def build_scene(
             parameters={name: getattr(config, name) for name in task_class.parameters},
         )
     )
+    if config.deconstruct:
+        task = Deconstruction(task)
     task.world, task.robot = world, ROBOTS[config.robot](world)
     task.build(world)
     world.seal()

@@ -27,22 +27,23 @@ class PickPlaceLimits:
     """Where a simulated approach starts, along the tool's axis."""
     free_samples_m: tuple[float, ...] = (0.06, 0.03)
     """Where on the way down it is tested that nothing is in the way, besides its end."""
-    approach_step_m: float = 0.005
-    """Stride of a simulated approach or retreat, per step."""
+    acceleration_m_s2: float = 25.0
+    """Greatest acceleration of a simulated way; the arm's motors brake it in time."""
+    held_acceleration_m_s2: float = 15.0
+    """The same with something in the gripper."""
+    swing_rad_s2: float = 60.0
+    """Greatest acceleration of a joint in a simulated swing."""
+    held_swing_rad_s2: float = 30.0
     notch: float = 0.075
     """Share of the opening by which fingers close without simulation."""
     closing_steps: int = 40
     lift_m: float = 0.005
     lift_steps: int = 4
     """Least number of steps of a simulated way."""
-    swing_step_rad: float = 0.008
-    """Greatest turn of a joint per step of a simulated swing."""
     transit_z_m: float = 0.3
     """Height of the tool at which simulated swings start and end."""
     margin_m: float = 5e-4
     """Closer than this, a way is not free."""
-    carry_step_m: float = 0.004
-    """Stride of simulated carrying."""
     hover_m: float = 0.003
     """Height above its place from which an object is lowered."""
     lower_steps: int = 2
@@ -53,6 +54,10 @@ class PickPlaceLimits:
     """Steps after which a body that is not squeezed is no longer held."""
     max_press_n: float = 40.0
     """A simulated approach stops when it meets this force."""
+
+
+PEAK_ACCELERATION = 10 / math.sqrt(3)
+"""Of `smooth_step`, which covers 1 in a time of 1."""
 
 
 class HeldState(NamedTuple):
@@ -128,7 +133,8 @@ class PickPlace:
         if self._approach(position, rotation, 0.0):
             self._close()
             reached = robot.tool_transform()[0]
-            self._travel(reached, self._above(reached, rotation, limits.lift_m), rotation, None)
+            above = self._above(reached, rotation, limits.lift_m)
+            self._travel(reached, above, rotation, limits.lift_steps)
             body = robot.held_body()
             if body is not None:
                 self._take(body)
@@ -289,13 +295,14 @@ class PickPlace:
             start: of the tool point.
             end: of the tool point.
             rotation: of the tool.
-            count: number of steps; from the distance by default.
+            count: number of steps; if None, as many as the limits of acceleration ask for.
         """
         limits = self.limits
-        distance = math.dist(start, end)
         if count is None:
-            stride = limits.carry_step_m if self.held is not None else limits.approach_step_m
-            count = max(limits.lift_steps, math.ceil(distance / stride))
+            most = limits.acceleration_m_s2
+            if self.held is not None:
+                most = limits.held_acceleration_m_s2
+            count = max(limits.lift_steps, self._count(math.dist(start, end), most))
         goes_down = end[2] < start[2]
         for i in range(1, count + 1):
             place = smooth_step(i / count)
@@ -315,11 +322,18 @@ class PickPlace:
         """Simulate a smooth move of the arm in joint angles."""
         start = self.robot.joints
         turns = [e - s for s, e in zip(start, joints, strict=True)]
-        count = max(2, math.ceil(max(map(abs, turns)) / self.limits.swing_step_rad))
+        limits = self.limits
+        most = limits.swing_rad_s2 if self.held is None else limits.held_swing_rad_s2
+        count = max(2, self._count(max(map(abs, turns)), most))
         for i in range(1, count + 1):
             place = smooth_step(i / count)
             self.robot.command([s + place * t for s, t in zip(start, turns, strict=True)])
             self.world.step()
+
+    def _count(self, length: float, acceleration: float) -> int:
+        """Return the number of steps for a smooth way whose acceleration is never above a limit."""
+        duration_s = math.sqrt(PEAK_ACCELERATION * length / acceleration)
+        return math.ceil(duration_s / self.world.physics.time_step_s)
 
     # -- contacts ----------------------------------------------------------------------------
 

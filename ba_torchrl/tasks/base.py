@@ -163,6 +163,10 @@ class Task(ABC):
         """Positions and yaws that the vector observation lists: by default the objects'."""
         return [(body.position, body.yaw_rad) for body in self.objects]
 
+    def is_start(self) -> bool:
+        """Whether an episode may start from the scene as it is now."""
+        return self.is_valid() and not self.is_goal()
+
     @property
     def continues(self) -> bool:
         """Whether the next episode goes on with the objects as they are now."""

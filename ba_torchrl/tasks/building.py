@@ -129,10 +129,7 @@ class Building:
         if held in self.pieces:
             return False
         views = self._views()
-        return any(
-            not self._strays(filling, views)
-            for filling in self._fillings(views, held)
-        )
+        return any(not self._strays(filling, views) for filling in self._fillings(views, held))
 
     def has_tipped(self, held: Body | None = None) -> bool:
         """Whether a piece that must stay upright does not, and is not in the gripper either."""
@@ -227,9 +224,7 @@ class Building:
 
         return fill(())
 
-    def _fullest(
-        self, views: Mapping[Body, _View], held: Body | None
-    ) -> tuple[list[Filling], int]:
+    def _fullest(self, views: Mapping[Body, _View], held: Body | None) -> tuple[list[Filling], int]:
         """Return all ways to see bodies in as many slots as possible, and how many these are."""
         count = len(self.blueprint.slots)
         found: list[Filling] = []
@@ -311,7 +306,11 @@ class Building:
             if math.dist(_middle((here, there))[:2], middle[:2]) >= self.block_m:
                 return False
         bridge = self.blueprint.slots[self.blueprint.bridge_on(number)]
-        if bridge.span.least_m <= math.dist(here[:2], there[:2]) <= bridge.span.most_m:
+        apart = math.dist(here[:2], there[:2])
+        if bridge.span.gap_m is not None:
+            way = (np.array(there[:2]) - here[:2]) / max(apart, 1e-9)
+            apart -= float(_reach(body, way[None])[0] + _reach(other, -way[None])[0])
+        if bridge.span.least_m <= apart <= bridge.span.most_m:
             return True
         return any(
             piece.kind == bridge.piece.kind and views[candidate].below.issuperset((body, other))
@@ -344,9 +343,7 @@ class Building:
             ]
         return strays
 
-    def _piles(
-        self, views: Mapping[Body, _View], held: Body | None
-    ) -> dict[Body, frozenset[Body]]:
+    def _piles(self, views: Mapping[Body, _View], held: Body | None) -> dict[Body, frozenset[Body]]:
         """Return all that lies on each piece, right on it or on what does."""
         piles: dict[Body, frozenset[Body]] = {}
         # from the top down: what lies on a piece is higher than it
@@ -483,15 +480,18 @@ class Building:
             cos, sin = math.cos(side), math.sin(side)
             far = (body.shape.vertices[:, :2] @ [cos, sin]).max()
             near = (body.shape.vertices[:, :2] @ [-cos, -sin]).max()
-            reach = ((world_vertices(anchor)[:, :2] - center) @ ways.T).max(axis=0)
-            radii = reach + max(far, near) + bridge.span.gap_m
+            radii = _reach(anchor, ways) + max(far, near) + bridge.span.gap_m
             yaw = -side
         spots = center + radii[:, None] * ways
         others = [other for other in self.pieces if other is not body and other is not anchor]
         cost = self._shortage(spots, body, others, put_down)
         if crowding is not None:
             length = max(
-                (np.ptp(b.shape.vertices[:, 1]) for b, p in self.pieces.items() if p == bridge.piece),
+                (
+                    np.ptp(b.shape.vertices[:, 1])
+                    for b, p in self.pieces.items()
+                    if p == bridge.piece
+                ),
                 default=0.0,
             )
             along = radii[:, None] / 2 + length / 2 * np.linspace(-1.0, 1.0, SITE_POINTS)
@@ -525,6 +525,11 @@ class Building:
         gaps = np.hypot(*(spots[:, None] - at).transpose(2, 0, 1))
         room = (gaps - [radius_m(other) for other in others]).min(axis=1)
         return outside + np.maximum(put_down.gap_m + radius_m(body) - room, 0.0)
+
+
+def _reach(body: Body, ways: np.ndarray) -> np.ndarray:
+    """Return how far a body, as it lies, reaches from its origin in directions [N, 2], [N]."""
+    return ((world_vertices(body)[:, :2] - body.position[:2]) @ ways.T).max(axis=0)
 
 
 def _middle(points: Iterable[Vector]) -> Vector:

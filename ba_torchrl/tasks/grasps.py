@@ -42,6 +42,7 @@ CLOSED_HALF_M = 0.024
 CLOSED_TIP_M = 0.0136
 """Closed fingers end this far below the tool point, deeper than open ones."""
 PRESS_M = 1.5e-3
+DIG_M = 0.006
 OBJECT_HALF_M = 0.045
 WALL_ROOM_M = 0.05
 """Objects this near to a wall leave no room for a finger behind them."""
@@ -49,6 +50,12 @@ LOW_M = 0.01
 """Height of the tool above the workspace's lower end while it pushes."""
 NEAR_M = 0.018
 """Fingers this near to the start of a push are there."""
+
+ENDS = (-0.9, -0.6, -0.3, 0.0, 0.3, 0.6, 0.9)
+SLIDING_RADIUS_M = 0.02
+"""Mean distance from its centre of the friction under an object."""
+WORST_RISK = 4.0
+DRAG_COST = 8.0
 
 MET_M = 3e-3
 """Fingers meet what is this near to the outermost point between them."""
@@ -100,6 +107,9 @@ class GraspPlanner:
         self._side_m = max(workspace.x[1] - workspace.x[0], workspace.y[1] - workspace.y[0])
         self._side_m += 2 * BORDER_M
         self._corner = (x - self._side_m / 2, y - self._side_m / 2)
+
+        pixels = round(self._side_m / PIXEL_M)
+        self._plain = np.zeros((pixels, pixels))
 
     def heights(self) -> np.ndarray:
         """Return the height image that grasps are checked against, metres."""
@@ -169,31 +179,55 @@ class GraspPlanner:
     def _pushes(self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray) -> Iterator[Nudge]:
         """Yield pushes against a body's side, away from the walls.
 
-        A gripper that cannot turn rather pushes an end, so that the body turns.
+        For a gripper that cannot turn, those that turn the body into its grasp.
         """
         middle = np.array(self._workspace.center)
-        points = self._placed_samples(body)[:, :2]
-        center = points.mean(axis=0)
+        samples = self._placed_samples(body)
+        center = samples[:, :2].mean(axis=0)
+        low = self._workspace.z[0] + LOW_M
+        shares, lengths = ((0.0, -0.7, 0.7), (1.0,)) if reach.turn_rad else (ENDS, (0.5, 1.0))
         for turn in np.arange(8) * np.pi / 4:
             ahead = np.array([math.cos(turn), math.sin(turn)])
             side = np.array([-ahead[1], ahead[0]])
-            along, across = (points - center) @ ahead, (points - center) @ side
-            pushed = center + reach.step_m * ahead
-            if not self._is_on_floor(pushed, OBJECT_HALF_M):
-                continue
-            inward = math.dist(center, middle) - math.dist(pushed, middle)
-            for offset in np.array([0.0, -0.7, 0.7]) * np.abs(across).max():
+            along, across = ((samples[:, :2] - center) @ axis for axis in (ahead, side))
+            for offset in np.array(shares) * np.abs(across).max():
                 met = np.abs(across - offset) < BAND_HALF_M
                 if not met.any():
                     continue
                 start = center + (along[met].min() - CLOSED_HALF_M) * ahead + offset * side
-                if self._is_free(start, heights):
-                    low = self._workspace.z[0] + LOW_M
-                    end = start + reach.step_m * ahead
-                    lever = 0.0 if reach.turn_rad else abs(offset)
-                    cost = _travel(start, low + NEAR_M, tool, reach)
-                    cost -= (inward + lever) / reach.step_m
+                if not self._is_free(start, heights):
+                    continue
+                travel = _travel(start, low + NEAR_M, tool, reach)
+                for length in lengths:
+                    end = start + length * reach.step_m * ahead
+                    # a body that slides flat turns about a point beyond its centre
+                    push = length * reach.step_m - (CLOSED_HALF_M - BAND_HALF_M)
+                    share = SLIDING_RADIUS_M**2 / (SLIDING_RADIUS_M**2 + offset**2)
+                    pushed = center + share * push * ahead
+                    if not self._is_on_floor(pushed, OBJECT_HALF_M):
+                        continue
+                    cost = travel - (math.dist(center, middle) - math.dist(pushed, middle)) / 0.05
+                    if not reach.turn_rad:
+                        angle = -offset * push / (SLIDING_RADIUS_M**2 + offset**2)
+                        moved = _turned_about(samples, center, angle)
+                        cost += 3 * self._risk_alone(moved, tool)
                     yield Nudge((*start, low), (*end, low), NEAR_M, cost)
+
+    def _risk_alone(self, samples: np.ndarray, tool: Pose) -> float:
+        """Return the least risk of a grasp, at the gripper's yaw, of a body with nothing near."""
+        position, yaw = tool
+        low, high = self._workspace.z
+        found = _search(
+            samples,
+            samples[:, :3].mean(axis=0),
+            np.array([yaw]),
+            self._plain,
+            np.array(self._corner),
+            low,
+            high,
+            np.array(position),
+        )
+        return min(float(found[:, 4].min()), WORST_RISK) if len(found) else WORST_RISK
 
     def _drags(self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray) -> Iterator[Nudge]:
         """Yield a pull at the top of a body by a wall towards the middle.
@@ -212,8 +246,8 @@ class GraspPlanner:
         touching = top + CLOSED_TIP_M
         start = (*center, touching - PRESS_M)
         way = (middle - center) / np.abs(middle - center).max() * reach.step_m
-        cost = 1.0 + _travel(center, touching + PRESS_M, tool, reach)
-        yield Nudge(start, (*(center + way), touching - 2 * PRESS_M), 3 * PRESS_M, cost)
+        cost = DRAG_COST + _travel(center, touching + PRESS_M, tool, reach)
+        yield Nudge(start, (*(center + way), touching - DIG_M), 3 * PRESS_M, cost)
 
     def _height_at(self, point: np.ndarray, heights: np.ndarray) -> float:
         i, j = ((point - self._corner) / PIXEL_M).astype(int)
@@ -245,6 +279,16 @@ class GraspPlanner:
         placed[:, :3] = local[:, :3] @ rotation.T + position
         placed[:, 3:] = local[:, 3:] @ rotation.T
         return placed
+
+
+def _turned_about(samples: np.ndarray, center_xy: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Return points and normals [N, 6] turned about a vertical line."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    out = samples.copy()
+    out[:, :2] = (samples[:, :2] - center_xy) @ turn.T + center_xy
+    out[:, 3:5] = samples[:, 3:5] @ turn.T
+    return out
 
 
 def _travel(start: np.ndarray, low_z: float, tool: Pose, reach: Reach) -> float:
@@ -338,6 +382,17 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
                             blocked = True  # something lies on it
                 if blocked:
                     continue
+                # what the fingers would close on besides
+                crowd = 0
+                for s in range(-1, 2, 2):
+                    edge = highest_u - middle + 0.006
+                    for m in range(3):
+                        for w in _BAND:
+                            fu = s * (edge + (HALF_GAP_M - edge) * m / 3)
+                            h = _height(
+                                heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w
+                            )
+                            crowd += h > z
                 # surfaces that the fingers meet
                 left, right = 1.0, -1.0
                 for k in range(n):
@@ -370,6 +425,7 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noq
                 risk = 2.5 * (1 - square) + 1.5 * max(0.0, 0.75 - facing)
                 spare = HALF_GAP_M - (highest_u - lowest_u) / 2
                 risk += 0.4 * max(0.0, SPARE_M - spare) / SPARE_M
+                risk += 0.1 * crowd
                 risk += 0.3 * max(0.0, 0.025 - depth) / 0.015
                 risk += 6 * (abs(v0) + 0.5 * abs(middle))
                 risk += 0.5 * max(0.0, top - peak) / 0.02

@@ -78,7 +78,8 @@ class Span(NamedTuple):
     aim_m: float
     most_m: float
     gap_m: float | None = None
-    """Where given, an expert aims for this gap between their surfaces instead."""
+    """Where given, an expert aims for this gap between their surfaces, along the line between them,
+    and the limits are of that gap too."""
 
 
 @dataclass(frozen=True)

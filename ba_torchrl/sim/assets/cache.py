@@ -45,7 +45,7 @@ def cached_parts(
         return _read(path)
     except FileNotFoundError:
         pass
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         logger.warning("%s is not readable and is made anew: %s", path, error)
     parts = tuple(make())
     try:

@@ -42,7 +42,7 @@ class ObjectGrasping(CloseLoopTask):
 
     lift_height_m: ClassVar[float] = 0.15
     failures_allowed: ClassVar[int] = 3
-    risk_allowed: ClassVar[float] = 2.2
+    risk_allowed: ClassVar[float] = 1.0
     """Where a grasp is riskier, the expert pushes the object first."""
 
     def build(self, world: World) -> None:

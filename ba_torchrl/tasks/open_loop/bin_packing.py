@@ -38,9 +38,6 @@ LOWEST_PICK_M = 0.012
 EAVES_M = 0.026
 HAND_M = (0.06, 0.016)
 """Half the room of the hand as it picks an object."""
-TALL_WALL_M = 0.03
-WIDER_M = 0.012
-"""Beside walls taller than that above the fingertips, a hand needs more room by this much."""
 LAYOUTS = 20
 
 PIXEL_M = 0.001
@@ -123,7 +120,7 @@ class BinPacking(PackingTask):
             chosen = [self.pool.bodies[kind * count + i] for i, kind in enumerate(kinds)]
             rooms = [Room(*body.shape.bounds_m[1][:2], *hand) for body in chosen]
             try:
-                places = scatter(self, rng, rooms, [around])
+                places = scatter(self, rng, rooms, [around], clear_of=around)
                 break
             except PlacementError:
                 if attempt == LAYOUTS - 1:
@@ -163,12 +160,7 @@ class BinPacking(PackingTask):
             for other in self.pool.present
             if other is not body and other is not held and vertical_extent(other)[1] > above_m
         ]
-        if self._rim_m() <= above_m:
-            return found
-        wide = WIDER_M if self._rim_m() - above_m > TALL_WALL_M else 0.0
-        return found + [
-            wall.resized(wall.half_x + wide, wall.half_y + wide) for wall in self._walls()
-        ]
+        return found + self._walls() if self._rim_m() > above_m else found
 
     def expert_command(self) -> PickPlaceCommand:
         """Drop the largest object that can be grasped to the lowest place that has room for it."""

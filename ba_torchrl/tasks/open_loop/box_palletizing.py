@@ -32,6 +32,8 @@ ROW_M = 0.067
 """Between the middles of boxes side by side: fingers fit between them."""
 COLUMN_M = 0.088
 """Between the middles of boxes end to end."""
+PATTERN_M = 2 * ROW_M + BOX_M[0]
+"""Width of a layer, the greater of the two."""
 SLOT_M = 0.01
 """A box is in a slot if along neither side of the pallet it is farther off than this."""
 SLOT_RAD = math.pi / 8
@@ -94,8 +96,9 @@ class BoxPalletizing(PackingTask):
         for attempt in range(LAYOUTS):
             pallet = random_rectangle(self, rng, half_x, half_y, fixed_yaw_rad=math.pi / 2)
             try:
+                stack = pallet.resized(PATTERN_M * self.unit / 2, PATTERN_M * self.unit / 2)
                 self._arrivals = [
-                    scatter(self, rng, [room], [pallet])[0]
+                    scatter(self, rng, [room], [pallet], clear_of=stack)[0]
                     for _ in range(self.settings.num_objects)
                 ]
                 break

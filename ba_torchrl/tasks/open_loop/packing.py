@@ -20,6 +20,7 @@ from ba_torchrl.tasks.open_loop.rectangles import (
     TIP_M,
     Rectangle,
     finger_gap_m,
+    gap_m,
     narrowest,
     outline,
 )
@@ -28,6 +29,8 @@ SCALE = 0.8
 """At this scale, objects have the sizes of appendix A.1."""
 OPEN_M = 0.074
 """Between the fingers of a fully open gripper."""
+HAND_ABOVE_M = 0.05
+"""Above the fingers, this far above the tool point, the hand is wider than they are."""
 RELEASE_GAP_M = 1e-3
 """What is held is let go this far above what it will rest on."""
 ENOUGH_M = 4e-3
@@ -158,6 +161,8 @@ class PackingTask(OpenLoopTask):
         """Return where to grasp an object: in its middle, or where the fingers have more room."""
         height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
         others = self.obstacles(body, height - TIP_M)
+        tall = self.obstacles(body, height + HAND_ABOVE_M)
+        half_hand = self.robot.hand_half_m
         half_open = self.finger_opening * OPEN_M / 2
         choices = []
         for side in narrowest(body, None if self.reach.turn_rad else 0.0):
@@ -166,6 +171,8 @@ class PackingTask(OpenLoopTask):
                     continue
                 xy = side.at(0.0, offset * self.unit)
                 room = finger_gap_m(xy, side.yaw_rad, half_open, others)
+                hand = Rectangle(*xy, side.yaw_rad, *half_hand)
+                room = min([room, *(gap_m(hand, other) for other in tall)])
                 choices.append(Grasp(*xy, side.yaw_rad, room))
         return max(choices, key=lambda choice: min(choice.room_m, ENOUGH_M))
 

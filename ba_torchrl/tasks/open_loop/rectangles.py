@@ -177,6 +177,7 @@ def scatter(
     rng: np.random.Generator,
     rooms: Sequence[Room],
     fixed: Sequence[Rectangle] = (),
+    clear_of: Rectangle | None = None,
 ) -> list[tuple[tuple[float, float], float]]:
     """Return random places and yaws, inside the workspace and apart from each other.
 
@@ -185,6 +186,7 @@ def scatter(
         rng: draws them.
         rooms: one for each object.
         fixed: what stands there already.
+        clear_of: something tall, which the hand above the fingers must not meet.
 
     Raises:
         PlacementError: there is no room.
@@ -198,6 +200,10 @@ def scatter(
                 yaw = task.random_yaw(rng, 2 * math.pi)
                 body = Rectangle(*xy, yaw, room.half_x, room.half_y)
                 hand = body.resized(room.hand_x, room.hand_y) if room.hand_x else None
+                if clear_of is not None:
+                    whole_hand = body.resized(*task.robot.hand_half_m)
+                    if gap_m(whole_hand, clear_of) < 0:
+                        continue
                 if body.is_inside(task.settings.workspace) and all(
                     gap_m(body, other) >= room.margin_m
                     and (hand is None or gap_m(hand, other) >= 0)

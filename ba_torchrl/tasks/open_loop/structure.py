@@ -40,6 +40,7 @@ class Part(NamedTuple):
 class StructureTask(OpenLoopTask):
     """Pieces scattered on the floor; success when they stand as the blueprint says."""
 
+    parameters = frozenset({"deconstruct"})
     tipping_ends: ClassVar[bool] = True
     """Whether a piece on its side, such as a roof, ends the episode."""
 
@@ -97,7 +98,7 @@ class StructureTask(OpenLoopTask):
             return PickPlaceCommand(PLACE if held is not None else PICK, x, y, 0.1)
         if move.body is held:
             return self._place(move)
-        yaw = max(self._grasp_yaws(move.body), key=lambda yaw: self._room(move.body, yaw))
+        yaw = max(self.grasp_yaws(move.body), key=lambda yaw: self.room(move.body, yaw))
         x, y, z = move.body.position
         return PickPlaceCommand(PICK, x, y, z, yaw)
 
@@ -125,13 +126,13 @@ class StructureTask(OpenLoopTask):
             line_yaw_rad=None if self.reach.turn_rad else math.pi / 2,
         )
 
-    def _grasp_yaws(self, body: Body) -> list[float]:
+    def grasp_yaws(self, body: Body) -> list[float]:
         """Return the yaws to grasp a body at; a gripper that does not turn has one."""
         if not self.reach.turn_rad:
             return [0.0]
         return self.building.pieces[body].grasp_yaws(body)
 
-    def _room(self, body: Body, yaw_rad: float, at: Vector | None = None) -> float:
+    def room(self, body: Body, yaw_rad: float, at: Vector | None = None) -> float:
         """Return the gap between the hand, open around a body, and what stands beside it."""
         others = [other for other in self.bodies if other is not body]
         room = finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
@@ -146,7 +147,7 @@ class StructureTask(OpenLoopTask):
         return room
 
     def _crowding(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
-        """Return by how much the hand would come too near to sites when it fetches the rest.
+        """Return how much room is wanting at sites for the hand to fetch the rest, load and all.
 
         Args:
             sites: [S, P, 2] points that a structure will stand on.
@@ -155,19 +156,20 @@ class StructureTask(OpenLoopTask):
         crowd_m = np.zeros(len(sites))
         wanted = SITE_GAP_M + self.block_m / 2
         for other in rest:
-            yaws = self._grasp_yaws(other)
+            yaws = self.grasp_yaws(other)
             points = sites - other.position[:2]
             # for each yaw, the gap between the hand and the nearest point
-            gaps = [
-                (np.abs(_turned(points, -yaw)) - self.robot.hand_half_m).max(axis=2).min(axis=1)
-                for yaw in yaws
-            ]
-            crowd_m += np.maximum(wanted - np.max(gaps, axis=0), 0.0)
+            hands = [_gaps(points, yaw, self.robot.hand_half_m) for yaw in yaws]
+            low, high = other.shape.bounds_m
+            half = tuple(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True))
+            load = _gaps(points, self.building.pieces[other].yaw_rad(other), half)
+            gaps = np.minimum(np.max(hands, axis=0), load)
+            crowd_m += np.maximum(wanted - gaps, 0.0)
         return crowd_m
 
     def _effort(self, body: Body) -> float:
         """Prefer pieces that stand free."""
-        room = max(self._room(body, yaw) for yaw in self._grasp_yaws(body))
+        room = max(self.room(body, yaw) for yaw in self.grasp_yaws(body))
         return 0.0 if room > 0 else 1.0
 
     def _place(self, move: Move) -> PickPlaceCommand:
@@ -192,8 +194,13 @@ class StructureTask(OpenLoopTask):
 
     def _roomiest(self, move: Move, yaws_rad: Sequence[float]) -> float:
         """Return the first of the yaws at which the fingers can part most freely."""
-        rooms = [min(self._room(move.body, yaw, move.position), AMPLE_M) for yaw in yaws_rad]
+        rooms = [min(self.room(move.body, yaw, move.position), AMPLE_M) for yaw in yaws_rad]
         return yaws_rad[rooms.index(max(rooms))]
+
+
+def _gaps(points: np.ndarray, yaw_rad: float, half_m: tuple[float, float]) -> np.ndarray:
+    """Return how far the nearest of points [S, P, 2] is from a rectangle about the origin, [S]."""
+    return (np.abs(_turned(points, -yaw_rad)) - half_m).max(axis=2).min(axis=1)
 
 
 def _turned(points: np.ndarray, yaw_rad: float) -> np.ndarray:
