@@ -215,5 +215,5 @@ def lathe_parts(profile_m: Sequence[tuple[float, float]], sides: int = 16) -> li
             ),
             _prism_faces(sides),
         )
-        for ends in zip(profile_m[:-1], profile_m[1:], strict=True)
+        for ends in pairwise(profile_m)
     ]

@@ -21,6 +21,11 @@ from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body, Vector
 from ba_torchrl.sim.robots.base import Pose, Robot, downward
 
+OPENING_TOLERANCE = 0.02
+"""An opening this close to the wanted one is reached."""
+STALL_SHARE = 0.1
+"""Fingers slower than this share of their speed have met something."""
+
 
 @dataclass(frozen=True)
 class MotionLimits:
@@ -42,10 +47,6 @@ class MotionLimits:
     sample_m: float = 0.01
     sample_rad: float = 0.14
     gripper_steps: int = 60
-    gripper_tolerance: float = 0.02
-    """An opening this close to the wanted one is reached."""
-    stall_share: float = 0.1
-    """Fingers slower than this share of their speed have met something."""
 
 
 class CloseLoopMotion:
@@ -97,7 +98,7 @@ class CloseLoopMotion:
             fraction = max(path.length_m / 0.05, 0.6 * path.angle_rad / (math.pi / 4), 0.15)
             duration = limits.held_time_s * math.sqrt(fraction)
             count = max(4, round(duration / self.world.physics.time_step_s))
-            self._follow(path, [_quintic(i / count) for i in range(1, count + 1)], held)
+            self._follow(path, [smooth_step(i / count) for i in range(1, count + 1)], held)
         else:
             done = self._skip_free_part(path) if self.teleport else 0.0
             if done == 0.0 and path.goes_down and self._rests_on_something(held):
@@ -109,25 +110,10 @@ class CloseLoopMotion:
 
     def grip(self, opening: float) -> None:
         """Open or close the fingers towards an opening until they are there or meet something."""
-        robot, limits = self.robot, self.limits
         if abs(opening - self._wanted_opening) < 1e-3:
             return
         self._wanted_opening = opening
-        stride = robot.finger_speed * self.world.physics.time_step_s / robot.finger_open
-        target = robot.opening()
-        resting = 0
-        for _ in range(limits.gripper_steps):
-            before = robot.opening()
-            target += min(max(opening - target, -stride), stride)
-            robot.hold_opening(target)
-            self.world.step()
-            after = robot.opening()
-            if target == opening and abs(after - opening) < limits.gripper_tolerance:
-                return
-            resting = resting + 1 if abs(after - before) < limits.stall_share * stride else 0
-            if resting >= 2:
-                break
-        robot.hold_opening(opening)  # the motors stay on: they squeeze what the fingers met
+        ramp_fingers(self.robot, opening, self.limits.gripper_steps)
 
     # ----------------------------------------------------------------------------------------
 
@@ -270,6 +256,31 @@ class _Path:
         return self._robot.inverse_kinematics((x, y, z), rotation, self._robot.joints)
 
 
-def _quintic(u: float) -> float:
-    """Smooth start and stop: zero velocity and acceleration at 0 and 1."""
+def smooth_step(u: float) -> float:
+    """Return a smooth way from 0 to 1: zero velocity and acceleration at both ends."""
     return u * u * u * (10 - 15 * u + 6 * u * u)
+
+
+def ramp_fingers(robot: Robot, opening: float, max_steps: int) -> None:
+    """Move the fingers at their speed until they are there or meet something.
+
+    Args:
+        robot: whose fingers; the simulation goes on meanwhile.
+        opening: where to, 0 to 1.
+        max_steps: they are left on their way after so many steps.
+    """
+    stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open
+    target = robot.opening()
+    resting = 0
+    for _ in range(max_steps):
+        before = robot.opening()
+        target += min(max(opening - target, -stride), stride)
+        robot.hold_opening(target)
+        robot.world.step()
+        after = robot.opening()
+        if target == opening and abs(after - opening) < OPENING_TOLERANCE:
+            return
+        resting = resting + 1 if abs(after - before) < STALL_SHARE * stride else 0
+        if resting >= 2:
+            break
+    robot.hold_opening(opening)  # the motors stay on: they squeeze what the fingers met

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import pybullet
 
 from ba_torchrl.sim.bodies import Body, Quaternion, Vector
+from ba_torchrl.sim.motion import ramp_fingers, smooth_step
 from ba_torchrl.sim.robots.base import Matrix, Robot
 
 
@@ -37,6 +38,8 @@ class PickPlaceLimits:
     notch: float = 0.075
     """Share of the opening by which fingers close without simulation."""
     closing_steps: int = 40
+    squeeze_steps: int = 3
+    """Steps after which closed fingers press with all their force, on more than one point."""
     lift_m: float = 0.005
     lift_steps: int = 4
     """Least number of steps of a simulated way."""
@@ -368,33 +371,12 @@ class PickPlace:
                 free = opening
             self.robot.set_opening(free)
         ramp_fingers(self.robot, 0.0, self.limits.closing_steps)
+        self.world.step(self.limits.squeeze_steps)
 
     def _open(self) -> None:
         """Let go of what is between the fingers, without pushing what stands beside it."""
         limits = self.limits
+        if not self.teleport:
+            self.robot.renew_contacts()  # the hand turned since it closed
         wanted = min(self.robot.opening() + limits.release_opening, self.opening)
         ramp_fingers(self.robot, wanted, limits.release_steps)
-
-
-def smooth_step(u: float) -> float:
-    """Return a smooth way from 0 to 1: zero velocity and acceleration at both ends."""
-    return u * u * u * (10 - 15 * u + 6 * u * u)
-
-
-def ramp_fingers(robot: Robot, opening: float, max_steps: int) -> None:
-    """Move the fingers at their speed until they are there or meet something."""
-    stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open
-    target = robot.opening()
-    resting = 0
-    for _ in range(max_steps):
-        before = robot.opening()
-        target += min(max(opening - target, -stride), stride)
-        robot.hold_opening(target)
-        robot.world.step()
-        after = robot.opening()
-        if target == opening and abs(after - opening) < 0.02:
-            return
-        resting = resting + 1 if abs(after - before) < 0.1 * stride else 0
-        if resting >= 2:
-            break
-    robot.hold_opening(opening)  # the motors stay on: they squeeze what the fingers met

@@ -15,8 +15,10 @@ DROP_INTERVAL_S = 0.15
 """Time between objects: each falls 11 cm, out of the next one's way."""
 SETTLE_S = 4.0
 LOW_DROP_M = 5e-3
-APART_M = 0.085
-LAYOUT_ATTEMPTS = 500
+FLUSHES = 30
+APART_M = 5e-3
+LAYOUTS = 20
+TRIES = 50
 DROP_ATTEMPTS = 3
 """Heaps tried until one comes to rest inside its area; round objects may roll for long."""
 
@@ -95,12 +97,14 @@ class Clutter:
         for _ in range(DROP_ATTEMPTS):
             for body in self.present:
                 self._put_aside(body)
-            # pairs of the last scene must be gone: PyBullet keeps hints with them
-            self.world.step(2)
+            # PyBullet drops pairs that are near each other no more a few at a time, and would take
+            # up those of the last heap where it left them: the same heap would go on differently
+            for _ in range(FLUSHES):
+                self.world.detect_collisions()
             chosen = rng.choice(len(self.bodies), size=count, replace=False)
             self.present = [self.bodies[i] for i in chosen]
             points = rng.uniform(-spread_m, spread_m, (count, 2))
-            apart = None if random_orientation else _points_apart(rng, count, spread_m)
+            apart = None if random_orientation else _apart(rng, self.present, spread_m)
             for i, body in enumerate(self.present):
                 x, y = center_xy + (points[i] if apart is None else apart[i])
                 if apart is None:
@@ -132,13 +136,27 @@ class Clutter:
         body.is_hidden = True
 
 
-def _points_apart(rng: np.random.Generator, count: int, spread_m: float) -> np.ndarray | None:
-    """Return random points [count, 2] of a square about zero, apart from each other, or None."""
-    for _ in range(LAYOUT_ATTEMPTS):
-        points = rng.uniform(-spread_m, spread_m, (count, 2))
-        gaps = np.linalg.norm(points[:, None] - points[None], axis=2) + APART_M * np.eye(count)
-        if (gaps >= APART_M).all():
-            return points
+def _apart(rng: np.random.Generator, bodies: Sequence[Body], spread_m: float) -> np.ndarray | None:
+    """Return random points [N, 2] of a square about zero at which upright bodies do not touch.
+
+    Returns:
+        None if no room was found for all of them.
+    """
+    bounds = np.array([np.array(body.shape.bounds_m)[:, :2] for body in bodies])
+    for _ in range(LAYOUTS):
+        placed: list[np.ndarray] = []
+        for low_high in bounds:
+            for _ in range(TRIES):
+                low, high = low_high + rng.uniform(-spread_m, spread_m, 2)
+                others = np.array([other[:2] for other in placed]).reshape(-1, 2, 2)
+                gaps = np.maximum(low - others[:, 1], others[:, 0] - high)
+                if (gaps.max(axis=1) > APART_M).all():
+                    placed.append(np.array([low, high]))
+                    break
+            else:
+                break
+        else:
+            return np.array(placed)[:, 0] - bounds[:, 0]
     return None
 
 

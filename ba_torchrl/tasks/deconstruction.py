@@ -27,15 +27,17 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
 from ba_torchrl.tasks.open_loop.structure import StructureTask
-from ba_torchrl.tasks.structures import Slot, Span
+from ba_torchrl.tasks.structures import Slot
 
 APART_BLOCKS = 2.4
 """Pieces that lie apart keep this distance of their centres, as at the start of an episode."""
-GAP_M = 5e-3
+GAP_M = 0.02
 """They also leave this much between their outlines."""
-AMPLE_GAP_M = 0.01
+AMPLE_GAP_M = 5e-3
 AMPLE_ROOM_M = 5e-3
 """A site for a piece leaves this much more to its neighbours, and to the fingers."""
+SPAN_SHARE = 0.5
+"""Pairs stand up to this share of the way from the span aimed for to the greatest allowed."""
 SITES = 300
 """Random sites that are tried for a piece; the best of them is good enough."""
 BEARINGS = 16
@@ -81,15 +83,15 @@ class Deconstruction(OpenLoopTask):
         grounded = [
             i
             for i, slot in enumerate(slots)
-            if not slot.on and (building.blueprint.partner(i) or i) >= i
+            if not slot.on
+            and (building.blueprint.partner(i) is None or building.blueprint.partner(i) > i)
         ]
         room = 2 * max(map(radius_m, bodies)) + self.block_m
         centers = dict(
             zip(grounded, self.random_points(rng, [Spot(room, room)] * len(grounded)), strict=True)
         )
-        lines: dict[int, tuple[tuple[float, float], float]] = {}
         for number, slot in enumerate(slots):
-            self._stand_in(number, slot, bodies, centers, lines, rng)
+            self._stand_in(number, slot, bodies, centers.get(number), rng)
 
     def is_start(self) -> bool:
         """Whether the structure stands."""
@@ -122,8 +124,15 @@ class Deconstruction(OpenLoopTask):
         self.task.set_state(state)
 
     def pick_height_m(self, top_m: float) -> float:
-        """Return the height of the tool for a pick, where an action leaves it open."""
-        return self.task.pick_height_m(top_m)
+        """Return the height of the tool for a pick, where an action leaves it open.
+
+        The next piece is held as it will be when it is picked from the ground.
+        """
+        base_m = 0.0
+        if to_move := self._to_move():
+            top = max(to_move, key=lambda body: body.position[2])
+            base_m = vertical_extent(top)[0] - self.settings.workspace.z[0]
+        return self.task.pick_height_m(top_m - base_m) + base_m
 
     def place_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a place, where an action leaves it open."""
@@ -154,7 +163,9 @@ class Deconstruction(OpenLoopTask):
             for yaw in self.task.grasp_yaws(body)
         ]
         _, _, body, yaw = max(options, key=lambda option: option[:2])
-        x, y, z = body.position
+        x, y, _ = body.position
+        floor = self.settings.workspace.z[0]
+        z = self.pick_height_m(vertical_extent(body)[1] - floor) + floor
         return PickPlaceCommand(PICK, x, y, z, yaw)
 
     # -- the structure -----------------------------------------------------------------------
@@ -164,64 +175,67 @@ class Deconstruction(OpenLoopTask):
         number: int,
         slot: Slot,
         bodies: Sequence[Body],
-        centers: Mapping[int, tuple[float, float]],
-        lines: dict[int, tuple[tuple[float, float], float]],
+        center: tuple[float, float] | None,
         rng: np.random.Generator,
     ) -> None:
-        """Put a body into its slot; those it rests on are in theirs.
+        """Put a body into its slot; those in the slots before are in theirs.
 
         Args:
             number: of the slot.
             slot: the slot.
             bodies: the body in each slot.
-            centers: where on the ground single pieces and pairs stand, by their first slot.
-            lines: of pairs whose first piece stands, by the second slot: where that one goes, and
-                the heading of both; added to.
+            center: where on the ground it goes, or the middle of its pair.
             rng: generator.
         """
-        building = self.task.building
-        slots, body = building.blueprint.slots, bodies[number]
-        piece = building.pieces[body]
+        building, body = self.task.building, bodies[number]
+        piece, partner = building.pieces[body], building.blueprint.partner(number)
         supports = [bodies[i] for i in slot.on]
-        aligned = slot.inherits_yaw and self.settings.random_orientation
-        yaw = self.random_yaw(rng, 2 * math.pi) - piece.grasp_yaws_rad[0]
-        heading = None
-        if len(supports) == 1:
-            heading = building.pieces[supports[0]].yaw_rad(supports[0])
-            yaw = heading if aligned else yaw
+        if partner is not None and partner < number:
+            xy = bodies[partner].position[:2]
         elif supports:
+            xy = _middle([bodies[i].position[:2] for i in slot.over or slot.on])
+        else:
+            xy = center
+        yaw = self.random_yaw(rng, 2 * math.pi) - piece.grasp_yaws_rad[0]
+        if len(supports) == 2:
             (ax, ay, _), (bx, by, _) = (support.position for support in supports)
             yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
-        over = [bodies[i].position for i in slot.over or slot.on]
-        xy = (
-            tuple(sum(values) / len(values) for values in zip(*over, strict=True))[:2]
-            if over
-            else centers.get(number)
-        )
-        partner = building.blueprint.partner(number)
-        if partner is not None and partner > number:
-            bridge = slots[building.blueprint.bridge_on(number)]
-            if heading is None:
-                heading = self.random_yaw(rng, 2 * math.pi) - bridge.piece.grasp_yaws_rad[0]
-            apart = self._apart_m(bridge.span, bodies[number], bodies[partner], rng)
-            # a piece's length lies along its y axis
-            dx, dy = -apart / 2 * math.sin(heading), apart / 2 * math.cos(heading)
-            lines[partner] = (xy[0] + dx, xy[1] + dy), heading
-            xy = xy[0] - dx, xy[1] - dy
-        elif partner is not None:
-            xy = lines[number][0]
+        elif supports and slot.inherits_yaw and self.settings.random_orientation:
+            yaw = building.pieces[supports[0]].yaw_rad(supports[0])
         self.task.stand(body, xy, yaw)
         if supports:
-            x, y, z = body.position
             lift = max(vertical_extent(support)[1] for support in supports)
+            x, y, z = body.position
             body.place((x, y, z + lift - self.settings.surface_z_m), yaw)
+        if partner is not None and partner < number:
+            self._part(number, bodies, rng)
 
-    def _apart_m(self, span: Span, body: Body, partner: Body, rng: np.random.Generator) -> float:
-        """Return how far apart the centres of the two pieces under a bridge go."""
-        if span.gap_m is None:
-            return float(rng.uniform(span.aim_m, (span.aim_m + span.most_m) / 2))
-        # however the two are turned, the gap is not below what is aimed for
-        return span.gap_m + radius_m(body) + radius_m(partner)
+    def _part(self, number: int, bodies: Sequence[Body], rng: np.random.Generator) -> None:
+        """Part two bodies that stand in one place, as a bridge needs it."""
+        building = self.task.building
+        slots = building.blueprint.slots
+        bridge = slots[building.blueprint.bridge_on(number)]
+        pair = [bodies[i] for i in bridge.on]
+        if slots[number].on:  # along the piece that carries them, which is long along y
+            support = bodies[slots[number].on[0]]
+            heading = building.pieces[support].yaw_rad(support)
+        else:
+            heading = self.random_yaw(rng, 2 * math.pi) - bridge.piece.grasp_yaws_rad[0]
+        line = np.array([-math.sin(heading), math.cos(heading)])
+        share = rng.uniform(0.0, SPAN_SHARE)
+        apart = (1 - share) * bridge.span.aim_m + share * bridge.span.most_m
+        if bridge.span.gap_m is not None:  # as near as that only with the free sides to each other
+            for body in pair:
+                grasp_yaw = building.pieces[body].grasp_yaws_rad[0]
+                body.place(body.position, heading - grasp_yaw + math.pi * rng.integers(2))
+            first, second = (
+                (world_vertices(body)[:, :2] - body.position[:2]) @ line for body in pair
+            )
+            apart += first.max() - second.min()
+        for body, side in zip(pair, (-0.5, 0.5), strict=True):
+            x, y, z = body.position
+            dx, dy = (side * apart * line).tolist()
+            body.place((x + dx, y + dy, z), body.yaw_rad)
 
     # -- taking it apart ---------------------------------------------------------------------
 
@@ -297,6 +311,10 @@ class Deconstruction(OpenLoopTask):
         """Return a generator keyed on the scene."""
         poses = np.array([body.position for body in self.objects])
         return np.random.default_rng(np.frombuffer(poses.tobytes(), np.uint32).tolist())
+
+
+def _middle(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    return tuple(sum(values) / len(values) for values in zip(*points, strict=True))
 
 
 def _shadow(points: np.ndarray) -> np.ndarray:

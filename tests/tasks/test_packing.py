@@ -189,7 +189,7 @@ def filled_bin(make, count=4):
     for body, cell in zip(task.objects, cells, strict=False):
         if body.shape.bounds_m[1][1] > 0.03:  # long ones would meet: they stand on an end
             turn = yaw_quaternion(bin_yaw)
-            x, y, z, w = TURNED
+            x, y, _, w = TURNED
             sz, cz = turn[2], turn[3]
             body.move_to(
                 (*inside.at(*cell), 0.044), (cz * x - sz * y, cz * y + sz * x, sz * w, cz * w)
@@ -221,7 +221,7 @@ def test_an_object_that_is_not_within_the_walls_is_not_packed(make, along):
 
 
 def test_an_object_on_the_rim_is_not_packed(make):
-    env, task, inside = filled_bin(make, count=1)
+    _, task, inside = filled_bin(make, count=1)
     (body,) = task.objects
     assert task.is_goal()
     low = body.shape.bounds_m[0][2]
@@ -284,7 +284,7 @@ def test_bottles_that_stand_in_the_tray_are_arranged(make):
 
 
 def test_a_bottle_lying_in_the_tray_ends_the_episode(make):
-    env, task, tray = stand_bottles(make)
+    _, task, tray = stand_bottles(make)
     body = task.objects[1]
     body.move_to((*tray.at(0.0, 0.0), 0.2), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
     assert not task.is_goal()
@@ -564,12 +564,12 @@ def test_other_robots_do_it_too(make, task, config, robot):
     assert follow(env, env.reset())[-1]["success"]
 
 
-@pytest.mark.parametrize("task", [BIN, BOXES])
-def test_the_expert_recovers_from_careless_actions(make, task):
+@pytest.mark.parametrize(("task", "least"), [(BIN, 0.7), (BOXES, 0.9)])
+def test_the_expert_recovers_from_careless_actions(make, task, least):
     env = make(task, obs_size=128, num_objects=6, max_steps=60)
     space = env.action_spec.space
     outcomes = []
-    for episode in range(8):
+    for episode in range(14):
         state = env.reset(seed=episode)
         rng = np.random.default_rng(episode)
         for _ in range(6):
@@ -582,8 +582,9 @@ def test_the_expert_recovers_from_careless_actions(make, task):
                 break
         else:
             outcomes.append(bool(follow(env, state)[-1]["success"]))
-    assert len(outcomes) >= 5
-    assert np.mean(outcomes) >= 0.8
+    # what was dropped flat against the outside of the bin has no room for a finger
+    assert len(outcomes) >= 9
+    assert np.mean(outcomes) >= least, outcomes
 
 
 def test_what_is_narrow_is_found_in_any_pose(make):

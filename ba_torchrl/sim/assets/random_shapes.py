@@ -69,16 +69,16 @@ class RandomShapes(ObjectSet):
     def parts(self, index: int) -> tuple[Mesh, ...]:
         """Return the convex hull, which is what PyBullet makes of such a mesh anyway.
 
-        It stands on the facet, and with the yaw, that suit a gripper at yaw 0 best.
+        It lies flat, with the yaw that suits a gripper at yaw 0 best.
         """
         number, scale = CHOICE[index]
 
         def hull() -> list[Mesh]:
             vertices, faces = convex_hull(read_shape(number).vertices * scale)
-            best = max(rests(Mesh(vertices, faces)), key=lambda rest: rest.squareness)
-            return [Mesh(vertices @ best.turn.T, faces)]
+            flattest = min(rests(Mesh(vertices, faces)), key=lambda rest: rest.height_m)
+            return [Mesh(vertices @ flattest.turn.T, faces)]
 
-        return cached_parts(shape_path(number).read_bytes(), f"random shape 2 {scale}", hull)
+        return cached_parts(shape_path(number).read_bytes(), f"random shape 3 {scale}", hull)
 
 
 def shape_path(number: int) -> Path:

@@ -214,7 +214,7 @@ class Robot(ABC):
     def hold_opening(self, opening: float) -> None:
         """Command the fingers to an opening."""
         if self.has_flat_pads and self.commanded_opening < min(opening, self.opening()) - 1e-3:
-            self._renew_contacts()  # they squeezed, now they let go
+            self.renew_contacts()  # they squeezed, now they let go
         pybullet.setJointMotorControlArray(
             self.id,
             self.finger_joints,
@@ -226,7 +226,7 @@ class Robot(ABC):
         )
         self.commanded_opening = opening
 
-    def _renew_contacts(self) -> None:
+    def renew_contacts(self) -> None:
         """Have what the fingers touch lose and find its contacts anew, without moving it.
 
         Bullet keeps the normals of lasting contacts as they were in the world. Once the hand has

@@ -1,4 +1,4 @@
-"""What the improvised houses are made of: random shapes in place of cubes (appendix A.1, figure 12).
+"""The pieces of the improvised houses: random shapes in place of cubes (appendix A.1, figure 12).
 
 A world takes no new bodies once it is sealed, so a pool of shapes in several sizes is loaded at the
 start, and every episode draws from it.
@@ -43,8 +43,8 @@ HIGH = (1.2, 1.32)
 CUBOID_M = ((0.025, 0.035), (0.075, 0.105), (0.02, 0.035))
 """Range of each edge of a random cuboid."""
 SHAPE_GAP_M = (-0.02, 0.008, 0.02)
-"""Gap between two shapes next to each other, along the line between their centres: least, aimed for,
-most. Below zero they stand side by side at an angle."""
+"""Gap between two shapes next to each other, along the line between their centres: least, aimed
+for, most. Below zero they stand side by side at an angle."""
 ROOM_M = 0.015
 """Gap between pieces at the start, beyond the circles around them."""
 LOWEST_PICK_M = 0.0125

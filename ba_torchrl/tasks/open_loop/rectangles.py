@@ -11,7 +11,7 @@ import numpy as np
 from ba_torchrl.sim.bodies import Body, world_vertices
 from ba_torchrl.tasks.base import PlacementError, Task, Workspace
 
-LAYOUTS = 50
+LAYOUTS = 10
 TRIES = 100
 """Random layouts, and places for each thing in one, before giving up."""
 WIDTH_YAWS = 12

@@ -10,20 +10,24 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Shape, Vector, world_vertices
+from ba_torchrl.sim.bodies import Body, Shape, Vector, radius_m, world_vertices
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Spot
-from ba_torchrl.tasks.building import Building, Move, PutDown
+from ba_torchrl.tasks.building import CROWDED, Building, Move, PutDown
 from ba_torchrl.tasks.experts import finger_room
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
 from ba_torchrl.tasks.structures import Blueprint, Piece
 
+START_GAP_M = 0.01
+"""Least gap between the circles around two pieces at the start."""
 HAND_OVER_TOOL_M = 0.018
 """What reaches higher than this above the tool point must keep clear of the whole hand."""
 SITE_GAP_M = 0.01
 """Gap wanted between a structure and the hand that fetches a piece beside it."""
 FREE_YAWS = 8
 """Yaws of a half turn that are tried where any will do."""
+BLOCKED_M = 0.05
+"""What it is worth in metres of way that the hand touches nothing else when it picks."""
 AMPLE_M = 0.02
 """More room than this is no better."""
 
@@ -69,7 +73,12 @@ class StructureTask(OpenLoopTask):
 
         Fixed orientations are those at which a gripper that does not turn can grasp them.
         """
-        points = self.random_points(rng, [part.spot for part in self._parts])
+        spots, reach_m = [], 0.0
+        for part, body in zip(self._parts, self.bodies, strict=True):
+            apart_m = radius_m(body) + reach_m + START_GAP_M  # long pieces may lie end to end
+            spots.append(part.spot._replace(distance_m=max(part.spot.distance_m, apart_m)))
+            reach_m = max(reach_m, radius_m(body))
+        points = self.random_points(rng, spots)
         for part, body, xy in zip(self._parts, self.bodies, points, strict=True):
             yaw = self.random_yaw(rng, 2 * math.pi) - part.piece.grasp_yaws_rad[0]
             self.stand(body, xy, yaw)
@@ -133,14 +142,23 @@ class StructureTask(OpenLoopTask):
         return self.building.pieces[body].grasp_yaws(body)
 
     def room(self, body: Body, yaw_rad: float, at: Vector | None = None) -> float:
-        """Return the gap between the hand, open around a body, and what stands beside it."""
-        others = [other for other in self.bodies if other is not body]
-        room = finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
+        """Return the gap between the hand, open around a body, and what stands beside it.
+
+        It is infinite, or at least `AMPLE_M`, where nothing stands near.
+        """
         x, y, z = body.position if at is None else at
+        reach = math.hypot(*self.robot.hand_half_m) + AMPLE_M
+        others = [
+            other
+            for other in self.bodies
+            if other is not body and math.dist(other.position[:2], (x, y)) < reach + radius_m(other)
+        ]
+        room = finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
         for other in others:
             corners = world_vertices(other)
             if corners[:, 2].max() > z + HAND_OVER_TOOL_M:
-                along_across = _turned(corners[:, :2] - (x, y), -yaw_rad)
+                cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+                along_across = (corners[:, :2] - (x, y)) @ ((cos, -sin), (sin, cos))
                 low, high = along_across.min(axis=0), along_across.max(axis=0)
                 gaps = np.maximum(low, -high) - self.robot.hand_half_m
                 room = min(room, float(gaps.max()))
@@ -153,24 +171,29 @@ class StructureTask(OpenLoopTask):
             sites: [S, P, 2] points that a structure will stand on.
             rest: what is to be fetched then.
         """
-        crowd_m = np.zeros(len(sites))
-        wanted = SITE_GAP_M + self.block_m / 2
+        if not rest:
+            return np.zeros(len(sites))
+        # as seen by each piece's hand, once for each yaw, and by its load
+        centers = np.array([other.position[:2] for other in rest])
+        yaws, halves = [], []
         for other in rest:
-            yaws = self.grasp_yaws(other)
-            points = sites - other.position[:2]
-            # for each yaw, the gap between the hand and the nearest point
-            hands = [_gaps(points, yaw, self.robot.hand_half_m) for yaw in yaws]
+            grasps = self.grasp_yaws(other)
             low, high = other.shape.bounds_m
-            half = tuple(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True))
-            load = _gaps(points, self.building.pieces[other].yaw_rad(other), half)
-            gaps = np.minimum(np.max(hands, axis=0), load)
-            crowd_m += np.maximum(wanted - gaps, 0.0)
-        return crowd_m
+            load = tuple(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True))
+            yaws.append([grasps[0], grasps[-1], self.building.pieces[other].yaw_rad(other)])
+            halves.append([self.robot.hand_half_m, self.robot.hand_half_m, load])
+        x, y = np.moveaxis(sites[:, :, None] - centers, 3, 0)[..., None]  # [S, P, rest, 1]
+        cos, sin = np.cos(yaws), np.sin(yaws)
+        half_along, half_across = np.moveaxis(np.array(halves), 2, 0)
+        along, across = np.abs(x * cos + y * sin), np.abs(y * cos - x * sin)
+        gaps = np.maximum(along - half_along, across - half_across).min(axis=1)  # [S, rest, 3]
+        gaps = np.minimum(gaps[:, :, :2].max(axis=2), gaps[:, :, 2])
+        return np.maximum(SITE_GAP_M + self.block_m / 2 - gaps, 0.0).sum(axis=1)
 
     def _effort(self, body: Body) -> float:
         """Prefer pieces that stand free."""
         room = max(self.room(body, yaw) for yaw in self.grasp_yaws(body))
-        return 0.0 if room > 0 else 1.0
+        return 0.0 if room > 0 else BLOCKED_M - CROWDED * room
 
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
@@ -196,14 +219,3 @@ class StructureTask(OpenLoopTask):
         """Return the first of the yaws at which the fingers can part most freely."""
         rooms = [min(self.room(move.body, yaw, move.position), AMPLE_M) for yaw in yaws_rad]
         return yaws_rad[rooms.index(max(rooms))]
-
-
-def _gaps(points: np.ndarray, yaw_rad: float, half_m: tuple[float, float]) -> np.ndarray:
-    """Return how far the nearest of points [S, P, 2] is from a rectangle about the origin, [S]."""
-    return (np.abs(_turned(points, -yaw_rad)) - half_m).max(axis=2).min(axis=1)
-
-
-def _turned(points: np.ndarray, yaw_rad: float) -> np.ndarray:
-    """Return points [..., 2] turned about the origin."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    return points @ np.array([[cos, sin], [-sin, cos]])

@@ -1,0 +1,142 @@
+"""Demonstrations by deconstruction: episodes in which a structure is taken apart, reversed in time.
+
+`reverse_episode` is arithmetic on recorded episodes; no simulator takes part. That the reversed
+actions do build the structure is measured by `replay_scores`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.factory import make_env
+
+_ENDS = (
+    keys.REWARD,
+    keys.DONE,
+    keys.TERMINATED,
+    keys.TRUNCATED,
+    keys.SUCCESS,
+    keys.FAULT,
+    keys.STEP_COUNT,
+)
+_EXTRA = (keys.UNDO_ACTION, keys.UNDO_IN_HAND, keys.CAN_UNDO, keys.EXPERT_ACTION)
+
+
+def is_reversible(episode: TensorDictBase) -> bool:
+    """Whether an episode [T] of taking apart, reversed, is one of building.
+
+    It must end with all apart, every action must move one object and can be undone, and picks and
+    places must take turns, a pick first.
+    """
+    holding = episode[keys.HOLDING].flatten().tolist()
+    return (
+        bool(episode[keys.NEXT, keys.SUCCESS][-1])
+        and bool(episode[keys.NEXT, keys.CAN_UNDO].all())
+        and holding == [i % 2 == 1 for i in range(len(holding))]
+        and not bool(episode[keys.NEXT, keys.HOLDING][-1])
+    )
+
+
+def reverse_episode(episode: TensorDictBase) -> TensorDict:
+    """Return the episode [T] of building that an episode of taking apart is in reverse.
+
+    It comes out as the expert's would: the last observation of the one is the first of the other,
+    the actions are those that undo, the held object is shown as their picks see it, and the last
+    step, which completes the structure, has the reward and terminates.
+
+    Args:
+        episode: steps [T] of an environment with ``deconstruct=True``.
+
+    Raises:
+        ValueError: it is not `is_reversible`.
+    """
+    if not is_reversible(episode):
+        raise ValueError("the episode cannot be reversed: an action moved nothing, or too much")
+    steps = len(episode)
+    following = episode[keys.NEXT]
+    seen = [key for key in episode.keys() if key not in {*_ENDS, *_EXTRA, keys.ACTION, keys.NEXT}]  # noqa: SIM118 -- a TensorDict
+    # state t + 1, then t: the states on both sides of each step, the last step first
+    before, after = (side.select(*seen).flip(0).clone() for side in (following, episode))
+    if keys.IN_HAND in seen:
+        # what is held in state t is picked, in reverse, from state t + 1
+        shown = torch.where(
+            episode[keys.HOLDING][..., None, None],
+            following[keys.UNDO_IN_HAND],
+            episode[keys.IN_HAND],
+        )
+        after[keys.IN_HAND] = shown.flip(0)
+        before[keys.IN_HAND] = torch.cat([following[keys.IN_HAND][-1:], shown[1:].flip(0)])
+    count = torch.arange(steps)[:, None]
+    last = count == steps - 1
+    never = torch.zeros_like(last)
+    for state, number, at_goal in ((before, count, never), (after, count + 1, last)):
+        state.update(
+            {
+                keys.STEP_COUNT: number,
+                keys.SUCCESS: at_goal,
+                keys.TERMINATED: at_goal.clone(),
+                keys.DONE: at_goal.clone(),
+                keys.TRUNCATED: never.clone(),
+                keys.FAULT: never.clone(),
+            }
+        )
+    after[keys.REWARD] = last.to(torch.float32)
+    before[keys.ACTION] = following[keys.UNDO_ACTION].flip(0)
+    before[keys.NEXT] = after
+    return before
+
+
+class ReplayScores(NamedTuple):
+    """How reversed episodes fare in the simulator."""
+
+    reversible: float
+    """Share of the episodes of taking apart that can be reversed."""
+    success_rate: float
+    """Share of these whose reverse, played from the scattered pieces, reaches the goal."""
+    mean_length: float
+
+
+def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> ReplayScores:
+    """Take structures apart, and play the reversed actions from the scattered pieces.
+
+    Args:
+        task: id of a task that can be deconstructed.
+        episodes: how many.
+        seed: of the first episode.
+        config: other fields of `EnvConfig`.
+    """
+    env = make_env(task, **{**config, "seed": seed, "deconstruct": True, "expert": True})
+    lengths, reached = [], 0
+    try:
+        for _ in range(episodes):
+            episode = env.rollout(
+                env.max_steps, lambda td: td.set(keys.ACTION, td[keys.EXPERT_ACTION].clone())
+            )
+            if not is_reversible(episode):
+                continue
+            actions = reverse_episode(episode)[keys.ACTION]
+            lengths.append(len(actions))
+            reached += _play(env, actions)
+    finally:
+        env.close()
+    kept = len(lengths)
+    if not kept:
+        return ReplayScores(0.0, 0.0, float("nan"))
+    return ReplayScores(kept / episodes, reached / kept, sum(lengths) / kept)
+
+
+def _play(env: ManipulationEnv, actions: Tensor) -> bool:
+    """Return whether actions [T, A] build what lies scattered, the last one completing it."""
+    scene = env.scene
+    deconstruction, scene.task = scene.task, scene.task.task
+    try:
+        steps = [env.step(TensorDict({keys.ACTION: action}))[keys.NEXT] for action in actions]
+    finally:
+        scene.task = deconstruction
+    return [bool(step[keys.SUCCESS]) for step in steps] == [False] * (len(steps) - 1) + [True]
