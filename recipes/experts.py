@@ -5,14 +5,17 @@ python recipes/experts.py robots=[panda,ur5] episodes=50 tasks=[close_loop/block
 """
 
 from pathlib import Path
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
+from ba_torchrl.config import ConfigError
 from ba_torchrl.data.demos import expert_scores
 from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
 hydra_schema.register()
@@ -23,32 +26,40 @@ def main(settings: DictConfig) -> None:
     """Let the experts play, and print how they did."""
     quiet_libraries()
     variants = OmegaConf.to_container(settings.variants, resolve=True)
-    tasks = settings.tasks or list_tasks()
-    lines = [
-        f"| task | robot | {' | '.join(variants)} |",
-        f"|---|---|{'---|' * len(variants)}",
-    ]
-    with tqdm(total=len(tasks) * len(settings.robots) * len(variants), unit="table cell") as bar:
-        for task in tasks:
-            for robot in settings.robots:
-                cells = []
-                for env in variants.values():
-                    scores = expert_scores(
-                        task,
-                        settings.episodes,
-                        seed=settings.seed,
-                        num_envs=settings.num_envs,
-                        parallel=settings.parallel,
-                        **{**env, "robot": robot},
-                    )
-                    cells.append(f"{scores.success_rate:.3f}, {scores.mean_length:.1f} steps")
-                    bar.update()
-                lines.append(f"| `{task}` | {robot} | {' | '.join(cells)} |")
-                tqdm.write(lines[-1])
-    table = "\n".join(lines)
-    print(f"\n{table}\n\n{settings.episodes} episodes each, seed {settings.seed}")
+    tables = []
+    for control, columns in variants.items():
+        tasks = [task for task in settings.tasks or list_tasks() if TASKS[task].control == control]
+        if not tasks:
+            continue
+        lines = [
+            f"| task | robot | {' | '.join(columns)} |",
+            f"|---|---|{'---|' * len(columns)}",
+        ]
+        cells = [(task, robot) for task in tasks for robot in settings.robots]
+        for task, robot in tqdm(cells, unit="row"):
+            row = [_cell(task, settings, {**env, "robot": robot}) for env in columns.values()]
+            lines.append(f"| `{task}` | {robot} | {' | '.join(row)} |")
+            tqdm.write(lines[-1])
+        tables.append("\n".join(lines))
+    text = "\n\n".join(tables)
+    print(f"\n{text}\n\n{settings.episodes} episodes each, seed {settings.seed}")
     if settings.path is not None:
-        Path(settings.path).write_text(table + "\n")
+        Path(settings.path).write_text(text + "\n")
+
+
+def _cell(task: str, settings: DictConfig, env: dict[str, Any]) -> str:
+    try:
+        scores = expert_scores(
+            task,
+            settings.episodes,
+            seed=settings.seed,
+            num_envs=settings.num_envs,
+            parallel=settings.parallel,
+            **env,
+        )
+    except ConfigError as error:
+        return f"not possible: {error}"
+    return f"{scores.success_rate:.3f}, {scores.mean_length:.1f} steps"
 
 
 if __name__ == "__main__":
