@@ -33,11 +33,12 @@ setup: $(STAMP)
 train: $(STAMP)
 	$(BIN)/python recipes/train.py --config-name quickstart $(ARGS)
 
+# One process per core, each with one thread: numeric libraries would fight over the cores.
 test: $(STAMP)
-	$(BIN)/python -m pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(ARGS)
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,6 +1,8 @@
-"""Collect demonstrations from a task's expert and save them.
+"""Collect demonstrations from a task's expert, or by taking structures apart, and save them.
 
 python recipes/collect_demos.py task=close_loop/block_picking episodes=100 path=demos/picking
+python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction
+python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction replays=200
 """
 
 from pathlib import Path
@@ -11,7 +13,8 @@ from tqdm import tqdm
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.config import ConfigError
-from ba_torchrl.data.demos import collect_demonstrations, save_demonstrations
+from ba_torchrl.data.deconstruction import replay_scores
+from ba_torchrl.data.demos import collect_demonstrations, save_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.record.logging import quiet_libraries
 from ba_torchrl.training import hydra_schema
@@ -30,7 +33,7 @@ def main(settings: DictConfig) -> None:
         settings.task,
         settings.num_envs,
         parallel=settings.parallel,
-        **{**env_settings, "seed": settings.seed, "expert": True},
+        **{**env_settings, "seed": settings.seed, **source_config(settings.source)},
     )
     try:
         with tqdm(total=settings.episodes, unit="episode") as bar:
@@ -38,18 +41,32 @@ def main(settings: DictConfig) -> None:
                 env,
                 settings.episodes,
                 seed=settings.seed,
+                source=settings.source,
                 only_successful=settings.only_successful,
                 on_episode=lambda _: bar.update(),
             )
     finally:
         env.close()
+    if not episodes:
+        raise ConfigError(f"none of {settings.episodes} episodes of {settings.task} is of use")
     save_demonstrations(
-        settings.path, episodes, task=settings.task, env=env_settings, seed=settings.seed
+        settings.path,
+        episodes,
+        task=settings.task,
+        env=env_settings,
+        seed=settings.seed,
+        source=settings.source,
     )
     print(
         f"{len(episodes)} episodes of {settings.task}, success {success_rate(episodes):.2f}, "
         f"{mean_length(episodes):.1f} steps each, in {settings.path}"
     )
+    if settings.replays and settings.source == "deconstruction":
+        scores = replay_scores(settings.task, settings.replays, seed=settings.seed, **env_settings)
+        print(
+            f"of {settings.replays} structures taken apart {scores.reversible:.3f} can be "
+            f"reversed; played in the simulator, {scores.success_rate:.3f} of these reach the goal"
+        )
 
 
 if __name__ == "__main__":

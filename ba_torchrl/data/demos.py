@@ -1,4 +1,4 @@
-"""Demonstrations: episodes played by the tasks' experts."""
+"""Demonstrations: episodes played by the tasks' experts, or reversed from taking the goal apart."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 import torchrl
@@ -15,10 +15,14 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl import __version__
 from ba_torchrl.config import ConfigError, EnvConfig, parse
+from ba_torchrl.data.deconstruction import is_reversible, reverse_episode
 from ba_torchrl.data.episodes import collect_episodes, is_success, mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_vector
 
+Source = Literal["expert", "deconstruction"]
+"""Where demonstrations come from."""
+SOURCES: tuple[Source, ...] = get_args(Source)
 _METADATA_FILE = "demonstrations.json"
 _EPISODE = "episode"
 
@@ -36,7 +40,7 @@ def as_transitions(tensordict: TensorDictBase, *, is_expert: bool) -> TensorDict
         is_expert: whether they are demonstrations.
     """
     flat = tensordict.reshape(-1)
-    state = (keys.PIXELS, keys.HOLDING)
+    state = [key for key in (keys.PIXELS, keys.IN_HAND, keys.HOLDING) if key in flat]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
     out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))
     out[keys.IS_EXPERT] = torch.full((len(flat), 1), is_expert)
@@ -48,23 +52,43 @@ def collect_demonstrations(
     episodes: int,
     *,
     seed: int | None = None,
+    source: Source = "expert",
     only_successful: bool = False,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
     """Let the expert play.
 
     Args:
-        env: a vector of environments made with ``expert=True``.
+        env: a vector of environments made with ``expert=True``, and with ``deconstruct=True`` if
+            that is the source.
         episodes: how many to play.
         seed: of the first episodes; environment i starts from ``seed + i``.
+        source: "expert", or "deconstruction" for episodes reversed in time; of those, what cannot
+            be reversed is always left out, and all that is left succeeds.
         only_successful: leave out episodes that did not reach the goal.
         on_episode: called with each episode when it ends, for progress bars.
 
     Returns:
-        Episodes as TensorDicts [T].
+        Episodes as TensorDicts [T], with what an environment without ``expert`` gives.
+
+    Raises:
+        ConfigError: the source is unknown.
     """
+    if source not in SOURCES:
+        raise ConfigError(f"source: {source!r} is not one of {', '.join(SOURCES)}")
     played = collect_episodes(env, expert_policy, episodes, seed=seed, on_episode=on_episode)
-    return [episode for episode in played if is_success(episode) or not only_successful]
+    if source == "deconstruction":
+        return [reverse_episode(episode) for episode in played if is_reversible(episode)]
+    return [
+        episode.exclude(keys.EXPERT_ACTION, (keys.NEXT, keys.EXPERT_ACTION))
+        for episode in played
+        if is_success(episode) or not only_successful
+    ]
+
+
+def source_config(source: Source) -> dict[str, bool]:
+    """Return the fields of `EnvConfig` that a source of demonstrations needs."""
+    return {"expert": True, **({"deconstruct": True} if source == "deconstruction" else {})}
 
 
 class ExpertScores(NamedTuple):
@@ -110,6 +134,7 @@ def save_demonstrations(
     task: str,
     env: dict[str, Any],
     seed: int,
+    source: Source = "expert",
 ) -> None:
     """Write episodes as one memory-mapped TensorDict, with what they were collected from.
 
@@ -119,6 +144,7 @@ def save_demonstrations(
         task: id of the task.
         env: fields of `EnvConfig` that were given.
         seed: of the first episodes.
+        source: where they come from.
 
     Raises:
         ValueError: there are no episodes.
@@ -127,7 +153,7 @@ def save_demonstrations(
         raise ValueError("there are no episodes to save")
     path = Path(path)
     numbered = [
-        episode.set(_EPISODE, torch.full((len(episode), 1), number))
+        episode.copy().set(_EPISODE, torch.full((len(episode), 1), number))
         for number, episode in enumerate(episodes)
     ]
     torch.cat(numbered).memmap(path, copy_existing=True)
@@ -135,6 +161,7 @@ def save_demonstrations(
         "task": task,
         "env": _env_values(env),
         "seed": seed,
+        "source": source,
         "episodes": len(episodes),
         "versions": {
             "ba_torchrl": __version__,
@@ -180,5 +207,6 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
 
 def _env_values(env: dict[str, Any]) -> dict[str, Any]:
     """Return every environment parameter that shapes the data, defaults filled in, as JSON."""
-    values = parse(EnvConfig, env, "env").model_dump(mode="json", exclude={"seed", "expert"})
+    other = {"seed", *source_config("deconstruction")}
+    values = parse(EnvConfig, env, "env").model_dump(mode="json", exclude=other)
     return json.loads(json.dumps(values))

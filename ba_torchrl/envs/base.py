@@ -243,6 +243,8 @@ class ManipulationEnv(EnvBase):
         self._episode += 1
         self._step_count = 0
         afresh = self._episode == 1
+        if afresh and self.task_class.is_chaotic:
+            self._drop_scenes()
         self._scene = self._new_episode(rng, afresh)
         self._observation = self._observe(self._scene)
         self._ends = {}

@@ -164,6 +164,8 @@ class World:
         # client numbers are used again, connections are not
         if snapshot.connection is not self._disconnect or self.is_closed:
             raise SimulationError("the state is of another world: that one was closed or rebuilt")
+        # once for the places, where the engine then looks afresh, and once for all else
+        pybullet.restoreState(snapshot.id, physicsClientId=self.client)
         self._forget_pairs()
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
 
@@ -219,8 +221,17 @@ class World:
         """Let the engine look afresh at what is near each other.
 
         It keeps its last guess at how two convex hulls, such as a finger and a block, are apart,
-        which no saved state holds; from another guess the same scene goes on differently.
+        which no saved state holds; from another guess the same scene goes on differently. It also
+        goes through its list of pairs a few at a time, to drop those that are apart by now, and
+        starts again at the first one only once the list was empty.
         """
+        pybullet.setCollisionFilterGroupMask(self.floor, -1, 0, 0, physicsClientId=self.client)
+        for body in self.bodies:
+            for link in body.links if isinstance(body, Part) else (-1,):
+                pybullet.setCollisionFilterGroupMask(
+                    body.id, link, 0, 0, physicsClientId=self.client
+                )
+        self.detect_collisions()
         _renew_pairs(self.client, self.floor, is_static=True)
         for body in self.bodies:
             if isinstance(body, Part):

@@ -15,7 +15,6 @@ DROP_INTERVAL_S = 0.15
 """Time between objects: each falls 11 cm, out of the next one's way."""
 SETTLE_S = 4.0
 LOW_DROP_M = 5e-3
-FLUSHES = 30
 APART_M = 5e-3
 LAYOUTS = 20
 TRIES = 50
@@ -97,10 +96,6 @@ class Clutter:
         for _ in range(DROP_ATTEMPTS):
             for body in self.present:
                 self._put_aside(body)
-            # PyBullet drops pairs that are near each other no more a few at a time, and would take
-            # up those of the last heap where it left them: the same heap would go on differently
-            for _ in range(FLUSHES):
-                self.world.detect_collisions()
             chosen = rng.choice(len(self.bodies), size=count, replace=False)
             self.present = [self.bodies[i] for i in chosen]
             points = rng.uniform(-spread_m, spread_m, (count, 2))

@@ -38,6 +38,7 @@ class ObjectGrasping(CloseLoopTask):
     num_objects = 5
     num_objects_range = (1, 15)
     fits_tray = True
+    is_chaotic = True
     parameters = frozenset({"object_set", "asset_root"})
 
     lift_height_m: ClassVar[float] = 0.15

@@ -105,7 +105,7 @@ class ImproviseTask(StructureTask):
 
     def pick_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a pick; these pieces are low."""
-        return max(super().pick_height_m(top_m), LOWEST_PICK_M)
+        return max(OpenLoopTask.pick_height_m(self, top_m), LOWEST_PICK_M)
 
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square searched for the highest point.

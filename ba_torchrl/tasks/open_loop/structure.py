@@ -111,6 +111,13 @@ class StructureTask(OpenLoopTask):
         x, y, z = move.body.position
         return PickPlaceCommand(PICK, x, y, z, yaw)
 
+    def pick_height_m(self, top_m: float) -> float:
+        """Return the height of the tool for a pick.
+
+        Between two pixels a ridge looks lower than it is, and closing fingers reach lower.
+        """
+        return max(super().pick_height_m(top_m), self.block_m / 2)
+
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square searched for the highest point.
 

@@ -1,0 +1,66 @@
+import json
+
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.config import ConfigError
+from ba_torchrl.data.demos import (
+    collect_demonstrations,
+    load_demonstrations,
+    save_demonstrations,
+    source_config,
+)
+
+TASK = "open_loop/block_stacking"
+ENV = {"obs_size": 32, "num_objects": 2}
+
+
+@pytest.fixture(scope="module", params=["expert", "deconstruction"])
+def collected(request):
+    env = ba_torchrl.make_vector_env(
+        TASK, 2, parallel=False, seed=0, **ENV, **source_config(request.param)
+    )
+    yield request.param, collect_demonstrations(env, 4, seed=0, source=request.param)
+    env.close()
+
+
+def test_both_sources_give_episodes_of_the_same_form(collected):
+    plain = ba_torchrl.make(TASK, seed=0, **ENV)
+    rollout = plain.rollout(2)
+    plain.close()
+    _, episodes = collected
+    for episode in episodes:
+        assert set(episode.keys(True, True)) == set(rollout.keys(True, True))
+        assert len(episode) == 2
+        assert episode["next", "success"].flatten().tolist() == [False, True]
+        assert episode["holding"].flatten().tolist() == [False, True]
+
+
+def test_the_primitive_follows_what_is_held(collected):
+    for episode in collected[1]:
+        assert episode["action"][:, 0].tolist() == [0, 1]
+
+
+def test_either_source_loads_for_building(collected, tmp_path):
+    source, episodes = collected
+    path = tmp_path / "demos"
+    save_demonstrations(path, episodes, task=TASK, env=ENV, seed=0, source=source)
+    loaded = load_demonstrations(path, task=TASK, env=ENV)
+    for episode, original in zip(loaded, episodes, strict=True):
+        for key in original.keys(True, True):
+            assert torch.equal(episode[key], original[key]), key
+    assert "episode" not in episodes[0]
+    metadata = json.loads((path / "demonstrations.json").read_text())
+    assert metadata["source"] == source
+    assert metadata["seed"] == 0
+    assert set(metadata["versions"]) == {"ba_torchrl", "torch", "torchrl"}
+
+
+def test_another_configuration_is_refused_by_name(collected, tmp_path):
+    _, episodes = collected
+    save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)
+    with pytest.raises(ConfigError, match="in_hand_mode: collected with 'raw', needed 'proj'"):
+        load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "in_hand_mode": "proj"})
+    with pytest.raises(ConfigError, match="num_objects: collected with 2, needed 3"):
+        load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "num_objects": 3})
