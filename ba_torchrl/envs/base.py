@@ -107,6 +107,8 @@ class ManipulationEnv(EnvBase):
 
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine in the mode "fast"."""
+    picture_m: ClassVar[tuple[float, float, float]] = (-0.06, 0.2, 1.05)
+    """Of `render`: its middle along x from the workspace's, its height, and how far away it is."""
     default_action_sequence: ClassVar[str]
     """`action_sequence` unless it is given."""
 
@@ -173,7 +175,15 @@ class ManipulationEnv(EnvBase):
         """Return a picture of the scene for people, [height, width, 3] uint8."""
         x, y = self.workspace.center
         floor = self.config.floor_color or LIGHT_FLOOR
-        return render_rgb(self.scene.world, (x - 0.06, y, 0.2), width, height, floor_rgb=floor)
+        aside, z, distance = self.picture_m
+        return render_rgb(
+            self.scene.world,
+            (x + aside, y, z),
+            width,
+            height,
+            distance_m=distance,
+            floor_rgb=floor,
+        )
 
     def get_state(self) -> EnvState:
         """Return the whole state, to come back to with `set_state`.

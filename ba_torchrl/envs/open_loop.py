@@ -37,6 +37,7 @@ class OpenLoopEnv(ManipulationEnv):
     """
 
     default_action_sequence = "pxyr"
+    picture_m = (0.0, 0.05, 0.85)
     # half a millimetre of creep in a stack of four, and at rest after three steps
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 

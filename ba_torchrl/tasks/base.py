@@ -175,7 +175,7 @@ class Task(ABC):
         """Whether the next episode goes on with the objects as they are now."""
         return False
 
-    def resume(self) -> None:
+    def resume(self) -> None:  # noqa: B027 -- most tasks never continue
         """Start an episode that goes on with the objects, the arm still where the last one ended.
 
         Called if `continues` says so, in place of `randomise`.
