@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numba
@@ -16,7 +16,6 @@ from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.tasks.base import Reach, Workspace
 from ba_torchrl.tasks.experts import turned
-from ba_torchrl.tasks.tray import MARGIN_M
 
 HALF_GAP_M = 0.04
 """Half the distance between the open fingers."""
@@ -37,26 +36,8 @@ SHALLOWEST_M = 0.006
 LEAST_SQUARE = 0.3
 """How nearly opposite the surfaces that the fingers meet are at least."""
 
-CLOSED_HALF_M = 0.024
-"""A push starts this far from the surface: half the closed fingers and some room."""
-CLOSED_TIP_M = 0.0136
-"""Closed fingers end this far below the tool point, deeper than open ones."""
-PRESS_M = 1.5e-3
-DIG_M = 0.006
-OBJECT_HALF_M = 0.045
-WALL_ROOM_M = 0.05
-"""Objects this near to a wall leave no room for a finger behind them."""
-LOW_M = 0.01
-"""Height of the tool above the workspace's lower end while it pushes."""
-NEAR_M = 0.018
-"""Fingers this near to the start of a push are there."""
-
-ENDS = (-0.9, -0.6, -0.3, 0.0, 0.3, 0.6, 0.9)
-SLIDING_RADIUS_M = 0.02
-"""Mean distance from its centre of the friction under an object."""
 WORST_RISK = 4.0
-DRAG_COST = 8.0
-
+"""Stands for no grasp at all."""
 MET_M = 3e-3
 """Fingers meet what is this near to the outermost point between them."""
 
@@ -79,16 +60,6 @@ class Grasp(NamedTuple):
     """Actions it takes, failures counted in."""
 
 
-class Nudge(NamedTuple):
-    """A way with closed fingers that turns or moves an object, pushing its side or its top."""
-
-    start: Vector
-    end: Vector
-    slack_m: float
-    """Fingers this far above the start are there."""
-    cost: float
-
-
 class GraspPlanner:
     """Finds the cheapest grasp in a heap.
 
@@ -100,13 +71,13 @@ class GraspPlanner:
 
     def __init__(self, pool: Sequence[Body], camera: HeightCamera, workspace: Workspace) -> None:
         self._camera = camera
-        self._workspace = workspace
+        self.workspace = workspace
         self._samples: dict[int, np.ndarray] = {}
         self._pool = pool
         x, y = workspace.center
         self._side_m = max(workspace.x[1] - workspace.x[0], workspace.y[1] - workspace.y[0])
         self._side_m += 2 * BORDER_M
-        self._corner = (x - self._side_m / 2, y - self._side_m / 2)
+        self.corner = (x - self._side_m / 2, y - self._side_m / 2)
 
         pixels = round(self._side_m / PIXEL_M)
         self._plain = np.zeros((pixels, pixels))
@@ -114,7 +85,7 @@ class GraspPlanner:
     def heights(self) -> np.ndarray:
         """Return the height image that grasps are checked against, metres."""
         pixels = round(self._side_m / PIXEL_M)
-        return self._camera.heightmap(self._workspace.center, self._side_m, pixels)
+        return self._camera.heightmap(self.workspace.center, self._side_m, pixels)
 
     def plan(
         self, bodies: Sequence[Body], tool: Pose, reach: Reach, heights: np.ndarray
@@ -130,14 +101,14 @@ class GraspPlanner:
         (x, y, z), yaw = tool
         yaws = np.arange(YAWS) * np.pi / YAWS if reach.turn_rad else np.array([yaw])
         best = None
-        low, high = self._workspace.z
+        low, high = self.workspace.z
         for body in bodies:
             found = _search(
-                self._placed_samples(body),
+                self.placed_samples(body),
                 np.array(body.position),
                 yaws,
                 heights,
-                np.array(self._corner),
+                np.array(self.corner),
                 low,
                 high,
                 np.array([x, y, z]),
@@ -145,8 +116,8 @@ class GraspPlanner:
             for row in found:
                 gx, gy, gz, risk = row[0], row[1], row[2], row[4]
                 if not (
-                    self._workspace.x[0] <= gx <= self._workspace.x[1]
-                    and self._workspace.y[0] <= gy <= self._workspace.y[1]
+                    self.workspace.x[0] <= gx <= self.workspace.x[1]
+                    and self.workspace.y[0] <= gy <= self.workspace.y[1]
                 ):
                     continue
                 target_yaw = turned(yaw, row[3], reach, math.pi)
@@ -161,113 +132,28 @@ class GraspPlanner:
                     best = Grasp(body, (gx, gy, gz), target_yaw, float(risk), float(cost))
         return best
 
-    def nudge(
-        self, bodies: Sequence[Body], tool: Pose, reach: Reach, heights: np.ndarray
-    ) -> Nudge | None:
-        """Return the handiest nudge of any of the bodies, or None if there is none.
+    def risk_alone(self, samples: np.ndarray, tool: Pose) -> float:
+        """Return the least risk of a grasp, at the gripper's yaw, of a body with nothing near.
 
         Args:
-            bodies: to choose from.
+            samples: from `placed_samples`, or moved from there.
             tool: where the gripper is.
-            reach: of one action.
-            heights: from `heights`.
         """
-        nudges = [nudge for body in bodies for nudge in self._pushes(body, tool, reach, heights)]
-        nudges += [nudge for body in bodies for nudge in self._drags(body, tool, reach, heights)]
-        return min(nudges, key=lambda nudge: nudge.cost, default=None)
-
-    def _pushes(self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray) -> Iterator[Nudge]:
-        """Yield pushes against a body's side, away from the walls.
-
-        For a gripper that cannot turn, those that turn the body into its grasp.
-        """
-        middle = np.array(self._workspace.center)
-        samples = self._placed_samples(body)
-        center = samples[:, :2].mean(axis=0)
-        low = self._workspace.z[0] + LOW_M
-        shares, lengths = ((0.0, -0.7, 0.7), (1.0,)) if reach.turn_rad else (ENDS, (0.5, 1.0))
-        for turn in np.arange(8) * np.pi / 4:
-            ahead = np.array([math.cos(turn), math.sin(turn)])
-            side = np.array([-ahead[1], ahead[0]])
-            along, across = ((samples[:, :2] - center) @ axis for axis in (ahead, side))
-            for offset in np.array(shares) * np.abs(across).max():
-                met = np.abs(across - offset) < BAND_HALF_M
-                if not met.any():
-                    continue
-                start = center + (along[met].min() - CLOSED_HALF_M) * ahead + offset * side
-                if not self._is_free(start, heights):
-                    continue
-                travel = _travel(start, low + NEAR_M, tool, reach)
-                for length in lengths:
-                    end = start + length * reach.step_m * ahead
-                    # a body that slides flat turns about a point beyond its centre
-                    push = length * reach.step_m - (CLOSED_HALF_M - BAND_HALF_M)
-                    share = SLIDING_RADIUS_M**2 / (SLIDING_RADIUS_M**2 + offset**2)
-                    pushed = center + share * push * ahead
-                    if not self._is_on_floor(pushed, OBJECT_HALF_M):
-                        continue
-                    cost = travel - (math.dist(center, middle) - math.dist(pushed, middle)) / 0.05
-                    if not reach.turn_rad:
-                        angle = -offset * push / (SLIDING_RADIUS_M**2 + offset**2)
-                        moved = _turned_about(samples, center, angle)
-                        cost += 3 * self._risk_alone(moved, tool)
-                    yield Nudge((*start, low), (*end, low), NEAR_M, cost)
-
-    def _risk_alone(self, samples: np.ndarray, tool: Pose) -> float:
-        """Return the least risk of a grasp, at the gripper's yaw, of a body with nothing near."""
         position, yaw = tool
-        low, high = self._workspace.z
+        low, high = self.workspace.z
         found = _search(
             samples,
             samples[:, :3].mean(axis=0),
             np.array([yaw]),
             self._plain,
-            np.array(self._corner),
+            np.array(self.corner),
             low,
             high,
             np.array(position),
         )
         return min(float(found[:, 4].min()), WORST_RISK) if len(found) else WORST_RISK
 
-    def _drags(self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray) -> Iterator[Nudge]:
-        """Yield a pull at the top of a body by a wall towards the middle.
-
-        Fingers stick better than the floor, and the walls are without friction.
-        """
-        middle = np.array(self._workspace.center)
-        points = self._placed_samples(body)
-        center = points[:, :2].mean(axis=0)
-        if self._is_on_floor(center, WALL_ROOM_M):
-            return
-        near = np.linalg.norm(points[:, :2] - center, axis=1) < 0.01
-        top = float(points[near, 2].max() if near.any() else points[:, 2].max())
-        if self._height_at(center, heights) > top + 0.005:
-            return  # something lies on it
-        touching = top + CLOSED_TIP_M
-        start = (*center, touching - PRESS_M)
-        way = (middle - center) / np.abs(middle - center).max() * reach.step_m
-        cost = DRAG_COST + _travel(center, touching + PRESS_M, tool, reach)
-        yield Nudge(start, (*(center + way), touching - DIG_M), 3 * PRESS_M, cost)
-
-    def _height_at(self, point: np.ndarray, heights: np.ndarray) -> float:
-        i, j = ((point - self._corner) / PIXEL_M).astype(int)
-        return float(heights[i, j])
-
-    def _is_free(self, point: np.ndarray, heights: np.ndarray) -> bool:
-        """Whether closed fingers fit at a point of the floor."""
-        if not self._is_on_floor(point, BAND_HALF_M):
-            return False
-        i, j = ((point - self._corner) / PIXEL_M).astype(int)
-        reach = round(CLOSED_HALF_M / PIXEL_M) - 2
-        window = heights[i - reach : i + reach + 1, j - reach : j + reach + 1]
-        return float(window.max()) < LOW_M
-
-    def _is_on_floor(self, point: np.ndarray, margin_m: float) -> bool:
-        """Whether a point is off the tray's walls by a margin."""
-        half = (self._workspace.width - MARGIN_M) / 2 - margin_m
-        return float(np.abs(point - self._workspace.center).max()) < half
-
-    def _placed_samples(self, body: Body) -> np.ndarray:
+    def placed_samples(self, body: Body) -> np.ndarray:
         """Return points on a body's surface and their normals as it lies now, [N, 6]."""
         key = id(body.shape)
         if key not in self._samples:
@@ -279,23 +165,6 @@ class GraspPlanner:
         placed[:, :3] = local[:, :3] @ rotation.T + position
         placed[:, 3:] = local[:, 3:] @ rotation.T
         return placed
-
-
-def _turned_about(samples: np.ndarray, center_xy: np.ndarray, angle_rad: float) -> np.ndarray:
-    """Return points and normals [N, 6] turned about a vertical line."""
-    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    turn = np.array([[cos, -sin], [sin, cos]])
-    out = samples.copy()
-    out[:, :2] = (samples[:, :2] - center_xy) @ turn.T + center_xy
-    out[:, 3:5] = samples[:, 3:5] @ turn.T
-    return out
-
-
-def _travel(start: np.ndarray, low_z: float, tool: Pose, reach: Reach) -> float:
-    """Return about how many actions it takes to get closed fingers to the start of a nudge."""
-    (x, y, z), _ = tool
-    aside = float(np.abs(start - (x, y)).max())
-    return 0.0 if aside <= NEAR_M and z <= low_z else 2.0 + aside / reach.step_m
 
 
 def _rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:

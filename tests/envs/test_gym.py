@@ -98,7 +98,7 @@ def test_ids_are_known_whatever_is_imported_first_and_without_torch(imports, tmp
         tmp_path,
     )
     assert known == sorted(map(gym_id, TASKS))
-    assert not {"torch", "torchrl", "numba"} & set(loaded)
+    assert not {"torch", "torchrl"} & set(loaded)
 
 
 def test_make_needs_no_import_of_the_package(tmp_path):

@@ -108,7 +108,7 @@ def test_the_default_view_is_what_environments_observe(task):
         center_m=workspace.center,
         z_m=workspace.z,
         workspace_m=workspace.width,
-        width_m=env.view_width_m,
+        width_m=env.config.view_scale * workspace.width,
         pixels=env.config.obs_size,
         camera_height_m=scene.robot.camera_height_m,
         finger_span_m=scene.robot.finger_span_m,

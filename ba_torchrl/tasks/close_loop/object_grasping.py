@@ -19,7 +19,8 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.base import CloseLoopTask
 from ba_torchrl.tasks.clutter import Clutter
 from ba_torchrl.tasks.experts import ALIGNED_M, ALIGNED_RAD, CLOSED, OPEN, lift, towards
-from ba_torchrl.tasks.grasps import NEAR_M, Grasp, GraspPlanner, Nudge
+from ba_torchrl.tasks.grasps import Grasp, GraspPlanner
+from ba_torchrl.tasks.nudges import NEAR_M, Nudge, NudgePlanner
 from ba_torchrl.tasks.tray import FLOOR_Z_M, MARGIN_M, add_tray
 
 WALL_PIXELS = 25
@@ -106,7 +107,7 @@ class ObjectGrasping(CloseLoopTask):
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
         grasp = planner.plan(self.clutter.present, tool, reach, heights)
         if grasp is None or grasp.risk > self.risk_allowed:
-            nudge = planner.nudge(self.clutter.present, tool, reach, heights)
+            nudge = NudgePlanner(planner).plan(self.clutter.present, tool, reach, heights)
             if nudge is not None:
                 return self._push(nudge, over_z)
         if grasp is None or robot.opening() < 0.9:
