@@ -289,7 +289,8 @@ class CovidTest(OpenLoopTask):
         if any(map(self._is_presented, self.tubes)):
             return [swab for swab in self.swabs if swab not in self._spent]
         fresh = [tube for tube in self.tubes if tube not in self._used]
-        return [tube for tube in fresh if not self.is_collected(tube)] or fresh
+        # one that strayed among the used first, before others lie beside it
+        return [tube for tube in fresh if self.is_collected(tube)] or fresh
 
     def _place(self, held: Body) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
