@@ -111,7 +111,6 @@ class GraspPlanner:
                 np.array(self.corner),
                 low,
                 high,
-                np.array([x, y, z]),
             )
             for row in found:
                 gx, gy, gz, risk = row[0], row[1], row[2], row[4]
@@ -139,17 +138,15 @@ class GraspPlanner:
             samples: from `placed_samples`, or moved from there.
             tool: where the gripper is.
         """
-        position, yaw = tool
         low, high = self.workspace.z
         found = _search(
             samples,
             samples[:, :3].mean(axis=0),
-            np.array([yaw]),
+            np.array([tool[1]]),
             self._plain,
             np.array(self.corner),
             low,
             high,
-            np.array(position),
         )
         return min(float(found[:, 4].min()), WORST_RISK) if len(found) else WORST_RISK
 
@@ -195,7 +192,7 @@ def _height(heights, corner, x, y):  # noqa: ANN001, ANN202 -- compiled
 
 
 @numba.njit(cache=True)
-def _search(samples, center, yaws, heights, corner, low_z, high_z, tool):  # noqa: ANN001, ANN202
+def _search(samples, center, yaws, heights, corner, low_z, high_z):  # noqa: ANN001, ANN202
     """Return the feasible grasps of one body, [N, 5]: x, y, z, yaw, risk between 0 and 1."""
     found = np.empty((yaws.shape[0] * _OFFSETS_V.shape[0] * _OFFSETS_U.shape[0], 5))
     count = 0
