@@ -59,7 +59,7 @@ class ManipulationEnv(EnvBase):
     """A manipulation task as an unbatched TorchRL environment on the CPU.
 
     Episodes follow from the seed alone: episode n of seed s is the same in any process, whatever
-    happened before.
+    happened before. Only tasks that go on with the objects of the last episode depend on it.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.

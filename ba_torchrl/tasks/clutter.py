@@ -31,7 +31,7 @@ RETREAT_Z_M = (0.55, 0.5, 0.45, 0.4, 0.35)
 class Clutter:
     """Loads every shape of a set once, and shows some of them at a time.
 
-    Objects out of use fall freely, each in its own column, from a height that takes days to fall.
+    Objects out of use fall freely, each in its own column, for seven simulated minutes at least.
     That costs less than anything that rests, and nothing about a body ever changes but its pose:
     changed masses or collision filters would give it a new place in PyBullet's lists, and a
     restored state another future.

@@ -12,7 +12,7 @@ from ba_torchrl.tasks.clutter import ASIDE_SPACING_M, ASIDE_X_M, ASIDE_Z_M
 class Pool:
     """The bodies of a task that brings some of them only, or not all at once.
 
-    Those put aside fall freely, each in its own column, from a height that takes days to fall:
+    Those put aside fall freely, each in its own column, for seven simulated minutes at least:
     that costs less than anything that rests, and nothing about a body ever changes but its pose.
 
     Args:
