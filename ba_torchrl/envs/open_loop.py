@@ -46,7 +46,7 @@ class OpenLoopEnv(ManipulationEnv):
         super().__init__(task_id, config)
 
     def _configure(self) -> None:
-        x, y, _ = self.workspace.x, self.workspace.y, self.workspace.z
+        x, y = self.workspace.x, self.workspace.y
         if not math.isclose(x[1] - x[0], y[1] - y[0], rel_tol=1e-6):
             raise ConfigError("workspace: an open-loop task needs a square one, x as wide as y")
         self.actions = OpenLoopActions(
