@@ -41,8 +41,18 @@ class SimulationUnit:
         self.world.step()
 
 
-def _close_loop_tasks() -> list[str]:
-    return [task for task in list_tasks() if task.startswith("close_loop/")]
+BUDGETS: dict[str, tuple[Budget, Budget | None]] = {
+    "close_loop": (Budget("36-60", 5.0, 2.5), None),
+    "close_loop/block_picking": (Budget("31", 4.0, 1.5), None),
+    "close_loop/object_grasping": (Budget("79", 15.0, 8.0), None),
+    "open_loop/block_stacking": (Budget("82", 8.0, 3.0), None),
+    "open_loop/house_building_4": (Budget("96", 10.0, 4.0), None),
+    "open_loop/box_palletizing": (Budget("374", 35.0, 12.0), None),
+    "open_loop/covid_test": (Budget("388", 35.0, 12.0), None),
+    "open_loop/bin_packing": (Budget("181", 18.0, 8.0), None),
+    "open_loop/object_grasping": (Budget("2650", 200.0, 60.0), Budget("2210", 250.0, 150.0)),
+}
+"""Of a step and of a reset, for a task or for all the others of its kind."""
 
 
 def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
@@ -59,8 +69,8 @@ def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
     return played
 
 
-@measurement("simulation/close_loop_step", over=_close_loop_tasks)
-def close_loop_step(bench: Bench, task: str) -> list[Row]:
+@measurement("simulation/step", over=list_tasks)
+def step_and_reset(bench: Bench, task: str) -> list[Row]:
     """Steps and resets of a task, the actions the expert's but not asked for while the clock runs.
 
     The same seed gives the same episodes, so the actions are recorded beforehand.
@@ -83,17 +93,14 @@ def close_loop_step(bench: Bench, task: str) -> list[Row]:
             physics.append(env.scene.world.steps - before)
             units.append(seconds(unit))
             state = result[keys.NEXT]
+    size = env.observation_spec[keys.PIXELS].shape[-1]
     env.close()
     unit.world.close()
-    name = task.removeprefix("close_loop/").replace("_", " ")
-    budget = {
-        "close_loop/block_picking": Budget("31", 4.0, 1.5),
-        "close_loop/object_grasping": Budget("79", 15.0, 8.0),
-    }.get(task, Budget("36-60", 5.0, 2.5))
+    of_step, of_reset = BUDGETS.get(task, BUDGETS.get(task.split("/")[0], (None, None)))
     notes = f"{np.mean(physics):.1f} physics steps per action, {len(steps)} actions"
     return [
-        timed_row(f"close-loop step, {name}, 128 px", "ms", steps, units, budget, notes),
-        timed_row(f"close-loop reset, {name}", "ms", resets, units),
+        timed_row(f"{task}, step, {size} px", "ms", steps, units, of_step, notes),
+        timed_row(f"{task}, reset", "ms", resets, units, of_reset),
     ]
 
 
