@@ -119,6 +119,16 @@ ANGLES = {0: (), 1: ("rz",), 2: ("rz", "rx"), 3: ("rz", "ry", "rx")}
 MAX_TILT_RAD = math.pi / 2
 
 
+class GridAxis(NamedTuple):
+    """Equally spaced values of an action's component; index i stands for first + i * step."""
+
+    first: float
+    step: float
+    count: int
+    period: float | None = None
+    """Values this far apart are the same; None where they are not."""
+
+
 @dataclass(frozen=True)
 class OpenLoopActions:
     """The open-loop action vector: a pose to pick from or place at, in metres and radians.
@@ -216,6 +226,26 @@ class OpenLoopActions:
             for name, (low, high) in zip(self.components, self.ranges, strict=True)
         ]
         return np.array(action, dtype=np.float32)
+
+    def axis(self, name: str, count: int) -> GridAxis:
+        """Return the values that a component is divided into.
+
+        Args:
+            name: of the component. x and y take the centres of pixels, so that an image of the
+                workspace and the action share their grid; yaws start from zero.
+            count: number of values.
+
+        Raises:
+            ValueError: there is no such grid.
+        """
+        if name in ("x", "y"):
+            low, high = self.bounds_m["xy".index(name)]
+            step = (high - low) / count
+            return GridAxis(low + step / 2, step, count)
+        if name == "rz":
+            turn = math.pi if self.half_rotation else 2 * math.pi
+            return GridAxis(0.0, turn / count, count, turn)
+        raise ValueError(f"no grid for the component {name!r}")
 
     def wrap(self, rz: float, ry: float, rx: float) -> tuple[float, float, float]:
         """Return the equivalent angles within the ranges.

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, Literal, Self, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 Interval = tuple[float, float]
@@ -111,11 +112,13 @@ class EnvConfig(StrictModel):
     """Close loop: the objects lie in a tray as in Object Grasping."""
     view_type: str = Field(default="camera_center_xyz", json_schema_extra=_CLOSE_LOOP)
     """Close loop: from where the depth image is taken; see `ba_torchrl.sim.views`."""
-    view_scale: float = Field(default=1.5, gt=0, json_schema_extra=_CLOSE_LOOP)
+    view_scale: float = Field(default=1.5, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
     """Close loop: width of the image as a multiple of the workspace's width."""
-    dpos: float = Field(default=0.05, gt=0, json_schema_extra=_CLOSE_LOOP)
+    dpos: float = Field(default=0.05, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
     """Close loop: displacement along an axis at action 1."""
-    drot: float = Field(default=math.pi / 4, gt=0, json_schema_extra=_CLOSE_LOOP)
+    drot: float = Field(
+        default=math.pi / 4, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP
+    )
     """Close loop: change of yaw at action 1."""
     obs_type: Literal["pixel", "vec"] = "pixel"
     """Observe an image, or the poses of gripper and objects as a vector."""
@@ -142,13 +145,24 @@ class EnvConfig(StrictModel):
     """Custom physics: length of a physics step."""
     solver_iterations: int | None = Field(default=None, ge=1)
     """Custom physics: iterations of the contact solver in each step."""
-    solver_residual: float | None = Field(default=None, ge=0)
+    solver_residual: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     """Custom physics: residual at which the solver stops early; 0, the default, keeps episodes and
     restored states exact to the last bit."""
     expert: bool = False
     """Add what the expert would do to every observation."""
     seed: int | None = Field(default=None, ge=0)
     """Seed of the first episode and all that follow it; drawn at random if None."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_numpy(cls, values: Any) -> Any:
+        """Take NumPy's numbers and arrays for what they hold."""
+        if not isinstance(values, dict):
+            return values
+        return {
+            name: value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+            for name, value in values.items()
+        }
 
     @field_validator("workspace", mode="before")
     @classmethod

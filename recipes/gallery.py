@@ -22,6 +22,10 @@ def main(settings: DictConfig) -> None:
         strips[task] = expert_strip(task, settings.seed, settings.pictures)
         path = Path(settings.folder) / f"{task.replace('/', '_')}.png"
         tqdm.write(str(strip_figure(task, strips[task], path)))
+    for task in settings.deconstructions:
+        strip = expert_strip(task, settings.seed, settings.pictures, deconstruct=True)
+        path = Path(settings.folder) / f"{task.replace('/', '_')}_deconstruction.png"
+        print(strip_figure(f"{task}, taken apart", strip, path))
     if settings.overview is not None:
         print(overview_figure(strips, settings.overview))
 

@@ -2,6 +2,7 @@
 
 python recipes/train.py task=close_loop/block_picking algorithm=sacfd network=equi seed=0
 python recipes/train.py --config-name quickstart
+python recipes/train.py task=close_loop/block_picking run_dir=runs/mine resume=true
 """
 
 from ba_torchrl._malloc import tune_malloc
@@ -21,7 +22,7 @@ hydra_schema.register()
 
 @hydra.main(config_path="../configs", config_name="train", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Run the experiment that the configuration describes."""
+    """Run the experiment that the configuration describes, or go on with it."""
     quiet_libraries()
     config = ExperimentConfig.parse(OmegaConf.to_container(settings, resolve=True))
     result = Experiment(config).run()
@@ -35,6 +36,7 @@ def main(settings: DictConfig) -> None:
     if result.video is not None:
         print(f"  video       {result.video}")
     print(f"  checkpoint  {result.checkpoint}")
+    print(f"  result      {result.record}")
 
 
 if __name__ == "__main__":

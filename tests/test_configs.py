@@ -1,5 +1,6 @@
 """Every configuration that ships describes a run that can start."""
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from ba_torchrl.algorithms import base as registries
+from ba_torchrl.config import ConfigError
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 
@@ -27,12 +30,42 @@ def experiment(name, *overrides):
     return ExperimentConfig.parse(values)
 
 
+TASK_OF = {"sac": "close_loop/block_picking", "spatial_q": "open_loop/block_stacking"}
+
+
+@cache
+def names_of(group):
+    """The registered name behind each preset of a group."""
+    hydra_schema.register()
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        presets = sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+        return {preset: compose(f"{group}/{preset}")[group].name for preset in presets}
+
+
+def suits(algorithm, network):
+    controls = (
+        registry[names[preset]].control
+        for registry, names, preset in (
+            (registries.ALGORITHMS, names_of("algorithm"), algorithm),
+            (registries.NETWORKS, names_of("network"), network),
+        )
+    )
+    return len(set(controls)) == 1
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("network", NETWORKS)
-def test_presets_compose(algorithm, network):
-    config = experiment("train", f"algorithm={algorithm}", f"network={network}", "seed=3")
+def test_presets_compose_or_are_refused(algorithm, network):
+    task = TASK_OF[names_of("algorithm")[algorithm]]
+    overrides = (f"task={task}", f"algorithm={algorithm}", f"network={network}", "seed=3")
+    if not suits(algorithm, network):
+        with pytest.raises(ConfigError, match="network"):
+            experiment("train", *overrides)
+        return
+    config = experiment("train", *overrides)
     assert config.label == f"{algorithm} {network}"
-    assert config.run_dir.endswith(f"close_loop_block_picking-{algorithm}_{network}-seed3")
+    name = task.replace("/", "_")
+    assert config.run_dir.endswith(f"{name}-{algorithm}_{network}-seed3")
 
 
 def test_the_paper_sets_the_defaults():
@@ -53,7 +86,28 @@ def test_sac_is_sacfd_without_demonstrations_in_its_loss():
     assert not sac.prioritized
 
 
-@pytest.mark.parametrize("network", NETWORKS)
+def test_the_paper_sets_the_defaults_of_the_open_loop():
+    overrides = ("task=open_loop/block_stacking", "algorithm=sdqfd", "network=equi_asr")
+    config = experiment("train", *overrides)
+    algorithm = config.algorithm_config
+    assert (algorithm.learning_rate, algorithm.weight_decay) == (1e-4, 1e-5)
+    assert (algorithm.gamma, algorithm.batch_size, algorithm.buffer_size) == (0.95, 16, 100_000)
+    assert (algorithm.demonstrations, algorithm.replay) == ("sdqfd", "split")
+    assert (algorithm.demonstration_weight, algorithm.margin) == (0.1, 0.1)
+    assert (algorithm.epsilon_init, algorithm.target_interval) == (0.0, 100)
+    assert (config.env_config.obs_size, config.network_config.num_rotations) == (128, 16)
+    assert experiment("train", *overrides[:1], "algorithm=adet", overrides[2]).algorithm_config == (
+        algorithm.model_copy(update={"demonstrations": "adet", "demonstration_weight": 0.01})
+    )
+
+
+def test_the_open_loop_quick_start_composes():
+    config = experiment("quickstart_open_loop", "seed=1")
+    assert config.task == "open_loop/block_stacking"
+    assert config.env_config.num_objects == 3
+
+
+@pytest.mark.parametrize("network", [name for name in NETWORKS if suits("sacfd", name)])
 def test_the_quick_start_takes_any_network(network):
     config = experiment("quickstart", f"network={network}", "env.max_steps=20")
     assert config.env_config.max_steps == 20

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from ba_torchrl.config import StrictModel
+from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.config import ConfigError, StrictModel
 from ba_torchrl.modules.base import NETWORKS, NetworkConfig
 from ba_torchrl.registry import Registry
 
@@ -24,9 +26,12 @@ class Problem:
     """What an algorithm must know about the environments it learns from."""
 
     image_size: int
-    action_sequence: str
+    actions: CloseLoopActions | OpenLoopActions
+    """The action vector."""
     max_depth_m: float
     """Greatest value of the image."""
+    in_hand_shape: tuple[int, int] | None
+    """Channels and size of the in-hand image; None where there is none."""
     total_updates: int
     """Length of the run; schedules end with it."""
     seed: int
@@ -67,6 +72,22 @@ class Algorithm(ABC):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
 
+    @abstractmethod
+    def save_replay(self, folder: Path) -> None:
+        """Write the replay into a folder: transitions, priorities and the state of its draws.
+
+        Args:
+            folder: is there, and empty.
+        """
+
+    @abstractmethod
+    def load_replay(self, folder: Path) -> None:
+        """Restore what `save_replay` wrote.
+
+        Args:
+            folder: may be gone afterwards.
+        """
+
 
 class AlgorithmConfig(StrictModel, ABC):
     """Hyper-parameters of an algorithm; building it needs a network and the problem."""
@@ -80,6 +101,12 @@ class AlgorithmConfig(StrictModel, ABC):
         Raises:
             ConfigError: it does not.
         """
+        if network.control != self.control:
+            known = [name for name in NETWORKS if NETWORKS[name].control == self.control]
+            raise ConfigError(
+                f"{type(network).__name__} is a network for {network.control} tasks; this "
+                f"algorithm learns {self.control} ones, with network: {', '.join(known)}"
+            )
 
     @abstractmethod
     def build(self, network: NetworkConfig, problem: Problem) -> Algorithm:

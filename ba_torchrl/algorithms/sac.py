@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -78,7 +79,7 @@ class SAC(Algorithm):
     def __init__(self, config: SACConfig, network: NetworkConfig, problem: Problem) -> None:
         self.config = config
         self.problem = problem
-        nets = network.build(ActorCriticSpec(problem.image_size, problem.action_sequence))
+        nets = network.build(ActorCriticSpec(problem.image_size, problem.actions.sequence))
         observation = [keys.PIXELS, keys.HOLDING]
         self.quantizer = DepthQuantizer(problem.max_depth_m)
         self.policy = _tanh_policy(_Acting(nets.actor, self.quantizer)).select_out_keys(keys.ACTION)
@@ -109,7 +110,7 @@ class SAC(Algorithm):
         self.replay = make_replay_buffer(
             config.buffer_size,
             config.batch_size,
-            quantizer=self.quantizer,
+            codecs={keys.PIXELS: self.quantizer},
             prioritized=config.prioritized,
             priority_exponent=config.priority_exponent,
             weight_exponent=config.importance_exponent,
@@ -118,7 +119,7 @@ class SAC(Algorithm):
         )
         self.augmentation = (
             SO2Augmentation(
-                problem.action_sequence,
+                problem.actions.sequence,
                 probability=config.augmentation_probability,
                 seed=problem.seed,
             )
@@ -178,6 +179,14 @@ class SAC(Algorithm):
         self.scheduler.load_state_dict(state["scheduler"])
         self.augmentation.load_state_dict(state["augmentation"])
         self.updates = state["updates"]
+
+    def save_replay(self, folder: Path) -> None:
+        """Write the replay into a folder: transitions, priorities and the state of its draws."""
+        self.replay.dumps(folder)
+
+    def load_replay(self, folder: Path) -> None:
+        """Restore what `save_replay` wrote."""
+        self.replay.loads(folder)
 
 
 class _Acting(nn.Module):

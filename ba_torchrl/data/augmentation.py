@@ -14,7 +14,7 @@ from ba_torchrl.envs import keys
 _NEXT_PIXELS = (keys.NEXT, keys.PIXELS)
 
 
-def _quarters_and_rotation(angle_rad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def quarters_and_rotation(angle_rad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return (quarter turns or -1 if not a whole number of them, cosine, sine) of angles [B].
 
     Cosine and sine are exact at quarter turns.
@@ -39,17 +39,28 @@ def rotate_images(images: Tensor, angle_rad: Tensor) -> Tensor:
         images: [B, C, H, H], rows along +x, columns along +y.
         angle_rad: [B] float64 on the CPU, radians.
     """
-    quarters, cos, sin = _quarters_and_rotation(angle_rad)
+    quarters, cos, sin = quarters_and_rotation(angle_rad)
     # Where an output pixel comes from, in (column, row): the inverse rotation.
     zero = torch.zeros_like(cos)
     rows = [torch.stack([cos, -sin, zero], dim=-1), torch.stack([sin, cos, zero], dim=-1)]
     source = torch.stack(rows, dim=1).to(images)
     grid = F.affine_grid(source, list(images.shape), align_corners=False)
     turned = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    exact_quarters(turned, images, quarters)
+    return turned
+
+
+def exact_quarters(turned: Tensor, images: Tensor, quarters: Tensor) -> None:
+    """Overwrite images that were turned by whole quarters with exact copies.
+
+    Args:
+        turned: [B, C, H, H], changed in place.
+        images: before they were turned.
+        quarters: int64 [B] on the CPU; -1 leaves an image as it is.
+    """
     for k in sorted(set(quarters.tolist()) - {-1}):
         exact = (quarters == k).nonzero().squeeze(-1).to(images.device)
         turned[exact] = torch.rot90(images[exact], k, (-2, -1))
-    return turned
 
 
 def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
@@ -61,7 +72,7 @@ def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
         displacement: [B, 2].
         angle_rad: [B] float64 on the CPU, radians.
     """
-    _, cos, sin = (value.to(displacement.device) for value in _quarters_and_rotation(angle_rad))
+    _, cos, sin = (value.to(displacement.device) for value in quarters_and_rotation(angle_rad))
     cos, sin = cos.to(displacement.dtype), sin.to(displacement.dtype)
     dx, dy = displacement.unbind(dim=-1)
     turned = torch.stack([cos * dx - sin * dy, sin * dx + cos * dy], dim=-1)
@@ -127,4 +138,4 @@ class SO2Augmentation(nn.Module):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Take over what ``get_extra_state`` returned."""
-        self._generator.set_state(state)
+        self._generator.set_state(state.cpu())

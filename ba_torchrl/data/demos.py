@@ -185,6 +185,25 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
             names every difference.
     """
     path = Path(path)
+    check_demonstrations(path, task=task, env=env)
+    data = TensorDict.load_memmap(path)
+    numbers = data[_EPISODE].squeeze(-1)
+    return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
+
+
+def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> None:
+    """Check that there are demonstrations of the same task and parameters at ``path``.
+
+    Args:
+        path: folder that `save_demonstrations` wrote.
+        task: id of the task they are for.
+        env: fields of `EnvConfig` of the environments they are for.
+
+    Raises:
+        ConfigError: there are none, or they come from other environments; the message names every
+            difference.
+    """
+    path = Path(path)
     try:
         metadata = json.loads((path / _METADATA_FILE).read_text())
     except (OSError, json.JSONDecodeError) as error:
@@ -200,9 +219,6 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
         raise ConfigError(
             f"the demonstrations at {path} do not fit:\n  " + "\n  ".join(differences)
         )
-    data = TensorDict.load_memmap(path)
-    numbers = data[_EPISODE].squeeze(-1)
-    return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
 
 
 def _env_values(env: dict[str, Any]) -> dict[str, Any]:

@@ -1,9 +1,24 @@
-"""Eight-bit depth: what the replay stores, and what the acting policy must therefore see."""
+"""How the replay stores images, and what the acting policy must therefore see."""
 
 from __future__ import annotations
 
+import math
+from typing import Protocol
+
 import torch
 from torch import Tensor, nn
+
+
+class ImageCodec(Protocol):
+    """Between images in metres and the bytes that stand for them; equal images, equal bytes."""
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Return uint8 codes; leading dimensions stay as they are."""
+        ...
+
+    def decode(self, codes: Tensor) -> Tensor:
+        """Return float32 images of codes."""
+        ...
 
 
 class DepthQuantizer(nn.Module):
@@ -58,6 +73,53 @@ class DepthQuantizer(nn.Module):
     def forward(self, depth: Tensor) -> Tensor:
         """Return the nearest storable depth, in the type of the input."""
         return self.decode(self.encode(depth)).to(depth.dtype)
+
+    def extra_repr(self) -> str:
+        """Return the range for ``print``."""
+        return f"high_m={self.high_m}"
+
+
+class HalfPrecision(nn.Module):
+    """Heights as float16: two bytes each, exact to a 2048th of the height.
+
+    As a module it rounds and restores: put it before an acting policy, so that it sees what the
+    learner sees.
+
+    Args:
+        high_m: largest height, metres.
+
+    Raises:
+        ValueError: ``high_m`` is not positive, or beyond what float16 can hold.
+    """
+
+    def __init__(self, high_m: float) -> None:
+        super().__init__()
+        if not 0 < high_m <= torch.finfo(torch.float16).max:
+            raise ValueError(f"high_m must be positive and finite in float16, got {high_m}")
+        self.high_m = float(high_m)
+
+    @property
+    def max_error_m(self) -> float:
+        """Largest error of a height within the range: half the spacing there, metres."""
+        return 2.0 ** (math.frexp(math.nextafter(self.high_m, 0.0))[1] - 12)
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Return heights [..., W] of a floating type as bytes [..., 2 W].
+
+        Raises:
+            TypeError: the heights are not of a floating type.
+        """
+        if not image.is_floating_point():
+            raise TypeError(f"heights must be floating point metres, got {image.dtype}")
+        return image.half().contiguous().view(torch.uint8)
+
+    def decode(self, codes: Tensor) -> Tensor:
+        """Return bytes [..., 2 W] as float32 heights [..., W]."""
+        return codes.view(torch.float16).float()
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return the nearest storable heights, in the type of the input."""
+        return image.half().to(image.dtype)
 
     def extra_repr(self) -> str:
         """Return the range for ``print``."""

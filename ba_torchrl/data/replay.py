@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,10 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
 
 from ba_torchrl.data._frames import FrameTable
-from ba_torchrl.data.quantization import DepthQuantizer
+from ba_torchrl.data.quantization import ImageCodec
 from ba_torchrl.data.sampler import ExpertPrioritizedSampler
 from ba_torchrl.envs import keys
 
-NEXT_PIXELS = (keys.NEXT, keys.PIXELS)
-_FRAME_KEYS = (keys.PIXELS, NEXT_PIXELS)
 _INDEX = "index"  # TorchRL's writer adds it
 _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))
 
@@ -29,22 +27,31 @@ class ReplaySchemaError(ValueError):
 
 
 class FrameStorage(LazyTensorStorage):
-    """A TorchRL storage that keeps each frame of ``pixels`` and ("next", "pixels") once.
+    """A TorchRL storage that keeps each image once, whether a step's own or its next one.
 
     Everything else lies in ordinary columns. Images go in and come out as float32 metres, within
-    the quantiser's error; in between they are eight bits per pixel, compressed without loss.
+    the codec's error; in between they are its bytes, compressed without loss.
 
     Args:
         max_size: number of transitions.
-        quantizer: between metres and codes.
+        codecs: how each kind of image is stored, by its key, such as ``pixels``; the key nested in
+            "next" goes with it.
+
+    Raises:
+        ValueError: there is no kind of image.
     """
 
-    def __init__(self, max_size: int, quantizer: DepthQuantizer) -> None:
+    def __init__(self, max_size: int, codecs: Mapping[str, ImageCodec]) -> None:
         super().__init__(max_size, device="cpu")
-        self.quantizer = quantizer
-        self._frames: FrameTable | None = None
-        # Slots of (image, next image) of each transition, -1 where none is stored yet.
-        self._slots = torch.full((self.max_size, 2), -1, dtype=torch.int32)
+        if not codecs:
+            raise ValueError("codecs names no image")
+        self.codecs = dict(codecs)
+        self.frame_keys: list[NestedKey] = [
+            nested for key in codecs for nested in (key, (keys.NEXT, key))
+        ]
+        self._frames: dict[str, FrameTable] = {}
+        # Slots of (image, next image) of each kind and transition, -1 where none is stored yet.
+        self._slots = torch.full((len(codecs), self.max_size, 2), -1, dtype=torch.int32)
 
     def set(
         self,
@@ -66,18 +73,22 @@ class FrameStorage(LazyTensorStorage):
         places = torch.as_tensor(places, dtype=torch.long)
         if len(places) > self.max_size:  # each place once, with the latest
             places, data = places[-self.max_size :], data[-self.max_size :]
-        super().set(places, data.exclude(*_FRAME_KEYS), set_cursor=set_cursor)
-        images = [data.get(key).cpu() for key in _FRAME_KEYS]
-        if self._frames is None:
-            self._frames = FrameTable(images[0].shape[1:])
-        self._store_frames(places, images)
+        super().set(places, data.exclude(*self.frame_keys), set_cursor=set_cursor)
+        for number, (key, codec) in enumerate(self.codecs.items()):
+            images = [data.get(nested).cpu() for nested in (key, (keys.NEXT, key))]
+            if key not in self._frames:
+                self._frames[key] = FrameTable(codec.encode(images[0][:1]).shape[1:])
+            self._store_frames(places, images, codec, self._frames[key], self._slots[number])
 
-    def _store_frames(self, places: Tensor, images: list[Tensor]) -> None:
-        frames, slots = self._frames, self._slots.numpy()
+    @staticmethod
+    def _store_frames(
+        places: Tensor, images: list[Tensor], codec: ImageCodec, frames: FrameTable, slots: Tensor
+    ) -> None:
+        slots = slots.numpy()
         for row, place in enumerate(places.tolist()):
             # One by one: a single image is too small for torch to wake its threads, which costs
             # milliseconds where environments keep the cores busy.
-            codes = [self.quantizer.encode(image[row]).flatten().numpy() for image in images]
+            codes = [codec.encode(image[row]).flatten().numpy() for image in images]
             # Acquired before released, so that a frame in both stays.
             new = [frames.acquire(code) for code in codes]
             for slot in slots[place].tolist():
@@ -94,10 +105,11 @@ class FrameStorage(LazyTensorStorage):
             index: places.
         """
         data = super().get(index).copy()
-        slots = self._slots[: len(self)][index]
-        images = self.quantizer.decode(self._frames.read(slots))
-        for i, key in enumerate(_FRAME_KEYS):
-            data.set(key, images.select(slots.ndim - 1, i))
+        for number, (key, codec) in enumerate(self.codecs.items()):
+            slots = self._slots[number, : len(self)][index]
+            images = codec.decode(self._frames[key].read(slots))
+            for i, nested in enumerate((key, (keys.NEXT, key))):
+                data.set(nested, images.select(slots.ndim - 1, i))
         return data
 
     def column(self, key: NestedKey) -> Tensor:
@@ -114,26 +126,34 @@ class FrameStorage(LazyTensorStorage):
         return self._storage[key][: len(self)]
 
     @property
+    def image_shapes(self) -> dict[str, torch.Size]:
+        """Shape of each kind of image, once one is stored."""
+        return {
+            key: self.codecs[key].decode(torch.zeros(table.shape, dtype=torch.uint8)).shape
+            for key, table in self._frames.items()
+        }
+
+    @property
     def frame_count(self) -> int:
-        """Number of different frames held."""
-        return 0 if self._frames is None else len(self._frames)
+        """Number of different frames held, of all kinds together."""
+        return sum(len(frames) for frames in self._frames.values())
 
     @property
     def nbytes(self) -> int:
         """Bytes of memory in use; reserved pages that were never written are not counted."""
-        if self._frames is None:
+        if not self._frames:
             return 0
         row = sum(
             value[0].numel() * value.element_size() for value in self._storage.values(True, True)
         )
-        row += self._slots.element_size() * 2
-        return len(self) * row + self._frames.nbytes
+        row += self._slots.element_size() * 2 * len(self.codecs)
+        return len(self) * row + sum(frames.nbytes for frames in self._frames.values())
 
     def _empty(self) -> None:
         super()._empty()
         self._slots.fill_(-1)
-        if self._frames is not None:
-            self._frames.clear()
+        for frames in self._frames.values():
+            frames.clear()
 
     def state_dict(self) -> dict[str, Any]:
         """Return columns, frames and their assignment; views, to be saved and not changed."""
@@ -141,16 +161,21 @@ class FrameStorage(LazyTensorStorage):
             return {"size": 0}
         size = len(self)
         columns = self._storage[:size]
-        frames, frame_sizes = self._frames.dump()
+        frames = {}
+        for number, (key, table) in enumerate(self._frames.items()):
+            packed, sizes = table.dump()
+            frames[key] = {
+                "slots": self._slots[number, :size],
+                "shape": list(table.shape),
+                "sizes": sizes,
+                "packed": packed,
+            }
         return {
             "size": size,
             "columns": {
                 "/".join(key) if isinstance(key, tuple) else key: value
                 for key, value in columns.items(True, True)
             },
-            "slots": self._slots[:size],
-            "frame_shape": list(self._frames.shape),
-            "frame_sizes": frame_sizes,
             "frames": frames,
         }
 
@@ -161,7 +186,7 @@ class FrameStorage(LazyTensorStorage):
             state_dict: of a storage with at most this one's capacity.
 
         Raises:
-            ValueError: it holds more transitions than fit.
+            ValueError: it holds more transitions than fit, or other kinds of images.
         """
         size = state_dict["size"]
         if size > self.max_size:
@@ -169,17 +194,24 @@ class FrameStorage(LazyTensorStorage):
         self._empty()
         if not size:
             return
+        if set(state_dict["frames"]) != set(self.codecs):
+            raise ValueError(
+                f"images saved: {', '.join(state_dict['frames'])}; kept here: "
+                f"{', '.join(self.codecs)}"
+            )
         columns = TensorDict(
             {tuple(name.split("/")): value for name, value in state_dict["columns"].items()},
             batch_size=[size],
         )
         super().set(torch.arange(size), columns)
-        slots = state_dict["slots"]
-        self._slots[:size] = slots
-        self._frames = FrameTable(torch.Size(state_dict["frame_shape"]))
-        self._frames.load(
-            state_dict["frames"], state_dict["frame_sizes"], slots.reshape(-1).tolist()
-        )
+        self._frames = {}
+        for number, key in enumerate(self.codecs):
+            saved = state_dict["frames"][key]
+            self._slots[number, :size] = saved["slots"]
+            self._frames[key] = FrameTable(torch.Size(saved["shape"]))
+            self._frames[key].load(
+                saved["packed"], saved["sizes"], saved["slots"].reshape(-1).tolist()
+            )
 
     def dumps(self, path: str | Path) -> None:
         """Write the contents into a folder, made if missing."""
@@ -203,7 +235,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
     Args:
         storage: the frame storage.
         sampler: TorchRL's or ours.
-        batch_size: of a sample.
+        batch_size: of a sample; None where every call gives it.
         generator: source of uniform draws.
     """
 
@@ -212,7 +244,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
         *,
         storage: FrameStorage,
         sampler: Sampler,
-        batch_size: int,
+        batch_size: int | None,
         generator: torch.Generator,
     ) -> None:
         super().__init__(
@@ -271,7 +303,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
         found = {key: (value.dtype, value.shape[1:]) for key, value in data.items(True, True)}
         expected = self._schema()
         if expected is None:
-            missing = [key for key in _FRAME_KEYS if key not in found]
+            missing = [key for key in self.storage.frame_keys if key not in found]
             if missing:
                 raise ReplaySchemaError(f"transitions lack {missing}")
             return
@@ -297,7 +329,9 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             for key, value in storage._storage.items(True, True)
             if key != _INDEX
         }
-        return schema | dict.fromkeys(_FRAME_KEYS, (torch.float32, storage._frames.shape))
+        for key, shape in storage.image_shapes.items():
+            schema |= dict.fromkeys((key, (keys.NEXT, key)), (torch.float32, shape))
+        return schema
 
 
 def _text(dtype: torch.dtype, shape: torch.Size) -> str:
@@ -306,21 +340,21 @@ def _text(dtype: torch.dtype, shape: torch.Size) -> str:
 
 def make_replay_buffer(
     capacity: int,
-    batch_size: int,
+    batch_size: int | None,
     *,
-    quantizer: DepthQuantizer,
+    codecs: Mapping[str, ImageCodec],
     seed: int,
     prioritized: bool = True,
     priority_exponent: float = 0.6,
     weight_exponent: float = 0.4,
     expert_bonus: float = 1.0,
 ) -> FrameReplayBuffer:
-    """Return an empty replay whose samples are float32 images in metres (appendix G.2).
+    """Return an empty replay whose samples hold float32 images in metres (appendix G.2).
 
     Args:
         capacity: number of transitions.
-        batch_size: of a sample.
-        quantizer: between metres and the stored bytes; the acting policy must use the same.
+        batch_size: of a sample; None where every call gives it.
+        codecs: how each kind of image is stored, by key; the acting policy must use the same.
         seed: of the draws.
         prioritized: by TD error with the experts' bonus, else uniformly.
         priority_exponent: alpha.
@@ -338,7 +372,7 @@ def make_replay_buffer(
             expert_bonus=expert_bonus,
         )
     return FrameReplayBuffer(
-        storage=FrameStorage(capacity, quantizer),
+        storage=FrameStorage(capacity, codecs),
         sampler=sampler,
         batch_size=batch_size,
         generator=generator,

@@ -168,7 +168,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         largest, place = state_dict["max_priority"]
         self._max_priority = None if largest is None else (largest, place)
         self.beta = state_dict["beta"]
-        self.generator.set_state(state_dict["generator"])
+        self.generator.set_state(state_dict["generator"].cpu())
 
     def dumps(self, path: str | Path) -> None:
         """Write the state into a folder, made if missing."""

@@ -45,6 +45,7 @@ SETTLE_STEPS = 100
 class EnvState:
     """Everything an environment's future follows from; see `ManipulationEnv.get_state`."""
 
+    owner: object
     scale: float
     scene: SceneState
     observation: dict[str, torch.Tensor]
@@ -79,12 +80,17 @@ class ManipulationEnv(EnvBase):
         self.workspace = (
             self.task_class.workspace if config.workspace is None else Workspace(*config.workspace)
         )
-        self.max_steps = config.max_steps or self.task_class.max_steps
-        self.action_sequence = config.action_sequence or self.default_action_sequence
+        self.max_steps = self.task_class.max_steps if config.max_steps is None else config.max_steps
+        self.action_sequence = (
+            self.default_action_sequence
+            if config.action_sequence is None
+            else config.action_sequence
+        )
         """One letter per action component."""
         self._configure()
         low, high = config.object_scale_range or self.task_class.scale_range
         self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
+        self._identity = object()
         self._scenes: dict[float, Scene] = {}
         self._scene: Scene | None = None
         self._observation: dict[str, torch.Tensor] = {}
@@ -190,15 +196,18 @@ class ManipulationEnv(EnvBase):
 
         It lives in this process and costs a few milliseconds; ten thousand of them cost memory.
         The future from here is that from `set_state`, bit by bit; had nobody asked, it might
-        differ in the last bits.
+        differ in the last bits. Tasks with a clutter or a bin go on in a world built anew, here
+        and after each `set_state`: that takes tenths of a second.
 
         Raises:
             SimulationError: the environment was not reset yet.
         """
         scene = self.scene
-        return EnvState(
+        is_chaotic = self.task_class.is_chaotic
+        state = EnvState(
+            owner=self._identity,
             scale=next(key for key, value in self._scenes.items() if value is scene),
-            scene=scene.get_state(),
+            scene=scene.get_state(outlives_world=is_chaotic),
             observation=self._observation,
             memory=self._memory,
             base_seed=self.base_seed,
@@ -206,6 +215,9 @@ class ManipulationEnv(EnvBase):
             step_count=self._step_count,
             ends=self._ends,
         )
+        if is_chaotic:
+            self.set_state(state)
+        return state
 
     def set_state(self, state: EnvState) -> TensorDict:
         """Return to a state of this environment: the same actions then give the same future.
@@ -220,9 +232,11 @@ class ManipulationEnv(EnvBase):
             SimulationError: it is the state of another environment, or of a simulation that
                 failed and was rebuilt since.
         """
-        scene = self._scenes.get(state.scale)
-        if scene is None:
-            raise SimulationError("the state's world is gone: it is not this environment's")
+        if state.owner is not self._identity:
+            raise SimulationError("the state is of another environment")
+        if self.task_class.is_chaotic:
+            self._drop_scenes()
+        scene = self._scene_for(state.scale)
         scene.set_state(state.scene)
         self._scene = scene
         self._observation, self._memory = state.observation, state.memory
@@ -318,12 +332,14 @@ class ManipulationEnv(EnvBase):
 
     def _try_out(self) -> None:
         """Fail now, not in a worker, if the objects or the robot do not fit the workspace."""
-        scene = self._scene_for(float(self._scales[-1]))
-        check_reach(scene.robot, self.workspace, self._heights_to_reach)
-        try:
-            scene.task.randomise(np.random.default_rng(0))
-        except PlacementError as error:
-            raise ConfigError(f"{self.task_id}: {error}") from None
+        check_reach(
+            self._scene_for(float(self._scales[-1])).robot, self.workspace, self._heights_to_reach
+        )
+        for scale in {float(self._scales[0]), float(self._scales[-1])}:
+            try:
+                self._start(self._scene_for(scale), np.random.default_rng(0))
+            except PlacementError as error:
+                raise ConfigError(f"{self.task_id}: {error}") from None
 
     def _scene_for(self, scale: float) -> Scene:
         """Return the sealed world for objects of this scale, building it the first time."""
@@ -355,17 +371,29 @@ class ManipulationEnv(EnvBase):
             scene.world.settle(max_steps=SETTLE_STEPS)
             if scene.task.is_start():
                 return scene
+        scene = self._scene_for(float(rng.choice(self._scales)))
+        self._start(scene, rng)
+        return scene
+
+    def _start(self, scene: Scene, rng: np.random.Generator) -> None:
+        """Bring new objects into a scene.
+
+        Raises:
+            PlacementError: no attempt gave a valid scene that still has to be solved.
+        """
+        invalid = 0
         for _ in range(RESET_ATTEMPTS):
-            scene = self._scene_for(float(rng.choice(self._scales)))
             scene.world.restore_pristine()
             self._place_robot(scene)
             scene.task.randomise(rng)
             scene.world.settle(max_steps=SETTLE_STEPS)
             if scene.task.is_start():
-                return scene
+                return
+            invalid += not scene.task.is_valid()
         raise PlacementError(
-            f"{self.task_id}: {RESET_ATTEMPTS} random scenes in a row were invalid or solved "
-            "from the start; the workspace is too small for the objects"
+            f"of {RESET_ATTEMPTS} random scenes {invalid} had an object outside the workspace and "
+            f"{RESET_ATTEMPTS - invalid} were solved from the start; objects of this size need "
+            "another workspace"
         )
 
     def _judge(self, scene: Scene) -> tuple[bool, bool]:

@@ -40,6 +40,8 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}
 
     def __init__(self, task: str, render_mode: str | None = None, **config: Any) -> None:
+        if "frameskip" in config:  # TorchRL's GymEnv tries it first, and goes on after this
+            raise TypeError("GymEnv.__init__() got an unexpected keyword argument 'frameskip'")
         if render_mode not in (None, *self.metadata["render_modes"]):
             known = ", ".join(self.metadata["render_modes"])
             raise ConfigError(f"unknown render_mode {render_mode!r}. Known: {known}")

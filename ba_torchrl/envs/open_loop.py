@@ -109,7 +109,10 @@ class OpenLoopEnv(ManipulationEnv):
         }
 
     def _place_robot(self, scene: Scene) -> None:
+        held = scene.motion.held
         scene.motion.reset()
+        if held is not None and held not in scene.task.objects:
+            held.is_hidden = True  # the task has put it aside
         self._memory = {}
 
     def _act(self, scene: Scene, action: np.ndarray) -> None:
@@ -170,7 +173,7 @@ class OpenLoopEnv(ManipulationEnv):
         """Return how things lie before an action, if it will be asked what undoes it."""
         if not self.config.deconstruct:
             return None
-        return watch(scene.task.objects, *scene.motion.get_state()), self._heightmap(scene)
+        return watch(scene.task.objects, scene.motion.held, scene.motion.grasp), self._heightmap(scene)
 
     def _remember_undo(self, scene: Scene, before: Watch, heights: np.ndarray) -> dict[str, Any]:
         """Return the memory with what undoes an action that has just settled.
@@ -181,7 +184,7 @@ class OpenLoopEnv(ManipulationEnv):
             heights: the heightmap before it.
         """
         memory = {name: value for name, value in self._memory.items() if name != "undo"}
-        command = before.undo(*scene.motion.get_state())
+        command = before.undo(scene.motion.held, scene.motion.grasp)
         if command is None:
             return memory
         action = self.actions.encode(command)

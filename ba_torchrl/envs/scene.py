@@ -11,7 +11,14 @@ from ba_torchrl.config import CUSTOM_PHYSICS, ConfigError, EnvConfig
 from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
-from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SimulationError, Snapshot, World
+from ba_torchrl.sim.world import (
+    FINE_PHYSICS,
+    Physics,
+    SavedState,
+    SimulationError,
+    Snapshot,
+    World,
+)
 from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace
 from ba_torchrl.tasks.deconstruction import Deconstruction
 from ba_torchrl.tasks.tray import add_tray
@@ -34,7 +41,7 @@ class Motion(Protocol):
 class SceneState:
     """Everything in a scene, at one moment."""
 
-    world: Snapshot
+    world: Snapshot | SavedState
     robot: Any
     motion: Any
     task: Any
@@ -52,10 +59,14 @@ class Scene:
     motion: Motion
     camera: HeightCamera
 
-    def get_state(self) -> SceneState:
-        """Return the state to come back to."""
+    def get_state(self, *, outlives_world: bool = False) -> SceneState:
+        """Return the state to come back to.
+
+        Args:
+            outlives_world: another scene that was built alike can take it up, too.
+        """
         return SceneState(
-            self.world.snapshot(),
+            self.world.save() if outlives_world else self.world.snapshot(),
             self.robot.get_state(),
             self.motion.get_state(),
             self.task.get_state(),
@@ -63,12 +74,15 @@ class Scene:
         )
 
     def set_state(self, state: SceneState) -> None:
-        """Return to a state of this scene.
+        """Return to a state of this scene, or to one that outlives its world.
 
         Raises:
             SimulationError: it is another scene's.
         """
-        self.world.restore(state.world)
+        if isinstance(state.world, SavedState):
+            self.world.load(state.world)
+        else:
+            self.world.restore(state.world)
         self.task.set_state(state.task)
         self.robot.set_state(state.robot)
         self.motion.set_state(state.motion)
@@ -112,7 +126,9 @@ def build_scene(
             random_orientation=config.random_orientation,
             bounding_box_check=config.workspace_check == "bounding_box",
             reach=reach,
-            num_objects=config.num_objects or task_class.num_objects,
+            num_objects=(
+                task_class.num_objects if config.num_objects is None else config.num_objects
+            ),
             surface_z_m=surface_z_m,
             parameters={name: getattr(config, name) for name in task_class.parameters},
         )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 from torch import nn
 
 from ba_torchrl.registry import Registry
+
+Control = Literal["open_loop", "close_loop"]
 
 ACTION_LETTERS = "pxyzr"
 """Close-loop action components: p gripper, x y z displacement, r yaw."""
@@ -68,8 +70,12 @@ class ActorCritic(NamedTuple):
 class NetworkConfig(Protocol):
     """What a registered network is: a pydantic model of its hyper-parameters that can build."""
 
-    def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules for ``spec``."""
+    control: ClassVar[Control]
+    """Which tasks it is for: close-loop ones take an `ActorCritic`, open-loop ones a
+    `ba_torchrl.modules.spatial.SpatialQNetwork`."""
+
+    def build(self, spec: Any) -> Any:
+        """Return freshly initialised modules for an `ActorCriticSpec`, or for a `SpatialSpec`."""
         ...
 
 

@@ -75,7 +75,8 @@ class CNNTwinCritic(nn.Module):
         return torch.cat([head(x) for head in self.heads], dim=-1)
 
 
-def _initialise(module: nn.Module) -> None:
+def initialise_plain(module: nn.Module) -> None:
+    """Draw a plain layer's weights as Xavier does (others are left alone); for ``apply``."""
     if isinstance(module, nn.Conv2d):
         nn.init.xavier_normal_(module.weight)
     elif isinstance(module, nn.Linear):
@@ -109,7 +110,7 @@ class CNNConfig(ImageNetworkConfig):
             critic=CNNTwinCritic(features, spec.action_size, scaled_width(_HIDDEN, self.width)),
         )
         for network in networks:
-            network.apply(_initialise)
+            network.apply(initialise_plain)
         return networks
 
     def _trunk(self, spec: ActorCriticSpec) -> ImageTrunk:

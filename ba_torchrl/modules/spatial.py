@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
@@ -85,15 +85,3 @@ class SpatialQNetwork(nn.Module, ABC):
             float32 [B, *levels[level].shape].
         """
         raise NotImplementedError(f"{type(self).__name__} has one level")
-
-
-class SpatialNetworkConfig(Protocol):
-    """What a registered network is: a pydantic model of its hyper-parameters that can build."""
-
-    def build(self, spec: SpatialSpec) -> SpatialQNetwork:
-        """Return a freshly initialised network for ``spec``.
-
-        Raises:
-            ValueError: the network does not go with these shapes or these components.
-        """
-        ...

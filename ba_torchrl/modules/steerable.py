@@ -21,6 +21,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from escnn.group import Representation
     from escnn.gspaces import GSpace2D
 
@@ -34,6 +36,17 @@ ESCNN_FIX = (
 )
 
 
+def _gspaces() -> ModuleType:
+    try:
+        with warnings.catch_warnings():
+            # It misses the SO(3) package that the set-up leaves out on purpose.
+            warnings.filterwarnings("ignore", message=".*py3nj")
+            from escnn import gspaces
+    except ImportError as error:
+        raise ImportError(ESCNN_FIX) from error
+    return gspaces
+
+
 def planar_rotations(order: int) -> GSpace2D:
     """Return escnn's space of planar images under the rotations of the cyclic group C_order.
 
@@ -43,14 +56,40 @@ def planar_rotations(order: int) -> GSpace2D:
     Raises:
         ImportError: escnn is not installed; the message names the fix.
     """
-    try:
-        with warnings.catch_warnings():
-            # It misses the SO(3) package that the set-up leaves out on purpose.
-            warnings.filterwarnings("ignore", message=".*py3nj")
-            from escnn import gspaces
-    except ImportError as error:
-        raise ImportError(ESCNN_FIX) from error
-    return gspaces.rot2dOnR2(order)
+    return _gspaces().rot2dOnR2(order)
+
+
+def planar_rotations_and_flips(order: int) -> GSpace2D:
+    """Return escnn's space of planar images under the dihedral group D_order.
+
+    Args:
+        order: number of rotations; with the reflections the group has twice as many elements.
+
+    Raises:
+        ImportError: escnn is not installed; the message names the fix.
+    """
+    return _gspaces().flipRot2dOnR2(order)
+
+
+def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representation]:
+    """Return images under rotations, and how values of ``count`` evenly spaced yaws transform.
+
+    Turning the image by one step moves every value to the next yaw. Where yaws half a turn apart
+    are the same, the steps make C_2count, and half a turn moves nothing: the quotient
+    representation C_2count / C_2. Else it is the regular representation of C_count.
+
+    Args:
+        count: number of yaws.
+        half_rotation: they span half a turn.
+
+    Raises:
+        ImportError: escnn is not installed; the message names the fix.
+    """
+    if half_rotation:
+        gspace = planar_rotations(2 * count)
+        return gspace, gspace.quotient_repr(2)
+    gspace = planar_rotations(count)
+    return gspace, gspace.regular_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +157,9 @@ def _build_block(
             return None  # for instance trivial to vector through one pixel
         raise
     expansion = layer.basisexpansion
-    with torch.no_grad():
-        kernels = torch.stack([expansion(unit) for unit in torch.eye(expansion.dimension())])
+    # One pair of representations, so one buffer. Expanding unit vectors gives the same numbers, but
+    # takes most of a minute for 7x7 kernels of C_32.
+    (kernels,) = (v for n, v in expansion.named_buffers() if n.endswith("sampled_basis"))
     shape = (-1, out_repr.size, in_repr.size, kernel_size, kernel_size)
     info = list(expansion.get_basis_info())
     return KernelBlock(
@@ -160,7 +200,7 @@ def he_scales(
     }
 
 
-def _bias_expansion(out_types: FieldTypes) -> Tensor:
+def bias_expansion(out_types: FieldTypes) -> Tensor:
     """Return [channels, biases]: a bias acts on a trivial irrep, mapped into its field's basis."""
     columns, channels = [], sum(rep.size * count for rep, count in out_types)
     start = 0
@@ -239,7 +279,7 @@ class SteerableConv2d(nn.Module):
                 for pair, scale in scales.items()
             }
         )
-        expansion = _bias_expansion(out_types)
+        expansion = bias_expansion(out_types)
         self._bias_block = KernelBlock(expansion.t().contiguous(), (), ())
         count = expansion.shape[1]
         self.bias = nn.Parameter(torch.zeros(count)) if bias and count else None

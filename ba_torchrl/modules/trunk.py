@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import cache
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +13,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.config import StrictModel
-from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN
+from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, Control
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -83,6 +83,8 @@ class ImageNetworkConfig(StrictModel):
         depth_center_m: depth that becomes zero.
         depth_scale_m: depth that becomes one, counted from there.
     """
+
+    control: ClassVar[Control] = "close_loop"
 
     precision: Precision = "auto"
     depth_center_m: float = 0.0

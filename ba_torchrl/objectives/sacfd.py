@@ -10,14 +10,13 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.sac import compute_rsample_log_prob
-from torchrl.objectives.utils import dispatch_value_estimator
 
 from ba_torchrl.envs import keys
+from ba_torchrl.objectives.transitions import TransitionLoss
 
 
-class SACfDLoss(LossModule):
+class SACfDLoss(TransitionLoss):
     """Soft Actor-Critic with a behaviour term on the demonstrations in the batch (appendix G.2).
 
     With weights w_i (ones without prioritised replay), twin values q_1 and q_2 of the stored
@@ -64,7 +63,6 @@ class SACfDLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
     _schedulable_buffers = frozenset({"target_entropy", "demonstration_weight"})
 
     actor_network: ProbabilisticTensorDictSequential
@@ -126,52 +124,10 @@ class SACfDLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Entries that ``forward`` needs."""
         observation = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
-        names = [
-            self.tensor_keys.action,
-            *observation,
-            *(_next(key) for key in observation),
-            _next(self.tensor_keys.reward),
-            _next(self.tensor_keys.done),
-            _next(self.tensor_keys.terminated),
-        ]
+        names = self._transition_keys(observation)
         if self._needs_expert_flag:
             names.append(self.tensor_keys.is_expert)
-        return list(dict.fromkeys(names))
-
-    def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams: object
-    ) -> SACfDLoss:
-        """Choose how targets are formed; TD(0) with gamma 0.99 unless called.
-
-        Args:
-            value_type: TD0, the one estimator that fits a batch of single transitions, or one of
-                TorchRL's estimator objects.
-            hyperparams: its parameters, such as ``gamma``.
-
-        Raises:
-            NotImplementedError: another of TorchRL's named estimators.
-        """
-        value_type, settings = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None:
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=(ValueEstimators.TD0,),
-                tensor_keys=self._value_estimator_keys(),
-                value_network=None,
-                **settings,
-            )
-        return self
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(**self._value_estimator_keys())
-
-    def _value_estimator_keys(self) -> dict[str, NestedKey]:
-        return {
-            name: getattr(self.tensor_keys, name)
-            for name in ("value", "reward", "done", "terminated")
-        }
+        return names
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -249,14 +205,6 @@ class SACfDLoss(LossModule):
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
 
-    def _importance_weights(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Return the batch's importance weights [...] divided by their largest, None if absent."""
-        weights = tensordict.get(self.tensor_keys.priority_weight, None)
-        if weights is None:
-            return None
-        weights = weights.reshape(tensordict.batch_size)
-        return weights / weights.amax()
-
     def _demonstration_error(
         self, tensordict: TensorDictBase, sample: Tensor, action: Tensor
     ) -> Tensor:
@@ -272,10 +220,6 @@ class SACfDLoss(LossModule):
         flag = flag.reshape(tensordict.batch_size).to(sample.dtype)
         error = (sample - action).square().mean(dim=-1)
         return (flag * error).sum() / flag.sum().clamp_min(1)
-
-
-def _next(key: NestedKey) -> tuple[str, ...]:
-    return (keys.NEXT, key) if isinstance(key, str) else (keys.NEXT, *key)
 
 
 def _weighted(loss: Tensor, weights: Tensor | None) -> Tensor:

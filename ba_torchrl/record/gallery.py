@@ -25,15 +25,16 @@ class Strip(NamedTuple):
     """What a policy sees first, [H, W] metres."""
 
 
-def expert_strip(task: str, seed: int, pictures: int = 4) -> Strip:
+def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool = False) -> Strip:
     """Play one episode with the expert.
 
     Args:
         task: id of the task.
         seed: of the episode.
         pictures: how many to take, evenly spread from the first scene to the last.
+        deconstruct: the episode takes the structure apart.
     """
-    env = make(task, expert=True, seed=seed)
+    env = make(task, expert=True, seed=seed, deconstruct=deconstruct)
     try:
         state = env.reset()
         first = state[keys.PIXELS][0].numpy()
@@ -77,7 +78,7 @@ def overview_figure(strips: Mapping[str, Strip], path: str | Path, columns: int 
     figure, axes = _canvas(rows, columns, (2.6 * columns, 2.5 * rows))
     for axis, (name, strip) in zip(axes, strips.items(), strict=False):
         axis.imshow(strip.pictures[len(strip.pictures) // 2])
-        axis.set_title(name, fontsize=11)
+        axis.set_title(name.split("/")[-1].replace("_", " "), fontsize=9)
     return _write(figure, path, dpi=80)
 
 

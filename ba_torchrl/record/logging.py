@@ -46,7 +46,7 @@ def make_logger(
         return None
     if backend not in ("tensorboard", "wandb"):
         raise ValueError(f"unknown logger {backend!r}; known are csv, tensorboard and wandb")
-    if importlib.util.find_spec(backend) is None:
+    if not is_available(backend):
         raise ImportError(
             f"the logger {backend!r} needs a package that is not installed: "
             f"pip install 'ba-torchrl[{backend}]'"
@@ -55,6 +55,11 @@ def make_logger(
     logger = get_logger(backend, logger_name=str(run_dir), experiment_name=name, **options)
     logger.log_hparams(_flat(config))
     return logger
+
+
+def is_available(backend: Backend) -> bool:
+    """Whether the package that a backend needs is installed."""
+    return backend == "csv" or importlib.util.find_spec(backend) is not None
 
 
 def quiet_libraries() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,8 @@ from ba_torchrl.record.logging import read_scalars
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
     from numpy.typing import ArrayLike
 
     Curve = Sequence[ArrayLike]
@@ -50,33 +53,104 @@ def plot_learning_curve(
         ImportError: matplotlib is missing.
         ValueError: there is no curve, or the parts of one differ in length.
     """
-    try:
-        from matplotlib.figure import Figure  # no pyplot: it keeps figures in a global list
-    except ImportError as error:
-        raise ImportError("drawing curves needs pip install 'ba-torchrl[recipes]'") from error
+    figure = _figure((7, 4.5))
     if isinstance(curves, str | Path):
         scalars = read_scalars(curves)
         curves = {name: scalars[name] for name in scalars if name.endswith("success_rate")}
     if not curves:
         raise ValueError("there is no curve to draw")
-    figure = Figure(figsize=(7, 4.5), dpi=150, layout="constrained")
     axes = figure.add_subplot()
     for number, (name, curve) in enumerate(curves.items()):
         _draw(axes, number, name, curve)
     axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
+    _dress(axes, ylim)
+    axes.legend(frameon=False, loc="best")
+    return _save(figure, path)
+
+
+def plot_panels(
+    panels: Mapping[str, Mapping[str, Curve]],
+    path: str | Path,
+    *,
+    names: Sequence[str],
+    xlabel: str = "updates",
+    ylabel: str = "success rate",
+    ylim: tuple[float, float] | None = (0.0, 1.0),
+    columns: int | None = None,
+) -> Path:
+    """Draw curves into panels side by side, in the manner of the paper's figures 18 to 22.
+
+    Args:
+        panels: by title, curves by name as for `plot_learning_curve`.
+        path: of the PNG; its folder is made if it does not exist.
+        names: every name, in the order of colours; one name has one colour in all panels.
+        xlabel: below the panels.
+        ylabel: at their left.
+        ylim: least and greatest y; None fits the curves.
+        columns: most panels in a row; None leaves as few places empty as three to five can.
+
+    Returns:
+        The path.
+
+    Raises:
+        ImportError: matplotlib is missing.
+        ValueError: there is no panel, a name is not in ``names``, or the parts of a curve differ
+            in length.
+    """
+    if not panels:
+        raise ValueError("there is no panel to draw")
+    columns = columns or min((5, 4, 3), key=lambda n: -len(panels) % n)
+    columns = min(columns, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    figure = _figure((3.1 * columns + 0.6, 2.6 * rows + 0.6 + 0.25 * math.ceil(len(names) / 4)))
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=ylim is not None)
+    shown: dict[str, Line2D] = {}
+    for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
+        for name, curve in curves.items():
+            shown[name] = _draw(axes, list(names).index(name), name, curve)
+        axes.set_title(title, fontsize=10)
+        _dress(axes, ylim)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    for column in range(columns):
+        lowest = (len(panels) - 1 - column) // columns
+        grid[lowest, column].set_xlabel(xlabel)
+    figure.supylabel(ylabel, fontsize=10)
+    labels = [name for name in names if name in shown]
+    figure.legend(
+        [shown[name] for name in labels],
+        labels,
+        loc="outside lower center",
+        ncols=min(4, max(len(labels), 1)),
+        frameon=False,
+    )
+    return _save(figure, path)
+
+
+def _figure(size_in: tuple[float, float]) -> Figure:
+    try:
+        from matplotlib.figure import Figure  # no pyplot: it keeps figures in a global list
+    except ImportError as error:
+        raise ImportError("drawing curves needs pip install 'ba-torchrl[recipes]'") from error
+    return Figure(figsize=size_in, dpi=150, layout="constrained")
+
+
+def _dress(axes: Axes, ylim: tuple[float, float] | None) -> None:
     if ylim is not None:
         margin = 0.02 * (ylim[1] - ylim[0])  # lines along the edges stay visible
         axes.set_ylim(ylim[0] - margin, ylim[1] + margin)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, loc="best")
+
+
+def _save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="png")
     return path
 
 
-def _draw(axes: Axes, number: int, name: str, curve: Curve) -> None:
+def _draw(axes: Axes, number: int, name: str, curve: Curve) -> Line2D:
     parts = [np.asarray(part, dtype=float) for part in curve]
     if len(parts) not in (2, 4) or any(part.shape != (parts[0].size,) for part in parts):
         raise ValueError(
@@ -87,6 +161,9 @@ def _draw(axes: Axes, number: int, name: str, curve: Curve) -> None:
     color = _COLORS[number % len(_COLORS)]
     style = _STYLES[number // len(_COLORS) % len(_STYLES)]
     marker = "o" if x.size <= _MANY_POINTS else None
-    axes.plot(x, y, color=color, linestyle=style, marker=marker, markersize=3.5, label=name)
+    (line,) = axes.plot(
+        x, y, color=color, linestyle=style, marker=marker, markersize=3.5, label=name
+    )
     if band:
         axes.fill_between(x, *band, color=color, alpha=0.2, linewidth=0)
+    return line

@@ -66,7 +66,8 @@ PEAK_ACCELERATION = 10 / math.sqrt(3)
 class HeldState(NamedTuple):
     """What `PickPlace` remembers."""
 
-    held: Body | None
+    held: int | None
+    """Its place among the world's bodies."""
     grasp: tuple[Vector, Quaternion] | None
 
 
@@ -112,7 +113,7 @@ class PickPlace:
         self.limits = limits or PickPlaceLimits()
         self.held: Body | None = None
         """What is in the gripper; it is hidden from cameras, as is the arm."""
-        self._grasp: tuple[Vector, Quaternion] | None = None
+        self.grasp: tuple[Vector, Quaternion] | None = None
         """Its pose in the frame of the tool."""
 
     def reset(self) -> None:
@@ -166,12 +167,14 @@ class PickPlace:
 
     def get_state(self) -> HeldState:
         """Return what is held, and how."""
-        return HeldState(self.held, self._grasp)
+        held = None if self.held is None else self.world.bodies.index(self.held)
+        return HeldState(held, self.grasp)
 
     def set_state(self, state: HeldState) -> None:
         """Take up what `get_state` returned."""
         self._release()
-        self.held, self._grasp = state
+        self.held = None if state.held is None else self.world.bodies[state.held]
+        self.grasp = state.grasp
         if self.held is not None:
             self.held.is_hidden = True
 
@@ -185,12 +188,12 @@ class PickPlace:
     def _release(self) -> None:
         if self.held is not None:
             self.held.is_hidden = False
-        self.held = self._grasp = None
+        self.held = self.grasp = None
 
     def _remember_grasp(self) -> None:
         """Measure where in the gripper the body is now."""
         to_tool = pybullet.invertTransform(*self.robot.tool_transform())
-        self._grasp = pybullet.multiplyTransforms(*to_tool, *self.held.pose)
+        self.grasp = pybullet.multiplyTransforms(*to_tool, *self.held.pose)
 
     def _carry(self, joints: Sequence[float]) -> None:
         """Teleport the arm, and rigidly with it what is held."""
@@ -198,7 +201,7 @@ class PickPlace:
         if self.held is not None:
             self.world.detect_collisions()  # contacts end: Bullet would not turn their normals
             self.held.move_to(
-                *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self._grasp)
+                *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self.grasp)
             )
 
     def check_grasp(self) -> None:

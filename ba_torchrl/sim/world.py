@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 import weakref
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Self
 
 import pybullet
@@ -50,6 +52,13 @@ class Snapshot:
         self.connection = connection
         self.id = pybullet.saveState(physicsClientId=client)
         weakref.finalize(self, _forget, self.id, client, connection)
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """A state that outlives its world: any other with the same bodies can take it up."""
+
+    data: bytes = field(repr=False)
 
 
 class World:
@@ -168,6 +177,27 @@ class World:
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
         self._forget_pairs()
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
+
+    def save(self) -> SavedState:
+        """Return the state of every body and contact, for `load` in a world built alike."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "state.bullet"
+            pybullet.saveBullet(str(path), physicsClientId=self.client)
+            return SavedState(path.read_bytes())
+
+    def load(self, state: SavedState) -> None:
+        """Take up a state; motor commands are the caller's to repeat.
+
+        Raises:
+            SimulationError: its world had other bodies.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "state.bullet"
+            path.write_bytes(state.data)
+            try:
+                pybullet.restoreState(fileName=str(path), physicsClientId=self.client)
+            except pybullet.error as error:
+                raise SimulationError(f"the state is of another world ({error})") from None
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by ``count`` time steps."""

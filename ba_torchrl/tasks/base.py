@@ -126,8 +126,8 @@ class Task(ABC):
     fits_tray: ClassVar[bool] = False
     """Whether everything has room in the tray of `close_loop_tray`."""
     is_chaotic: ClassVar[bool] = False
-    """Whether so much collides that a seed repeats its episodes exactly only in a new world: how
-    the engine has sorted its lists of what may collide is in no saved state."""
+    """Whether so much collides that a seed or a state repeats its future exactly only in a new
+    world: how the engine has sorted its lists of what may collide is in no saved state."""
     parameters: ClassVar[frozenset[str]] = frozenset()
     """Fields of `EnvConfig` for some tasks only that this one takes."""
 

@@ -7,29 +7,20 @@ every question is answered from any state.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 
-from ba_torchrl.sim.bodies import (
-    CONTACT_M,
-    Body,
-    Vector,
-    radius_m,
-    vertical_extent,
-    world_vertices,
-)
+from ba_torchrl.sim.bodies import Body, Vector, vertical_extent
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.room import PutDown, nearest_spot, reach_m, shortage_m
+from ba_torchrl.tasks.standing import Filling, Standing, middle, read_views
 from ba_torchrl.tasks.structures import UPRIGHT_RAD, Blueprint, Piece, Slot
 
-LYING_COSINE = 0.5
-"""A piece lies on another if the surfaces that touch are within 60 degrees of level."""
-SPOT_STEP_M = 0.02
 BEARINGS = 16
-"""Spots on the ground are looked for in steps of this length, or in this many of a half turn."""
+"""Spots beside a piece are looked for in this many directions of a half turn."""
 SITE_POINTS = 7
 """What a structure will take up on the ground is told by this many points along a bridge."""
 CROWDED = 10.0
@@ -52,33 +43,6 @@ class Move(NamedTuple):
     yaw_period_rad: float
     onto: tuple[Body, ...]
     """What it will rest on; nothing stands for the ground."""
-
-
-class PutDown(NamedTuple):
-    """Where on the ground pieces may be put."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    gap_m: float
-    """Room wanted around a piece."""
-    z_m: float = 0.0
-    line_yaw_rad: float | None = None
-    """Direction in which two pieces for a bridge must stand; None if any will do."""
-
-
-class _View(NamedTuple):
-    """A piece as it lies now."""
-
-    position: Vector
-    tilt_rad: float
-    on_ground: bool
-    on_floor: bool
-    below: frozenset[Body]
-    """The pieces that it rests on."""
-
-
-Filling = tuple[Body | None, ...]
-"""The body in each slot."""
 
 
 class Building:
@@ -118,7 +82,6 @@ class Building:
                 raise ValueError(f"the blueprint needs {needed} of {piece.kind!r}")
             self.pieces |= dict.fromkeys(found, piece)
         self.pieces |= own_pieces or {}
-        self._by_id = {body.id: body for body in self.pieces}
 
     def is_built(self, held: Body | None = None) -> bool:
         """Whether the structure stands, with none of its pieces in the gripper.
@@ -128,8 +91,8 @@ class Building:
         """
         if held in self.pieces:
             return False
-        views = self._views()
-        return any(not self._strays(filling, views) for filling in self._fillings(views, held))
+        standing = self._standing(held)
+        return any(not standing.strays(filling) for filling in standing.fillings())
 
     def has_tipped(self, held: Body | None = None) -> bool:
         """Whether a piece that must stay upright does not, and is not in the gripper either."""
@@ -156,18 +119,18 @@ class Building:
             effort: metres to add to the way of a piece for picking it, to choose among equals.
             crowding: how much a site is too near to pieces; only free room counts if not given.
         """
-        views = self._views()
-        fillings, most = self._fullest(views, held)
+        standing = self._standing(held)
+        fillings, most = standing.fullest()
         if most == len(self.blueprint.slots):
             if held in self.pieces:
                 return self._to_ground(held, put_down)
-            strays = min((self._strays(filling, views) for filling in fillings), key=len)
+            strays = min(map(standing.strays, fillings), key=len)
             return self._to_ground(min(strays, key=effort), put_down) if strays else None
         effort = cache(effort)
-        piles = self._piles(views, held)
+        piles = standing.piles()
         best: tuple[tuple[int, float], Move | Body] | None = None
         for filling in fillings:
-            for detour, body, number in self._choices(filling, views, piles, held):
+            for detour, body, number in self._choices(filling, standing, piles):
                 if held in self.pieces and body is not held:
                     detour, body, number = detour + 1, held, None
                 if best is not None and detour > best[0][0]:
@@ -175,7 +138,7 @@ class Building:
                 move, way = body, 0.0
                 if number is not None:
                     move, crowd_m = self._into_slot(body, number, filling, put_down, crowding)
-                    way = math.dist(views[body].position[:2], move.position[:2])
+                    way = math.dist(standing.views[body].position[:2], move.position[:2])
                     way += CROWDED * crowd_m
                 cost = (detour, way + (0.0 if body is held else effort(body)))
                 if best is None or cost < best[0]:
@@ -184,182 +147,18 @@ class Building:
         move = best[1]
         return move if isinstance(move, Move) else self._to_ground(move, put_down)
 
-    # -- reading the scene -------------------------------------------------------------------
+    # ----------------------------------------------------------------------------------------
 
-    def _views(self) -> dict[Body, _View]:
-        """Return how every piece lies."""
-        heights = {body: body.position[2] for body in self.pieces}
-        views = {}
-        for body, piece in self.pieces.items():
-            touched, below = set(), set()
-            for point in pybullet.getContactPoints(body.id, physicsClientId=self.world.client):
-                if point[8] >= CONTACT_M:
-                    continue
-                touched.add(point[2])
-                other = self._by_id.get(point[2])
-                if (
-                    other is not None
-                    and point[7][2] > LYING_COSINE
-                    and heights[body] - heights[other] >= self.block_m / 2
-                ):
-                    below.add(other)
-            views[body] = _View(
-                body.position,
-                piece.tilt_rad(body),
-                not self.ground.isdisjoint(touched),
-                self.world.floor in touched,
-                frozenset(below),
-            )
-        return views
-
-    def _fillings(self, views: Mapping[Body, _View], held: Body | None) -> Iterator[Filling]:
-        """Yield every way to see a body in each of the slots."""
-
-        def fill(filling: Filling) -> Iterator[Filling]:
-            if len(filling) == len(self.blueprint.slots):
-                yield filling
-                return
-            for body in self._candidates(filling, views, held):
-                yield from fill((*filling, body))
-
-        return fill(())
-
-    def _fullest(self, views: Mapping[Body, _View], held: Body | None) -> tuple[list[Filling], int]:
-        """Return all ways to see bodies in as many slots as possible, and how many these are."""
-        count = len(self.blueprint.slots)
-        found: list[Filling] = []
-        most = 0
-
-        def fill(filling: Filling, filled: int) -> None:
-            nonlocal found, most
-            if filled + count - len(filling) < most:
-                return
-            if len(filling) == count:
-                if filled > most:
-                    found, most = [], filled
-                found.append(filling)
-                return
-            for body in self._candidates(filling, views, held):
-                fill((*filling, body), filled + 1)
-            fill((*filling, None), filled)
-
-        fill((), 0)
-        return found, most
-
-    def _candidates(
-        self, filling: Filling, views: Mapping[Body, _View], held: Body | None
-    ) -> Iterator[Body]:
-        """Yield the bodies that lie as they must for the next slot."""
-        number = len(filling)
-        slot = self.blueprint.slots[number]
-        if any(filling[i] is None for i in slot.on):
-            return
-        for body, piece in self.pieces.items():
-            if (
-                piece.kind == slot.piece.kind
-                and body is not held
-                and body not in filling
-                and self._fits(body, number, filling, views)
-            ):
-                yield body
-
-    def _fits(self, body: Body, number: int, filling: Filling, views: Mapping[Body, _View]) -> bool:
-        """Whether a body lies as it must to fill a slot."""
-        slot, view = self.blueprint.slots[number], views[body]
-        supports = [filling[i] for i in slot.on]
-        if view.tilt_rad >= UPRIGHT_RAD:
-            return False
-        partner = self.blueprint.partner(number)
-        if supports:
-            if view.on_floor or not view.below.issuperset(supports):
-                return False
-        elif not view.on_ground or view.below:
-            return False
-        if partner is not None:
-            return partner > number or self._is_pair(body, number, partner, filling, views)
-        if not supports:
-            return True
-        over = [filling[i] for i in slot.over or slot.on]
-        if None in over:
-            return False
-        dx, dy = (view.position[i] - _middle(views[o].position for o in over)[i] for i in (0, 1))
-        if len(over) == 1:
-            return max(abs(dx), abs(dy)) <= self.block_m / 2
-        return math.hypot(dx, dy) < self.block_m
-
-    def _is_pair(
-        self,
-        body: Body,
-        number: int,
-        partner: int,
-        filling: Filling,
-        views: Mapping[Body, _View],
-    ) -> bool:
-        """Whether a body stands right beside the one in a slot for a bridge to lie on both."""
-        other = filling[partner]
-        if other is None:
-            return False
-        on = self.blueprint.slots[number].on
-        here, there = views[body].position, views[other].position
-        if on:
-            middle = views[filling[on[0]]].position
-            if math.dist(_middle((here, there))[:2], middle[:2]) >= self.block_m:
-                return False
-        bridge = self.blueprint.slots[self.blueprint.bridge_on(number)]
-        apart = math.dist(here[:2], there[:2])
-        if bridge.span.gap_m is not None:
-            way = (np.array(there[:2]) - here[:2]) / max(apart, 1e-9)
-            apart -= float(_reach(body, way[None])[0] + _reach(other, -way[None])[0])
-        if bridge.span.least_m <= apart <= bridge.span.most_m:
-            return True
-        return any(
-            piece.kind == bridge.piece.kind and views[candidate].below.issuperset((body, other))
-            for candidate, piece in self.pieces.items()
-        )
-
-    def _strays(
-        self,
-        filling: Filling,
-        views: Mapping[Body, _View],
-        numbers: Sequence[int] | None = None,
-    ) -> list[Body]:
-        """Return what lies on the bodies in some slots and does not belong there.
-
-        Args:
-            filling: the body in each slot.
-            views: how the pieces lie.
-            numbers: the slots; those that must stay free if not given.
-        """
-        slots = self.blueprint.slots
-        if numbers is None:
-            numbers = [i for i, slot in enumerate(slots) if slot.stays_free]
-        strays = []
-        for number in numbers:
-            own = {filling[i] for i, slot in enumerate(slots) if number in slot.on}
-            strays += [
-                body
-                for body, view in views.items()
-                if filling[number] in view.below and body not in own
-            ]
-        return strays
-
-    def _piles(self, views: Mapping[Body, _View], held: Body | None) -> dict[Body, frozenset[Body]]:
-        """Return all that lies on each piece, right on it or on what does."""
-        piles: dict[Body, frozenset[Body]] = {}
-        # from the top down: what lies on a piece is higher than it
-        for body in sorted(self.pieces, key=lambda piece: -views[piece].position[2]):
-            upon = {b for b, view in views.items() if b is not held and body in view.below}
-            piles[body] = frozenset(upon.union(*(piles[b] for b in upon)))
-        return piles
-
-    # -- choosing ----------------------------------------------------------------------------
+    def _standing(self, held: Body | None) -> Standing:
+        """Return how the pieces lie."""
+        views = read_views(self.world, self.pieces, self.ground, self.block_m)
+        return Standing(self.blueprint, self.pieces, views, self.block_m, held)
 
     def _choices(
         self,
         filling: Filling,
-        views: Mapping[Body, _View],
+        standing: Standing,
         piles: Mapping[Body, frozenset[Body]],
-        held: Body | None,
     ) -> Iterator[tuple[int, Body, int | None]]:
         """Yield what could be done next.
 
@@ -374,17 +173,17 @@ class Building:
             if partner is not None and partner < number and filling[partner] is None:
                 continue
             beside = () if partner is None or filling[partner] is None else (partner,)
-            strays = self._strays(filling, views, (*slot.on, *beside))
+            strays = standing.strays(filling, (*slot.on, *beside))
             for body, piece in self.pieces.items():
                 if piece.kind != slot.piece.kind or body in filling:
                     continue
                 others = [stray for stray in strays if stray is not body]
                 in_the_way = set(others).union(piles[body], *(piles[stray] for stray in others))
-                in_the_way -= {body, held}
+                in_the_way -= {body, standing.held}
                 if not in_the_way:
                     yield 0, body, number
                 for top in in_the_way:
-                    if not any(top in views[other].below for other in in_the_way):
+                    if not any(top in standing.views[other].below for other in in_the_way):
                         yield len(in_the_way), top, None
 
     def _into_slot(
@@ -406,7 +205,7 @@ class Building:
             if beside is None:
                 return self._to_ground(body, put_down), 0.0
             return self._beside(body, beside, bridge, put_down, rest, crowding)
-        x, y, _ = _middle(filling[i].position for i in slot.over or slot.on)
+        x, y, _ = middle(filling[i].position for i in slot.over or slot.on)
         z = max(vertical_extent(support)[1] for support in supports)
         z += body.position[2] - vertical_extent(body)[0]
         yaw, period = None, piece.yaw_period_rad
@@ -480,11 +279,11 @@ class Building:
             cos, sin = math.cos(side), math.sin(side)
             far = (body.shape.vertices[:, :2] @ [cos, sin]).max()
             near = (body.shape.vertices[:, :2] @ [-cos, -sin]).max()
-            radii = _reach(anchor, ways) + max(far, near) + bridge.span.gap_m
+            radii = reach_m(anchor, ways) + max(far, near) + bridge.span.gap_m
             yaw = -side
         spots = center + radii[:, None] * ways
         others = [other for other in self.pieces if other is not body and other is not anchor]
-        cost = self._shortage(spots, body, others, put_down)
+        cost = shortage_m(spots, body, others, put_down)
         if crowding is not None:
             length = max(
                 (
@@ -504,38 +303,6 @@ class Building:
 
     def _to_ground(self, body: Body, put_down: PutDown) -> Move:
         """Return the move to a spot on the ground with room around it, the nearest such."""
-        x, y, z = body.position
-        spots = np.array([(a, b) for a in _steps(*put_down.x) for b in _steps(*put_down.y)])
         others = [other for other in self.pieces if other is not body]
-        cost = self._shortage(spots, body, others, put_down)
-        aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
-        best = np.lexsort((aways, cost))[0]
-        place = (*spots[best].tolist(), put_down.z_m + z - vertical_extent(body)[0])
+        place = nearest_spot(body, others, put_down)
         return Move(body, self.pieces[body], place, None, self.pieces[body].yaw_period_rad, ())
-
-    def _shortage(
-        self, spots: np.ndarray, body: Body, others: Sequence[Body], put_down: PutDown
-    ) -> np.ndarray:
-        """Return how much room is wanting at spots [S, 2]: outside the area, or beside others."""
-        low, high = np.array([put_down.x, put_down.y]).T
-        outside = np.maximum(np.maximum(low - spots, spots - high), 0.0).max(axis=1)
-        if not others:
-            return outside
-        at = np.array([other.position[:2] for other in others])
-        gaps = np.hypot(*(spots[:, None] - at).transpose(2, 0, 1))
-        room = (gaps - [radius_m(other) for other in others]).min(axis=1)
-        return outside + np.maximum(put_down.gap_m + radius_m(body) - room, 0.0)
-
-
-def _reach(body: Body, ways: np.ndarray) -> np.ndarray:
-    """Return how far a body, as it lies, reaches from its origin in directions [N, 2], [N]."""
-    return ((world_vertices(body)[:, :2] - body.position[:2]) @ ways.T).max(axis=0)
-
-
-def _middle(points: Iterable[Vector]) -> Vector:
-    return tuple(sum(values) / len(values) for values in zip(*points, strict=True))
-
-
-def _steps(low: float, high: float) -> list[float]:
-    count = max(1, round((high - low) / SPOT_STEP_M))
-    return [low + (high - low) * i / count for i in range(count + 1)]

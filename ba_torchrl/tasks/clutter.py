@@ -1,4 +1,4 @@
-"""Clutter: a pool of objects, some of which lie in a heap while the others are out of the way."""
+"""Clutter: a heap of objects in a tray that lasts from one episode to the next."""
 
 from __future__ import annotations
 
@@ -6,13 +6,25 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, Quaternion, Solid
-from ba_torchrl.sim.robots.base import Robot, downward
+from ba_torchrl.sim.assets.base import load_object_set
+from ba_torchrl.sim.bodies import Body, Quaternion
+from ba_torchrl.sim.robots.base import Pose, Robot, downward
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TaskSettings
+from ba_torchrl.tasks.pool import Pool
+from ba_torchrl.tasks.tray import FLOOR_Z_M, MARGIN_M, add_tray
+
+PARAMETERS = frozenset({"object_set", "asset_root"})
+"""What a task with clutter takes besides the parameters of all tasks."""
+
+FAILURES_ALLOWED = 3
+"""Episodes in a row that take nothing, until new objects fall."""
 
 DROP_Z_M = 0.2
 DROP_INTERVAL_S = 0.15
 """Time between objects: each falls 11 cm, out of the next one's way."""
+WALL_M = 0.03
+"""Objects start this far from the edge of the tray's floor at least."""
 SETTLE_S = 4.0
 LOW_DROP_M = 5e-3
 APART_M = 5e-3
@@ -21,138 +33,151 @@ TRIES = 50
 DROP_ATTEMPTS = 3
 """Heaps tried until one comes to rest inside its area; round objects may roll for long."""
 
-ASIDE_Z_M = 1e6
-ASIDE_SPACING_M = 0.3
-ASIDE_X_M = 5.0
 RETREAT_Z_M = (0.55, 0.5, 0.45, 0.4, 0.35)
 """Heights to which the arm retreats while objects fall: the first that is in its reach."""
 
 
 class Clutter:
-    """Loads every shape of a set once, and shows some of them at a time.
+    """A tray, every shape of an object set, and the heap that some of them form.
 
-    Objects out of use fall freely, each in its own column, for seven simulated minutes at least.
-    That costs less than anything that rests, and nothing about a body ever changes but its pose:
-    changed masses or collision filters would give it a new place in PyBullet's lists, and a
-    restored state another future.
+    A heap lasts until all of it was taken out or too many episodes in a row took nothing.
 
     Args:
         world: not sealed yet.
-        shapes: to draw from; repeated as often as ``count`` needs.
-        names: of the shapes.
-        count: most objects at a time.
+        robot: keeps away while objects fall.
+        settings: of the task; their `parameters` name the object set.
     """
 
-    def __init__(
-        self, world: World, shapes: Sequence[Solid], names: Sequence[str], count: int
-    ) -> None:
+    def __init__(self, world: World, robot: Robot, settings: TaskSettings) -> None:
         self.world = world
-        copies = -(-count // len(shapes))
-        self.bodies = [
-            world.add(shape, f"{name} {copy + 1}" if copies > 1 else name)
-            for copy in range(copies)
-            for shape, name in zip(shapes, names, strict=True)
-        ]
-        """The whole pool."""
-        self.present: list[Body] = []
-        """Those in use."""
-        for body in self.bodies:
-            self._put_aside(body)
+        self.robot = robot
+        self.settings = settings
+        self.failures = 0
+        """Episodes in a row that took nothing."""
+        if not settings.surface_z_m:
+            add_tray(world, settings.workspace.center, settings.workspace.width)
+        parameters = settings.parameters
+        shapes = load_object_set(parameters["object_set"], parameters["asset_root"])
+        copies = -(-settings.num_objects // len(shapes))
+        numbers = [f" {copy + 1}" if copies > 1 else "" for copy in range(copies)]
+        self.pool = Pool(
+            world,
+            [shape for _ in numbers for shape in shapes],
+            [f"{name}{number}" for number in numbers for name in shapes.names],
+        )
 
-    def put_aside(self, body: Body) -> None:
-        """Take an object out of use."""
-        self.present.remove(body)
-        self._put_aside(body)
+    def lasts(self, taken: Body | None) -> bool:
+        """Whether the next episode goes on with the heap.
 
-    def drop(
-        self,
-        rng: np.random.Generator,
-        count: int,
-        *,
-        center_xy: tuple[float, float],
-        spread_m: float,
-        surface_z_m: float,
-        random_orientation: bool,
-        robot: Robot,
-    ) -> None:
-        """Let new objects fall one by one and come to rest; the arm is out of the way meanwhile.
+        Args:
+            taken: what the last one took out, if anything.
+        """
+        if taken is not None:
+            return len(self.pool.present) > 1
+        return bool(self.pool.present) and self.failures + 1 < FAILURES_ALLOWED
+
+    def go_on(self, taken: Body | None) -> None:
+        """Put aside what an episode took out, and count those that took nothing."""
+        if taken is None:
+            self.failures += 1
+        else:
+            self.pool.put_aside(taken)
+            self.failures = 0
+
+    def drop(self, rng: np.random.Generator) -> None:
+        """Let new objects fall one by one and come to rest.
+
+        Their orientation is any; or, where the settings ask for fixed ones, upright with yaw 0.
+        These come down apart and from close above, so that they stay so, and last those for which
+        there is no room any more.
 
         Args:
             rng: draws objects and poses.
-            count: of objects.
-            center_xy: middle of the area, metres.
-            spread_m: objects start this far from the middle at most, along x and along y.
-            surface_z_m: height of what they fall on.
-            random_orientation: any orientation; else upright and with yaw 0. If there is room,
-                these objects come down apart and from close above, so that they stay so.
-            robot: to keep away.
         """
-        joints = robot.joints
-        heights = (robot.inverse_kinematics((*center_xy, z), downward(0.0)) for z in RETREAT_Z_M)
-        robot.teleport(next((found for found in heights if found is not None), joints))
-        pause = round(DROP_INTERVAL_S / self.world.physics.time_step_s)
-        for body in self.bodies:
-            self._put_aside(body)
+        self.failures = 0
+        settings, world, pool = self.settings, self.world, self.pool
+        center = np.array(settings.workspace.center)
+        half_m = (settings.workspace.width - MARGIN_M) / 2
+        count = settings.num_objects
+        joints = self.robot.joints
+        self._retreat()
+        pause = round(DROP_INTERVAL_S / world.physics.time_step_s)
         for _ in range(DROP_ATTEMPTS):
-            for body in self.present:
-                self._put_aside(body)
-            chosen = rng.choice(len(self.bodies), size=count, replace=False)
-            self.present = [self.bodies[i] for i in chosen]
-            points = rng.uniform(-spread_m, spread_m, (count, 2))
-            apart = None if random_orientation else _apart(rng, self.present, spread_m)
-            for i, body in enumerate(self.present):
-                x, y = center_xy + (points[i] if apart is None else apart[i])
-                if apart is None:
-                    z = DROP_Z_M
-                else:
-                    z = surface_z_m + LOW_DROP_M - body.shape.bounds_m[0][2]
-                turn = _random_turn(rng) if random_orientation else (0.0, 0.0, 0.0, 1.0)
-                body.move_to((x, y, z), turn)
-                body.is_hidden = False
-                self.world.step(pause)
-            if self.world.settle(round(SETTLE_S / self.world.physics.time_step_s)):
+            pool.clear()
+            chosen = rng.choice(len(pool.bodies), size=count, replace=False)
+            bodies = [pool.bodies[i] for i in chosen]
+            apart = {} if settings.random_orientation else _apart(rng, bodies, half_m)
+            for i, (x, y) in apart.items():
+                z = FLOOR_Z_M + LOW_DROP_M - bodies[i].shape.bounds_m[0][2]
+                pool.bring(bodies[i])
+                bodies[i].place((x + center[0], y + center[1], z))
+            for i in sorted(set(range(count)) - set(apart)):
+                x, y = center + rng.uniform(WALL_M - half_m, half_m - WALL_M, 2)
+                turn = _random_turn(rng) if settings.random_orientation else (0.0, 0.0, 0.0, 1.0)
+                pool.bring(bodies[i])
+                bodies[i].move_to((x, y, DROP_Z_M), turn)
+                world.step(pause)
+            if world.settle(round(SETTLE_S / world.physics.time_step_s)):
                 break
+        self.robot.teleport(joints)
+
+    @property
+    def landmarks(self) -> list[Pose]:
+        """Poses of the objects; for those that are gone, the workspace's upper corner."""
+        workspace = self.settings.workspace
+        corner = (workspace.x[1], workspace.y[1], workspace.z[1])
+        poses = [(body.position, body.yaw_rad) for body in self.pool.present]
+        return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
+
+    def get_state(self) -> tuple[tuple[int, ...], int]:
+        """Return which objects are in use, and the failures in a row."""
+        return self.pool.get_state(), self.failures
+
+    def set_state(self, state: tuple[tuple[int, ...], int]) -> None:
+        """Take up what `get_state` returned."""
+        present, self.failures = state
+        self.pool.set_state(present)
+
+    def _retreat(self) -> None:
+        """Put the arm high above the heap, as high as it reaches."""
+        robot, center_xy = self.robot, self.settings.workspace.center
+        ways = (robot.inverse_kinematics((*center_xy, z), downward(0.0)) for z in RETREAT_Z_M)
+        joints = next((found for found in ways if found is not None), robot.joints)
         robot.teleport(joints)
 
-    def get_state(self) -> tuple[int, ...]:
-        """Return which objects are in use."""
-        return tuple(self.bodies.index(body) for body in self.present)
 
-    def set_state(self, state: tuple[int, ...]) -> None:
-        """Take up what `get_state` returned; their poses are the world's to restore."""
-        self.present = [self.bodies[i] for i in state]
-        for body in self.bodies:
-            body.is_hidden = body not in self.present
+def _apart(
+    rng: np.random.Generator, bodies: Sequence[Body], half_m: float
+) -> dict[int, tuple[float, float]]:
+    """Return random points of a square about zero at which upright bodies do not touch, by index.
 
-    def _put_aside(self, body: Body) -> None:
-        row, column = divmod(self.bodies.index(body), 10)
-        x, y = ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row
-        body.place((x, y, ASIDE_Z_M))
-        body.is_hidden = True
+    Where there is no room for all of them, some are missing.
 
-
-def _apart(rng: np.random.Generator, bodies: Sequence[Body], spread_m: float) -> np.ndarray | None:
-    """Return random points [N, 2] of a square about zero at which upright bodies do not touch.
-
-    Returns:
-        None if no room was found for all of them.
+    Args:
+        rng: draws the points.
+        bodies: to be placed; large ones come first.
+        half_m: half the width of the square, which they do not leave.
     """
     bounds = np.array([np.array(body.shape.bounds_m)[:, :2] for body in bodies])
+    order = np.argsort(-np.prod(bounds[:, 1] - bounds[:, 0], axis=1))
+    best: dict[int, tuple[float, float]] = {}
     for _ in range(LAYOUTS):
-        placed: list[np.ndarray] = []
-        for low_high in bounds:
-            for _ in range(TRIES):
-                low, high = low_high + rng.uniform(-spread_m, spread_m, 2)
-                others = np.array([other[:2] for other in placed]).reshape(-1, 2, 2)
-                gaps = np.maximum(low - others[:, 1], others[:, 0] - high)
-                if (gaps.max(axis=1) > APART_M).all():
-                    placed.append(np.array([low, high]))
-                    break
-            else:
-                break
-        else:
-            return np.array(placed)[:, 0] - bounds[:, 0]
-    return None
+        points: dict[int, tuple[float, float]] = {}
+        taken = np.empty((0, 2, 2))
+        for i in order.tolist():
+            low, high = bounds[i]
+            tries = rng.uniform(-half_m - low, half_m - high, (TRIES, 1, 2))
+            gaps = np.maximum(low + tries - taken[:, 1], taken[:, 0] - high - tries)
+            free = np.flatnonzero((gaps.max(axis=2) > APART_M).all(axis=1))
+            if len(free):
+                point = tries[free[0], 0]
+                points[i] = tuple(point.tolist())
+                taken = np.concatenate([taken, [bounds[i] + point]])
+        if len(points) > len(best):
+            best = points
+        if len(best) == len(bodies):
+            break
+    return best
 
 
 def _random_turn(rng: np.random.Generator) -> Quaternion:

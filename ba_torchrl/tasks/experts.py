@@ -15,13 +15,15 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, Vector, radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.base import Reach, Workspace
-from ba_torchrl.tasks.building import Building, PutDown
+from ba_torchrl.tasks.building import Building
+from ba_torchrl.tasks.room import PutDown
 
 OPEN, CLOSED = 1.0, 0.0
 ALIGNED_M = 4e-3
 ALIGNED_RAD = 0.08
 FINGER_HALF_M = 0.0095
-"""Half the fingers' thickness, across the direction in which they open."""
+"""Half the width of a finger that layouts count on, whichever robot comes: across the direction in
+which fingers open."""
 CLEARANCE_M = 0.03
 """Height of the tool above a body's top at which the fingertips pass over it."""
 
@@ -122,7 +124,7 @@ def push(
         target = (x + travel * gx / norm, y + travel * gy / norm, low_z)
         return towards(robot, target, target_yaw, opening)
 
-    behind = behind_point(body, (ux, uy), workspace)
+    behind = behind_point(robot, body, (ux, uy), workspace)
     over_z = body.position[2] + half + CLEARANCE_M
     arrived = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
     in_the_way = not arrived and _distance_to_segment((bx, by), (x, y), behind) < 0.9 * math.dist(
@@ -134,7 +136,11 @@ def push(
 
 
 def behind_point(
-    body: Body, direction: tuple[float, float], workspace: Workspace, standoff_m: float = 0.08
+    robot: Robot,
+    body: Body,
+    direction: tuple[float, float],
+    workspace: Workspace,
+    standoff_m: float = 0.08,
 ) -> tuple[float, float]:
     """Return the point from which to push a body along ``direction``, inside the workspace.
 
@@ -142,7 +148,8 @@ def behind_point(
     """
     bx, by, _ = body.position
     inner = body.shape.mesh().vertices[:, :2]
-    nearest = float((inner**2).sum(axis=1).max() ** 0.5) + FINGER_HALF_M
+    nearest = float((inner**2).sum(axis=1).max() ** 0.5)
+    nearest += robot.gripper.half_width_m
     limit = standoff_m
     for b, u, (low, high) in zip((bx, by), direction, (workspace.x, workspace.y), strict=True):
         if abs(u) > 1e-9:
@@ -166,7 +173,6 @@ HOVER_M = 0.012
 """Gap under a body, or under the fingertips, that passes over another."""
 SLACK_M = 8e-3
 """Part of that gap that may be missing on the way."""
-TIP_BELOW_TOOL_M = 0.011
 RELEASE_GAP_M = 1e-3
 """A body is let go this far above what it will rest on."""
 NO_ROOM_M = 1.0
@@ -223,7 +229,7 @@ def carry_to(
         yaw + turn,
         CLOSED,
         reach,
-        below_m=tool[2] - min(vertical_extent(body)[0], tool[2] - TIP_BELOW_TOOL_M),
+        below_m=max(tool[2] - vertical_extent(body)[0], tip_below_tool_m(robot)),
         obstacles=[other for other in obstacles if other is not body],
         ceiling_m=ceiling_m,
         hover_m=hover_m,
@@ -266,17 +272,23 @@ def pick_up(
         return lift(5e-3, OPEN)  # the body may stand between the fingers
     if is_aligned and robot.opening() >= 0.9:
         return towards(robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= reach.step_m else OPEN)
-    over_z = min(vertical_extent(body)[1] + TIP_BELOW_TOOL_M + HOVER_M, ceiling_m)
+    below_m = tip_below_tool_m(robot)
+    over_z = min(vertical_extent(body)[1] + below_m + HOVER_M, ceiling_m)
     return travel(
         robot,
         (bx, by, over_z),
         target_yaw,
         OPEN,
         reach,
-        below_m=TIP_BELOW_TOOL_M,
+        below_m=below_m,
         obstacles=[body, *others],
         ceiling_m=ceiling_m,
     )
+
+
+def tip_below_tool_m(robot: Robot) -> float:
+    """Return how far below the tool point the fingers end as they are opened now, metres."""
+    return -robot.gripper.tip_m(robot.opening() * robot.gripper.half_gap_m)
 
 
 def travel(
@@ -342,12 +354,13 @@ def finger_room(
         at: where the body is, if not where it is now.
     """
     apart = HALF_FINGER_DEPTH_M + opening * (robot.finger_span_m / 2 - HALF_FINGER_DEPTH_M)
+    half_width, below_m = robot.gripper.half_width_m, -min(z for _, z in robot.gripper.arc)
     bx, by, bz = body.position if at is None else at
     ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
     gap = math.inf
     for other in others:
         corners = world_vertices(other)
-        if corners[:, 2].max() < bz - TIP_BELOW_TOOL_M:
+        if corners[:, 2].max() < bz - below_m:
             continue
         px, py = corners[:, 0] - bx, corners[:, 1] - by
         along, across = px * ux + py * uy, py * ux - px * uy
@@ -358,8 +371,8 @@ def finger_room(
                 max(
                     along.min() - center - HALF_FINGER_DEPTH_M,
                     center - HALF_FINGER_DEPTH_M - along.max(),
-                    across.min() - FINGER_HALF_M,
-                    -FINGER_HALF_M - across.max(),
+                    across.min() - half_width,
+                    -half_width - across.max(),
                 ),
             )
     return float(gap)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numba
@@ -14,27 +14,28 @@ from ba_torchrl.sim.assets.hulls import surface_samples
 from ba_torchrl.sim.bodies import Body, Vector
 from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.robots.base import Pose
+from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.tasks.base import Reach, Workspace
 from ba_torchrl.tasks.experts import turned
 
-HALF_GAP_M = 0.04
-"""Half the distance between the open fingers."""
 SPARE_M = 0.007
 """Room between an open finger and what it closes on; less is a risk."""
 LEAST_SPARE_M = 0.002
-BAND_HALF_M = 0.0125
-"""Half the fingers' width."""
-TIP_M = 0.0107
-"""The fingertips end this far below the tool point."""
-OUTLINE = ((0.038, -TIP_M), (0.044, -TIP_M), (0.051, -0.004), (0.058, 0.01), (0.065, 0.03))
-"""Half distances at which an open finger's lower side is at a height above the tool point."""
+BESIDE_M = 3e-3
+"""Room on either side of the fingers' width: a pixel of the height image."""
 CLEARANCE_M = 4.5e-3
-DEEPEST_M = 0.035
-"""Height of what is grasped above the tool point at most: more would meet the palm."""
+DEEPEST_M = 0.047
+"""Height of what is grasped above the fingers' tips at most: deeper holds no better."""
+CROWD_M = 0.012
+"""Closing fingers press on what is this much higher than their tips."""
 SHALLOWEST_M = 0.006
 """Least height of what is between the fingers above their tips."""
 LEAST_SQUARE = 0.3
 """How nearly opposite the surfaces that the fingers meet are at least."""
+
+PATCH_M = 0.01
+"""Fingers that meet a face over this width, across the line on which they close, keep it from
+turning; on an edge or a corner it turns until it slips out."""
 
 WORST_RISK = 4.0
 """Stands for no grasp at all."""
@@ -67,11 +68,28 @@ class GraspPlanner:
         pool: everything that may have to be grasped.
         camera: sees everything that may be in the way.
         workspace: where the tool may go.
+        gripper: what is to grasp.
     """
 
-    def __init__(self, pool: Sequence[Body], camera: HeightCamera, workspace: Workspace) -> None:
+    def __init__(
+        self, pool: Sequence[Body], camera: HeightCamera, workspace: Workspace, gripper: Gripper
+    ) -> None:
         self._camera = camera
         self.workspace = workspace
+        self.gripper = gripper
+        self.band_half_m = gripper.half_width_m + BESIDE_M
+        """Half the width of what the fingers meet or pass."""
+        outline = np.array(sorted(gripper.outline, key=lambda point: point[1]))
+        self._jaws = _Jaws(
+            half_gap=gripper.half_gap_m,
+            band_half=self.band_half_m,
+            palm=gripper.palm_m,
+            depth=gripper.closed_half_m - gripper.arc[0][0],
+            arc_u=np.array([u for u, _ in gripper.arc]),
+            arc_z=np.array([z for _, z in gripper.arc]),
+            outline_u=outline[:, 0].copy(),
+            outline_z=outline[:, 1].copy(),
+        )
         self._samples: dict[int, np.ndarray] = {}
         self._pool = pool
         x, y = workspace.center
@@ -88,7 +106,12 @@ class GraspPlanner:
         return self._camera.heightmap(self.workspace.center, self._side_m, pixels)
 
     def plan(
-        self, bodies: Sequence[Body], tool: Pose, reach: Reach, heights: np.ndarray
+        self,
+        bodies: Sequence[Body],
+        tool: Pose,
+        reach: Reach,
+        heights: np.ndarray,
+        penalty: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> Grasp | None:
         """Return the cheapest grasp of any of the bodies, or None if there is none.
 
@@ -97,6 +120,7 @@ class GraspPlanner:
             tool: where the gripper is.
             reach: of one action.
             heights: from `heights`.
+            penalty: from grasps [N, 6] (x, y, z, yaw, risk, slip) to what they cost besides [N].
         """
         (x, y, z), yaw = tool
         yaws = np.arange(YAWS) * np.pi / YAWS if reach.turn_rad else np.array([yaw])
@@ -111,8 +135,10 @@ class GraspPlanner:
                 np.array(self.corner),
                 low,
                 high,
+                self._jaws,
             )
-            for row in found:
+            extra = np.zeros(len(found)) if penalty is None else penalty(found)
+            for row, more in zip(found, extra.tolist(), strict=True):
                 gx, gy, gz, risk = row[0], row[1], row[2], row[4]
                 if not (
                     self.workspace.x[0] <= gx <= self.workspace.x[1]
@@ -126,7 +152,7 @@ class GraspPlanner:
                 travel += max(z - gz, 0.0) / reach.step_m
                 if aside > 0.015 or turn > 0.3:
                     travel += max(0.1 - z, 0.0) / reach.step_m  # up first
-                cost = travel + 12 * risk
+                cost = travel + 12 * risk + more
                 if best is None or cost < best.cost:
                     best = Grasp(body, (gx, gy, gz), target_yaw, float(risk), float(cost))
         return best
@@ -147,6 +173,7 @@ class GraspPlanner:
             np.array(self.corner),
             low,
             high,
+            self._jaws,
         )
         return min(float(found[:, 4].min()), WORST_RISK) if len(found) else WORST_RISK
 
@@ -175,9 +202,21 @@ def _rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:
     )
 
 
-_OUTLINE_U = np.array([u for u, _ in OUTLINE])
-_OUTLINE_Z = np.array([z for _, z in OUTLINE])
-_BAND = np.array([-BAND_HALF_M, 0.0, BAND_HALF_M])
+class _Jaws(NamedTuple):
+    """A gripper's outline for compiled code, metres."""
+
+    half_gap: float
+    band_half: float
+    palm: float
+    depth: float
+    """Extent of a fingertip along the line on which it closes."""
+    arc_u: np.ndarray
+    arc_z: np.ndarray
+    outline_u: np.ndarray
+    outline_z: np.ndarray
+    """Ascending, so that a search may stop."""
+
+
 _OFFSETS_V = np.array([0.0, -0.012, 0.012, -0.024, 0.024])
 _OFFSETS_U = np.array([0.0, -0.02, 0.02, -0.04, 0.04])
 
@@ -192,16 +231,22 @@ def _height(heights, corner, x, y):  # noqa: ANN001, ANN202 -- compiled
 
 
 @numba.njit(cache=True)
-def _search(samples, center, yaws, heights, corner, low_z, high_z):  # noqa: ANN001, ANN202
-    """Return the feasible grasps of one body, [N, 5]: x, y, z, yaw, risk between 0 and 1."""
-    found = np.empty((yaws.shape[0] * _OFFSETS_V.shape[0] * _OFFSETS_U.shape[0], 5))
+def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noqa: ANN001, ANN202
+    """Return the feasible grasps of one body, [N, 6]: x, y, z, yaw, risk between 0 and 1, slip.
+
+    Slip is the odds, as a logarithm from zero up, that the object turns between the fingers and
+    comes out: fitted to picks of random grasps of random shapes.
+    """
+    found = np.empty((yaws.shape[0] * _OFFSETS_V.shape[0] * _OFFSETS_U.shape[0], 6))
     count = 0
     n = samples.shape[0]
     u = np.empty(n)
     v = np.empty(n)
     met = np.empty(n, dtype=np.bool_)
     left_n, right_n = np.empty(4), np.empty(4)
-    top = samples[:, 2].max()
+    top, highest = samples[:, 2].max(), heights.max()
+    half_gap, band_half = jaws.half_gap, jaws.band_half
+    band = (-band_half, 0.0, band_half)
     for yaw in yaws:
         cos, sin = math.cos(yaw), math.sin(yaw)
         for k in range(n):
@@ -213,59 +258,64 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z):  # noqa: ANN
                 # what the fingers would close on, and how high it is
                 lowest_u, highest_u, peak = 1.0, -1.0, 0.0
                 for k in range(n):
-                    if abs(v[k] - v0) <= BAND_HALF_M and abs(u[k] - u0) < HALF_GAP_M:
+                    if abs(v[k] - v0) <= band_half and abs(u[k] - u0) < half_gap:
                         lowest_u, highest_u = min(lowest_u, u[k]), max(highest_u, u[k])
                         peak = max(peak, samples[k, 2])
-                if highest_u < lowest_u or highest_u - lowest_u > 2 * (HALF_GAP_M - LEAST_SPARE_M):
+                if highest_u < lowest_u or highest_u - lowest_u > 2 * (half_gap - LEAST_SPARE_M):
                     continue
                 middle = (highest_u + lowest_u) / 2
                 if u0 != 0.0 and abs(middle - u0) > 0.012:
                     continue  # another offset finds the same
                 x = center[0] + cos * middle - sin * v0
                 y = center[1] + sin * middle + cos * v0
+                half_width = (highest_u - lowest_u) / 2
+                tip = np.interp(half_width, jaws.arc_u, jaws.arc_z)
                 # as low as floor, neighbours and palm allow
-                z = max(low_z + 0.002, peak - DEEPEST_M)
-                for s in range(-1, 2, 2):
-                    for m in range(_OUTLINE_U.shape[0]):
-                        for w in _BAND:
-                            fu = s * _OUTLINE_U[m]
+                z = max(low_z + 0.002, peak - min(jaws.palm - CLEARANCE_M, DEEPEST_M + tip))
+                for m in range(jaws.outline_u.shape[0]):
+                    low = jaws.outline_z[m]
+                    if highest - low + CLEARANCE_M <= z or peak - (z + tip) < SHALLOWEST_M:
+                        break
+                    inside = jaws.outline_u[m] - jaws.depth
+                    if inside <= half_gap <= jaws.outline_u[m]:  # fingers may swing down here
+                        last = np.interp(max(half_width, inside), jaws.arc_u, jaws.arc_z)
+                        low = min(low, last)
+                    for fu in (-jaws.outline_u[m], jaws.outline_u[m]):
+                        for w in band:
                             h = _height(
                                 heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w
                             )
-                            z = max(z, h - _OUTLINE_Z[m] + CLEARANCE_M)
-                depth = peak - (z - TIP_M)
+                            z = max(z, h - low + CLEARANCE_M)
+                depth = peak - (z + tip)
                 if depth < SHALLOWEST_M or z > high_z:
                     continue
-                # what else is between the fingers, and the palm
-                blocked = False
-                for w in _BAND:
+                covered = False
+                for w in band:
                     for m in range(-2, 3):
                         fu = m * 0.015
                         h = _height(heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w)
-                        if h > z + 0.05:
-                            blocked = True
-                        if h > peak + 0.01:
-                            blocked = True  # something lies on it
-                if blocked:
+                        covered = covered or h > peak + 0.01
+                if covered:
                     continue
                 # what the fingers would close on besides
                 crowd = 0
-                for s in range(-1, 2, 2):
-                    edge = highest_u - middle + 0.006
-                    for m in range(3):
-                        for w in _BAND:
-                            fu = s * (edge + (HALF_GAP_M - edge) * m / 3)
+                edge = half_width + 0.006
+                for m in range(3):
+                    beside = edge + (half_gap - edge) * m / 3
+                    end = z + np.interp(beside, jaws.arc_u, jaws.arc_z) + CROWD_M
+                    for fu in (-beside, beside):
+                        for w in band:
                             h = _height(
                                 heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w
                             )
-                            crowd += h > z
+                            crowd += h > end
                 # surfaces that the fingers meet
                 left, right = 1.0, -1.0
                 for k in range(n):
                     met[k] = (
-                        abs(v[k] - v0) <= BAND_HALF_M
-                        and abs(u[k] - middle) < HALF_GAP_M
-                        and samples[k, 2] > z - TIP_M
+                        abs(v[k] - v0) <= band_half
+                        and abs(u[k] - middle) < half_gap
+                        and samples[k, 2] > z + tip
                     )
                     if met[k]:
                         left, right = min(left, u[k]), max(right, u[k])
@@ -273,13 +323,16 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z):  # noqa: ANN
                     continue
                 left_n[:] = 0.0
                 right_n[:] = 0.0
+                left_v0, left_v1, right_v0, right_v1 = 1.0, -1.0, 1.0, -1.0
                 for k in range(n):
                     if met[k] and u[k] < left + MET_M:
                         left_n[:3] += samples[k, 3:]
                         left_n[3] += 1.0
+                        left_v0, left_v1 = min(left_v0, v[k]), max(left_v1, v[k])
                     if met[k] and u[k] > right - MET_M:
                         right_n[:3] += samples[k, 3:]
                         right_n[3] += 1.0
+                        right_v0, right_v1 = min(right_v0, v[k]), max(right_v1, v[k])
                 left_n /= left_n[3]
                 right_n /= right_n[3]
                 square = -(left_n[0] * right_n[0] + left_n[1] * right_n[1] + left_n[2] * right_n[2])
@@ -289,13 +342,16 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z):  # noqa: ANN
                 if square < LEAST_SQUARE or facing < LEAST_SQUARE:
                     continue
                 risk = 2.5 * (1 - square) + 1.5 * max(0.0, 0.75 - facing)
-                spare = HALF_GAP_M - (highest_u - lowest_u) / 2
+                spare = half_gap - half_width
                 risk += 0.4 * max(0.0, SPARE_M - spare) / SPARE_M
                 risk += 0.1 * crowd
                 risk += 0.3 * max(0.0, 0.025 - depth) / 0.015
                 risk += 6 * (abs(v0) + 0.5 * abs(middle))
                 risk += 0.5 * max(0.0, top - peak) / 0.02
                 found[count, 0], found[count, 1], found[count, 2] = x, y, z
-                found[count, 3], found[count, 4] = yaw, risk
+                patch = min(left_v1 - left_v0, right_v1 - right_v0, PATCH_M)
+                askew = cos * (left_n[1] + right_n[1]) - sin * (left_n[0] + right_n[0])
+                slip = 2.3 * (1 - patch / PATCH_M) + 3.4 * abs(askew) + 60 * abs(v0)
+                found[count, 3], found[count, 4], found[count, 5] = yaw, risk, slip
                 count += 1
     return found[:count]

@@ -11,20 +11,22 @@ import numpy as np
 from ba_torchrl.sim.bodies import Body, Vector
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.tasks.base import Reach
-from ba_torchrl.tasks.grasps import BAND_HALF_M, PIXEL_M, GraspPlanner
-from ba_torchrl.tasks.tray import MARGIN_M
+from ba_torchrl.tasks.grasps import PIXEL_M, GraspPlanner
+from ba_torchrl.tasks.tray import FLOOR_Z_M, MARGIN_M
 
-CLOSED_HALF_M = 0.024
-"""A push starts this far from the surface: half the closed fingers and some room."""
-CLOSED_TIP_M = 0.0136
-"""Closed fingers end this far below the tool point, deeper than open ones."""
+BEHIND_M = 5.5e-3
+"""Room between a surface and the closed fingers that are about to push it."""
 PRESS_M = 1.5e-3
 DIG_M = 0.006
 OBJECT_HALF_M = 0.045
 WALL_ROOM_M = 0.05
 """Objects this near to a wall leave no room for a finger behind them."""
-LOW_M = 0.01
-"""Height of the tool above the workspace's lower end while it pushes."""
+OVER_FLOOR_M = 4.4e-3
+"""Height of the fingertips above the floor while they push."""
+HAND_ROOM_M = 3e-3
+"""Room under the hand, beside the fingers."""
+FLAT_M = 0.01
+"""Where the height image is lower, the floor is free."""
 NEAR_M = 0.018
 """Fingers this near to the start of a push are there."""
 
@@ -32,6 +34,8 @@ ENDS = (-0.9, -0.6, -0.3, 0.0, 0.3, 0.6, 0.9)
 SLIDING_RADIUS_M = 0.02
 """Mean distance from its centre of the friction under an object."""
 DRAG_COST = 8.0
+CRAMPED_COST = 12.0
+"""Of a nudge that takes the hand into a wall or another object: better than none."""
 
 
 class Nudge(NamedTuple):
@@ -53,6 +57,14 @@ class NudgePlanner:
 
     def __init__(self, grasps: GraspPlanner) -> None:
         self._grasps = grasps
+        gripper = grasps.gripper
+        self._tip_m = gripper.tip_m(0.0)
+        """Height at which the closed fingers end, above the tool point."""
+        self._standoff_m = gripper.closed_half_m + BEHIND_M
+        """A push starts this far from the surface."""
+        self._hand = np.array([p for p in gripper.closed_outline if p[0] > self._standoff_m])
+        """Distances from the tool and heights above it of what is wider than the fingers."""
+        self._low_m = max(grasps.workspace.z[0], FLOOR_Z_M + OVER_FLOOR_M - self._tip_m)
 
     def plan(
         self, bodies: Sequence[Body], tool: Pose, reach: Reach, heights: np.ndarray
@@ -77,24 +89,24 @@ class NudgePlanner:
         middle = np.array(self._grasps.workspace.center)
         samples = self._grasps.placed_samples(body)
         center = samples[:, :2].mean(axis=0)
-        low = self._grasps.workspace.z[0] + LOW_M
+        low, band_half = self._low_m, self._grasps.band_half_m
         shares, lengths = ((0.0, -0.7, 0.7), (1.0,)) if reach.turn_rad else (ENDS, (0.5, 1.0))
         for turn in np.arange(8) * np.pi / 4:
             ahead = np.array([math.cos(turn), math.sin(turn)])
             side = np.array([-ahead[1], ahead[0]])
             along, across = ((samples[:, :2] - center) @ axis for axis in (ahead, side))
             for offset in np.array(shares) * np.abs(across).max():
-                met = np.abs(across - offset) < BAND_HALF_M
+                met = np.abs(across - offset) < band_half
                 if not met.any():
                     continue
-                start = center + (along[met].min() - CLOSED_HALF_M) * ahead + offset * side
+                start = center + (along[met].min() - self._standoff_m) * ahead + offset * side
                 if not self._is_free(start, heights):
                     continue
                 travel = _travel(start, low + NEAR_M, tool, reach)
                 for length in lengths:
                     end = start + length * reach.step_m * ahead
                     # a body that slides flat turns about a point beyond its centre
-                    push = length * reach.step_m - (CLOSED_HALF_M - BAND_HALF_M)
+                    push = length * reach.step_m - (self._standoff_m - band_half)
                     share = SLIDING_RADIUS_M**2 / (SLIDING_RADIUS_M**2 + offset**2)
                     pushed = center + share * push * ahead
                     if not self._is_on_floor(pushed, OBJECT_HALF_M):
@@ -104,6 +116,8 @@ class NudgePlanner:
                         angle = -offset * push / (SLIDING_RADIUS_M**2 + offset**2)
                         moved = _turned_about(samples, center, angle)
                         cost += 3 * self._grasps.risk_alone(moved, tool)
+                    if not all(self._hand_fits(p, low, tool[1], heights) for p in (start, end)):
+                        cost += CRAMPED_COST
                     yield Nudge((*start, low), (*end, low), NEAR_M, cost)
 
     def _drags(self, body: Body, tool: Pose, reach: Reach, heights: np.ndarray) -> Iterator[Nudge]:
@@ -120,10 +134,12 @@ class NudgePlanner:
         top = float(points[near, 2].max() if near.any() else points[:, 2].max())
         if self._height_at(center, heights) > top + 0.005:
             return  # something lies on it
-        touching = top + CLOSED_TIP_M
+        touching = top - self._tip_m
         start = (*center, touching - PRESS_M)
         way = (middle - center) / np.abs(middle - center).max() * reach.step_m
         cost = DRAG_COST + _travel(center, touching + PRESS_M, tool, reach)
+        if not self._hand_fits(center, touching - DIG_M, tool[1], heights):
+            cost += CRAMPED_COST
         yield Nudge(start, (*(center + way), touching - DIG_M), 3 * PRESS_M, cost)
 
     def _height_at(self, point: np.ndarray, heights: np.ndarray) -> float:
@@ -132,12 +148,22 @@ class NudgePlanner:
 
     def _is_free(self, point: np.ndarray, heights: np.ndarray) -> bool:
         """Whether closed fingers fit at a point of the floor."""
-        if not self._is_on_floor(point, BAND_HALF_M):
+        if not self._is_on_floor(point, self._grasps.band_half_m):
             return False
         i, j = ((point - self._grasps.corner) / PIXEL_M).astype(int)
-        reach = round(CLOSED_HALF_M / PIXEL_M) - 2
+        reach = round(self._standoff_m / PIXEL_M) - 2
         window = heights[i - reach : i + reach + 1, j - reach : j + reach + 1]
-        return float(window.max()) < LOW_M
+        return float(window.max()) < FLAT_M
+
+    def _hand_fits(
+        self, point: np.ndarray, z_m: float, yaw_rad: float, heights: np.ndarray
+    ) -> bool:
+        """Whether the hand stays above walls and others with the tool at a place."""
+        beside = np.outer(self._hand[:, 0], (math.cos(yaw_rad), math.sin(yaw_rad)))
+        places = point + np.concatenate([beside, -beside])
+        pixels = ((places - self._grasps.corner) / PIXEL_M).astype(int)
+        i, j = np.clip(pixels, 0, len(heights) - 1).T
+        return bool((heights[i, j] + HAND_ROOM_M < z_m + np.tile(self._hand[:, 1], 2)).all())
 
     def _is_on_floor(self, point: np.ndarray, margin_m: float) -> bool:
         """Whether a point is off the tray's walls by a margin."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,8 @@ from ba_torchrl.algorithms.base import Algorithm, Problem
 from ba_torchrl.config import ConfigError
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_env
+from ba_torchrl.record.results import CONFIG_FILE
 from ba_torchrl.training.config import ExperimentConfig
-
-CONFIG_FILE = "config.json"
 
 
 class Checkpoints:
@@ -51,24 +51,44 @@ class Checkpoints:
         }
         return Path(self._rotation.save(self._checkpoint, step=updates, metadata=metadata))
 
+    def has(self, updates: int) -> bool:
+        """Whether there is a checkpoint of the policy after so many updates."""
+        return any(
+            int(path.name.rsplit("-", 1)[-1]) == updates for path in self._rotation.checkpoints()
+        )
+
+    def latest(self) -> Path:
+        """Return the folder of the newest checkpoint.
+
+        Raises:
+            ConfigError: nothing was saved yet.
+        """
+        return self._existing(self._rotation.latest())
+
     def load_best(self) -> Path:
         """Put the algorithm back to the checkpoint with the best evaluation; return its folder.
 
         Raises:
             ConfigError: nothing was saved yet.
         """
-        path = self._rotation.best()
+        path = self._existing(self._rotation.best())
+        self._checkpoint.load(path, map_location=self._device)
+        return path
+
+    @staticmethod
+    def _existing(path: Path | None) -> Path:
         if path is None:
             raise ConfigError("there is no checkpoint yet")
-        self._checkpoint.load(path, map_location=self._device)
         return Path(path)
 
 
 def write_config(config: ExperimentConfig) -> None:
-    """Write the run's resolved configuration into its folder."""
+    """Write the run's configuration into its folder, whole or not at all."""
     config.folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps(config.model_dump(mode="json"), indent=2)
-    (config.folder / CONFIG_FILE).write_text(text + "\n")
+    scratch = config.folder / f"{CONFIG_FILE}.tmp"
+    scratch.write_text(text + "\n")
+    os.replace(scratch, config.folder / CONFIG_FILE)
 
 
 def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
@@ -137,14 +157,23 @@ def build_algorithm(config: ExperimentConfig) -> Algorithm:
                 f"env.view_type {config.env_config.view_type!r}: the networks take depth or height "
                 "in one channel, nothing below zero"
             )
+        in_hand = None
+        if keys.IN_HAND in env.observation_spec:
+            in_hand = tuple(env.observation_spec[keys.IN_HAND].shape[:2])
         problem = Problem(
             image_size=pixels.shape[-1],
-            action_sequence=env.action_sequence,
+            actions=env.actions,
             max_depth_m=float(pixels.space.high.max()),
+            in_hand_shape=in_hand,
             total_updates=config.total_updates,
             seed=config.seed,
             device=config.torch_device,
         )
     finally:
         env.close()
-    return config.algorithm_config.build(config.network_config, problem)
+    try:
+        return config.algorithm_config.build(config.network_config, problem)
+    except ConfigError:
+        raise
+    except ValueError as error:  # sizes and components that a network does not take
+        raise ConfigError(str(error)) from error

@@ -13,7 +13,13 @@ from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.config import ConfigError, EnvConfig, StrictModel, parse
+from ba_torchrl.data.demos import Source, check_demonstrations, source_config
+from ba_torchrl.envs.scene import check_task_parameters
+from ba_torchrl.record.logging import is_available
 from ba_torchrl.tasks.base import TASKS
+
+SET_BY_THE_EXPERIMENT = ("seed", "expert")
+"""Fields of `EnvConfig` that are not for the user to set."""
 
 
 class SeedUse(IntEnum):
@@ -53,6 +59,8 @@ class ExperimentConfig(StrictModel):
     """How those processes start."""
     demonstrations: int = Field(default=100, ge=0)
     """Expert episodes in the replay from the start."""
+    demonstrations_source: Source = "expert"
+    """Where they come from: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
     """Leave out expert episodes that failed."""
     demonstrations_path: str | None = None
@@ -85,6 +93,10 @@ class ExperimentConfig(StrictModel):
     """Name of the curve in plots, such as "sacfd equi"."""
     run_dir: str = "runs/run"
     """Folder of everything the run writes."""
+    resume: bool = False
+    """Go on with the run in that folder if it was interrupted."""
+    benchmark: str | None = None
+    """Name of the benchmark that the run belongs to, for reports."""
 
     @cached_property
     def env_config(self) -> EnvConfig:
@@ -101,9 +113,29 @@ class ExperimentConfig(StrictModel):
         """The algorithm's hyper-parameters."""
         return _choose(ALGORITHMS, self.algorithm, "algorithm")
 
-    def derived_seed(self, use: SeedUse) -> int:
-        """Return the first seed of the environments that serve ``use``."""
-        return int(np.random.SeedSequence([self.seed, use]).generate_state(1)[0])
+    def derived_seed(self, use: SeedUse, part: int = 0) -> int:
+        """Return the first seed of the environments that serve ``use``.
+
+        Args:
+            use: what for.
+            part: another number gives others, as a resumed run needs.
+        """
+        return int(np.random.SeedSequence([self.seed, use, part]).generate_state(1)[0])
+
+    def resolved(self) -> dict[str, Any]:
+        """Return the configuration as JSON, every default filled in."""
+        return {
+            **self.model_dump(mode="json"),
+            "env": self.env_config.model_dump(mode="json", exclude=set(SET_BY_THE_EXPERIMENT)),
+            "algorithm": {
+                "name": self.algorithm["name"],
+                **self.algorithm_config.model_dump(mode="json"),
+            },
+            "network": {
+                "name": self.network["name"],
+                **self.network_config.model_dump(mode="json"),
+            },
+        }
 
     @property
     def torch_device(self) -> torch.device:
@@ -126,7 +158,7 @@ class ExperimentConfig(StrictModel):
         """
         config = parse(cls, values, what)
         control = TASKS[config.task].control  # raises with the known names
-        for reserved in ("seed", "expert"):
+        for reserved in SET_BY_THE_EXPERIMENT:
             if reserved in config.env:
                 raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
         _ = config.env_config
@@ -142,13 +174,25 @@ class ExperimentConfig(StrictModel):
             raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
         if config.pretrain_updates and not config.demonstrations:
             raise ConfigError("pretrain_updates needs demonstrations")
+        config._check_demonstrations()
+        if not is_available(config.logger):
+            raise ConfigError(
+                f"logger: {config.logger!r} needs a package that is not installed: "
+                f"pip install 'ba-torchrl[{config.logger}]'"
+            )
         try:
-            device = config.torch_device
-        except RuntimeError as error:
-            raise ConfigError(f"device: {error}") from None
-        if device.type == "cuda" and not torch.cuda.is_available():
-            raise ConfigError("device: no CUDA device is there; use device=cpu or device=auto")
+            torch.empty(0, device=config.torch_device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0]
+            raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
         return config
+
+    def _check_demonstrations(self) -> None:
+        source = source_config(self.demonstrations_source)
+        if self.demonstrations:
+            check_task_parameters(self.task, parse(EnvConfig, {**self.env, **source}, "env"))
+        if self.demonstrations_path is not None:
+            check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
 
 
 def _choose(registry: Any, values: dict[str, Any], kind: str) -> Any:

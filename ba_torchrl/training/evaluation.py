@@ -74,7 +74,7 @@ def evaluate(
             policy,
             episodes,
             seed=seed,
-            exclude=(keys.PIXELS, keys.EXPERT_ACTION),
+            exclude=(keys.PIXELS, keys.IN_HAND, keys.EXPERT_ACTION),
             on_episode=on_episode,
         )
     rate = success_rate(played)
@@ -86,17 +86,17 @@ def evaluate(
 def film(
     task: str,
     env_settings: dict[str, Any],
-    policy: Policy,
+    policy: Policy | None,
     episodes: int,
     seed: int,
     hold_frames: int = 4,
 ) -> list[np.ndarray]:
-    """Play greedy episodes and photograph every step.
+    """Play episodes, greedy ones of a policy that explores, and photograph every step.
 
     Args:
         task: id of the task.
         env_settings: fields of `EnvConfig`.
-        policy: acts on an unbatched root TensorDict.
+        policy: acts on an unbatched root TensorDict; None for random actions.
         episodes: how many.
         seed: of the first.
         hold_frames: how often the last picture of an episode is repeated.
@@ -106,13 +106,14 @@ def film(
     """
     frames: list[np.ndarray] = []
     env = make(task, **{**env_settings, "seed": seed})
+    act = env.rand_action if policy is None else policy
     try:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             for _ in range(episodes):
                 state = env.reset()
                 frames.append(env.render())
                 while not state[keys.DONE]:
-                    state = env.step(policy(state))[keys.NEXT]
+                    state = env.step(act(state))[keys.NEXT]
                     frames.append(env.render())
                 frames += [frames[-1]] * hold_frames
     finally:

@@ -4,6 +4,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
+from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.algorithms.base import NETWORKS, Problem
 from ba_torchrl.algorithms.sac import SACConfig
 from ba_torchrl.config import parse
@@ -18,8 +19,9 @@ def build(network="cnn", **config):
     sizes = {"cnn": {"width": 0.25}, "equi": {"group_order": 4, "n_hidden": 8}}[network]
     problem = Problem(
         image_size=64,
-        action_sequence="pxyzr",
+        actions=CloseLoopActions("pxyzr"),
         max_depth_m=DEPTH_M,
+        in_hand_shape=None,
         total_updates=10,
         seed=0,
         device=torch.device("cpu"),

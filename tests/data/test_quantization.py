@@ -1,9 +1,9 @@
-"""Eight-bit depth."""
+"""Eight-bit depth and half-precision heights."""
 
 import pytest
 import torch
 
-from ba_torchrl.data.quantization import DepthQuantizer
+from ba_torchrl.data.quantization import DepthQuantizer, HalfPrecision
 
 
 @pytest.mark.parametrize("high_m", [0.32, 0.45, 1.0])
@@ -61,3 +61,27 @@ def test_refusals():
         DepthQuantizer(0)
     with pytest.raises(TypeError, match="floating"):
         DepthQuantizer(1.0).encode(torch.zeros(3, dtype=torch.uint8))
+
+
+@pytest.mark.parametrize("high_m", [0.1, 0.24, 0.25, 0.3])
+def test_half_precision_errs_by_half_its_spacing(high_m):
+    codec = HalfPrecision(high_m)
+    heights = torch.linspace(0, high_m, 400_001)[:-1]
+    error = (codec(heights) - heights).abs().max().item()
+    assert error <= codec.max_error_m
+    assert error > 0.9 * codec.max_error_m  # the stated bound is reached
+    assert codec.max_error_m < high_m / 1000
+
+
+def test_half_precision_stores_two_bytes_and_what_the_policy_sees():
+    codec = HalfPrecision(0.25)
+    image = torch.rand(3, 1, 8, 6) * 0.25
+    codes = codec.encode(image)
+    assert codes.dtype == torch.uint8
+    assert codes.shape == (3, 1, 8, 12)
+    assert torch.equal(codec.decode(codes), codec(image))
+    assert codec(image).dtype == torch.float32
+    with pytest.raises(TypeError, match="floating"):
+        codec.encode(torch.zeros(2, dtype=torch.uint8))
+    with pytest.raises(ValueError, match="positive"):
+        HalfPrecision(0.0)

@@ -22,7 +22,9 @@ QUANTIZER = DepthQuantizer(0.32)
 
 
 def buffer(capacity=50, batch_size=8, seed=0, **settings):
-    return make_replay_buffer(capacity, batch_size, quantizer=QUANTIZER, seed=seed, **settings)
+    return make_replay_buffer(
+        capacity, batch_size, codecs={keys.PIXELS: QUANTIZER}, seed=seed, **settings
+    )
 
 
 def episode(length, rng, size=8, expert=False, truncated=False):
@@ -200,7 +202,7 @@ def test_memory_of_expert_episodes(task):
     quantizer = DepthQuantizer(float(pixels.space.high.max()))
     episodes = collect_demonstrations(env, 3, seed=0)
     env.close()
-    rb = make_replay_buffer(200, 8, quantizer=quantizer, seed=0)
+    rb = make_replay_buffer(200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
     for data in episodes:
         rb.extend(as_transitions(data, is_expert=True))
     assert rb.storage.nbytes / len(rb) <= 5_000
@@ -232,7 +234,7 @@ def test_overwriting_reuses_frames():
     for _ in range(50):
         rb.extend(episode(5, rng))
     assert rb.storage.frame_count == 24
-    assert rb.storage._frames.nbytes < 30 * (100 + 64 + 60)  # slots are used again
+    assert rb.storage._frames[keys.PIXELS].nbytes < 30 * (100 + 64 + 60)  # slots are used again
 
 
 @pytest.mark.parametrize("prioritized", [True, False])

@@ -338,6 +338,15 @@ def test_a_list_of_pictures_can_be_collected(make):
     assert len(env.render()) == 2
 
 
+def test_torchrl_wraps_it(make):
+    from torchrl.envs import GymEnv
+
+    env = GymEnv(gym_id("close_loop/block_reaching"), obs_size=32, seed=0)
+    rollout = env.rollout(3)
+    assert rollout["pixels"].shape == (3, 1, 32, 32)
+    env.close()
+
+
 def test_without_a_render_mode_render_says_so(make):
     env = make()
     env.reset()

@@ -320,11 +320,26 @@ def test_render_needs_a_display(monkeypatch):
         ({"workspace_color": (0.1, 0.2, 2.0)}, "red, green and blue"),
         ({"view_type": "from_below"}, "camera_center_xyz"),
         ({"num_object": 2}, "Did you mean 'num_objects'"),
+        ({"drot": math.inf}, "finite"),
+        ({"dpos": math.nan}, "dpos"),
+        ({"view_scale": math.inf}, "finite"),
+        ({"action_sequence": ""}, "pxyzr"),
+        ({"workspace": ((0.3, 0.6), (-0.15, 0.15), (0.0, 0.02))}, "50 had an object outside"),
     ],
 )
 def test_what_has_no_meaning_is_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         ba_torchrl.make(PICKING, **settings)
+
+
+def test_values_of_numpy_are_taken():
+    env = ba_torchrl.make(
+        PICKING, seed=np.int64(3), object_scale_range=np.array([0.8, 0.9]), dpos=np.float32(0.04)
+    )
+    assert env.config.seed == 3
+    assert env.config.object_scale_range == (0.8, 0.9)
+    assert env.config.dpos == pytest.approx(0.04)
+    env.close()
 
 
 def test_every_parameter_is_documented():

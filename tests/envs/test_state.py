@@ -29,7 +29,8 @@ def same(first, second):
 
 @pytest.mark.parametrize("task", ba_torchrl.list_tasks())
 def test_a_state_and_its_actions_have_one_future(task):
-    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True)
+    # enough steps, also where an episode has one
+    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=50)
     generator = torch.Generator().manual_seed(0)
     for taken in (0, 3, 5):  # before, near and after a grasp
         state = env.reset()
@@ -48,6 +49,51 @@ def test_a_state_and_its_actions_have_one_future(task):
         second = play(env, env.set_state(kept), actions)
         assert same(first, second)
         assert not same(first, away)
+    env.close()
+
+
+def expert_steps(env, state, count):
+    """Return what follows from the expert's actions, through the ends of episodes."""
+    for _ in range(count):
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+        if state["done"]:
+            state = env.reset()
+    return state
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        "open_loop/bin_packing",
+        "open_loop/object_grasping",
+        "open_loop/bottle_arrangement",
+        "close_loop/object_grasping",
+        "close_loop/block_in_bowl",
+    ],
+)
+def test_what_happens_in_between_leaves_no_trace(task):
+    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True)
+    expert_steps(env, env.reset(), 4)
+    kept, futures = env.get_state(), []
+    for away in (5, 0):
+        state, poses = env.set_state(kept), []
+        for _ in range(8):
+            state = expert_steps(env, state, 1)
+            poses.append([body.pose for body in env.scene.world.bodies])
+        futures.append(poses)
+        expert_steps(env, env.reset(), away)
+    assert futures[0] == futures[1]
+    env.close()
+
+
+@pytest.mark.parametrize("task", ["open_loop/object_grasping", "close_loop/object_grasping"])
+def test_a_state_of_a_heap_survives_another_seed(task):
+    env = ba_torchrl.make(task, obs_size=32, seed=0)
+    first = env.reset()["pixels"]
+    kept = env.get_state()
+    env.set_seed(1)
+    assert not torch.equal(env.reset()["pixels"], first)
+    assert torch.equal(env.set_state(kept)["pixels"], first)
     env.close()
 
 
@@ -85,7 +131,7 @@ def test_a_state_keeps_how_its_episode_ended():
 def test_a_state_of_another_environment_is_refused():
     first, second = (ba_torchrl.make("close_loop/block_picking", obs_size=32) for _ in range(2))
     first.reset()
-    with pytest.raises(SimulationError, match="another world"):
+    with pytest.raises(SimulationError, match="another environment"):
         second.set_state(first.get_state())
     with pytest.raises(SimulationError, match="reset"):
         second.get_state()

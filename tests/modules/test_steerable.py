@@ -17,16 +17,19 @@ from ba_torchrl.modules.steerable import (
     he_scales,
     kernel_block,
     planar_rotations,
+    planar_rotations_and_flips,
 )
 
 
 def field_types(gspace, spec):
     named = {
-        "regular": gspace.regular_repr,
-        "trivial": gspace.trivial_repr,
-        "vector": gspace.irrep(1),
+        "regular": lambda: gspace.regular_repr,
+        "trivial": lambda: gspace.trivial_repr,
+        "vector": lambda: gspace.irrep(1),
+        "quotient": lambda: gspace.quotient_repr(2),
+        "axial": lambda: gspace.irrep(1, 1),  # the vector of a dihedral group
     }
-    return [(named[name], count) for name, count in spec]
+    return [(named[name](), count) for name, count in spec]
 
 
 def escnn_twin(ours, gspace, in_types, out_types):
@@ -65,12 +68,17 @@ CASES = [
     (8, [("vector", 2), ("trivial", 3)], [("trivial", 2), ("regular", 1)], 3),
     (2, [("regular", 2), ("vector", 2)], [("vector", 2), ("trivial", 1)], 3),
     (8, [("trivial", 3)], [("vector", 1), ("trivial", 2)], 1),  # trivial to vector: no kernel
+    (8, [("regular", 3)], [("quotient", 2)], 1),
+    (8, [("quotient", 2), ("trivial", 1)], [("regular", 2)], 5),
+    ("D4", [("trivial", 1)], [("regular", 2)], 3),
+    ("D4", [("regular", 3)], [("regular", 2)], 3),
+    ("D4", [("regular", 2)], [("axial", 1), ("trivial", 3)], 3),
 ]
 
 
 def build(case):
     order, inputs, outputs, kernel_size = case
-    gspace = planar_rotations(order)
+    gspace = planar_rotations_and_flips(4) if order == "D4" else planar_rotations(order)
     types = field_types(gspace, inputs), field_types(gspace, outputs)
     ours = SteerableConv2d(gspace, *types, kernel_size, padding=kernel_size // 2)
     with torch.no_grad():

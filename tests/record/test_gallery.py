@@ -16,6 +16,13 @@ def test_a_strip_runs_from_the_first_scene_to_the_goal(tmp_path):
     assert picture.std() > 10
 
 
+def test_a_deconstruction_starts_from_the_goal():
+    task = "open_loop/house_building_2"
+    built = expert_strip(task, seed=0, pictures=2)
+    apart = expert_strip(task, seed=0, pictures=2, deconstruct=True)
+    assert built.first_image.max() < 0.6 * apart.first_image.max()
+
+
 def test_an_overview_has_a_cell_for_each_task(tmp_path):
     strip = expert_strip(TASK, seed=0, pictures=1)
     path = overview_figure({str(i): strip for i in range(5)}, tmp_path / "all.png", columns=4)

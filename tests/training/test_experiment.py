@@ -160,19 +160,56 @@ def test_a_missing_checkpoint_says_what_is_needed(tmp_path):
         ({"algorithm": {"name": "ppo"}}, "unknown algorithm 'ppo'.*sac"),
         ({"algorithm": {"name": "sac", "gama": 0.9}}, "Did you mean 'gamma'"),
         ({"algorithm": {"batch_size": 3}}, "algorithm.name is missing"),
-        ({"network": {"name": "mlp"}}, "Known: cnn, equi"),
+        ({"network": {"name": "mlp"}}, "Known: .*cnn.*equi"),
         ({"network": {"name": "cnn", "width": "wide"}}, "width"),
         ({"total_updates": 1}, "pretrain_updates"),
         ({"demonstrations": 0}, "needs demonstrations"),
         ({"device": "gpu"}, "device"),
         ({"num_envs": 0}, "num_envs"),
         ({"total_update": 5}, "Did you mean 'total_updates'"),
+        ({"device": "cuda:99"}, "device: use device=cpu"),
+        ({"demonstrations_source": "deconstruction"}, "'deconstruct' has no meaning"),
+        ({"demonstrations_path": "/no/such/folder"}, "no demonstrations at"),
+        ({"network": {"name": "fcn"}}, "network for open_loop tasks"),
     ],
 )
 def test_wrong_configurations_fail_before_anything_starts(tmp_path, changes, message):
     with pytest.raises(ConfigError, match=message):
         tiny(tmp_path, **changes)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_logger_without_its_package_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("ba_torchrl.training.config.is_available", lambda backend: False)
+    with pytest.raises(ConfigError, match=r"pip install 'ba-torchrl\[wandb\]'"):
+        tiny(tmp_path, logger="wandb")
+
+
+def test_an_image_size_that_the_network_does_not_take_is_refused(tmp_path):
+    config = tiny(tmp_path, env={**TINY["env"], "obs_size": 100})
+    with pytest.raises(ConfigError, match="image_size"):
+        Experiment(config, progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+OPEN_LOOP = {
+    "task": "open_loop/block_stacking",
+    "env": {"obs_size": 32, "num_objects": 2, "max_steps": 4},
+    "algorithm": {"name": "spatial_q", "batch_size": 4},
+    "network": {"name": "asr", "width": 0.125, "num_rotations": 4},
+}
+
+
+@pytest.mark.parametrize("source", ["expert", "deconstruction"])
+def test_an_open_loop_run_from_either_source(tmp_path, source):
+    config = tiny(tmp_path, **OPEN_LOOP, demonstrations_source=source)
+    result = Experiment(config, progress=False).run()
+    assert result.updates == 6
+    assert result.evaluation.episodes == 4
+    scalars = read_scalars(tmp_path / "run")
+    assert scalars["demonstrations/success_rate"].values == [1.0]
+    _, algorithm = load(tmp_path / "run")
+    assert algorithm.updates == 6
 
 
 @pytest.mark.parametrize("view", ["camera_side_rgbd", "camera_center_xy"])

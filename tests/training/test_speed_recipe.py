@@ -46,9 +46,9 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
 
 
 def test_memory_is_counted():
-    (row,) = measure("memory", repeats=2, progress=False)
-    assert row.unit == "MB"
-    assert 5 < row.values[0] <= row.budget.aim
+    rows = measure("memory", repeats=2, progress=False)
+    assert [row.unit for row in rows] == ["MB", "MB"]
+    assert all(5 < row.values[0] <= row.budget.aim for row in rows)
 
 
 def test_the_numpy_camera_agrees_with_the_compiled_one():

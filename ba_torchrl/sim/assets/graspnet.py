@@ -31,10 +31,20 @@ WIDEST_M, WIDER = 0.15, 0.8
 LARGEST_M3, LARGER = 6e-4, 0.85
 THINNEST_M, THINNER = 0.014, 1 / 0.95
 
+LONGEST_M = 0.35
+"""What is longer has no room in the tray: the diagonal of its flat floor, 0.25 m wide in the
+close-loop tasks. Cutlery of 0.3 m, as the rules above enlarge it, lies across."""
+LENGTHS_M = (1e-5, 1e6)
+"""Lengths of a mesh before it is scaled: micrometres to kilometres may be its unit, as the rules
+above scale it. Far outside arithmetic fails."""
+FLATTEST = 1e-3
+"""What is thinner than this share of its length is a sheet and no solid."""
+
 CONVEX_FILL = 0.95
 """A mesh that fills this share of its hull is taken for convex."""
 VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}
-RECIPE = f"graspnet 1 {CONVEX_FILL} {VHACD}"
+RECIPE = f"graspnet 2 {CONVEX_FILL} {VHACD} {LENGTHS_M} {LONGEST_M} {FLATTEST}"
+"""The limits belong to it: what was kept is not checked again."""
 
 
 @OBJECT_SETS.register("graspnet")
@@ -47,14 +57,15 @@ class GraspNet(ObjectSet):
 
     def __init__(self, asset_root: str | None = None) -> None:
         super().__init__()
-        if asset_root is None:
+        if not asset_root:  # an empty path would stand for the current folder
             raise ConfigError(f"object_set='graspnet' needs asset_root, a folder: {EXPECTED}")
-        root = Path(asset_root).expanduser()
-        if not root.is_dir():
-            raise ConfigError(f"asset_root: there is no folder {str(root)!r}: {EXPECTED}")
-        folders = sorted(
-            path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
-        )
+        root = Path(os.path.expanduser(asset_root))
+        with _access(root):
+            if not root.is_dir():
+                raise ConfigError(f"asset_root: there is no folder {str(root)!r}: {EXPECTED}")
+            folders = sorted(
+                path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
+            )
         if not folders:
             raise ConfigError(f"asset_root: {str(root)!r} has no sub-folders: {EXPECTED}")
         self.paths = [_mesh_file(folder) for folder in folders]
@@ -68,14 +79,18 @@ class GraspNet(ObjectSet):
         """Return the convex parts of a mesh, scaled.
 
         Raises:
-            ConfigError: the file is no mesh with a volume.
+            ConfigError: the file cannot be read, or is no mesh of an object that fits.
         """
         path = self.paths[index]
 
         def decompose() -> list[Mesh]:
-            return convex_parts(read_mesh(path), path)
+            mesh = read_mesh(path)
+            check_size(mesh, path)  # first, as cutting takes seconds
+            return convex_parts(mesh, path)
 
-        parts = cached_parts(path.read_bytes(), RECIPE, decompose)
+        with _access(path):
+            content = path.read_bytes()
+        parts = cached_parts(content, RECIPE, decompose)
         points = np.concatenate([part.vertices for part in parts])
         scale = graspable_scale(np.ptp(points, axis=0))
         return tuple(Mesh(part.vertices * scale, part.faces) for part in parts)
@@ -94,6 +109,37 @@ def graspable_scale(extents_m: Sequence[float]) -> float:
     scale = WIDER ** _times(middle / WIDEST_M, 1 / WIDER)
     scale *= LARGER ** _times(float(np.prod(extents_m)) * scale**3 / LARGEST_M3, LARGER**-3)
     return scale * THINNER ** _times(THINNEST_M / (smallest * scale), THINNER)
+
+
+def check_size(mesh: Mesh, path: Path) -> None:
+    """Check that a mesh is a solid which fits the tray once it is graspable.
+
+    Args:
+        mesh: metres.
+        path: where it is from, for messages.
+
+    Raises:
+        ConfigError: it is flat, outside `LENGTHS_M`, or when scaled longer than `LONGEST_M`.
+    """
+    sides = _principal_extents(mesh.vertices)
+    thinnest, _, longest = sides
+    if not LENGTHS_M[0] <= longest <= LENGTHS_M[1]:
+        raise ConfigError(
+            f"asset_root: {str(path)!r} measures {_measures(sides)}: it must be from "
+            f"{LENGTHS_M[0]:g} to {LENGTHS_M[1]:g} m long; check its unit, or remove its folder"
+        )
+    if thinnest <= FLATTEST * longest:
+        raise ConfigError(
+            f"asset_root: {str(path)!r} measures {_measures(sides)}: it is flat, which is no "
+            "solid; give the mesh a thickness, or remove its folder"
+        )
+    scale = graspable_scale(np.ptp(mesh.vertices, axis=0))
+    if longest * scale > LONGEST_M:
+        raise ConfigError(
+            f"asset_root: {str(path)!r} measures {_measures(sides)}, and when scaled so that it "
+            f"can be grasped {_measures(sides * scale)}: the tray has room for {LONGEST_M} m; "
+            "use a less elongated mesh, or remove its folder"
+        )
 
 
 def _times(excess: float, step: float) -> int:
@@ -156,14 +202,53 @@ def convex_parts(mesh: Mesh, path: Path) -> list[Mesh]:
     return parts
 
 
+def _principal_extents(points: np.ndarray) -> np.ndarray:
+    """Return the extents [3] of points [N, 3] along their principal axes, the smallest first.
+
+    They tell a sheet or a bar however it lies in its file, where the bounding box does not.
+    """
+    unit = np.abs(points).max() or 1.0  # squares of what is tiny or huge would not be numbers
+    centred = points / unit - np.mean(points / unit, axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    return np.sort(np.ptp(centred @ axes, axis=0)) * unit
+
+
+def _measures(extents_m: np.ndarray) -> str:
+    return " x ".join(f"{extent:.2g}" for extent in extents_m) + " m"
+
+
 def _mesh_file(folder: Path) -> Path:
-    files = {path.name: path for path in sorted(folder.glob("*.obj"))}
-    for name in PREFERRED:
-        if name in files:
-            return files[name]
-    if not files:
-        raise ConfigError(f"asset_root: {str(folder)!r} has no mesh file: {EXPECTED}")
-    return next(iter(files.values()))
+    """Return the mesh file of a sub-folder.
+
+    Raises:
+        ConfigError: there is none, or what would be taken is no file.
+    """
+    rank = {name: i for i, name in enumerate(PREFERRED)}
+    with _access(folder):
+        meshes = [path for path in folder.iterdir() if path.suffix.lower() == ".obj"]
+        if not meshes:
+            raise ConfigError(f"asset_root: {str(folder)!r} has no mesh file: {EXPECTED}")
+        path = min(meshes, key=lambda path: (rank.get(path.name.lower(), len(rank)), path.name))
+        if not path.is_file():
+            missing = path.is_symlink() and not path.exists()
+            what = "a link to nothing" if missing else "a folder" if path.is_dir() else "no file"
+            raise ConfigError(
+                f"asset_root: {str(path)!r} is {what}: put a mesh file in its place, or remove "
+                f"the folder {folder.name!r}"
+            )
+    return path
+
+
+@contextlib.contextmanager
+def _access(path: Path) -> Iterator[None]:
+    """Turn what the file system refuses into an error that names the path."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(
+            f"asset_root: cannot read {str(path)!r} ({error.strerror or error}): restore it or "
+            "make it readable, or remove it"
+        ) from error
 
 
 def _objects_of(path: Path) -> list[np.ndarray]:

@@ -11,6 +11,7 @@ import pybullet
 
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.bodies import CONTACT_M, Body, Quaternion, Vector
+from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
 from ba_torchrl.sim.world import World
 
 ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
@@ -192,6 +193,11 @@ class Robot(ABC):
         return position, math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
     # -- gripper -----------------------------------------------------------------------------
+
+    @property
+    def gripper(self) -> Gripper:
+        """The gripper's outline, measured on the model."""
+        return measured_gripper(type(self))
 
     def opening(self) -> float:
         """Return how far the gripper is open, 0 to 1."""

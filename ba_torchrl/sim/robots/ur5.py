@@ -130,6 +130,7 @@ class UR5Robotiq(UR5):
     tool_offset_m = (0.0, 0.0, 0.1543)
     home_joints = (0.954, -1.727, 1.529, -1.372, -1.571, -0.617)
     camera_height_m = 0.04
+    hand_half_m = (0.08, 0.03)
 
     finger_force = 0.6
     finger_speed = 7.5

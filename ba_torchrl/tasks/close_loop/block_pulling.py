@@ -58,7 +58,7 @@ class BlockPulling(CloseLoopTask):
         (px, py, _), (ox, oy, _) = pulled.position, other.position
         length = math.hypot(ox - px, oy - py) or 1.0
         direction = ((ox - px) / length, (oy - py) / length)
-        place = behind_point(pulled, direction, self.settings.workspace)
+        place = behind_point(self.robot, pulled, direction, self.settings.workspace)
         cramped = 0.08 - math.dist(place, (px, py))
         return math.dist(place, self.robot.tool_pose()[0][:2]) + 2 * cramped
 

@@ -12,7 +12,7 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Decal
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import BLOCK_M, TASKS
 from ba_torchrl.tasks.close_loop.base import GREEN, CloseLoopTask
 from ba_torchrl.tasks.experts import push
 
@@ -45,14 +45,17 @@ class BlockPushing(CloseLoopTask):
         return math.dist(self.block.position[:2], self.goal.position[:2]) < self.goal_radius_m
 
     def expert_command(self) -> GripperCommand:
-        """Go behind the block and push it with half-open fingers."""
+        """Go behind the block and push it with half-open fingers.
+
+        They are as much nearer to each other as it is smaller, or they would straddle it.
+        """
         return push(
             self.robot,
             self.block,
             self.goal.position[:2],
             workspace=self.settings.workspace,
             reach=self.reach,
-            opening=0.5,
+            opening=0.5 - max(BLOCK_M - self.block_m, 0.0) / (2 * self.robot.gripper.half_gap_m),
             stop_short_m=0.035,
         )
 

@@ -12,15 +12,13 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, Box, Color, Solid, gap_m, press_n, vertical_extent
 from ba_torchrl.sim.meshes import box_mesh, moved
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import BLOCK_M, TASKS
 from ba_torchrl.tasks.close_loop.base import CloseLoopTask
 from ba_torchrl.tasks.experts import (
     CLOSED,
-    FINGER_HALF_M,
     HALF_FINGER_DEPTH_M,
     HOVER_M,
     OPEN,
-    TIP_BELOW_TOOL_M,
     lift,
     pick_up,
     towards,
@@ -57,9 +55,12 @@ WALL_GAP_M = 1.5e-3
 """The low hand comes this much closer to a wall than where it presses, and no more."""
 HAND_HALF_M = 0.04
 """Half the closed hand's width along the fingers, with 2 mm to spare; with more, the press would be
-farther from the block's middle and tilt it."""
+farther from the block's middle and tilt it. At scale 1: less of the hand is beside a lower wall."""
 TIP_HALF_M = 8e-3
-"""The middle of the fingertips stays this far from the edge of the block's top."""
+"""At scale 1, the middle of the fingertips stays this far from the edge of the block's top."""
+
+TIP_BELOW_TOOL_M = 0.011
+"""About how far below the tool point closed fingers end: where it matters, gaps are measured."""
 OPENING_HEIGHT_M = TIP_BELOW_TOOL_M + HOVER_M
 """Height of the tool above the block's top at which the fingers open."""
 
@@ -68,8 +69,9 @@ OPENING_HEIGHT_M = TIP_BELOW_TOOL_M + HOVER_M
 class CornerPicking(CloseLoopTask):
     """A 5 cm block flush with two walls; success when it is held with the tool 15 cm above ground.
 
-    The walls stand over two edges of a smooth square base. Between block and walls there is no
-    room for a finger; pressed from above, the block slides out.
+    The walls stand over two edges of a smooth square base; their height goes with the block's, or
+    the hand would not reach down to a small one. Between block and walls there is no room for a
+    finger; pressed from above, the block slides out.
     """
 
     base_m: ClassVar[float] = 0.2
@@ -87,7 +89,8 @@ class CornerPicking(CloseLoopTask):
             Box(size_m=size, mass_kg=0, friction=self.base_friction, color=BASE), "base"
         )
         # centred on the edges of the base; the second wall ends at the first
-        edge, wall, height = self.base_m / 2, self.wall_m, self.wall_height_m
+        edge, wall = self.base_m / 2, self.wall_m
+        height = self.wall_height_m * self.settings.scale
         parts = (
             moved(box_mesh((wall, 2 * edge + wall / 2, height)), (-edge, -wall / 4, 0.0)),
             moved(box_mesh((2 * edge - wall / 2, wall, height)), (wall / 4, -edge, 0.0)),
@@ -156,8 +159,9 @@ class CornerPicking(CloseLoopTask):
         """
         turn = yaw_rad - self.corner[2]
         along = self.robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
+        across = self.robot.gripper.half_width_m
         cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
-        reaches = (along * cos + FINGER_HALF_M * sin, along * sin + FINGER_HALF_M * cos)
+        reaches = (along * cos + across * sin, along * sin + across * cos)
         place = self.to_corner(*self.block.position[:2])
         inner = (self.wall_m - self.base_m) / 2
         outer = inner - self.wall_m
@@ -174,7 +178,7 @@ class CornerPicking(CloseLoopTask):
         turn = wrap_angle(target_yaw - yaw)
         # the hand is wider than the block along the fingers, and has the wall beside it
         px, py = self.to_corner(*self.block.position[:2])
-        away = min(HAND_HALF_M - self.block_m / 2, self.block_m / 2 - TIP_HALF_M)
+        away = min(HAND_HALF_M - BLOCK_M / 2, BLOCK_M / 2 - TIP_HALF_M) * self.settings.scale
         if abs(math.cos(target_yaw - self.corner[2])) > 0.7:
             px += away
         else:

@@ -130,27 +130,28 @@ class DrawerOpening(CloseLoopTask):
         radius = ROD_DIAMETER_M / 2 * scale
         front = -ROD_OFFSET_M * scale
         hook_z = rz - HOOK_DEPTH_M * scale
+        finger = robot.gripper.half_width_m
         is_closed = robot.opening() < 0.1
 
         if (
             z < rz
             and front < ahead < -radius
-            and aside < POST_GAP_M / 2 * scale - FINGER_HALF_M
+            and aside < POST_GAP_M / 2 * scale - finger
             and turn < SLIGHT_TURN_RAD
             and is_closed
         ):
-            slack = -ahead - radius - FINGER_HALF_M
+            slack = -ahead - radius - finger
             farther = self._goal_m + MARGIN_M - self.cabinet.travel_m + slack
             advance = ahead + min(farther, reach.step_m / max(abs(ux), abs(uy)))
             target = (rx + advance * ux, ry + advance * uy, hook_z)
             return towards(robot, target, target_yaw, CLOSED)
 
-        behind = -radius - FINGER_HALF_M - PLAY_BEHIND_M
+        behind = -radius - finger - PLAY_BEHIND_M
         hx, hy = rx + behind * ux, ry + behind * uy
         is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
         if is_beside and turn <= ALIGNED_RAD and is_closed:
             return towards(robot, (hx, hy, hook_z), target_yaw, CLOSED)
-        across = 2 * FINGER_HALF_M if turn < SLIGHT_TURN_RAD else SPAN_HALF_M
+        across = 2 * finger if turn < SLIGHT_TURN_RAD else SPAN_HALF_M
         is_over_cabinet = ahead < front + across
         top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
         if z < top + CLEARANCE_M - 1e-3:

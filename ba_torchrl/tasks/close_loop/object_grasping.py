@@ -10,18 +10,16 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.clutter import Clutter
+from ba_torchrl.tasks.clutter import PARAMETERS, Clutter
 from ba_torchrl.tasks.experts import ALIGNED_M, ALIGNED_RAD, CLOSED, OPEN, lift, towards
 from ba_torchrl.tasks.grasps import Grasp, GraspPlanner
 from ba_torchrl.tasks.nudges import NEAR_M, Nudge, NudgePlanner
-from ba_torchrl.tasks.tray import FLOOR_Z_M, MARGIN_M, add_tray
 
 WALL_PIXELS = 25
 """Border of the planner's height image that shows the tray's walls."""
@@ -32,65 +30,40 @@ class ObjectGrasping(CloseLoopTask):
     """Random objects in a tray; success when one is held with the tool 15 cm above ground.
 
     An episode goes on with what the last one left, less what it lifted, until the tray is empty,
-    an object left the workspace, or `failures_allowed` episodes in a row came to nothing: then
-    new objects fall in.
+    an object left the workspace, or three episodes in a row came to nothing: then new objects fall
+    in.
     """
 
     num_objects = 5
     num_objects_range = (1, 15)
     fits_tray = True
     is_chaotic = True
-    parameters = frozenset({"object_set", "asset_root"})
+    parameters = PARAMETERS
 
     lift_height_m: ClassVar[float] = 0.15
-    failures_allowed: ClassVar[int] = 3
     risk_allowed: ClassVar[float] = 1.0
     """Where a grasp is riskier, the expert pushes the object first."""
 
     def build(self, world: World) -> None:
         """Load the tray and every shape of the object set."""
-        settings = self.settings
-        if not settings.surface_z_m:
-            add_tray(world, settings.workspace.center, settings.workspace.width)
-        parameters = settings.parameters
-        shapes = load_object_set(parameters["object_set"], parameters["asset_root"])
-        self.clutter = Clutter(world, shapes, shapes.names, settings.num_objects)
-        self._failures = 0
+        self.clutter = Clutter(world, self.robot, self.settings)
 
     def randomise(self, rng: np.random.Generator) -> None:
         """Let new objects fall into the tray."""
-        workspace = self.settings.workspace
-        self._failures = 0
-        self.clutter.drop(
-            rng,
-            self.settings.num_objects,
-            center_xy=workspace.center,
-            spread_m=(workspace.width - MARGIN_M) / 2 - 0.03,
-            surface_z_m=FLOOR_Z_M,
-            random_orientation=self.settings.random_orientation,
-            robot=self.robot,
-        )
+        self.clutter.drop(rng)
 
     @property
     def continues(self) -> bool:
         """Whether something is left that is worth another try."""
-        if self.is_goal():
-            return len(self.clutter.present) > 1
-        return bool(self.clutter.present) and self._failures + 1 < self.failures_allowed
+        return self.clutter.lasts(self._lifted())
 
     def resume(self) -> None:
         """Put what was lifted aside."""
-        if self.is_goal():
-            self.clutter.put_aside(self.robot.held_body())
-            self._failures = 0
-        else:
-            self._failures += 1
+        self.clutter.go_on(self._lifted())
 
     def is_goal(self) -> bool:
         """Whether any object is held and the tool higher than 15 cm."""
-        if self.robot.tool_pose()[0][2] <= self.lift_height_m:
-            return False
-        return self.robot.held_body() is not None
+        return self._lifted() is not None
 
     def expert_command(self) -> GripperCommand:
         """Close the fingers around the object that takes fewest actions, then go up.
@@ -105,14 +78,18 @@ class ObjectGrasping(CloseLoopTask):
         # above everything, the walls' upper parts left out, which the way never crosses
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
-        grasp = planner.plan(self.clutter.present, tool, reach, heights)
+        grasp = planner.plan(self.clutter.pool.present, tool, reach, heights, self._slip_cost)
         if grasp is None or grasp.risk > self.risk_allowed:
-            nudge = NudgePlanner(planner).plan(self.clutter.present, tool, reach, heights)
+            nudge = NudgePlanner(planner).plan(self.clutter.pool.present, tool, reach, heights)
             if nudge is not None:
                 return self._push(nudge, over_z)
         if grasp is None or robot.opening() < 0.9:
             return lift(reach.step_m, OPEN)
         return self._grasp(grasp, over_z)
+
+    def _slip_cost(self, grasps: np.ndarray) -> np.ndarray:
+        """Return the actions [N] that it is worth to have an object turn less in the fingers."""
+        return grasps[:, 5]
 
     def _grasp(self, grasp: Grasp, over_z: float) -> GripperCommand:
         """Go above the object with open fingers, down, and close them on arrival."""
@@ -147,29 +124,32 @@ class ObjectGrasping(CloseLoopTask):
     def planner(self) -> GraspPlanner:
         """What finds grasps; made when an expert is first asked."""
         camera = HeightCamera(self.world.bodies)
-        return GraspPlanner(self.clutter.bodies, camera, self.settings.workspace)
+        bodies = self.clutter.pool.bodies
+        return GraspPlanner(bodies, camera, self.settings.workspace, self.robot.gripper)
 
     @property
     def objects(self) -> Sequence[Body]:
         """What is in the tray."""
-        return self.clutter.present
+        return self.clutter.pool.present
 
     @property
     def landmarks(self) -> Sequence[Pose]:
         """The objects; in place of those that are gone, the workspace's upper corner."""
-        poses = list(super().landmarks)
-        workspace = self.settings.workspace
-        corner = (workspace.x[1], workspace.y[1], workspace.z[1])
-        return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
+        return self.clutter.landmarks
 
     def get_state(self) -> Any:
         """Return which objects are in use, and the failures in a row."""
-        return self.clutter.get_state(), self._failures
+        return self.clutter.get_state()
 
     def set_state(self, state: Any) -> None:
         """Take up what `get_state` returned."""
-        present, self._failures = state
-        self.clutter.set_state(present)
+        self.clutter.set_state(state)
+
+    def _lifted(self) -> Body | None:
+        """Return what is held, if the tool is high enough."""
+        if self.robot.tool_pose()[0][2] <= self.lift_height_m:
+            return None
+        return self.robot.held_body()
 
     def _is_inside(self, body: Body) -> bool:
         # thin objects lie lower than the workspace begins: the floor bounds them

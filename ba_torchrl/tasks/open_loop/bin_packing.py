@@ -15,7 +15,6 @@ from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_me
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, PlacementError
 from ba_torchrl.tasks.open_loop.packing import RELEASE_GAP_M, PackingTask, open_box
-from ba_torchrl.tasks.open_loop.pool import Pool
 from ba_torchrl.tasks.open_loop.rectangles import (
     Rectangle,
     Room,
@@ -24,6 +23,7 @@ from ba_torchrl.tasks.open_loop.rectangles import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pool import Pool
 
 BIN_M = (0.176, 0.144, 0.08)
 WALL_M = 0.004
@@ -93,6 +93,7 @@ class BinPacking(PackingTask):
     max_steps = 20
     num_objects = 8
     num_objects_range = (1, 10)
+    is_chaotic = True
 
     def build(self, world: World) -> None:
         """Load the bin, and as many objects of each shape as may be drawn."""

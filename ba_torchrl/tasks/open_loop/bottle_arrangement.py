@@ -12,7 +12,6 @@ from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, PlacementError
 from ba_torchrl.tasks.open_loop.packing import OPEN_M, RELEASE_GAP_M, Grasp, PackingTask, open_box
-from ba_torchrl.tasks.open_loop.pool import Pool
 from ba_torchrl.tasks.open_loop.rectangles import (
     TIP_M,
     Rectangle,
@@ -21,6 +20,7 @@ from ba_torchrl.tasks.open_loop.rectangles import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pool import Pool
 from ba_torchrl.tasks.structures import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)

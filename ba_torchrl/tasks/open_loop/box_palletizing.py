@@ -12,7 +12,6 @@ from ba_torchrl.sim.bodies import Body, Box, vertical_extent
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, PlacementError
 from ba_torchrl.tasks.open_loop.packing import ENOUGH_M, RELEASE_GAP_M, PackingTask
-from ba_torchrl.tasks.open_loop.pool import Pool
 from ba_torchrl.tasks.open_loop.rectangles import (
     Rectangle,
     Room,
@@ -22,6 +21,7 @@ from ba_torchrl.tasks.open_loop.rectangles import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pool import Pool
 from ba_torchrl.tasks.structures import CUBOID, UPRIGHT_RAD
 
 PALLET_M = (0.232, 0.192, 0.03)

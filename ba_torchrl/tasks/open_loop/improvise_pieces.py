@@ -24,8 +24,8 @@ from ba_torchrl.tasks.building import Building
 from ba_torchrl.tasks.experts import FINGER_HALF_M
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
 from ba_torchrl.tasks.open_loop.pieces import BLUE
-from ba_torchrl.tasks.open_loop.pool import Pool
 from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
+from ba_torchrl.tasks.pool import Pool
 from ba_torchrl.tasks.structures import CUBOID, Piece, Span
 
 NUMBERS = (2, 5, 27, 32, 66, 75, 83, 116, 118, 131, 137, 142, 143, 149, 154, 176, 187, 199, 200)

@@ -14,7 +14,6 @@ from ba_torchrl.sim.bodies import Body, Color, Solid, Vector, vertical_extent
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, joined, moved
 from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
-from ba_torchrl.tasks.open_loop.pool import Pool
 from ba_torchrl.tasks.open_loop.rectangles import (
     RELEASE_M,
     TIP_M,
@@ -24,6 +23,7 @@ from ba_torchrl.tasks.open_loop.rectangles import (
     narrowest,
     outline,
 )
+from ba_torchrl.tasks.pool import Pool
 
 SCALE = 0.8
 """At this scale, objects have the sizes of appendix A.1."""

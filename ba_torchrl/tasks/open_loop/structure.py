@@ -13,9 +13,10 @@ from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, Shape, Vector, radius_m, world_vertices
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Spot
-from ba_torchrl.tasks.building import CROWDED, Building, Move, PutDown
+from ba_torchrl.tasks.building import CROWDED, Building, Move
 from ba_torchrl.tasks.experts import finger_room
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
+from ba_torchrl.tasks.room import PutDown
 from ba_torchrl.tasks.structures import Blueprint, Piece
 
 START_GAP_M = 0.01

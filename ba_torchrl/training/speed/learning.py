@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import nn
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import Algorithm
 from ba_torchrl.data.demos import as_transitions, collect_demonstrations
-from ba_torchrl.data.quantization import DepthQuantizer
+from ba_torchrl.data.quantization import DepthQuantizer, HalfPrecision, ImageCodec
 from ba_torchrl.data.replay import FrameStorage
 from ba_torchrl.envs import keys
 from ba_torchrl.training.checkpoint import build_algorithm
@@ -34,13 +35,22 @@ class LearningUnit:
         self.convolution(self.images).sum().backward()
 
 
-def _learner(network: dict[str, Any], obs_size: int) -> Algorithm:
-    """Return SACfD with the expert's transitions in its replay."""
+CLOSE_LOOP = {
+    "task": "close_loop/block_picking",
+    "algorithm": {"name": "sac", "demonstration_weight": 1.0, "batch_size": 64},
+}
+OPEN_LOOP = {
+    "task": "open_loop/block_stacking",
+    "algorithm": {"name": "spatial_q", "demonstrations": "sdqfd", "batch_size": 16},
+}
+
+
+def _learner(experiment: dict[str, Any], network: dict[str, Any], obs_size: int) -> Algorithm:
+    """Return a learner with the expert's transitions in its replay."""
     config = ExperimentConfig.parse(
         {
-            "task": "close_loop/block_picking",
+            **experiment,
             "env": {"obs_size": obs_size},
-            "algorithm": {"name": "sac", "demonstration_weight": 1.0, "batch_size": 64},
             "network": network,
             "seed": SEED,
             "device": "cpu",
@@ -61,10 +71,8 @@ def _expert_episodes(task: str, obs_size: int, episodes: int) -> tuple[float, li
     return high, played
 
 
-def _update(
-    bench: Bench, work: str, network: dict[str, Any], obs_size: int, budget: Budget
-) -> list[Row]:
-    units, times = bench.time_against(LearningUnit(), {work: _learner(network, obs_size).update})
+def _update(bench: Bench, work: str, learner: Algorithm, budget: Budget) -> list[Row]:
+    units, times = bench.time_against(LearningUnit(), {work: learner.update})
     return [timed_row(work, "s", times[work], units, budget)]
 
 
@@ -74,8 +82,7 @@ def equivariant_update(bench: Bench) -> list[Row]:
     return _update(
         bench,
         "Equi SACfD update, batch 64, 128 px, C8, 64 fields",
-        {"name": "equi", "group_order": 8, "n_hidden": 64},
-        128,
+        _learner(CLOSE_LOOP, {"name": "equi", "group_order": 8, "n_hidden": 64}, 128),
         Budget("13.5", 2.0, 1.3),
     )
 
@@ -86,29 +93,50 @@ def quickstart_update(bench: Bench) -> list[Row]:
     return _update(
         bench,
         "Equi SACfD update, batch 64, 64 px, C8, 16 fields",
-        {"name": "equi", "group_order": 8, "n_hidden": 16},
-        64,
+        _learner(CLOSE_LOOP, {"name": "equi", "group_order": 8, "n_hidden": 16}, 64),
         Budget("", None, 0.15),
     )
 
 
 @measurement("learning/cnn_sacfd_update")
 def plain_update(bench: Bench) -> list[Row]:
-    """The learner without symmetry."""
+    """The close-loop learner without symmetry."""
     return _update(
         bench,
         "CNN SACfD update, batch 64, 128 px",
-        {"name": "cnn"},
-        128,
+        _learner(CLOSE_LOOP, {"name": "cnn"}, 128),
         Budget("1.57", 0.35, 0.2),
     )
 
 
-@measurement("memory/close_loop_replay")
-def replay_memory(bench: Bench) -> list[Row]:
+@measurement("learning/equi_sdqfd_update")
+def equivariant_spatial_update(bench: Bench) -> list[Row]:
+    """The paper's open-loop learner."""
+    return _update(
+        bench,
+        "SDQfD Equi ASR update, batch 16, 128 px, 16 rotations",
+        _learner(OPEN_LOOP, {"name": "equi_asr"}, 128),
+        Budget("40.6", 7.0, 4.0),
+    )
+
+
+@measurement("learning/cnn_sdqfd_update")
+def plain_spatial_update(bench: Bench) -> list[Row]:
+    """The open-loop learner without symmetry."""
+    return _update(
+        bench,
+        "SDQfD CNN ASR update, batch 16, 128 px, 16 rotations",
+        _learner(OPEN_LOOP, {"name": "asr"}, 128),
+        Budget("3.9", 1.0, 0.5),
+    )
+
+
+def _replay_memory(
+    bench: Bench, task: str, codecs: Callable[[float], dict[str, ImageCodec]], budget: Budget
+) -> list[Row]:
     """Bytes of the expert's episodes in the replay, scaled to its capacity."""
-    high, episodes = _expert_episodes("close_loop/block_picking", 128, bench.repeats)
-    storage = FrameStorage(CAPACITY, DepthQuantizer(high))
+    high, episodes = _expert_episodes(task, 128, bench.repeats)
+    storage = FrameStorage(CAPACITY, codecs(high))
     stored = 0
     for number in bench.rounds():
         data = as_transitions(episodes[number], is_expert=True)
@@ -116,5 +144,27 @@ def replay_memory(bench: Bench) -> list[Row]:
         stored += len(data)
     megabytes = storage.nbytes / stored * CAPACITY / 1e6
     notes = f"counted over {stored} transitions, {storage.nbytes / stored:.0f} bytes each"
-    work = "100,000 transitions of 128 px, close loop"
-    return [Row(work, "MB", [megabytes], Budget("3300", 1700.0, 500.0), None, notes)]
+    work = f"100,000 transitions of 128 px, {task}"
+    return [Row(work, "MB", [megabytes], budget, None, notes)]
+
+
+@measurement("memory/close_loop_replay")
+def close_loop_memory(bench: Bench) -> list[Row]:
+    """Eight-bit depth."""
+    return _replay_memory(
+        bench,
+        "close_loop/block_picking",
+        lambda high: {keys.PIXELS: DepthQuantizer(high)},
+        Budget("3300", 1700.0, 500.0),
+    )
+
+
+@measurement("memory/open_loop_replay")
+def open_loop_memory(bench: Bench) -> list[Row]:
+    """Half-precision heightmaps and in-hand images."""
+    return _replay_memory(
+        bench,
+        "open_loop/block_stacking",
+        lambda high: dict.fromkeys((keys.PIXELS, keys.IN_HAND), HalfPrecision(high)),
+        Budget("13000", 3400.0, 500.0),
+    )

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from tqdm import tqdm
 
 from ba_torchrl.config import ConfigError
+from ba_torchrl.record.results import processor
 from ba_torchrl.registry import Registry
 
 GROUPS = ("simulation", "learning", "memory")
@@ -216,16 +215,6 @@ def machine() -> str:
     packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "pybullet"))
     load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return (
-        f"{_processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads; "
+        f"{processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads; "
         f"{packages}; {datetime.now(UTC):%Y-%m-%d}{load}"
     )
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -6,14 +6,20 @@ from collections.abc import Sequence
 
 from ba_torchrl.sim.bodies import Body, Shape
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.clutter import ASIDE_SPACING_M, ASIDE_X_M, ASIDE_Z_M
+
+ASIDE_Z_M = 1e6
+ASIDE_SPACING_M = 0.3
+ASIDE_X_M = 5.0
+COLUMNS = 10
 
 
 class Pool:
     """The bodies of a task that brings some of them only, or not all at once.
 
-    Those put aside fall freely, each in its own column, for seven simulated minutes at least:
-    that costs less than anything that rests, and nothing about a body ever changes but its pose.
+    Those put aside fall freely, each in its own column, for seven simulated minutes at least.
+    That costs less than anything that rests, and nothing about a body ever changes but its pose:
+    changed masses or collision filters would give it a new place in PyBullet's lists, and a
+    restored state another future.
 
     Args:
         world: not sealed yet.
@@ -32,19 +38,28 @@ class Pool:
         """Put all bodies aside."""
         self.present = []
         for i, body in enumerate(self.bodies):
-            row, column = divmod(i, 10)
-            body.place((ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row, ASIDE_Z_M))
-            body.is_hidden = True
+            _park(body, i)
 
     def bring(self, body: Body) -> None:
         """Take a body into the scene; the caller gives it its pose."""
         body.is_hidden = False
         self.present.append(body)
 
+    def put_aside(self, body: Body) -> None:
+        """Take a body out of the scene."""
+        self.present.remove(body)
+        _park(body, self.bodies.index(body))
+
     def get_state(self) -> tuple[int, ...]:
         """Return which bodies are in the scene."""
         return tuple(self.bodies.index(body) for body in self.present)
 
     def set_state(self, state: tuple[int, ...]) -> None:
-        """Take up what `get_state` returned; poses are the world's to restore."""
+        """Take up what `get_state` returned; poses and visibility are the scene's to restore."""
         self.present = [self.bodies[i] for i in state]
+
+
+def _park(body: Body, place: int) -> None:
+    row, column = divmod(place, COLUMNS)
+    body.place((ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row, ASIDE_Z_M))
+    body.is_hidden = True

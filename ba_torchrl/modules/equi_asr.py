@@ -1,0 +1,169 @@
+"""The equivariant network that chooses a pixel, then a yaw (appendix E, G.1; "Equi ASR")."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from ba_torchrl.modules.asr import ASR, ASRNetworkConfig
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.cnn import initialise_plain
+from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
+from ba_torchrl.modules.equi_unet import EquivariantPixelValues
+from ba_torchrl.modules.heights import SpatialImageConfig, of_primitive
+from ba_torchrl.modules.in_hand import InHandVector
+from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.steerable import (
+    SteerableConv2d,
+    SteerableLinear,
+    planar_rotations_and_flips,
+    planar_yaws,
+)
+from ba_torchrl.modules.trunk import scaled_width
+
+if TYPE_CHECKING:
+    from escnn.group import Representation
+    from escnn.gspaces import GSpace2D
+
+
+class _Stage(NamedTuple):
+    fields: int
+    kernel_size: int
+    padding: int
+    pools: bool
+
+
+_TRUNKS = {
+    24: (
+        _Stage(8, 7, 2, False),  # 22
+        _Stage(16, 7, 2, True),  # 20 -> 10
+        _Stage(32, 7, 2, False),  # 8
+        _Stage(32, 3, 0, True),  # 6 -> 3
+        _Stage(16, 3, 0, False),  # 1
+    ),
+    40: (
+        _Stage(8, 7, 3, True),  # 40 -> 20
+        _Stage(16, 7, 3, True),  # 20 -> 10
+        _Stage(32, 7, 2, False),  # 8
+        _Stage(32, 3, 0, True),  # 6 -> 3
+        _Stage(16, 3, 0, False),  # 1
+    ),
+}
+"""From a patch of so many pixels to one. Pools see even sizes, or turns would not be exact."""
+
+
+class EquivariantYawValues(nn.Module):
+    """Q values of yaws that follow the turns of a patch.
+
+    The scene map and the in-hand image enter through the coefficients of a dynamic filter, so they
+    have to be invariant: the scene map turns with the scene, and is therefore reduced to the
+    largest and mean value of each of its channels.
+
+    Args:
+        gspace: images and their symmetry group.
+        out_repr: how the values of the yaws transform.
+        spec: shapes of the images.
+        config: width, precision, units.
+        patch_size: rows and columns of the patch.
+        scene_channels: channels of the scene map, each invariant.
+
+    Raises:
+        ValueError: the patch has another size than 24 or 40, or the in-hand image does not fit.
+    """
+
+    def __init__(
+        self,
+        gspace: GSpace2D,
+        out_repr: Representation,
+        spec: SpatialSpec,
+        config: SpatialImageConfig,
+        patch_size: int,
+        scene_channels: int,
+    ) -> None:
+        super().__init__()
+        if patch_size not in _TRUNKS:
+            raise ValueError(
+                f"network 'equi_asr' takes a patch_size of {' or '.join(map(str, _TRUNKS))} "
+                f"pixels, got {patch_size}; where the in-hand image has another size, set it"
+            )
+        self.config = config
+        stages = _TRUNKS[patch_size]
+        self.pools = tuple(stage.pools for stage in stages)
+        self.convs = nn.ModuleList()
+        types = [(gspace.trivial_repr, 1)]
+        for fields, kernel_size, padding, _ in stages:
+            out = [(gspace.regular_repr, scaled_width(fields, config.width))]
+            self.convs.append(SteerableConv2d(gspace, types, out, kernel_size, padding=padding))
+            types = out
+        ((_, fields),) = types
+        self.held = DynamicSteerableConv2d(gspace, gspace.regular_repr, fields, 1)
+        self.values = SteerableLinear(gspace, types, [(out_repr, 2)])
+
+        wide, narrow = scaled_width(1024, config.width), scaled_width(512, config.width)
+        self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width)
+        self.hand_linear = nn.Linear(self.hand.out_features, narrow)
+        self.scene_linear = nn.Sequential(
+            nn.Linear(2 * scene_channels, wide), nn.ReLU(), nn.Linear(wide, narrow)
+        )
+        self.apply(initialise_plain)
+        self.coefficients = filter_generator(2 * narrow, self.held)
+
+    def forward(self, patch: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
+        """Return values [B, yaws].
+
+        Args:
+            patch: heights around the pixel [B, 1, p, p].
+            in_hand: [B, C, h, w].
+            scene: [B, scene_channels, h', w'].
+            holding: [B, 1], which picks the primitive.
+        """
+        x = self.config.heights(patch)
+        for conv, pool in zip(self.convs, self.pools, strict=True):
+            x = conv(x)
+            # Pooling and ReLU commute; this order leaves the ReLU a quarter of the elements.
+            x = F.relu(F.max_pool2d(x, 2) if pool else x, inplace=True)
+        x = F.relu(self.held(x.float(), self._coefficients(in_hand, scene)))
+        return of_primitive(self.values(x.flatten(1)), holding)
+
+    def _coefficients(self, in_hand: Tensor, scene: Tensor) -> Tensor:
+        hand = self.hand_linear(self.hand(self.config.in_hand(in_hand)))
+        scene = scene.float()
+        scene = torch.cat([scene.amax(dim=(-2, -1)), scene.mean(dim=(-2, -1))], dim=1)
+        return self.coefficients(F.relu(torch.cat([self.scene_linear(scene), hand], dim=1)))
+
+
+@NETWORKS.register("equi_asr")
+class EquiASRConfig(ASRNetworkConfig):
+    """Hyper-parameters of the equivariant network that chooses a pixel, then a yaw.
+
+    The yaws' symmetry is the cyclic group's that contains the step from yaw to yaw: C_32 for 16
+    yaws in half a turn.
+
+    Args:
+        group_order: rotations of the pixels' dihedral group.
+    """
+
+    group_order: int = Field(default=4, ge=2)
+
+    def build(self, spec: SpatialSpec) -> ASR:
+        """Return a freshly initialised network.
+
+        Args:
+            spec: shapes and the action's components: x, y and rz.
+
+        Raises:
+            ImportError: escnn is missing; the message names the fix.
+            ValueError: a size does not fit, or the action has other components.
+        """
+        levels, patch_size = self._layout("equi_asr", spec)
+        gspace = planar_rotations_and_flips(self.group_order)
+        positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
+        gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
+        yaws = EquivariantYawValues(
+            gspace, yaw_repr, spec, self, patch_size, positions.scene_channels
+        )
+        return ASR(positions, yaws, levels, patch_size)

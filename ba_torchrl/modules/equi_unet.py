@@ -1,0 +1,141 @@
+"""The equivariant UNet, and Q values of every pixel from it: what is held enters as a filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ba_torchrl.modules.cnn import initialise_plain
+from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
+from ba_torchrl.modules.heights import SpatialImageConfig
+from ba_torchrl.modules.in_hand import InHandVector
+from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.steerable import FieldTypes, SteerableConv2d
+from ba_torchrl.modules.trunk import scaled_width
+from ba_torchrl.modules.unet import ResidualBlock, UNet
+
+if TYPE_CHECKING:
+    from escnn.group import Representation
+    from escnn.gspaces import GSpace2D
+
+_FIELDS = (16, 32, 64, 128, 128)
+
+
+def _block(gspace: GSpace2D, fields: int, width: int) -> ResidualBlock:
+    """Return a block of regular fields; unlike the plain one its shortcut is 3x3."""
+    regular = gspace.regular_repr
+    inputs, outputs = [(regular, fields)], [(regular, width)]
+
+    def conv(types: FieldTypes) -> SteerableConv2d:
+        return SteerableConv2d(gspace, types, outputs, 3, padding=1)
+
+    return ResidualBlock(conv(inputs), conv(outputs), None if fields == width else conv(inputs))
+
+
+def equivariant_unet(gspace: GSpace2D, fields: Sequence[int]) -> UNet:
+    """Return a UNet from one invariant channel to fields[0] regular fields.
+
+    Args:
+        gspace: images and their symmetry group.
+        fields: numbers of regular fields of the five scales, from fine to coarse.
+    """
+    f1, f2, f4, f8, f16 = fields
+    lift = SteerableConv2d(
+        gspace, [(gspace.trivial_repr, 1)], [(gspace.regular_repr, f1)], 3, padding=1
+    )
+    encoders = [nn.Sequential(lift, nn.ReLU(inplace=True), _block(gspace, f1, f1))]
+    encoders += [_block(gspace, a, b) for a, b in ((f1, f2), (f2, f4), (f4, f8), (f8, f16))]
+    inputs, outputs = (f16 + f8, 2 * f4, 2 * f2, 2 * f1), (f4, f2, f1, f1)
+    return UNet(encoders, [_block(gspace, a, b) for a, b in zip(inputs, outputs, strict=True)])
+
+
+class _Head(nn.Module):
+    """Regular fields to values: a hidden 3x3 layer of invariants if any, then one pixel wide.
+
+    Args:
+        gspace: images and their symmetry group.
+        fields: number of regular fields.
+        out_repr: representation of the values; a hidden layer makes sense for invariant ones.
+    """
+
+    def __init__(self, gspace: GSpace2D, fields: int, out_repr: Representation) -> None:
+        super().__init__()
+        types: FieldTypes = [(gspace.regular_repr, fields)]
+        self.hidden = None
+        if out_repr.is_trivial():
+            hidden = [(gspace.trivial_repr, fields)]
+            self.hidden = SteerableConv2d(gspace, types, hidden, 3, padding=1)
+            types = hidden
+        self.values = SteerableConv2d(gspace, types, [(out_repr, 1)], 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return float32 values [B, out, H, W] of x [B, C, H, W]."""
+        if self.hidden is not None:
+            x = F.relu(self.hidden(x), inplace=True)
+        # bfloat16 would round values near one to multiples of 1/256: ties among the best.
+        return self.values(x.float())
+
+
+class EquivariantPixelValues(nn.Module):
+    """Q values of every pixel that turn with the image; for full hands, what is held decides.
+
+    Args:
+        gspace: images and their symmetry group.
+        out_repr: how the values of one pixel transform: the trivial representation for one value,
+            a representation on yaws for one each.
+        spec: shapes of the images.
+        config: width, precision, units.
+
+    Raises:
+        ValueError: the in-hand image is too small or too large.
+    """
+
+    def __init__(
+        self,
+        gspace: GSpace2D,
+        out_repr: Representation,
+        spec: SpatialSpec,
+        config: SpatialImageConfig,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        fields = [scaled_width(f, config.width) for f in _FIELDS]
+        regular = gspace.regular_repr
+        self._group_size = regular.size
+        self.scene_channels = fields[-1]
+        self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width)
+        self.hand.apply(initialise_plain)
+        self.unet = equivariant_unet(gspace, fields)
+        self.held = DynamicSteerableConv2d(gspace, regular, fields[0], 3)
+        self.coefficients = filter_generator(self.hand.out_features, self.held)
+        self.pick = _Head(gspace, fields[0], out_repr)
+        self.place = _Head(gspace, fields[0], out_repr)
+
+    def forward(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+        """Return values and the invariant innermost map.
+
+        Args:
+            pixels: heightmaps [B, 1, H, W].
+            in_hand: [B, C, h, w]; matters where something is held.
+            holding: [B, 1].
+
+        Returns:
+            float32 [B, out, H, W], and [B, scene_channels, H/16, W/16] of numbers that turn with
+            the image and do not mix.
+        """
+        # Open hands first: then either head sees a slice, and no large map is copied.
+        order = holding.reshape(-1).long().argsort(stable=True)
+        full = int(holding.bool().sum())
+        parts = [len(order) - full, full]
+        maps = self.unet.encode(self.config.heights(pixels[order]))
+        opened, filled = self.unet.decode(maps).split(parts)
+        hand = self.hand(self.config.in_hand(in_hand[order[parts[0] :]]))
+        filled = F.relu(self.held(filled, self.coefficients(hand)))
+        restore = order.argsort()
+        values = torch.cat([self.pick(opened), self.place(filled)])[restore]
+        scene = maps[-1].unflatten(1, (-1, self._group_size)).amax(dim=2)
+        return values, scene[restore]

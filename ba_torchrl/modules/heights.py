@@ -1,0 +1,117 @@
+"""Shared by the networks with spatial Q values: their input, and which actions suit them."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from ba_torchrl.config import StrictModel
+from ba_torchrl.modules.base import Control
+from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.trunk import Precision, compute_dtype
+
+UNET_STRIDE = 16
+"""Pixels of the image per pixel of a UNet's innermost map; image sizes are multiples of it."""
+
+
+class SpatialImageConfig(StrictModel):
+    """Hyper-parameters of every network with spatial Q values.
+
+    The default leaves heights in metres, as the paper does; then a block of 3 cm hardly moves the
+    values of a fresh network. A scale of 0.05 makes it about one and suits a quick start.
+
+    Args:
+        precision: number format of the convolutions, see `compute_dtype`. Values of actions, the
+            fully connected layers and the filters' coefficients are always float32.
+        height_scale_m: height that becomes one. The floor stays zero, like what lies outside of
+            the image.
+        width: factor on every layer's width; 1 is the reference's size.
+    """
+
+    control: ClassVar[Control] = "open_loop"
+
+    precision: Precision = "auto"
+    height_scale_m: float = Field(default=1.0, gt=0)
+    width: float = Field(default=1.0, gt=0)
+
+    def heights(self, images: Tensor) -> Tensor:
+        """Return heights [B, 1, H, W] as the networks see them, in the compute dtype."""
+        return self.images(images if self.height_scale_m == 1 else images / self.height_scale_m)
+
+    def in_hand(self, images: Tensor) -> Tensor:
+        """Return in-hand images [B, C, h, w] likewise: C = 1 are heights, C = 3 counts."""
+        return self.heights(images) if images.shape[1] == 1 else self.images(images)
+
+    def images(self, images: Tensor) -> Tensor:
+        """Return images [B, C, H, W] in the compute dtype, channels-last."""
+        dtype = compute_dtype(self.precision, images.device)
+        return images.to(dtype=dtype, memory_format=torch.channels_last)
+
+
+def of_primitive(values: Tensor, holding: Tensor) -> Tensor:
+    """Return the values of the primitive that is up: the first half for open hands, else the last.
+
+    Args:
+        values: [B, 2n, ...].
+        holding: [B, 1].
+
+    Returns:
+        [B, n, ...].
+    """
+    pick, place = values.chunk(2, dim=1)
+    return torch.where(holding.bool().reshape(-1, *[1] * (values.dim() - 1)), place, pick)
+
+
+def has_yaw(name: str, spec: SpatialSpec) -> bool:
+    """Return whether the action has a yaw besides x and y.
+
+    Args:
+        name: of the network, for the error.
+        spec: names the action's components.
+
+    Raises:
+        ValueError: it has something else, too.
+    """
+    others = [c for c in spec.components if c not in ("x", "y", "rz")]
+    if others:
+        raise ValueError(
+            f"network {name!r} chooses x, y and rz, not {', '.join(others)}; take an "
+            "action_sequence without, such as 'pxy' or 'pxyr'"
+        )
+    return "rz" in spec.components
+
+
+def require_yaw(name: str, spec: SpatialSpec) -> None:
+    """Refuse an action without yaw.
+
+    Raises:
+        ValueError: the action has none, or something besides x, y and rz.
+    """
+    if not has_yaw(name, spec):
+        raise ValueError(
+            f"network {name!r} chooses a yaw, and the action has no rz; use 'fcn' or 'equi_fcn', "
+            "or an action_sequence with r, such as 'pxyr'"
+        )
+
+
+def require_unet_size(name: str, image_size: int) -> None:
+    """Refuse images that a UNet cannot halve four times.
+
+    Raises:
+        ValueError: the size is not a multiple of 16 pixels.
+    """
+    if image_size % UNET_STRIDE:
+        raise ValueError(
+            f"network {name!r} needs an image_size that is a multiple of {UNET_STRIDE}, got "
+            f"{image_size}; 'rot_fcn' takes any even one"
+        )
+
+
+def yaws_rad(count: int, half_rotation: bool, device: torch.device) -> Tensor:
+    """Return the yaws that the indices of an angle stand for, [count]."""
+    period_rad = math.pi if half_rotation else 2 * math.pi
+    return torch.arange(count, device=device) * (period_rad / count)

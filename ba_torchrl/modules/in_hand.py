@@ -1,0 +1,79 @@
+"""Plain convolutional encoders of the in-hand image, and of images of its size."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ba_torchrl.modules.cnn import CastConv2d
+from ba_torchrl.modules.trunk import scaled_width
+
+_LARGEST_LAST_MAP = 6
+
+
+class InHandMap(nn.Module):
+    """A feature map of a small image: three valid 3x3 convolutions and a pool, 24 -> 8 pixels.
+
+    Args:
+        channels: of the image.
+        size: of the image, pixels.
+        width: factor on the layers' widths, 64, 128 and 256.
+
+    Raises:
+        ValueError: nothing is left of an image of this size.
+    """
+
+    def __init__(self, channels: int, size: int, width: float) -> None:
+        super().__init__()
+        self.out_size = (size - 4) // 2 - 2
+        if self.out_size < 1:
+            raise ValueError(f"the in-hand image needs at least 10 pixels, got {size}")
+        first, second, self.out_channels = (scaled_width(w, width) for w in (64, 128, 256))
+        self.first = CastConv2d(channels, first, 3)
+        self.second = CastConv2d(first, second, 3)
+        self.third = CastConv2d(second, self.out_channels, 3)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return [B, out_channels, out_size, out_size] of images [B, C, h, h], in their dtype."""
+        x = F.relu(self.first(images), inplace=True)
+        # Pooling and ReLU commute; this order leaves the ReLU a quarter of the elements.
+        x = F.relu(F.max_pool2d(self.second(x), 2), inplace=True)
+        return F.relu(self.third(x), inplace=True)
+
+
+class InHandVector(nn.Module):
+    """A feature vector of a small image: four padded 3x3 convolutions with pools, and one layer.
+
+    Two pools at 24 pixels, three at 40.
+
+    Args:
+        channels: of the image.
+        size: of the image, pixels.
+        width: factor on the layers' widths, 32, 64, 128, 256 and 1024.
+
+    Raises:
+        ValueError: the image is too small or too large for two or three pools.
+    """
+
+    def __init__(self, channels: int, size: int, width: float) -> None:
+        super().__init__()
+        pools = 2 if size // 4 <= _LARGEST_LAST_MAP else 3
+        last = size >> pools
+        if not 1 <= last <= _LARGEST_LAST_MAP:
+            raise ValueError(f"the in-hand image needs 4 to 55 pixels, got {size}")
+        widths = [scaled_width(w, width) for w in (32, 64, 128, 256)]
+        self.convs = nn.ModuleList(
+            CastConv2d(a, b, 3, padding=1)
+            for a, b in zip([channels, *widths[:-1]], widths, strict=True)
+        )
+        self.pools = (pools == 3, True, True, False)
+        self.out_features = scaled_width(1024, width)
+        self.linear = nn.Linear(widths[-1] * last * last, self.out_features)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return float32 features [B, out_features] of images [B, C, h, h]."""
+        x = images
+        for conv, pool in zip(self.convs, self.pools, strict=True):
+            x = conv(x)
+            x = F.relu(F.max_pool2d(x, 2) if pool else x, inplace=True)
+        return F.relu(self.linear(x.flatten(1).float()), inplace=True)

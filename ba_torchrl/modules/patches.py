@@ -1,0 +1,67 @@
+"""Turned views of images, sampled bilinearly at the size that is asked for."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def sampling_grid(center_px: Tensor, yaw_rad: Tensor, size: int, image_size: int) -> Tensor:
+    """Return where a square view samples a square image, for ``grid_sample``.
+
+    Rows of the view run along the direction at angle yaw from the image's rows: it is what a
+    gripper turned by that yaw sees, which is the scene turned by minus the yaw.
+
+    Args:
+        center_px: rows and columns of the views' centres [N, 2]; pixel (i, j) has its centre at
+            (i + 1/2, j + 1/2).
+        yaw_rad: [N].
+        size: rows and columns of the views, pixels as large as the image's.
+        image_size: rows and columns of the image.
+
+    Returns:
+        [N, size, size, 2], column then row, -1 and 1 the image's outer edges.
+    """
+    offsets = torch.arange(size, device=center_px.device) - (size - 1) / 2
+    along, across = torch.meshgrid(offsets, offsets, indexing="ij")
+    cos, sin = yaw_rad.cos()[:, None, None], yaw_rad.sin()[:, None, None]
+    rows = center_px[:, 0, None, None] + cos * along - sin * across
+    columns = center_px[:, 1, None, None] + sin * along + cos * across
+    return torch.stack([columns, rows], dim=-1) * (2 / image_size) - 1
+
+
+def sample(images: Tensor, grid: Tensor) -> Tensor:
+    """Return views [N, C, h, w] of float32 images [N, C, H, W]; outside of them is zero."""
+    return F.grid_sample(images, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+
+
+def patches(images: Tensor, pixels: Tensor, size: int, yaw_rad: Tensor | None = None) -> Tensor:
+    """Return the surroundings of one pixel of each image.
+
+    The centre of the patch is the centre of the pixel. So with an even size and no yaw, every
+    value is the mean of four neighbours.
+
+    Args:
+        images: float32 [B, C, H, H].
+        pixels: int64 [B, 2], row and column.
+        size: rows and columns of the patch.
+        yaw_rad: angle of the patch's rows to the image's, [B]; none is zero.
+
+    Returns:
+        [B, C, size, size]; zero outside of the image.
+    """
+    center_px = pixels.to(images.dtype) + 0.5
+    yaw_rad = torch.zeros_like(center_px[:, 0]) if yaw_rad is None else yaw_rad
+    return sample(images, sampling_grid(center_px, yaw_rad, size, images.shape[-1]))
+
+
+def centre_fit(images: Tensor, size: int) -> Tensor:
+    """Return images [B, C, h, h] cropped, or padded with zeros, to ``size`` about their centre.
+
+    Args:
+        images: of a size that differs from ``size`` by an even number.
+        size: rows and columns of the result.
+    """
+    margin = (size - images.shape[-1]) // 2
+    return F.pad(images, (margin,) * 4) if margin else images

@@ -1,0 +1,234 @@
+"""Policies on spatial Q values: from maps of values to an action in the environment's units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from ba_torchrl.actions import PLACE, OpenLoopActions
+from ba_torchrl.envs import keys
+from ba_torchrl.modules.spatial import Level, SpatialQNetwork
+
+OBSERVATION_KEYS = [keys.PIXELS, keys.IN_HAND, keys.HOLDING]
+
+GROUND_M = 0.01
+"""Random actions go to pixels higher than this, if there are any."""
+
+
+class SpatialActions:
+    """The bijection between what the levels choose and the action, in the environment's units.
+
+    Indices of x and y are rows and columns of the heightmap, and stand for the centres of pixels.
+
+    Args:
+        actions: the environment's action vector.
+        levels: what is chosen, in this order.
+
+    Raises:
+        ValueError: the levels do not choose just the components of the action.
+    """
+
+    def __init__(self, actions: OpenLoopActions, levels: Sequence[Level]) -> None:
+        self.actions = actions
+        self.levels = tuple(levels)
+        chosen = [name for level in levels for name in level.components]
+        wanted = [name for name in actions.components if name != "p"]
+        if sorted(chosen) != sorted(wanted):
+            raise ValueError(
+                f"the network chooses {', '.join(chosen)}; the action sequence "
+                f"{actions.sequence!r} has {', '.join(wanted)}"
+            )
+        self.axes = [
+            actions.axis(name, count)
+            for level in levels
+            for name, count in zip(level.components, level.shape, strict=True)
+        ]
+        self._places = [actions.components.index(name) for name in chosen]
+        ends = torch.tensor([len(level.shape) for level in levels]).cumsum(0).tolist()
+        self._parts = [
+            slice(end - len(level.shape), end) for end, level in zip(ends, levels, strict=True)
+        ]
+
+    def to_action(self, indices: Tensor, holding: Tensor) -> Tensor:
+        """Return the action [..., A] of indices; the primitive follows from what is held.
+
+        Args:
+            indices: int64 [..., n], of all levels' components in their order.
+            holding: [..., 1], true where something is held.
+        """
+        shape = (*indices.shape[:-1], self.actions.size)
+        # float64 in between: the float32 next to the true centre, whatever the device
+        action = torch.zeros(shape, dtype=torch.float64, device=indices.device)
+        for i, (place, axis) in enumerate(zip(self._places, self.axes, strict=True)):
+            action[..., place] = axis.first + axis.step * indices[..., i].double()
+        if "p" in self.actions.components:
+            primitive = self.actions.components.index("p")
+            action[..., primitive] = PLACE * holding[..., 0].double()
+        return action.float()
+
+    def to_indices(self, action: Tensor) -> Tensor:
+        """Return the nearest indices, int64 [..., n], of actions [..., A]."""
+        columns = []
+        for place, axis in zip(self._places, self.axes, strict=True):
+            index = ((action[..., place].double() - axis.first) / axis.step).round().long()
+            if axis.period is None:
+                index = index.clamp(0, axis.count - 1)
+            else:
+                index = index.remainder(axis.count)
+            columns.append(index)
+        return torch.stack(columns, dim=-1)
+
+    def part(self, indices: Tensor, level: int) -> Tensor:
+        """Return one level's share of indices [..., n]."""
+        return indices[..., self._parts[level]]
+
+    def before(self, indices: Tensor, level: int) -> Tensor:
+        """Return what the levels before one have chosen, of indices [..., n]."""
+        return indices[..., : self._parts[level].start]
+
+    def flat(self, indices: Tensor, level: int) -> Tensor:
+        """Return one level's choice [...] as an index into its flattened values."""
+        flat = torch.zeros_like(indices[..., 0])
+        for index, size in zip(
+            self.part(indices, level).unbind(-1), self.levels[level].shape, strict=True
+        ):
+            flat = flat * size + index
+        return flat
+
+    def unflat(self, flat: Tensor, level: int) -> Tensor:
+        """Return the indices [..., m] of a choice [...] among a level's flattened values."""
+        return torch.stack(torch.unravel_index(flat, self.levels[level].shape), dim=-1)
+
+
+class SpatialValues(nn.Module):
+    """A network's values of actions in the environment's units, level by level.
+
+    Args:
+        network: gives the values.
+        actions: between its choices and the environment's actions.
+    """
+
+    in_keys = OBSERVATION_KEYS
+
+    def __init__(self, network: SpatialQNetwork, actions: SpatialActions) -> None:
+        super().__init__()
+        self.network = network
+        self.actions = actions
+
+    def greedy(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the choices of greatest value, level after level, and the last level's value.
+
+        Args:
+            pixels: heightmaps [B, 1, H, W], metres.
+            in_hand: [B, C, h, w].
+            holding: [B, 1].
+
+        Returns:
+            int64 [B, n] and float32 [B, 1].
+        """
+        q, state = self.network.first(pixels, in_hand, holding)
+        value, best = q.flatten(1).max(dim=1, keepdim=True)
+        chosen = self.actions.unflat(best[:, 0], 0)
+        for level in range(1, len(self.actions.levels)):
+            q = self.network.later(level, state, chosen)
+            value, best = q.flatten(1).max(dim=1, keepdim=True)
+            chosen = torch.cat([chosen, self.actions.unflat(best[:, 0], level)], dim=-1)
+        return chosen, value
+
+    def forward(
+        self, pixels: Tensor, in_hand: Tensor, holding: Tensor, action: Tensor
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Return every level's values, given what an action chose at the levels before.
+
+        Args:
+            pixels: heightmaps [B, 1, H, W], metres.
+            in_hand: [B, C, h, w].
+            holding: [B, 1].
+            action: [B, A].
+
+        Returns:
+            For each level the values of all its choices [B, N], and the action's choice [B].
+        """
+        indices = self.actions.to_indices(action)
+        q, state = self.network.first(pixels, in_hand, holding)
+        found = [(q.flatten(1), self.actions.flat(indices, 0))]
+        for level in range(1, len(self.actions.levels)):
+            q = self.network.later(level, state, self.actions.before(indices, level))
+            found.append((q.flatten(1), self.actions.flat(indices, level)))
+        return found
+
+
+class SpatialPolicy(nn.Module):
+    """Acts on spatial Q values: greedily, or with probability epsilon at random.
+
+    A random action goes to a pixel where something stands, if there is one, at a random angle.
+    TorchRL's ``EGreedyModule`` would draw the primitive as well, which is not free.
+    ``set_exploration_type`` chooses, as everywhere in TorchRL: only RANDOM explores.
+
+    Args:
+        values: of the actions.
+        rounding: of heightmap and in-hand image, to what the replay stores.
+        seed: of random actions.
+    """
+
+    epsilon: Tensor
+
+    def __init__(self, values: SpatialValues, rounding: nn.Module, seed: int) -> None:
+        super().__init__()
+        self.values = values
+        self.rounding = rounding
+        self.register_buffer("epsilon", torch.zeros(()))
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def get_generator_state(self) -> Tensor:
+        """Return the state of the source of random actions."""
+        return self._generator.get_state()
+
+    def set_generator_state(self, state: Tensor) -> None:
+        """Take over what `get_generator_state` returned."""
+        self._generator.set_state(state.cpu())
+
+    @torch.no_grad()
+    def forward(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> Tensor:
+        """Return actions [..., A] of heightmaps [..., 1, H, W] and what else is observed.
+
+        Args:
+            pixels: [..., 1, H, W], metres.
+            in_hand: [..., C, h, w].
+            holding: [..., 1].
+        """
+        leading = holding.shape[:-1]
+        count = math.prod(leading)
+        pixels = self.rounding(pixels.reshape(count, *pixels.shape[-3:]))
+        in_hand = self.rounding(in_hand.reshape(count, *in_hand.shape[-3:]))
+        holding = holding.reshape(count, 1)
+        indices, _ = self.values.greedy(pixels, in_hand, holding)
+        if exploration_type() == ExplorationType.RANDOM and self.epsilon > 0:
+            explores = torch.rand(count, generator=self._generator) < self.epsilon.cpu()
+            random = self._random_indices(pixels).to(indices.device)
+            indices = torch.where(explores.to(indices.device)[:, None], random, indices)
+        return self.values.actions.to_action(indices, holding).reshape(*leading, -1)
+
+    def _random_indices(self, pixels: Tensor) -> Tensor:
+        """Return random choices, int64 [B, n]."""
+        actions = self.values.actions
+        components = [name for level in actions.levels for name in level.components]
+        count, width = len(pixels), pixels.shape[-1]
+        weights = (pixels[:, 0] > GROUND_M).flatten(1).float().cpu()
+        weights[weights.sum(dim=1) == 0] = 1.0
+        pixel = torch.multinomial(weights, 1, generator=self._generator)[:, 0]
+        columns = {"x": pixel // width, "y": pixel % width}
+        for name, axis in zip(components, actions.axes, strict=True):
+            if name not in columns:
+                columns[name] = torch.randint(axis.count, (count,), generator=self._generator)
+        return torch.stack([columns[name] for name in components], dim=-1)
+
+
+def spatial_policy(policy: SpatialPolicy) -> TensorDictModule:
+    """Return the policy as a TensorDict module, from the observation to ``action``."""
+    return TensorDictModule(policy, in_keys=OBSERVATION_KEYS, out_keys=[keys.ACTION])

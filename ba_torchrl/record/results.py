@@ -1,0 +1,229 @@
+"""Results: what a finished run leaves as data, one ``result.json`` per run folder.
+
+`RunResult` is the schema. Reports are made from these files alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Collection, Iterable, Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from pydantic import Field, ValidationError
+
+from ba_torchrl import __version__
+from ba_torchrl.config import StrictModel
+
+RESULT_FILE = "result.json"
+CONFIG_FILE = "config.json"
+FAILURE_FILE = "failure.json"
+"""What a benchmark leaves in the folder of a run that failed: ``reason``, ``when`` and ``log``."""
+PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
+
+CIRCUMSTANCES = frozenset(
+    {
+        "run_dir",
+        "resume",
+        "label",
+        "benchmark",
+        "device",
+        "threads",
+        "parallel",
+        "start_method",
+        "logger",
+        "log_every",
+        "video_episodes",
+    }
+)
+"""Fields of a run's configuration that say where and how it is computed and shown, not what is
+learnt: a run can be resumed under others, and runs that differ in them are averaged."""
+
+
+class CurvePoint(StrictModel):
+    """One evaluation of the greedy policy during the run."""
+
+    updates: int
+    """Gradient updates so far."""
+    env_steps: int
+    """Steps of all environments so far, demonstrations not counted."""
+    seconds: float
+    """Since the run began, time between an interruption and its resumption not counted."""
+    episodes: int
+    success_rate: float
+    standard_error: float
+    """Of the success rate, over these episodes (binomial)."""
+    mean_length: float
+    """Steps per episode, failures at their full length."""
+
+
+class FinalEvaluation(StrictModel):
+    """The evaluation that is reported, on episodes that chose nothing."""
+
+    policy: Literal["last", "best"]
+    updates: int
+    """Age of the policy."""
+    episodes: int
+    success_rate: float
+    standard_error: float
+    mean_length: float
+
+
+class RunResult(StrictModel):
+    """Everything a report needs to know about a run."""
+
+    format: Literal[1] = 1
+    task: str
+    label: str
+    """Name of the method, such as "sacfd equi"."""
+    benchmark: str | None
+    """The benchmark that the run belongs to."""
+    seed: int
+    curve: list[CurvePoint]
+    """In the order of updates."""
+    final: FinalEvaluation
+    config: dict[str, Any]
+    """The run's configuration, every default filled in."""
+    versions: dict[str, str]
+    """Of Python and the packages."""
+    hardware: dict[str, Any]
+    """`cpu`, `cores`, `memory_gb`, `gpu` (None on the CPU) and the learner's `threads`."""
+    seconds: float
+    """Wall time of the run, time between an interruption and its resumption not counted."""
+    resumed_at: list[int] = Field(default_factory=list)
+    """Updates after which the run went on from where it had been interrupted."""
+    finished: str
+    """When, UTC, ISO 8601."""
+    files: dict[str, str]
+    """`curve`, `checkpoint` and perhaps `video`, relative to the run folder."""
+
+
+def write_result(folder: str | Path, result: RunResult) -> Path:
+    """Write ``result.json`` into a run folder, whole or not at all."""
+    path = Path(folder) / RESULT_FILE
+    scratch = path.with_suffix(".tmp")
+    scratch.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    os.replace(scratch, path)
+    return path
+
+
+def read_result(folder: str | Path) -> RunResult:
+    """Read the result of a run folder.
+
+    Raises:
+        FileNotFoundError: the run is not finished.
+        ValueError: the file is something else.
+    """
+    path = Path(folder) / RESULT_FILE
+    try:
+        return RunResult.model_validate_json(path.read_text(encoding="utf-8"))
+    except ValidationError as error:
+        raise ValueError(f"{path} is no result of a run: {error}") from None
+
+
+def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
+    """Find the run folders below some folders, themselves included.
+
+    Returns:
+        Those of finished runs and those of all others, each sorted.
+    """
+    roots = [Path(root) for root in roots]
+    finished, *others = (
+        {file.parent for root in roots for file in root.rglob(name)}
+        for name in (RESULT_FILE, CONFIG_FILE, FAILURE_FILE)
+    )
+    return sorted(finished), sorted(set().union(*others) - finished)
+
+
+def failure_reason(folder: str | Path) -> str | None:
+    """Return why the run in a folder failed when a benchmark last tried it, None if it did not."""
+    path = Path(folder) / FAILURE_FILE
+    return json.loads(path.read_text(encoding="utf-8"))["reason"] if path.exists() else None
+
+
+def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by dotted name, "env.obs_size"."""
+    out: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping):
+            out |= flat(value, f"{prefix}{key}.")
+        else:
+            out[f"{prefix}{key}"] = value
+    return out
+
+
+def differences(
+    first: Mapping[str, Any],
+    second: Mapping[str, Any],
+    besides: Collection[str] = CIRCUMSTANCES,
+) -> dict[str, tuple[Any, Any]]:
+    """Return the settings in which two runs' configurations differ, and both values.
+
+    Args:
+        first: a configuration with every default filled in.
+        second: another.
+        besides: fields that may differ.
+    """
+    a, b = (
+        flat({key: value for key, value in config.items() if key not in besides})
+        for config in (first, second)
+    )
+    return {
+        name: (a.get(name), b.get(name))
+        for name in sorted(a.keys() | b.keys())
+        if a.get(name) != b.get(name)
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that shape results."""
+    found = {"python": platform.python_version(), "ba_torchrl": __version__}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue  # escnn is optional
+    return found
+
+
+def hardware(device: torch.device) -> dict[str, Any]:
+    """Return what a run is computed on.
+
+    Args:
+        device: the learner's.
+    """
+    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
+    return {
+        "cpu": processor(),
+        "cores": os.cpu_count(),
+        "memory_gb": _memory_gb(),
+        "gpu": gpu,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def processor() -> str:
+    """Return the name of the processor."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass  # not Linux
+    return platform.processor() or platform.machine()
+
+
+def now() -> str:
+    """Return the time, UTC, ISO 8601."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _memory_gb() -> float | None:
+    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
+        return None
+    return round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)

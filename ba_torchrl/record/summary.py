@@ -1,0 +1,270 @@
+"""Summary: finished runs, gathered by benchmark, task and method, as figures over seeds.
+
+Runs whose settings differ are never averaged: their methods get names that tell them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import bootstrap
+
+from ba_torchrl.record.results import (
+    CIRCUMSTANCES,
+    RunResult,
+    differences,
+    read_result,
+    run_folders,
+)
+
+CONFIDENCE = 0.95
+RESAMPLES = 9999
+GOOD_RATE = 0.8
+"""Sample efficiency is how soon the mean curve reaches this success rate."""
+ALL_TASKS = "all tasks"
+LOOSE_RUNS = "runs"
+"""Title of what belongs to no benchmark."""
+COLUMNS = (
+    "benchmark",
+    "task",
+    "method",
+    "seeds",
+    "success",
+    "standard_error",
+    "low",
+    "high",
+    "curve_mean",
+    "updates_to_80",
+    "env_steps_to_80",
+    "mean_length",
+    "hours",
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run and where it lies."""
+
+    folder: Path
+    result: RunResult
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ in nothing but their seed."""
+
+    task: str
+    method: str
+    runs: Sequence[Run]
+    """By seed."""
+
+    @property
+    def updates(self) -> np.ndarray:
+        """Where the curve has points, [n]."""
+        return np.array([point.updates for point in self.runs[0].result.curve])
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Success rate of every seed at these points, [seeds, n]."""
+        return np.array([[p.success_rate for p in run.result.curve] for run in self.runs])
+
+    @property
+    def by_seed(self) -> dict[int, float]:
+        """Success rate that each seed reports."""
+        return {run.result.seed: run.result.final.success_rate for run in self.runs}
+
+    @property
+    def final(self) -> np.ndarray:
+        """The same as an array, [seeds]."""
+        return np.array(list(self.by_seed.values()))
+
+    def reaches(self, rate: float) -> tuple[float, float]:
+        """Return after how many updates and environment steps the mean curve reaches a rate.
+
+        Both are nan if it does not; they are as fine as the evaluations are.
+        """
+        reached = np.flatnonzero(self.rates.mean(0) >= rate)
+        if not reached.size:
+            return float("nan"), float("nan")
+        points = [run.result.curve[reached[0]] for run in self.runs]
+        return float(points[0].updates), float(np.mean([point.env_steps for point in points]))
+
+
+@dataclass(frozen=True)
+class Section:
+    """One benchmark, or all runs that belong to none."""
+
+    title: str
+    groups: Sequence[Group]
+
+    @property
+    def tasks(self) -> list[str]:
+        """Tasks in alphabetical order."""
+        return sorted({group.task for group in self.groups})
+
+    @property
+    def methods(self) -> list[str]:
+        """Methods in alphabetical order."""
+        return sorted({group.method for group in self.groups})
+
+
+def load_sections(roots: Iterable[str | Path]) -> tuple[list[Section], list[Path]]:
+    """Read every finished run below some folders.
+
+    Args:
+        roots: folders.
+
+    Returns:
+        Benchmarks by name, what belongs to none last; and the folders of unfinished runs.
+
+    Raises:
+        FileNotFoundError: a folder is missing, or none holds a finished run.
+        ValueError: a result cannot be read, or the same run is there twice.
+    """
+    roots = [Path(root) for root in roots]
+    for root in roots:
+        if not root.is_dir():
+            raise FileNotFoundError(f"there is no folder {root}")
+    finished, unfinished = run_folders(roots)
+    if not finished:
+        raise FileNotFoundError(
+            f"no finished run below {', '.join(map(str, roots))}: "
+            "a run leaves its result.json when it ends"
+        )
+    by_title: dict[str, list[Run]] = {}
+    for folder in finished:
+        run = Run(folder, read_result(folder))
+        by_title.setdefault(run.result.benchmark or LOOSE_RUNS, []).append(run)
+    titles = sorted(by_title, key=lambda title: (title == LOOSE_RUNS, title))
+    return [Section(title, _grouped(by_title[title])) for title in titles], unfinished
+
+
+def standard_error(values: np.ndarray) -> np.ndarray | float:
+    """Return the standard error of the mean over the first axis; nan for a single value."""
+    if len(values) < 2:
+        return np.full(values.shape[1:], np.nan)[()]
+    return values.std(axis=0, ddof=1) / np.sqrt(len(values))
+
+
+def interval(values: np.ndarray) -> tuple[float, float]:
+    """Return a bootstrap interval of the mean at `CONFIDENCE`; nan for a single value.
+
+    Args:
+        values: one per seed. With few seeds such an interval is too narrow, if anything.
+    """
+    if len(values) < 2:
+        return float("nan"), float("nan")
+    found = bootstrap(
+        (values,),
+        np.mean,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def summarize(section: Section) -> list[dict[str, Any]]:
+    """Return the table of a section: rows with the names of `COLUMNS`.
+
+    There is a row per task and method, and then one for each method that was run on every task,
+    where a seed's success is its mean over tasks.
+    """
+    groups = sorted(section.groups, key=lambda group: (group.task, group.method))
+    rows = [_row(section.title, group) for group in groups]
+    if len(section.tasks) == 1:
+        return rows
+    for method in section.methods:
+        of_method = [group for group in groups if group.method == method]
+        shared = set.intersection(*(set(group.by_seed) for group in of_method))
+        if len(of_method) < len(section.tasks) or not shared:
+            continue
+        final = np.array(
+            [np.mean([group.by_seed[seed] for group in of_method]) for seed in sorted(shared)]
+        )
+        own = [row for row in rows if row["method"] == method and row["task"] != ALL_TASKS]
+        low, high = interval(final)
+        rows.append(
+            {
+                **dict.fromkeys(COLUMNS, float("nan")),
+                "benchmark": section.title,
+                "task": ALL_TASKS,
+                "method": method,
+                "seeds": len(shared),
+                "success": float(final.mean()),
+                "standard_error": float(standard_error(final)),
+                "low": low,
+                "high": high,
+                "curve_mean": float(np.mean([row["curve_mean"] for row in own])),
+                "hours": float(np.mean([row["hours"] for row in own])),
+            }
+        )
+    return rows
+
+
+def _row(title: str, group: Group) -> dict[str, Any]:
+    """Return a task's and method's row."""
+    low, high = interval(group.final)
+    updates, steps = group.reaches(GOOD_RATE)
+    results = [run.result for run in group.runs]
+    values = (
+        title,
+        group.task,
+        group.method,
+        len(group.runs),
+        float(group.final.mean()),
+        float(standard_error(group.final)),
+        low,
+        high,
+        float(group.rates.mean()),
+        updates,
+        steps,
+        float(np.mean([result.final.mean_length for result in results])),
+        float(np.mean([result.seconds for result in results])) / 3600,
+    )
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def _grouped(runs: Sequence[Run]) -> list[Group]:
+    """Gather the seeds of each task and method; tell methods apart whose settings differ."""
+    named: dict[tuple[str, str], list[list[Run]]] = {}
+    for run in runs:
+        alike = named.setdefault((run.result.task, run.result.label), [])
+        for group in alike:
+            if not _differences(group[0], run):
+                group.append(run)
+                break
+        else:
+            alike.append([run])
+    groups = []
+    for (task, label), alike in named.items():
+        for members in alike:
+            seeds = [run.result.seed for run in members]
+            twice = {seed for seed in seeds if seeds.count(seed) > 1}
+            if twice:
+                where = ", ".join(str(run.folder) for run in members if run.result.seed in twice)
+                raise ValueError(f"{task}, {label}: the same run is there twice: {where}")
+            name = label + _distinction(members[0], [other[0] for other in alike])
+            groups.append(Group(task, name, sorted(members, key=lambda run: run.result.seed)))
+    return groups
+
+
+def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
+    return differences(first.result.config, second.result.config, {*CIRCUMSTANCES, "seed"})
+
+
+def _distinction(run: Run, others: Sequence[Run]) -> str:
+    """Return what sets a run apart from others of its name, such as " (env.obs_size 64)"."""
+    names = sorted({name for other in others for name in _differences(run, other)})
+    values = []
+    for name in names:
+        value: Any = run.result.config
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        values.append(f"{name} {value}")
+    return f" ({', '.join(values)})" if values else ""

@@ -1,0 +1,131 @@
+"""The outline of a robot's gripper, measured on its collision shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pybullet
+
+from ba_torchrl.sim.world import World
+
+if TYPE_CHECKING:
+    from ba_torchrl.sim.robots.base import Robot
+
+TIPS_M = 0.01
+"""The lowest part of the fingers, which counts as their tips."""
+
+_OPENINGS = tuple(np.linspace(0.0, 1.0, 9).tolist())
+_STRIDE_M = 5e-3
+_SPACING_M = 1e-3
+_HALF_U_M, _HALF_V_M = 0.14, 0.02
+_BELOW_M, _ABOVE_M = 0.05, 0.1
+_CHAMFER_M = 2e-3
+_RAYS_AT_ONCE = 8192
+_POSITION = (0.45, 0.0, 0.25)
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """Outline of a gripper that points down, as things beneath it meet it.
+
+    Distances are from the tool point along the line on which the fingers close, the same on both
+    sides; heights are above the tool point.
+    """
+
+    half_gap_m: float
+    """Half the distance between the open fingers."""
+    half_width_m: float
+    """Half the fingertips' width, across the line on which they close."""
+    closed_half_m: float
+    """Half the extent of both fingertips along that line when they are closed."""
+    palm_m: float
+    """Height of the lowest part over the gap between the fingers, however wide it is."""
+    arc: tuple[tuple[float, float], ...]
+    """Half gaps from closed to open, and the height at which the fingers end there: those that
+    swing go down as they close."""
+    outline: tuple[tuple[float, float], ...]
+    """Distances, ascending from zero, and the height at which the open gripper begins there."""
+    closed_outline: tuple[tuple[float, float], ...]
+    """The same of the closed gripper."""
+
+    def tip_m(self, half_gap_m: float) -> float:
+        """Return the height at which the fingers end, given half the distance between them."""
+        gaps, heights = zip(*self.arc, strict=True)
+        return float(np.interp(half_gap_m, gaps, heights))
+
+
+@cache
+def measured_gripper(robot: type[Robot]) -> Gripper:
+    """Return the outline of a robot's gripper.
+
+    Rays from below find the collision shapes as contacts do, their margins included. It takes a
+    world of its own and tenths of a second, once in a process.
+    """
+    from ba_torchrl.sim.robots.base import downward  # the robot's module imports this one
+
+    us = np.arange(0.0, _HALF_U_M + _SPACING_M / 2, _SPACING_M)
+    vs = np.arange(-_HALF_V_M, _HALF_V_M + _SPACING_M / 2, _SPACING_M)
+    with World() as world:
+        body = robot(world)
+        body.teleport(body.inverse_kinematics(_POSITION, downward(0.0)))
+        closed, opened = (_underside(body, opening, us, vs) for opening in (0.0, 1.0))
+        lines = [_underside(body, opening, us, np.zeros(1))[:, 0] for opening in _OPENINGS]
+
+    arc, palm = [], np.inf
+    for heights in lines:
+        gap = us[_are_tips(heights)].min()
+        arc.append((float(gap), float(heights.min())))
+        palm = min([palm, *heights[us < gap - _CHAMFER_M]])
+    tips = _are_tips(opened)
+    return Gripper(
+        half_gap_m=arc[-1][0],
+        half_width_m=float(np.abs(vs[tips.any(axis=0)]).max()) + _SPACING_M / 2,
+        closed_half_m=float(us[_are_tips(closed).any(axis=1)].max()) + _SPACING_M / 2,
+        palm_m=float(palm),
+        arc=tuple(arc),
+        outline=_outline(us, opened),
+        closed_outline=_outline(us, closed),
+    )
+
+
+def _outline(us: np.ndarray, heights: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Return the lowest heights around every few millimetres of the way out, as far as they go."""
+    profile = heights.min(axis=1)
+    reach = us[np.isfinite(profile)].max()
+    return tuple(
+        (float(u), float(profile[np.abs(us - u) < _STRIDE_M / 2].min()))
+        for u in np.arange(0.0, reach + _STRIDE_M / 2, _STRIDE_M)
+    )
+
+
+def _are_tips(heights: np.ndarray) -> np.ndarray:
+    return heights < heights.min() + TIPS_M
+
+
+def _underside(robot: Robot, opening: float, us: np.ndarray, vs: np.ndarray) -> np.ndarray:
+    """Return heights [U, V] above the tool at which rays from below meet the gripper.
+
+    Both sides count, and infinity stands for nothing there.
+    """
+    robot.set_opening(opening)
+    robot.world.detect_collisions()
+    (x, y, z), _ = robot.tool_pose()
+    grid = np.stack(np.meshgrid(np.concatenate([us, -us]), vs, indexing="ij"), -1).reshape(-1, 2)
+    low, high = (
+        np.column_stack([grid + np.array([x, y]), np.full(len(grid), z + height)])
+        for height in (-_BELOW_M, _ABOVE_M)
+    )
+    hits = [
+        hit
+        for i in range(0, len(grid), _RAYS_AT_ONCE)
+        for hit in pybullet.rayTestBatch(
+            low[i : i + _RAYS_AT_ONCE].tolist(),
+            high[i : i + _RAYS_AT_ONCE].tolist(),
+            physicsClientId=robot.client,
+        )
+    ]
+    heights = np.array([hit[3][2] - z if hit[0] == robot.id else np.inf for hit in hits])
+    return heights.reshape(2, len(us), len(vs)).min(axis=0)

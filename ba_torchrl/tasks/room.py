@@ -1,0 +1,76 @@
+"""Room on the ground: where a piece can be put without standing too near to others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ba_torchrl.sim.bodies import Body, Vector, radius_m, vertical_extent, world_vertices
+
+SPOT_STEP_M = 0.02
+"""Spots are looked for in steps of this length."""
+
+
+class PutDown(NamedTuple):
+    """Where on the ground pieces may be put."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    gap_m: float
+    """Room wanted around a piece."""
+    z_m: float = 0.0
+    line_yaw_rad: float | None = None
+    """Direction in which two pieces for a bridge must stand; None if any will do."""
+
+
+def nearest_spot(body: Body, others: Sequence[Body], put_down: PutDown) -> Vector:
+    """Return where a body's origin goes to stand, as it is turned, at the nearest spot with room.
+
+    Where there is none, it is the spot that lacks least.
+
+    Args:
+        body: to put down.
+        others: to keep away from.
+        put_down: where there may be room.
+    """
+    x, y, z = body.position
+    spots = np.array([(a, b) for a in _steps(*put_down.x) for b in _steps(*put_down.y)])
+    aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
+    best = np.lexsort((aways, shortage_m(spots, body, others, put_down)))[0]
+    return (*spots[best].tolist(), put_down.z_m + z - vertical_extent(body)[0])
+
+
+def shortage_m(
+    spots: np.ndarray, body: Body, others: Sequence[Body], put_down: PutDown
+) -> np.ndarray:
+    """Return how much room is wanting at spots [S, 2]: outside the area, or beside others.
+
+    Args:
+        spots: to look at, metres.
+        body: to put down.
+        others: to keep away from.
+        put_down: where there may be room.
+
+    Returns:
+        [S], metres.
+    """
+    low, high = np.array([put_down.x, put_down.y]).T
+    outside = np.maximum(np.maximum(low - spots, spots - high), 0.0).max(axis=1)
+    if not others:
+        return outside
+    at = np.array([other.position[:2] for other in others])
+    gaps = np.hypot(*(spots[:, None] - at).transpose(2, 0, 1))
+    room = (gaps - [radius_m(other) for other in others]).min(axis=1)
+    return outside + np.maximum(put_down.gap_m + radius_m(body) - room, 0.0)
+
+
+def reach_m(body: Body, ways: np.ndarray) -> np.ndarray:
+    """Return how far a body, as it lies, reaches from its origin in directions [N, 2], [N]."""
+    return ((world_vertices(body)[:, :2] - body.position[:2]) @ ways.T).max(axis=0)
+
+
+def _steps(low: float, high: float) -> list[float]:
+    count = max(1, round((high - low) / SPOT_STEP_M))
+    return [low + (high - low) * i / count for i in range(count + 1)]

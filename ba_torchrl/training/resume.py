@@ -1,0 +1,165 @@
+"""Resuming: the state of a run at its last evaluation, from which it goes on if it is interrupted.
+
+Kept: the algorithm (networks, optimiser, schedules, generators), its replay with priorities, the
+process's random number generators, the learning curve and all counters. Not kept: the episodes in
+progress, which start anew with other seeds, and what happened since the last evaluation, which is
+done again. A resumed run is therefore another sample of the same run, not the same bits.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+
+from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.config import ConfigError
+from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
+from ba_torchrl.training.checkpoint import read_config, write_config
+from ba_torchrl.training.config import ExperimentConfig
+
+logger = logging.getLogger(__name__)
+
+RECENT_EPISODES = 100
+_FOLDER = "resume"
+
+
+@dataclass
+class Progress:
+    """How far a run has come."""
+
+    curve: list[CurvePoint] = field(default_factory=list)
+    recent: deque[bool] = field(default_factory=lambda: deque(maxlen=RECENT_EPISODES))
+    """Whether each of the latest training episodes reached the goal."""
+    env_steps: int = 0
+    faults: int = 0
+    seconds: float = 0.0
+    """Wall time until the state was saved."""
+    resumed_at: list[int] = field(default_factory=list)
+    """Updates after which the run was resumed."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything as plain values."""
+        values = {name: value for name, value in vars(self).items() if name != "curve"}
+        curve = [point.model_dump() for point in self.curve]
+        return {**values, "recent": list(self.recent), "curve": curve}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over what `state_dict` returned."""
+        vars(self).update(state)
+        self.recent = deque(state["recent"], maxlen=RECENT_EPISODES)
+        self.curve = [CurvePoint(**point) for point in state["curve"]]
+
+
+class ResumeState:
+    """What a run saves at every evaluation and removes when it has finished; it is large.
+
+    TorchRL publishes each state under its final name only when it is complete, and the previous
+    one is removed after that: a crash while writing leaves that one whole.
+
+    Args:
+        folder: the run folder.
+        algorithm: whose state and replay are kept.
+        progress: the run's counters and curve.
+        device: where to load tensors to.
+    """
+
+    def __init__(
+        self, folder: Path, algorithm: Algorithm, progress: Progress, device: torch.device
+    ) -> None:
+        self._folder = folder / _FOLDER
+        self._device = device
+        self._checkpoint = Checkpoint(
+            algorithm=algorithm,
+            replay=_Replay(algorithm),
+            progress=progress,
+            generators=GlobalRNGState(),
+        )
+        self._rotation = CheckpointRotation(self._folder, keep_last=1)
+
+    def save(self, updates: int) -> None:
+        """Write the state of a run after so many updates."""
+        self._rotation.save(self._checkpoint, step=updates)
+
+    def load(self) -> bool:
+        """Restore the last state; return whether there is one."""
+        for leftover in self._folder.glob(".*"):  # a state whose writing was interrupted
+            shutil.rmtree(leftover)
+        latest = self._rotation.latest()
+        if latest is None:
+            return False
+        self._checkpoint.load(latest, map_location=self._device)
+        return True
+
+    def remove(self) -> None:
+        """Delete the state of a finished run."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def resumable_updates(folder: str | Path) -> int | None:
+    """Return after how many updates the run in a folder would go on, None if it cannot."""
+    folder = Path(folder) / _FOLDER
+    latest = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
+    return None if latest is None else int(latest.name.rsplit("-", 1)[-1])
+
+
+def open_run_folder(config: ExperimentConfig) -> None:
+    """Make the run folder and write the configuration into it, if no other run lies there.
+
+    Raises:
+        ConfigError: there is a run, and it is finished, or ``resume`` is off, or it had other
+            settings; the message names each.
+    """
+    folder = config.folder
+    if not (folder / CONFIG_FILE).exists():
+        if config.resume:
+            logger.warning("no run to resume in %s: starting one", folder)
+    elif (folder / RESULT_FILE).exists():
+        raise ConfigError(f"{folder} holds a finished run; choose another run_dir")
+    elif not config.resume:
+        raise ConfigError(
+            f"{folder} holds a run that did not finish: resume=true goes on with it, another "
+            "run_dir starts anew"
+        )
+    else:
+        check_same_run(config)
+        if resumable_updates(folder) is None:
+            if (folder / "checkpoints").exists():
+                raise ConfigError(
+                    f"{folder} has checkpoints, but nothing to resume from; choose another run_dir"
+                )
+            logger.warning("the run in %s has not been evaluated yet: starting it anew", folder)
+    write_config(config)
+
+
+def check_same_run(config: ExperimentConfig) -> None:
+    """Check that the run in the folder of ``config`` was started with the same settings.
+
+    Raises:
+        ConfigError: it was not; the message names every difference.
+    """
+    found = differences(read_config(config.folder).resolved(), config.resolved())
+    if found:
+        lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
+        raise ConfigError(
+            f"the run in {config.folder} was started with other settings:\n  " + "\n  ".join(lines)
+        )
+
+
+class _Replay:
+    """An algorithm's replay as TorchRL's checkpoints want it: with ``dump`` and ``load``."""
+
+    def __init__(self, algorithm: Algorithm) -> None:
+        self._algorithm = algorithm
+
+    def dump(self, path: Path) -> None:
+        self._algorithm.save_replay(path)
+
+    def load(self, path: Path) -> None:
+        self._algorithm.load_replay(path)

@@ -1,0 +1,28 @@
+"""One run of a benchmark: reads its configuration as JSON from the standard input.
+
+Environments in processes of their own import this module again, so everything else is imported
+where it is needed.
+"""
+
+from ba_torchrl._malloc import tune_malloc
+
+
+def main() -> None:
+    """Run the experiment."""
+    tune_malloc()  # before torch allocates anything
+
+    import json
+    import logging
+    import sys
+
+    from ba_torchrl.record.logging import quiet_libraries
+    from ba_torchrl.training.config import ExperimentConfig
+    from ba_torchrl.training.experiment import Experiment
+
+    logging.basicConfig(level=logging.INFO)
+    quiet_libraries()
+    Experiment(ExperimentConfig.parse(json.load(sys.stdin)), progress=False).run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""Run a benchmark: tasks x algorithms x networks x seeds. The same command continues a grid.
+
+python recipes/benchmark.py benchmark=close_loop_4d seeds=4
+python recipes/benchmark.py benchmark=close_loop_4d dry_run=true       # what is done, what is not
+python recipes/benchmark.py tasks=[close_loop/block_picking] networks=[cnn] total_updates=600 \
+    env.obs_size=64 network.width=0.5 folder=runs/small
+"""
+
+import signal
+import sys
+from collections import Counter
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from ba_torchrl.config import parse
+from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.benchmark import BenchmarkConfig, plan, status
+from ba_torchrl.training.jobs import run_all
+
+hydra_schema.register()
+
+
+@hydra.main(config_path="../configs", config_name="benchmark", version_base="1.3")
+def main(settings: DictConfig) -> None:
+    """Run what is missing of the grid, or list it."""
+    quiet_libraries()
+    values = OmegaConf.to_container(settings, resolve=True)
+    dry_run = values.pop("dry_run")
+    grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields if name in values}
+    config = parse(BenchmarkConfig, grid, "benchmark")
+    runs = plan(config, values, hydra_schema.preset)
+    if dry_run:
+        states = {run.run_dir: status(run) for run in runs}
+        for run in runs:
+            print(f"{run.task:36} {run.label:20} seed {run.seed:<3} {states[run.run_dir]}")
+        counts = Counter(state.state for state in states.values())
+        print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
+        return
+    # so that the runs end with this process
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    failures = run_all(runs, jobs=config.jobs, max_hours=config.max_hours)
+    print(f"{len(runs) - len(failures)} of {len(runs)} runs done in {config.folder}")
+    for folder, reason in failures.items():
+        print(f"  failed  {folder}: {reason}")
+    if failures:
+        sys.exit(1)
+    print(f"  next    python recipes/report.py {config.folder}")
+
+
+if __name__ == "__main__":
+    main()

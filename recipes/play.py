@@ -1,0 +1,45 @@
+"""Watch a task: the expert, or random actions, in a video or in a window.
+
+python recipes/play.py task=open_loop/covid_test video=covid_test.mp4
+python recipes/play.py task=close_loop/block_pushing policy=random episodes=3
+python recipes/play.py task=close_loop/corner_picking video=null env.render=true   # needs a display
+"""
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from ba_torchrl.config import ConfigError
+from ba_torchrl.data.demos import expert_policy
+from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.record.video import write_video
+from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.evaluation import film
+
+POLICIES = {"expert": expert_policy, "random": None}
+
+hydra_schema.register()
+
+
+@hydra.main(config_path="../configs", config_name="play", version_base="1.3")
+def main(settings: DictConfig) -> None:
+    """Play episodes and write their pictures."""
+    quiet_libraries()
+    if settings.policy not in POLICIES:
+        raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
+    torch.manual_seed(settings.seed)
+    env = OmegaConf.to_container(settings.env, resolve=True)
+    frames = film(
+        settings.task,
+        {**env, "expert": settings.policy == "expert"},
+        POLICIES[settings.policy],
+        settings.episodes,
+        settings.seed,
+    )
+    print(f"{settings.episodes} episodes of {settings.task}, {len(frames)} pictures")
+    if settings.video is not None:
+        print(f"  video  {write_video(settings.video, frames, fps=settings.fps)}")
+
+
+if __name__ == "__main__":
+    main()

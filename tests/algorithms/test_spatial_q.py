@@ -1,0 +1,184 @@
+import copy
+import math
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import ba_torchrl
+from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
+from ba_torchrl.algorithms.spatial_q import SpatialQConfig
+from ba_torchrl.config import ConfigError, parse
+from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+
+TASK = "open_loop/block_stacking"
+ENV = {"obs_size": 32, "num_objects": 2}
+BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
+TINY = {"num_rotations": 4, "width": 0.125, "precision": "float32", "height_scale_m": 0.05}
+
+
+def build(network="asr", sequence="pxyr", *, sizes=None, seed=0, **config):
+    torch.manual_seed(seed)
+    problem = Problem(
+        image_size=32,
+        actions=OpenLoopActions(sequence, BOUNDS),
+        max_depth_m=0.24,
+        in_hand_shape=(1, 24),
+        total_updates=10,
+        seed=seed,
+        device=torch.device("cpu"),
+    )
+    settings = parse(SpatialQConfig, {"batch_size": 4, "buffer_size": 500, **config}, "spatial_q")
+    values = TINY if sizes is None else sizes
+    return settings.build(parse(NETWORKS[network], values, network), problem)
+
+
+@pytest.fixture(scope="module")
+def transitions():
+    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
+    episodes = collect_demonstrations(env, 4, seed=0, only_successful=True)
+    env.close()
+    return torch.cat([as_transitions(episode, is_expert=True) for episode in episodes])
+
+
+def online(transitions):
+    data = transitions.clone()
+    data["is_expert"] = torch.zeros_like(data["is_expert"])
+    return data
+
+
+def test_the_batch_is_half_demonstrations_once_the_policy_has_met_something(transitions):
+    algorithm = build()
+    algorithm.extend(transitions)
+    assert algorithm.replay.sample()["is_expert"].all()
+    algorithm.extend(online(transitions))
+    assert algorithm.replay.sample()["is_expert"].sum() == 2
+    assert algorithm.replay_size == 2 * len(transitions)
+
+
+@pytest.mark.parametrize("network", ["asr", "fcn", "rot_fcn", "equi_asr", "equi_fcn"])
+def test_every_network_learns_the_demonstrations(network, transitions):
+    algorithm = build(network, learning_rate=1e-3, demonstration_weight=10.0)
+    algorithm.extend(transitions)
+    before = float(algorithm.loss(transitions.clone())["demonstration_error"])
+    for _ in range(40):
+        algorithm.update()
+    assert float(algorithm.loss(transitions.clone())["demonstration_error"]) < 0.9 * before
+
+
+@pytest.mark.parametrize("demonstrations", ["none", "dqfd", "sdqfd", "adet"])
+@pytest.mark.parametrize("replay", ["split", "prioritized", "uniform"])
+def test_every_loss_takes_steps_on_every_replay(demonstrations, replay, transitions):
+    algorithm = build("fcn", demonstrations=demonstrations, replay=replay)
+    algorithm.extend(transitions)
+    before = [parameter.clone() for parameter in algorithm.loss.parameters()]
+    scalars = algorithm.update()
+    assert all(math.isfinite(float(value)) for value in scalars.values())
+    after = list(algorithm.loss.parameters())
+    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_priorities_follow_the_errors(transitions):
+    algorithm = build(replay="prioritized", batch_size=16)
+    algorithm.extend(transitions)
+    sampler = algorithm.replay.sampler
+    places = torch.arange(len(transitions))
+    before = torch.as_tensor(sampler._sum_tree[places]).clone()
+    algorithm.update()
+    after = torch.as_tensor(sampler._sum_tree[places])
+    assert not torch.equal(before, after)
+
+
+def test_the_target_is_copied_every_interval(transitions):
+    algorithm = build(target_interval=3)
+    algorithm.extend(transitions)
+
+    def is_equal():
+        pairs = zip(
+            algorithm.loss.value_network_params.values(True, True),
+            algorithm.loss.target_value_network_params.values(True, True),
+            strict=True,
+        )
+        return all(torch.equal(a.data, b.data) for a, b in pairs)
+
+    assert is_equal()
+    found = []
+    for _ in range(7):
+        algorithm.update()
+        found.append(is_equal())
+    assert found == [False, False, True, False, False, True, False]
+
+
+def test_gradients_are_clamped_element_by_element(transitions):
+    algorithm = build(gradient_clamp=1e-5, demonstration_weight=1.0)
+    algorithm.extend(transitions)
+    algorithm.update()
+    largest = max(float(p.grad.abs().max()) for p in algorithm.loss.parameters())
+    assert largest == pytest.approx(1e-5)
+
+
+def test_the_policy_sees_heights_as_the_replay_stores_them(transitions):
+    algorithm = build()
+    state = transitions[:6].select("pixels", "in_hand", "holding")
+    stored = state.clone()
+    stored["pixels"] = state["pixels"].half().float()
+    nearby = stored.clone()
+    nearby["pixels"] = stored["pixels"] * (1 + 2.0**-13)
+    assert torch.equal(algorithm.policy(nearby)["action"], algorithm.policy(stored)["action"])
+
+
+def test_the_policy_is_greedy_until_epsilon_says_otherwise(transitions):
+    state = transitions[:6].select("pixels", "in_hand", "holding")
+    with set_exploration_type(ExplorationType.RANDOM):
+        greedy = build()
+        first, second = (greedy.policy(state.clone())["action"] for _ in range(2))
+        assert torch.equal(first, second)
+        explorer = build(epsilon_init=1.0, epsilon_end=0.5, epsilon_updates=4)
+        first, second = (explorer.policy(state.clone())["action"] for _ in range(2))
+        assert not torch.equal(first, second)
+    explorer.extend(transitions)
+    found = []
+    for _ in range(6):
+        found.append(float(explorer.acting.epsilon))
+        explorer.update()
+    assert found == pytest.approx([1.0, 0.875, 0.75, 0.625, 0.5, 0.5])
+
+
+def test_a_restored_learner_goes_on_as_the_first_would_have(transitions, tmp_path):
+    first = build(target_interval=3, augmentation="se2")
+    first.extend(transitions)
+    for _ in range(4):
+        first.update()
+    second = build(target_interval=3, augmentation="se2", seed=5)
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    first.save_replay(tmp_path)
+    second.load_replay(tmp_path)
+    assert second.updates == 4
+    assert second.replay_size == first.replay_size
+    batch = transitions[:4]
+    for algorithm in (first, second):
+        algorithm.replay.sample = lambda: batch.clone()
+    for _ in range(3):
+        one, other = first.update(), second.update()
+        assert float(one["loss_qvalue"]) == pytest.approx(float(other["loss_qvalue"]), rel=1e-6)
+    for a, b in zip(first.loss.parameters(), second.loss.parameters(), strict=True):
+        torch.testing.assert_close(a, b)
+    assert float(one["target_value"]) == pytest.approx(float(other["target_value"]), rel=1e-6)
+
+
+def test_an_action_without_yaw_takes_the_networks_that_suit_it(transitions):
+    assert build("fcn", "pxy").policy(transitions[:2])["action"].shape == (2, 3)
+    with pytest.raises(ValueError, match="fcn"):
+        build("asr", "pxy")
+    with pytest.raises(ValueError, match="no yaw"):
+        build("fcn", "pxy", augmentation="se2")
+
+
+def test_networks_of_the_other_kind_are_refused():
+    spatial, close = parse(SpatialQConfig, {}, "q"), parse(ALGORITHMS["sac"], {}, "sac")
+    with pytest.raises(ConfigError, match=r"for close_loop tasks; .* asr, equi_asr"):
+        spatial.check(parse(NETWORKS["cnn"], {}, "cnn"))
+    with pytest.raises(ConfigError, match=r"for open_loop tasks; .* cnn, equi"):
+        close.check(parse(NETWORKS["fcn"], {}, "fcn"))
+    spatial.check(parse(NETWORKS["fcn"], {}, "fcn"))

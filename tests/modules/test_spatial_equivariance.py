@@ -1,0 +1,197 @@
+"""Networks with spatial Q values under turns, flips and shifts of the scene."""
+
+import pytest
+import torch
+
+pytest.importorskip("escnn")
+
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.spatial import SpatialSpec
+
+SIZE = 32
+XY, XYR = ("x", "y"), ("x", "y", "rz")
+SMALL = {"width": 0.125, "precision": "float32"}
+
+
+def build(name, components=XYR, half_rotation=True, size=SIZE, in_hand_size=24, **fields):
+    torch.manual_seed(0)
+    spec = SpatialSpec(size, in_hand_size, 1, components, half_rotation)
+    return NETWORKS[name](**{**SMALL, **fields}).build(spec)
+
+
+def batch(size=SIZE, in_hand_size=24, n=4, seed=0):
+    """Heightmaps, in-hand images, half of them held, and one pixel each."""
+    generator = torch.Generator().manual_seed(seed)
+    pixels = torch.rand(n, 1, size, size, generator=generator)
+    holding = torch.arange(n)[:, None] % 2 == 0
+    in_hand = (
+        torch.rand(n, 1, in_hand_size, in_hand_size, generator=generator) * holding[..., None, None]
+    )
+    chosen = torch.randint(size, (n, 2), generator=generator)
+    return pixels, in_hand, holding, chosen
+
+
+def train(network, steps=4):
+    """A few optimiser steps towards random targets, so that biases are no longer zero."""
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3)
+    before = [p.detach().clone() for p in network.parameters()]
+    for step in range(steps):
+        pixels, in_hand, holding, chosen = batch(in_hand_size=24, seed=step + 10)
+        first, state = network.first(pixels, in_hand, holding)
+        levels = [first, *(network.later(n, state, chosen) for n in range(1, len(network.levels)))]
+        loss = sum((values - torch.rand_like(values)).square().mean() for values in levels)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert all(not torch.equal(p, q) for p, q in zip(network.parameters(), before, strict=True))
+
+
+def assert_equal(actual, expected):
+    """To 1e-4 of the spread: a constant is equivariant, too."""
+    spread = float(expected.std())
+    assert spread > 1e-4
+    torch.testing.assert_close(actual, expected, atol=1e-4 * spread, rtol=1e-4)
+
+
+def turned_pixels(chosen, size):
+    """Where a quarter turn by torch.rot90(k=1) takes pixels: read off from a turned image."""
+    numbers = torch.arange(size * size).reshape(size, size)
+    position = torch.empty(size * size, dtype=torch.long)
+    position[torch.rot90(numbers).flatten()] = torch.arange(size * size)
+    moved = position[chosen[:, 0] * size + chosen[:, 1]]
+    return torch.stack([moved // size, moved % size], dim=1)
+
+
+CASES = [
+    ("equi_fcn", XY, True, {}),
+    ("equi_fcn", XYR, True, {"num_rotations": 6}),
+    ("equi_fcn", XYR, False, {"num_rotations": 8}),
+    ("equi_asr", XYR, True, {"num_rotations": 6}),
+    ("equi_asr", XYR, False, {"num_rotations": 8}),
+    ("equi_asr", XYR, True, {"num_rotations": 4, "patch_size": 40}),
+]
+
+
+@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize(("name", "components", "half", "fields"), CASES)
+def test_a_quarter_turn_turns_pixels_and_shifts_yaws(name, components, half, fields, trained):
+    network = build(name, components, half, **fields)
+    if trained:
+        train(network)
+    pixels, in_hand, holding, chosen = batch()
+    turned = torch.rot90(pixels, 1, (-2, -1))
+    with torch.no_grad():
+        first, state = network.first(pixels, in_hand, holding)
+        turned_first, turned_state = network.first(turned, in_hand, holding)
+        expected = torch.rot90(first, 1, (-2, -1))
+        shift = fields.get("num_rotations", 0) // (2 if half else 4)
+        if network.levels[0].components[0] == "rz":
+            expected = expected.roll(shift, dims=1)
+        assert_equal(turned_first, expected)
+        if len(network.levels) == 2:
+            yaws = network.later(1, state, chosen)
+            turned_yaws = network.later(1, turned_state, turned_pixels(chosen, SIZE))
+            expected = yaws.roll(shift, dims=1)
+            assert_equal(turned_yaws, expected)
+            # What tells the yaws apart may be small beside what tells the pixels apart.
+            mean = expected.mean(dim=1, keepdim=True)
+            assert_equal(turned_yaws - mean, expected - mean)
+            wrong = turned_yaws - yaws.roll(shift + 1, dims=1)
+            assert wrong.std() > 0.1 * (expected - mean).std()
+
+
+def test_opposite_sense_of_the_yaws_is_wrong():
+    """With three quarter turns left to go, the test above can tell the two senses apart."""
+    network = build("equi_asr", half_rotation=False, num_rotations=8)
+    pixels, in_hand, holding, chosen = batch()
+    turned = torch.rot90(pixels, 1, (-2, -1))
+    with torch.no_grad():
+        yaws = network.later(1, network.first(pixels, in_hand, holding)[1], chosen)
+        state = network.first(turned, in_hand, holding)[1]
+        turned_yaws = network.later(1, state, turned_pixels(chosen, SIZE))
+    assert (turned_yaws - yaws.roll(-2, dims=1)).std() > 0.1 * yaws.std(dim=1).min()
+
+
+@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("name", ["equi_fcn", "equi_asr"])
+def test_flips_of_the_image_flip_the_pixels_values(name, trained):
+    network = build(name, XY if name == "equi_fcn" else XYR)
+    if trained:
+        train(network)
+    pixels, in_hand, holding, _ = batch()
+    with torch.no_grad():
+        values = network.first(pixels, in_hand, holding)[0]
+        for dim in (-2, -1):
+            flipped = network.first(pixels.flip(dim), in_hand, holding)[0]
+            assert_equal(flipped, values.flip(dim))
+
+
+@pytest.mark.parametrize(("half", "num_rotations"), [(True, 6), (False, 8)])
+def test_rot_fcn_sees_each_yaw_in_its_own_frame(half, num_rotations):
+    """Turning the scene shifts the yaws; those that leave the half turn meet a turned-over view."""
+    network = build("rot_fcn", half_rotation=half, size=26, num_rotations=num_rotations)
+    pixels, in_hand, holding, _ = batch(size=26)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.01 * torch.randn_like(parameter))  # biases, too
+        values = network.first(pixels, in_hand, holding)[0]
+        turned = network.first(torch.rot90(pixels, 1, (-2, -1)), in_hand, holding)[0]
+    expected = torch.rot90(values, 1, (-2, -1)).roll(num_rotations // (2 if half else 4), dims=1)
+    assert_equal(turned[:, num_rotations // 2 :], expected[:, num_rotations // 2 :])
+    if not half:
+        assert_equal(turned, expected)
+
+
+def test_rot_fcn_values_the_image_turned_against_the_yaw():
+    """A gripper at +90 degrees sees the scene turned by -90; what it says is turned back."""
+    network = build("rot_fcn", half_rotation=False, size=26, num_rotations=4)
+    pixels, in_hand, holding, _ = batch(size=26)
+    assert network.padded_size == 48
+    padded = torch.nn.functional.pad(pixels, (11,) * 4)
+    with torch.no_grad():
+        values = network.first(pixels, in_hand, holding)[0]
+        for index in range(4):
+            view = torch.rot90(padded, -index, (-2, -1))
+            expected = network.values(view, in_hand, holding)[0][:, 0]
+            expected = torch.rot90(expected, index, (-2, -1))[:, 11:-11, 11:-11]
+            assert_equal(values[:, index], expected)
+
+
+@pytest.mark.parametrize("name", ["fcn", "asr"])
+def test_plain_networks_have_no_such_symmetry(name):
+    """So that the tests above could fail."""
+    network = build(name, XY if name == "fcn" else XYR)
+    pixels, in_hand, holding, _ = batch()
+    with torch.no_grad():
+        values = network.first(pixels, in_hand, holding)[0]
+        turned = network.first(torch.rot90(pixels, 1, (-2, -1)), in_hand, holding)[0]
+    assert (turned - torch.rot90(values, 1, (-2, -1))).std() > 0.1 * values.std()
+
+
+@pytest.mark.parametrize(
+    ("name", "components", "fields"),
+    [
+        ("fcn", XY, {}),
+        ("fcn", XYR, {"num_rotations": 3}),
+        ("equi_fcn", XY, {}),
+        ("equi_fcn", XYR, {"num_rotations": 2}),
+    ],
+)
+def test_a_shift_by_the_stride_shifts_the_values(name, components, fields):
+    """Without biases an empty floor gives zeros, and the image is wider than a scene's reach."""
+    size = 288
+    network = build(name, components, size=size, **{"width": 1 / 16, **fields})
+    with torch.no_grad():
+        for parameter_name, parameter in network.named_parameters():
+            if parameter_name.endswith("bias") and "coefficients" not in parameter_name:
+                parameter.zero_()  # the dynamic filter's coefficients stay
+    pixels = torch.zeros(1, 1, size, size)
+    pixels[..., 136:148, 140:150] = torch.rand(12, 10)
+    moved = pixels.roll((16, -16), dims=(-2, -1))
+    in_hand, holding = torch.zeros(1, 1, 24, 24), torch.tensor([[name == "equi_fcn"]])
+    with torch.no_grad():
+        values = network.first(pixels, in_hand, holding)[0]
+        shifted = network.first(moved, in_hand, holding)[0]
+        assert_equal(shifted, values.roll((16, -16), dims=(-2, -1)))
+        half_stride = network.first(pixels.roll(3, dims=-1), in_hand, holding)[0]
+    assert (half_stride - values.roll(3, dims=-1)).abs().max() > 1e-3 * values.abs().max()

@@ -1,0 +1,344 @@
+"""Every registered network with spatial Q values: sizes, shapes, precision, errors."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from pydantic import ValidationError
+from torchrl.objectives import LossModule
+
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.spatial import SpatialSpec
+
+pytest.importorskip("escnn")
+
+XY, XYR = ("x", "y"), ("x", "y", "rz")
+NAMES = [name for name in NETWORKS if NETWORKS[name].control == "open_loop"]
+SMALL = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
+
+
+def build(name, size=32, in_hand_size=24, channels=1, components=XYR, half=True, **fields):
+    torch.manual_seed(0)
+    spec = SpatialSpec(size, in_hand_size, channels, components, half)
+    return NETWORKS[name](**{**SMALL, **fields}).build(spec)
+
+
+def batch(size=32, in_hand_size=24, channels=1, n=4, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return (
+        torch.rand(n, 1, size, size, generator=generator),
+        torch.rand(n, channels, in_hand_size, in_hand_size, generator=generator),
+        torch.arange(n)[:, None] % 3 == 1,
+        torch.randint(size, (n, 2), generator=generator),
+    )
+
+
+def values_of(network, pixels, in_hand, holding, chosen):
+    """The Q values of all levels."""
+    first, state = network.first(pixels, in_hand, holding)
+    return [first, *(network.later(n, state, chosen) for n in range(1, len(network.levels)))]
+
+
+def count(module):
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_registry_holds_the_networks():
+    assert {"fcn", "equi_fcn", "rot_fcn", "asr", "equi_asr"} <= set(NAMES)
+
+
+# Weights layer by layer, added up by hand, with the biases behind them.
+PLAIN_UNET = (
+    (288 + 32 + 18_432)  # lift, R(32 -> 32)
+    + (57_344 + 229_376 + 917_504)  # R(32 -> 64), R(64 -> 128), R(128 -> 256)
+    + (3_670_016 + 131_072 + 256)  # R(256 -> 512), 1x1
+    + (576 + 64) + (73_728 + 128) + (294_912 + 256)  # in-hand image
+    + 1_900_544  # fuse
+    + (1_900_544 + 32_768 + 128) + (475_136 + 8_192 + 64) + (118_784 + 2_048 + 32) + 29_696
+)  # fmt: skip
+IN_HAND_CONVS = (288 + 32) + (18_432 + 64) + (73_728 + 128) + (294_912 + 256)
+GENERATOR = IN_HAND_CONVS + (9216 + 1) * 1024 + (1024 + 1) * (16 * 16 * 48 + 16)
+PLAIN_YAWS = (1_152 + 64) + (73_728 + 128) + (294_912 + 256) + 32_769 * 1024 + 1025 * 32
+# C32: 7x7 kernels per pair of fields: 18 from a trivial one, 576; 3x3: 192. One bias per field.
+YAW_CONVS = (8 * 18 + 8) + (8 * 16 * 576 + 16) + (16 * 32 * 576 + 32) + (32 * 32 * 192 + 32)
+YAW_CONVS += (32 * 16 * 192 + 16) + (16 * 2 * 16 + 2)
+YAW_FILTER = 1025 * (16 * 16 * 32 + 16)
+YAW_SCENE = (256 + 1) * 1024 + 1025 * 512  # of the pooled scene; 16384 inputs where flattened
+EQUI_YAWS = YAW_CONVS + YAW_FILTER + YAW_SCENE
+
+
+def yaw_hand(last_map):
+    return IN_HAND_CONVS + (256 * last_map**2 + 1) * 1024 + 1025 * 512
+
+
+@pytest.mark.parametrize(
+    ("name", "components", "in_hand_size", "first", "later"),
+    [
+        ("fcn", XY, 24, PLAIN_UNET + 66, 0),
+        ("fcn", XYR, 24, PLAIN_UNET + 33 * 32, 0),
+        ("rot_fcn", XYR, 24, PLAIN_UNET + 66, 0),
+        ("equi_fcn", XY, 24, GENERATOR + 6_050_290, 0),
+        ("asr", XYR, 24, PLAIN_UNET + 66, PLAIN_YAWS),
+        ("asr", XYR, 40, PLAIN_UNET + 66, PLAIN_YAWS),
+        ("equi_asr", XYR, 24, GENERATOR + 6_050_290, EQUI_YAWS + yaw_hand(6)),
+    ],
+)
+def test_parameter_counts_are_the_references(name, components, in_hand_size, first, later):
+    network = build(name, 128, in_hand_size, components=components, width=1.0, num_rotations=16)
+    parts = dict(network.named_children())
+    assert count(parts.pop("values" if "values" in parts else "positions")) == first
+    assert sum(map(count, parts.values())) == later
+
+
+def test_totals_are_the_references():
+    """9.86, 28.5, 34.0 and 36.7 million; the last with the scene map flattened, as it was there."""
+    assert round(PLAIN_UNET + 66, -4) == 9_860_000
+    assert round(GENERATOR + 6_050_290, -4) == 28_490_000
+    assert round(PLAIN_YAWS, -5) == 34_000_000
+    flattened = EQUI_YAWS + (16_384 - 256) * 1024
+    assert round(flattened + yaw_hand(6), -5) == 36_700_000
+    assert round(flattened + yaw_hand(5), -5) == 33_800_000
+
+
+def test_equi_fcn_with_yaws_has_the_references_size():
+    network = build("equi_fcn", 128, width=1.0, num_rotations=8)
+    assert count(network) == 47_125_954  # 47.1 million at C16
+
+
+@pytest.mark.parametrize("half", [True, False])
+@pytest.mark.parametrize("in_hand_size", [24, 40])
+@pytest.mark.parametrize("size", [32, 64, 128])
+@pytest.mark.parametrize("name", NAMES)
+def test_shapes_with_a_yaw(name, size, in_hand_size, half):
+    network = build(name, size, in_hand_size, half=half)
+    values = values_of(network, *batch(size, in_hand_size))
+    assert len(values) == len(network.levels)
+    components = []
+    for level, q in zip(network.levels, values, strict=True):
+        assert q.shape == (4, *level.shape)
+        assert q.dtype == torch.float32
+        assert torch.isfinite(q).all()
+        components += level.components
+    assert sorted(components) == ["rz", "x", "y"]
+    assert all(n == (4 if c == "rz" else size) for level in network.levels
+               for c, n in zip(level.components, level.shape, strict=True))  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["fcn", "equi_fcn"])
+def test_shapes_without_a_yaw(name):
+    network = build(name, 48, components=XY)
+    assert network.levels == ((("x", "y"), (48, 48)),)
+    (values,) = values_of(network, *batch(48))
+    assert values.shape == (4, 48, 48)
+
+
+def test_rot_fcn_takes_the_papers_ninety_pixels():
+    network = build("rot_fcn", 90, num_rotations=2)
+    assert network.padded_size == 128
+    (values,) = values_of(network, *batch(90, n=1))
+    assert values.shape == (1, 2, 90, 90)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("name", NAMES)
+def test_every_input_matters_and_samples_do_not_mix(name, channels):
+    network = build(name, channels=channels)
+    pixels, in_hand, holding, chosen = batch(channels=channels)
+    with torch.no_grad():
+        values = values_of(network, pixels, in_hand, holding, chosen)
+        other = values_of(network, pixels, in_hand, ~holding, chosen)
+        for q, p in zip(values, other, strict=True):
+            assert ((q - p).abs().flatten(1).amax(dim=1) > 1e-4 * q.std()).all()  # the primitive
+        other = values_of(network, pixels, in_hand.flip(-1) * 2, holding, chosen)
+        for q, p in zip(values, other, strict=True):
+            assert (q - p)[1].abs().max() > 1e-4 * q.std()  # what is held
+        other = values_of(network, pixels.flip(0), in_hand, holding, chosen)
+        for q, p in zip(values, other, strict=True):
+            assert (q - p).abs().max() > 1e-3 * q.std()
+        for i in range(4):
+            alone = values_of(
+                network,
+                pixels[i : i + 1],
+                in_hand[i : i + 1],
+                holding[i : i + 1],
+                chosen[i : i + 1],
+            )
+            for q, p in zip(values, alone, strict=True):
+                torch.testing.assert_close(p[0], q[i], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["equi_fcn", "equi_asr"])
+def test_where_to_pick_does_not_depend_on_the_in_hand_image(name):
+    network = build(name)
+    pixels, in_hand, holding, _ = batch()
+    with torch.no_grad():
+        values = network.first(pixels, in_hand, holding)[0]
+        other = network.first(pixels, in_hand.flip(0) * 3, holding)[0]
+    opened = ~holding[:, 0]
+    assert torch.equal(values[opened], other[opened])
+    assert not torch.allclose(values[~opened], other[~opened])
+
+
+@pytest.mark.parametrize("primitive", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_batch_of_one_primitive_only_learns(name, primitive):
+    network = build(name)
+    pixels, in_hand, _, chosen = batch()
+    holding = torch.full((4, 1), primitive)
+    sum(q.square().sum() for q in values_of(network, pixels, in_hand, holding, chosen)).backward()
+    assert all(p.grad is None or torch.isfinite(p.grad).all() for p in network.parameters())
+    some = [p for p in network.parameters() if p.grad is not None and p.grad.abs().sum() > 0]
+    assert len(some) > 10
+
+
+@pytest.mark.parametrize("name", ["asr", "equi_asr"])
+def test_the_second_level_trains_the_first_ones_encoder(name):
+    network = build(name)
+    values_of(network, *batch())[1].square().sum().backward()
+    encoder = network.positions.unet.encoders[0]
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in encoder.parameters())
+    assert network.positions.unet.decoders[-1].first.bias is None or (
+        network.positions.unet.decoders[-1].first.bias.grad is None
+    )
+
+
+@pytest.mark.parametrize("name", ["asr", "equi_asr"])
+def test_the_second_level_knows_the_pixel(name):
+    network = build(name)
+    pixels, in_hand, holding, chosen = batch()
+    with torch.no_grad():
+        state = network.first(pixels, in_hand, holding)[1]
+        here, there = network.later(1, state, chosen), network.later(1, state, (chosen + 16) % 32)
+    assert ((here - there).abs().amax(dim=1) > 1e-3 * here.std()).all()
+    with pytest.raises(ValueError, match="later level of this network is 1"):
+        network.later(2, state, chosen)
+
+
+def test_a_one_level_network_has_no_later_one():
+    with pytest.raises(NotImplementedError, match="one level"):
+        build("fcn").later(1, None, torch.zeros(4, 2, dtype=torch.long))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bfloat16_is_close_to_float32(name):
+    exact, rough = build(name), build(name, precision="bfloat16")
+    rough.load_state_dict(exact.state_dict())
+    inputs = batch()
+    pairs = list(zip(values_of(rough, *inputs), values_of(exact, *inputs), strict=True))
+    for actual, expected in pairs:
+        assert actual.dtype == torch.float32
+        assert not torch.equal(actual, expected)
+        assert (actual - expected).norm() < 0.05 * expected.norm()
+    sum(q.sum() for q, _ in pairs).backward()
+    assert {p.grad.dtype for p in rough.parameters() if p.grad is not None} == {torch.float32}
+
+
+def test_bfloat16_values_keep_differences_below_its_grain():
+    """The heads are float32: values between one and two would else share at most 128 levels."""
+    for name in ("fcn", "equi_fcn"):
+        network = build(name, precision="bfloat16", components=XY)
+        biases = [p for n, p in network.named_parameters() if "head.b" in n or "values.b" in n]
+        with torch.no_grad():
+            for bias in biases:
+                bias.add_(1.5)
+        (values,) = values_of(network, *batch())
+        one_to_two = values[(values > 1) & (values < 2)]
+        assert one_to_two.numel() > 2000
+        assert one_to_two.unique().numel() > 1000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_heights_in_other_units_are_the_same_network(name):
+    metres, units = build(name), build(name, height_scale_m=0.05)
+    pixels, in_hand, holding, chosen = batch()
+    for expected, actual in zip(
+        values_of(metres, pixels, in_hand, holding, chosen),
+        values_of(units, pixels * 0.05, in_hand * 0.05, holding, chosen),
+        strict=True,
+    ):
+        torch.testing.assert_close(
+            actual, expected, atol=1e-4 * float(expected.detach().std()), rtol=1e-3
+        )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_copies_and_pickles_are_small_and_equal(name):
+    """Policies are copied for evaluation and sent to processes that may lack escnn."""
+    network, inputs = build(name), batch()
+    data = pickle.dumps(network)
+    assert b"escnn" not in data
+    fresh = build(name)
+    with torch.no_grad():
+        for parameter in fresh.parameters():
+            parameter.normal_()
+    fresh.load_state_dict(network.state_dict())
+    for other in (copy.deepcopy(network), pickle.loads(data), fresh):
+        for q, p in zip(values_of(other, *inputs), values_of(network, *inputs), strict=True):
+            assert torch.equal(q, p)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_functional_calls_see_the_given_parameters(name):
+    """TorchRL's target networks run the same module on other weights."""
+
+    class Holder(LossModule):
+        net: object
+        net_params: object
+        target_net_params: object
+
+    holder = Holder()
+    holder.convert_to_functional(build(name), "net", create_target_params=True)
+    holder._has_update_associated["net"] = True
+    inputs = batch()
+
+    def values(params):
+        with params.to_module(holder.net, preserve_module_state=False):
+            return torch.cat([q.flatten() for q in values_of(holder.net, *inputs)])
+
+    start = values(holder.net_params)
+    start.square().sum().backward()
+    assert all(p.grad is not None for p in holder.net_params.values(True, True))
+    assert torch.equal(values(holder.target_net_params), start)
+    with torch.no_grad():
+        for value in holder.net_params.values(True, True):
+            value.mul_(1.5)
+    assert torch.equal(values(holder.target_net_params), start)
+    assert not torch.allclose(values(holder.net_params), start)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_network_cannot_serve_is_refused(name):
+    with pytest.raises(ValueError, match="x, y and rz, not z, ry, rx"):
+        build(name, components=("x", "y", "z", "rz", "ry", "rx"))
+    with pytest.raises(ValidationError):
+        NETWORKS[name](widht=2)
+    with pytest.raises(ValidationError):
+        NETWORKS[name](width=0.0)
+    size, message = (91, "even image_size") if name == "rot_fcn" else (90, "multiple of 16")
+    with pytest.raises(ValueError, match=message):
+        build(name, size)
+    if name not in ("fcn", "equi_fcn"):
+        with pytest.raises(ValueError, match="use 'fcn' or 'equi_fcn'"):
+            build(name, components=XY)
+
+
+def test_patches_and_in_hand_images_of_other_sizes():
+    for name in ("asr", "equi_asr"):
+        network = build(name, in_hand_size=32, patch_size=24)
+        assert network.later(1, *_state(network, 32)).shape == (4, 4)
+        with pytest.raises(ValueError, match="even number of pixels"):
+            build(name, in_hand_size=25, patch_size=24)
+    with pytest.raises(ValueError, match="patch_size of 24 or 40"):
+        build("equi_asr", in_hand_size=32)
+    with pytest.raises(ValueError, match="4 to 55"):
+        build("equi_fcn", in_hand_size=64)
+    with pytest.raises(ValueError, match="at least 10"):
+        build("fcn", in_hand_size=8)
+    with pytest.raises(ValueError, match="leave out group_order"):
+        build("equi_fcn", group_order=4)
+
+
+def _state(network, in_hand_size):
+    pixels, in_hand, holding, chosen = batch(in_hand_size=in_hand_size)
+    return network.first(pixels, in_hand, holding)[1], chosen

@@ -1,0 +1,213 @@
+"""Patches, dynamic filters and groups of yaws against independent arithmetic."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("escnn")
+
+from escnn import nn as enn
+
+from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
+from ba_torchrl.modules.heights import yaws_rad
+from ba_torchrl.modules.in_hand import InHandMap, InHandVector
+from ba_torchrl.modules.patches import centre_fit, patches, sample, sampling_grid
+from ba_torchrl.modules.steerable import (
+    SteerableConv2d,
+    planar_rotations,
+    planar_rotations_and_flips,
+    planar_yaws,
+)
+from ba_torchrl.sim.in_hand import crop
+
+
+def numpy_crop(image, row, column, size, yaw=0.0):
+    """Bilinear crop about the centre of a pixel, one value at a time; zero outside."""
+    patch = np.zeros((size, size))
+    for i in range(size):
+        for j in range(size):
+            u, v = i - (size - 1) / 2, j - (size - 1) / 2
+            r = row + math.cos(yaw) * u - math.sin(yaw) * v
+            c = column + math.sin(yaw) * u + math.cos(yaw) * v
+            r0, c0 = math.floor(r), math.floor(c)
+            for dr in (0, 1):
+                for dc in (0, 1):
+                    if 0 <= r0 + dr < len(image) and 0 <= c0 + dc < len(image):
+                        weight = (1 - abs(r - r0 - dr)) * (1 - abs(c - c0 - dc))
+                        patch[i, j] += weight * image[r0 + dr, c0 + dc]
+    return patch
+
+
+@pytest.mark.parametrize("size", [8, 7])
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, 0.4, -2.0])
+def test_patches_equal_a_crop_in_numpy(size, yaw):
+    images = torch.rand(4, 1, 20, 20, generator=torch.Generator().manual_seed(0))
+    pixels = torch.tensor([[10, 4], [0, 0], [19, 10], [7, 18]])
+    actual = patches(images, pixels, size, torch.full((4,), yaw))
+    for image, (row, column), patch in zip(images, pixels.tolist(), actual, strict=True):
+        expected = numpy_crop(image[0].double().numpy(), row, column, size, yaw)
+        np.testing.assert_allclose(patch[0].numpy(), expected, atol=2e-5)
+    if yaw == 0:
+        assert torch.equal(patches(images, pixels, size), actual)
+
+
+def test_a_turned_patch_is_what_the_environment_shows_as_in_hand():
+    """So a yaw's index means the same to the networks, the in-hand image and the gripper."""
+    image = torch.rand(1, 1, 30, 30)
+    for yaw in yaws_rad(5, True, torch.device("cpu")):
+        patch = patches(image, torch.tensor([[13, 17]]), 24, yaw[None])
+        expected = crop(image[0, 0].numpy(), (13.5, 17.5), 24, float(yaw))
+        np.testing.assert_allclose(patch[0, 0].numpy(), expected, atol=2e-5)
+
+
+def test_an_odd_patch_has_the_pixel_in_its_middle_and_an_even_one_four_means():
+    image = torch.rand(1, 1, 16, 16)
+    odd = patches(image, torch.tensor([[5, 9]]), 5)[0, 0]
+    torch.testing.assert_close(odd, image[0, 0, 3:8, 7:12], atol=1e-5, rtol=0)
+    even = patches(image, torch.tensor([[5, 9]]), 4)[0, 0]
+    expected = torch.nn.functional.avg_pool2d(image[..., 3:8, 7:12], 2, stride=1)[0, 0]
+    torch.testing.assert_close(even, expected, atol=1e-5, rtol=0)
+
+
+def test_a_view_at_a_quarter_turn_is_the_scene_turned_back():
+    image = torch.rand(1, 1, 12, 12)
+    grid = sampling_grid(torch.full((1, 2), 6.0), torch.tensor([math.pi / 2]), 12, 12)
+    torch.testing.assert_close(
+        sample(image, grid), torch.rot90(image, -1, (-2, -1)), atol=1e-5, rtol=0
+    )
+
+
+def test_yaws_span_half_a_turn_or_a_whole_one():
+    device = torch.device("cpu")
+    torch.testing.assert_close(yaws_rad(4, True, device), torch.arange(4) * math.pi / 4)
+    torch.testing.assert_close(yaws_rad(4, False, device), torch.arange(4) * math.pi / 2)
+
+
+@pytest.mark.parametrize("size", [20, 24, 30])
+def test_centre_fit_keeps_the_centre(size):
+    image = torch.rand(1, 1, 24, 24)
+    fitted = centre_fit(image, size)
+    assert fitted.shape[-2:] == (size, size)
+    shared = min(size, 24)
+    torch.testing.assert_close(centre_fit(fitted, shared), centre_fit(image, shared))
+    assert fitted.sum() == pytest.approx(float(centre_fit(image, shared).sum()), rel=1e-5)
+
+
+def test_in_hand_encoders_say_which_sizes_they_take():
+    assert InHandMap(1, 24, 0.1).out_size == 8
+    assert InHandMap(1, 40, 0.1).out_size == 16
+    for size, last in ((24, 6), (40, 5), (32, 4), (20, 5)):
+        encoder = InHandVector(1, size, 0.25)
+        assert encoder.linear.in_features == 64 * last * last
+        assert encoder(torch.rand(3, 1, size, size)).shape == (3, 256)
+    with pytest.raises(ValueError, match="at least 10 pixels"):
+        InHandMap(1, 9, 0.1)
+    with pytest.raises(ValueError, match="4 to 55"):
+        InHandVector(1, 56, 0.1)
+
+
+# -- the dynamic filter -----------------------------------------------------------------------
+
+
+def dynamic(kernel_size=3, count=3, group="D4"):
+    gspace = planar_rotations_and_flips(4) if group == "D4" else planar_rotations(8)
+    layer = DynamicSteerableConv2d(gspace, gspace.regular_repr, count, kernel_size)
+    return gspace, layer, torch.randn(4, layer.num_coefficients)
+
+
+@pytest.mark.parametrize(("group", "kernel_size"), [("D4", 3), ("C8", 3), ("C8", 1)])
+def test_dynamic_filter_equals_a_loop_over_escnns_layer(group, kernel_size):
+    torch.manual_seed(0)
+    gspace, layer, coefficients = dynamic(kernel_size, group=group)
+    x = torch.randn(4, layer.count * layer.size, 9, 9)
+    fields = enn.FieldType(gspace, layer.count * [gspace.regular_repr])
+    twin = enn.R2Conv(fields, fields, kernel_size, padding=kernel_size // 2, initialize=False)
+    assert layer.num_weights == twin.weights.numel()
+    actual = layer(x, coefficients)
+    for sample_x, numbers, y in zip(x, coefficients, actual, strict=True):
+        with torch.no_grad():
+            twin.weights.copy_(numbers[: layer.num_weights])
+            twin.bias.copy_(numbers[layer.num_weights :])
+        expected = twin(fields(sample_x[None])).tensor[0]
+        torch.testing.assert_close(y, expected, atol=1e-4, rtol=1e-4)
+    assert layer(x[:0], coefficients[:0]).shape == (0, *x.shape[1:])
+
+
+def test_dynamic_filters_gradient_equals_a_loops():
+    torch.manual_seed(0)
+    _, layer, coefficients = dynamic()
+    x = torch.randn(4, layer.count * layer.size, 6, 6)
+    target = torch.randn_like(x)
+
+    def gradients(apply):
+        inputs = x.clone().requires_grad_(), coefficients.clone().requires_grad_()
+        (apply(*inputs) * target).sum().backward()
+        return [tensor.grad for tensor in inputs]
+
+    def loop(x, coefficients):
+        filters, biases = layer.filters(coefficients)
+        return torch.cat(
+            [
+                torch.nn.functional.conv2d(a[None], w, b, padding=1)
+                for a, w, b in zip(x, filters, biases, strict=True)
+            ]
+        )
+
+    for actual, expected in zip(gradients(layer), gradients(loop), strict=True):
+        torch.testing.assert_close(actual, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_without_features_the_generator_makes_a_he_initialised_filter():
+    torch.manual_seed(0)
+    gspace, layer, _ = dynamic(count=16)
+    generator = filter_generator(64, layer)
+    types = [(gspace.regular_repr, 16)]
+    plain = SteerableConv2d(gspace, types, types, 3).coefficients["in0_out0"]
+    coefficients = generator(torch.zeros(1, 64))[0]
+    actual = coefficients[: layer.num_weights].reshape(-1, plain.shape[-1]).std(dim=0)
+    torch.testing.assert_close(actual, plain.detach().flatten(0, 1).std(dim=0), rtol=0.3, atol=0)
+    assert not coefficients[layer.num_weights :].any()
+    moved = (
+        generator(torch.randn(200, 64))[:, : layer.num_weights] - coefficients[: layer.num_weights]
+    )
+    spread = moved.reshape(-1, plain.shape[-1]).std(dim=0).detach()
+    torch.testing.assert_close(spread, actual.detach(), rtol=0.3, atol=0)
+
+
+# -- groups -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("half", "order", "size"), [(True, 8, 4), (False, 4, 4)])
+def test_values_of_yaws_shift_by_one_per_step(half, order, size):
+    gspace, representation = planar_yaws(4, half)
+    group = gspace.fibergroup
+    assert (group.order(), representation.size) == (order, size)
+    step = representation(group.element(1))
+    np.testing.assert_allclose(step, np.roll(np.eye(size), 1, axis=0), atol=1e-12)
+
+
+def test_dihedral_fields_of_one_layer_turn_and_flip():
+    """The lift to regular fields permutes eight channels, and their maximum is invariant."""
+    torch.manual_seed(0)
+    gspace = planar_rotations_and_flips(4)
+    layer = SteerableConv2d(
+        gspace, [(gspace.trivial_repr, 1)], [(gspace.regular_repr, 2)], 3, padding=1
+    )
+    x = torch.randn(1, 1, 10, 10)
+    with torch.no_grad():
+        plain = layer(x).unflatten(1, (2, 8))
+        for move in (
+            lambda t: torch.rot90(t, 1, (-2, -1)),
+            lambda t: t.flip(-1),
+            lambda t: t.flip(-2),
+        ):
+            moved = layer(move(x)).unflatten(1, (2, 8))
+            torch.testing.assert_close(
+                moved.amax(dim=2), move(plain.amax(dim=2)), atol=1e-5, rtol=1e-5
+            )
+            torch.testing.assert_close(
+                moved.sort(dim=2).values, move(plain).sort(dim=2).values, atol=1e-5, rtol=1e-5
+            )
+            assert (moved - move(plain)).abs().max() > 0.1

@@ -1,0 +1,193 @@
+import itertools
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.modules.spatial import Level, SpatialQNetwork
+from ba_torchrl.modules.spatial_policy import (
+    SpatialActions,
+    SpatialPolicy,
+    SpatialValues,
+    spatial_policy,
+)
+
+BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
+PIXELS = Level(("x", "y"), (6, 8))
+YAWS = Level(("rz",), (4,))
+VOLUME = Level(("rz", "x", "y"), (4, 6, 8))
+
+
+def layout(sequence="pxyr", levels=(PIXELS, YAWS), half_rotation=True):
+    return SpatialActions(OpenLoopActions(sequence, BOUNDS, half_rotation), levels)
+
+
+class Table(SpatialQNetwork):
+    """Values from tables: the second level's depend on the pixel that was chosen."""
+
+    levels = (PIXELS, YAWS)
+
+    def __init__(self, seed=0):
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.pixels = nn.Parameter(torch.rand(2, 6, 8, generator=generator))
+        self.yaws = nn.Parameter(torch.rand(2, 6, 8, 4, generator=generator))
+
+    def first(self, pixels, in_hand, holding):
+        primitive = holding[:, 0].long()
+        return self.pixels[primitive] + 0 * pixels.mean(), primitive
+
+    def later(self, level, state, chosen):
+        assert level == 1
+        return self.yaws[state, chosen[:, 0], chosen[:, 1]]
+
+
+def observation(count, holding=None):
+    flags = torch.zeros(count, 1, dtype=torch.bool) if holding is None else holding
+    return torch.zeros(count, 1, 6, 8), torch.zeros(count, 1, 4, 4), flags
+
+
+@pytest.mark.parametrize("half_rotation", [True, False])
+@pytest.mark.parametrize("sequence", ["pxyr", "rxy", "ypxr"])
+@pytest.mark.parametrize("levels", [(PIXELS, YAWS), (VOLUME,)], ids=["asr", "fcn"])
+def test_every_choice_becomes_an_action_and_comes_back(sequence, levels, half_rotation):
+    actions = layout(sequence, levels, half_rotation)
+    shapes = [size for level in levels for size in level.shape]
+    every = torch.tensor(list(itertools.product(*map(range, shapes))))
+    action = actions.to_action(every, torch.zeros(len(every), 1, dtype=torch.bool))
+    assert action.dtype == torch.float32
+    assert torch.equal(actions.to_indices(action), every)
+    assert len(action.unique(dim=0)) == len(every)
+    for level in range(len(levels)):
+        assert torch.equal(
+            actions.unflat(actions.flat(every, level), level), actions.part(every, level)
+        )
+    assert torch.equal(actions.flat(every, 0).unique(), torch.arange(math.prod(levels[0].shape)))
+
+
+def test_an_index_means_the_middle_of_its_pixel():
+    actions = layout()
+    action = actions.to_action(
+        torch.tensor([[0, 0, 0], [5, 7, 3]]), torch.tensor([[False], [True]])
+    )
+    step_x, step_y = 0.4 / 6, 0.4 / 8
+    expected = [
+        [0, 0.25 + step_x / 2, -0.2 + step_y / 2, 0],
+        [1, 0.65 - step_x / 2, 0.2 - step_y / 2, 3 * math.pi / 4],
+    ]
+    torch.testing.assert_close(action, torch.tensor(expected), atol=1e-7, rtol=0)
+
+
+def test_the_nearest_pixel_and_yaw_stand_for_an_action():
+    actions = layout()
+    low = torch.tensor([0.0, 0.25, -0.2, 0.0])
+    corner = torch.tensor([0.0, 0.65, 0.2, 0.0])
+    just_before = torch.tensor([0.0, 0.25 + 0.4 / 6 - 1e-4, -0.2 + 0.4 / 8 + 1e-4, 0.0])
+    assert actions.to_indices(low).tolist() == [0, 0, 0]
+    assert actions.to_indices(corner).tolist() == [5, 7, 0]
+    assert actions.to_indices(just_before).tolist() == [0, 1, 0]
+    step = math.pi / 4
+    for yaw, index in [(0.4 * step, 0), (0.6 * step, 1), (3.4 * step, 3), (3.6 * step, 0)]:
+        assert actions.to_indices(torch.tensor([0.0, 0.4, 0.0, yaw]))[2] == index
+    full = layout(half_rotation=False)  # the same steps now span a whole turn
+    assert full.to_indices(torch.tensor([0.0, 0.4, 0.0, math.pi]))[2] == 2
+
+
+def test_levels_must_choose_what_the_action_has():
+    with pytest.raises(ValueError, match="chooses x, y, rz; the action sequence 'pxy' has x, y"):
+        layout("pxy")
+    with pytest.raises(ValueError, match="no grid for the component 'z'"):
+        layout("pxyz", (Level(("x", "y", "z"), (6, 8, 5)),))
+
+
+def test_greedy_takes_the_best_pixel_and_then_the_best_yaw_there():
+    network = Table()
+    values = SpatialValues(network, layout())
+    holding = torch.tensor([[False], [True]])
+    chosen, value = values.greedy(*observation(2, holding))
+    for primitive in (0, 1):
+        best = int(network.pixels[primitive].argmax())
+        row, column = divmod(best, 8)
+        yaw = int(network.yaws[primitive, row, column].argmax())
+        assert chosen[primitive].tolist() == [row, column, yaw]
+        assert value[primitive, 0] == network.yaws[primitive, row, column, yaw]
+
+
+def test_levels_are_taken_as_the_action_chose_them():
+    network = Table()
+    actions = layout()
+    values = SpatialValues(network, actions)
+    holding = torch.tensor([[True], [False]])
+    indices = torch.tensor([[2, 3, 1], [5, 0, 3]])
+    first, later = values(*observation(2, holding), actions.to_action(indices, holding))
+    assert first[1].tolist() == [2 * 8 + 3, 5 * 8]
+    assert later[1].tolist() == [1, 3]
+    assert torch.equal(first[0][0], network.pixels[1].flatten())
+    assert torch.equal(later[0], torch.stack([network.yaws[1, 2, 3], network.yaws[0, 5, 0]]))
+
+
+def policy(epsilon=0.0, seed=0, rounding=None):
+    made = SpatialPolicy(SpatialValues(Table(), layout()), rounding or nn.Identity(), seed)
+    made.epsilon.fill_(epsilon)
+    return made
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
+def test_only_the_action_leaves_the_policy_for_any_batch_shape(shape):
+    state = TensorDict(
+        {
+            "pixels": torch.zeros(*shape, 1, 6, 8),
+            "in_hand": torch.zeros(*shape, 1, 4, 4),
+            "holding": torch.ones(*shape, 1, dtype=torch.bool),
+        },
+        batch_size=shape,
+    )
+    out = spatial_policy(policy())(state)
+    assert set(out.keys()) == {"pixels", "in_hand", "holding", "action"}
+    assert out["action"].shape == (*shape, 4)
+    assert (out["action"][..., 0] == 1).all()
+
+
+def test_the_policy_rounds_both_images():
+    seen = []
+
+    class Note(nn.Module):
+        def forward(self, image):
+            seen.append(image.shape)
+            return image
+
+    policy(rounding=Note())(*observation(2))
+    assert seen == [(2, 1, 6, 8), (2, 1, 4, 4)]
+
+
+def test_exploration_goes_to_what_stands_there_and_keeps_the_primitive():
+    pixels, in_hand, holding = observation(4000)
+    pixels[:, 0, 2, 3] = pixels[:, 0, 4, 5] = 0.03
+    holding[::2] = True
+    explorer = policy(epsilon=0.75)
+    with set_exploration_type(ExplorationType.RANDOM):
+        action = explorer(pixels, in_hand, holding)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        greedy = explorer(pixels, in_hand, holding)
+    assert torch.equal(action[:, 0], holding[:, 0].float())
+    same = (action == greedy).all(dim=1)
+    assert abs(float(same.float().mean()) - 0.25) < 0.03
+    found = layout().to_indices(action[~same])
+    spots = {tuple(pair) for pair in found[:, :2].tolist()}
+    assert spots == {(2, 3), (4, 5)}
+    share = torch.bincount(found[:, 2], minlength=4) / len(found)
+    assert (share - 0.25).abs().max() < 0.04
+
+
+def test_on_an_empty_ground_exploration_goes_anywhere_and_the_seed_repeats_it():
+    results = []
+    for seed in (0, 0, 1):
+        with set_exploration_type(ExplorationType.RANDOM):
+            results.append(policy(epsilon=1.0, seed=seed)(*observation(2000)))
+    assert torch.equal(results[0], results[1])
+    assert not torch.equal(results[0], results[2])
+    assert len(layout().to_indices(results[0])[:, :2].unique(dim=0)) == 48

@@ -1,0 +1,307 @@
+import json
+import shutil
+
+import pytest
+import torch
+
+from ba_torchrl.config import ConfigError
+from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.record.results import read_result
+from ba_torchrl.training.checkpoint import find_checkpoint
+from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.resume import check_same_run, resumable_updates
+
+TINY = {
+    "task": "close_loop/block_reaching",
+    "env": {"obs_size": 64, "max_steps": 8},
+    "algorithm": {"name": "sac", "batch_size": 8},
+    "network": {"name": "cnn", "width": 0.25},
+    "num_envs": 2,
+    "parallel": False,
+    "demonstrations": 3,
+    "pretrain_updates": 2,
+    "total_updates": 9,
+    "min_replay": 5,
+    "eval_every": 3,
+    "eval_episodes": 2,
+    "final_eval_episodes": 2,
+    "log_every": 1,
+    "video_episodes": 0,
+}
+UNIFORM = {**TINY["algorithm"], "prioritized": False}
+
+
+class Interrupted(BaseException):
+    """Not an error that anything would handle."""
+
+
+def config_for(tmp_path, **changes):
+    return ExperimentConfig.parse({**TINY, "run_dir": str(tmp_path / "run"), **changes})
+
+
+def run(config):
+    return Experiment(config, progress=False).run()
+
+
+def interrupt(config, after):
+    """Run until so many updates are done, then stop without warning; return the experiment."""
+    experiment = Experiment(config, progress=False)
+    update = experiment.algorithm.update
+
+    def update_or_stop():
+        if experiment.algorithm.updates == after:
+            raise Interrupted
+        return update()
+
+    experiment.algorithm.update = update_or_stop
+    with pytest.raises(Interrupted):
+        experiment.run()
+    return experiment
+
+
+def interrupt_between_state_and_checkpoint(config):
+    """Run until the first state is saved, and no further; return the experiment."""
+    experiment = Experiment(config, progress=False)
+
+    def stop(updates, success_rate):
+        raise Interrupted
+
+    experiment.checkpoints.save = stop
+    with pytest.raises(Interrupted):
+        experiment.run()
+    return experiment
+
+
+def resumed(config):
+    """Return an experiment that went back to the last evaluation and no further."""
+    experiment = Experiment(config.model_copy(update={"resume": True}), progress=False)
+    assert experiment._resume()
+    experiment.close()
+    return experiment
+
+
+def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
+    config = config_for(tmp_path)
+    interrupt(config, after=5)
+    assert resumable_updates(config.folder) == 3
+    assert not (config.folder / "result.json").exists()
+
+    experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
+    result = experiment.run()
+    whole = run(config_for(tmp_path / "whole"))
+
+    assert result.updates == whole.updates == 9
+    assert experiment.algorithm.scheduler.last_epoch == 9
+    a, b = (read_result(run.record.parent) for run in (result, whole))
+    assert [point.updates for point in a.curve] == [3, 6, 9]
+    # two updates on demonstrations, then one for each step of both environments
+    assert [point.env_steps for point in a.curve] == [2, 8, 14]
+    assert [point.env_steps for point in b.curve] == [2, 8, 14]
+    assert a.resumed_at == [3]
+    assert b.resumed_at == []
+    assert a.curve[0].seconds < a.curve[1].seconds < a.curve[2].seconds < a.seconds
+    scalars = read_scalars(config.folder)
+    assert scalars["train/loss_qvalue"].steps.tolist() == list(range(1, 10))
+    assert scalars["demonstrations/success_rate"].steps.tolist() == [0]
+    demonstrated = len(experiment.algorithm.replay.storage.column("is_expert").nonzero())
+    assert experiment.algorithm.replay_size == demonstrated + 14
+    assert resumable_updates(config.folder) is None
+    assert not (config.folder / "resume").exists()
+    assert find_checkpoint(config.folder).name.endswith("9")
+
+
+@pytest.mark.parametrize("algorithm", [TINY["algorithm"], UNIFORM], ids=["prioritized", "uniform"])
+def test_learner_replay_priorities_and_generators_come_back_bit_by_bit(tmp_path, algorithm):
+    config = config_for(tmp_path, algorithm=algorithm)
+    first = interrupt_between_state_and_checkpoint(config)  # nothing has happened since
+    expected = torch.random.get_rng_state()
+    torch.manual_seed(12345)
+    second = resumed(config)
+    assert torch.equal(torch.random.get_rng_state(), expected)
+
+    old, new = first.algorithm, second.algorithm
+    assert new.updates == 3
+    assert new.replay_size == old.replay_size
+    for key, value in old.loss.state_dict().items():
+        assert torch.equal(new.loss.state_dict()[key], value), key
+    for key in ("exp_avg", "exp_avg_sq", "step"):
+        for index, moments in old.optimizer.state_dict()["state"].items():
+            assert torch.equal(new.optimizer.state_dict()["state"][index][key], moments[key])
+    if config.algorithm_config.prioritized:
+        a, b = (algorithm.replay.sampler.state_dict() for algorithm in (old, new))
+        assert torch.equal(a["leaves"], b["leaves"])
+        assert len(set(a["leaves"][: old.replay_size].tolist())) > 3  # not all of them alike
+        assert a["max_priority"] == b["max_priority"]
+        assert a["beta"] == b["beta"]
+    for _ in range(3):
+        a, b = old.replay.sample(), new.replay.sample()
+        for key in a.keys(True, True):
+            assert torch.equal(a[key], b[key]), key
+    a, b = old.augmentation(old.replay.sample()), new.augmentation(new.replay.sample())
+    assert torch.equal(a["action"], b["action"])
+    # what is added next goes where it would have gone
+    more = old.replay.storage[:2].exclude("index").clone()
+    assert new.replay.extend(more).tolist() == old.replay.extend(more).tolist()
+
+
+def test_a_resumed_run_collects_other_episodes(tmp_path):
+    config = config_for(tmp_path)
+    interrupt(config, after=4)
+    experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
+    seeds = []
+    make = experiment._make_env
+    experiment._make_env = lambda seed, **kwargs: seeds.append(seed) or make(seed, **kwargs)
+    experiment.run()
+    assert config.derived_seed(SeedUse.COLLECTION) not in seeds
+    assert config.derived_seed(SeedUse.COLLECTION, 3) in seeds
+    assert config.derived_seed(SeedUse.EVALUATION) in seeds  # the same test for every policy
+    assert config.derived_seed(SeedUse.COLLECTION, 0) == config.derived_seed(SeedUse.COLLECTION)
+
+
+def test_a_crash_while_saving_leaves_the_last_state_whole(tmp_path):
+    config = config_for(tmp_path)
+    experiment = Experiment(config, progress=False)
+    save = experiment.algorithm.save_replay
+
+    def save_and_fail_at_the_second(folder):
+        save(folder)
+        if experiment.algorithm.updates == 6:
+            raise Interrupted
+
+    experiment.algorithm.save_replay = save_and_fail_at_the_second
+    with pytest.raises(Interrupted):
+        experiment.run()
+    # a kill leaves the unfinished state lying about, which an exception does not
+    state = next((config.folder / "resume").iterdir())
+    shutil.copytree(state, state.with_name(f".{state.name}.stage-0123"))
+    assert resumable_updates(config.folder) == 3
+    again = resumed(config)
+    assert [point.updates for point in again._progress.curve] == [3]
+    assert [path.name for path in (config.folder / "resume").iterdir()] == [state.name]
+
+
+def test_a_checkpoint_that_was_not_written_any_more_is_written(tmp_path):
+    config = config_for(tmp_path)
+    interrupt_between_state_and_checkpoint(config)
+    assert not (config.folder / "checkpoints").exists()
+    resumed(config)
+    assert find_checkpoint(config.folder).name.endswith("3")
+
+
+def test_an_interruption_of_the_last_evaluation_repeats_no_update(tmp_path, monkeypatch):
+    config = config_for(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Experiment, "_plot", lambda self: (_ for _ in ()).throw(Interrupted()))
+        with pytest.raises(Interrupted):
+            run(config)
+    experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
+    experiment.algorithm.update = None
+    assert experiment.run().updates == 9
+    result = read_result(config.folder)
+    assert [point.updates for point in result.curve] == [3, 6, 9]
+    assert result.resumed_at == [9]
+
+
+def test_what_was_interrupted_before_its_first_evaluation_starts_anew(tmp_path, caplog):
+    interrupt(config_for(tmp_path), after=2)
+    result = run(config_for(tmp_path, resume=True))
+    assert "has not been evaluated yet" in caplog.text
+    assert result.updates == 9
+    assert read_result(result.record.parent).resumed_at == []
+
+
+def test_nothing_to_resume_starts_a_run_and_says_so(tmp_path, caplog):
+    assert run(config_for(tmp_path, resume=True, total_updates=3)).updates == 3
+    assert "no run to resume" in caplog.text
+
+
+def test_a_changed_configuration_is_refused_by_name(tmp_path):
+    config = config_for(tmp_path)
+    interrupt(config, after=4)
+    before = (config.folder / "config.json").read_bytes()
+    changed = config_for(
+        tmp_path,
+        resume=True,
+        total_updates=12,
+        env={**TINY["env"], "max_steps": 9},
+        algorithm={**TINY["algorithm"], "gamma": 0.9},
+        seed=1,
+    )
+    with pytest.raises(ConfigError) as error:
+        Experiment(changed, progress=False)
+    for line in (
+        "algorithm.gamma: 0.99 there, 0.9 now",
+        "env.max_steps: 8 there, 9 now",
+        "seed: 0 there, 1 now",
+        "total_updates: 9 there, 12 now",
+    ):
+        assert line in str(error.value)
+    assert str(error.value).count(" there, ") == 4
+    assert (config.folder / "config.json").read_bytes() == before
+
+
+def test_how_and_where_it_runs_may_change(tmp_path):
+    config = config_for(tmp_path)
+    interrupt(config, after=4)
+    moved = tmp_path / "moved"
+    shutil.move(config.folder, moved)
+    spelled_out = {**TINY["env"], "robot": "kuka"}  # a default, written down
+    other = config_for(
+        tmp_path,
+        resume=True,
+        run_dir=str(moved),
+        parallel=True,
+        start_method="fork",
+        threads=1,
+        label="other",
+        video_episodes=1,
+        env=spelled_out,
+    )
+    check_same_run(other)
+    assert run(other).updates == 9
+
+
+def test_a_folder_with_a_run_is_not_written_over(tmp_path):
+    config = config_for(tmp_path)
+    interrupt(config, after=4)
+    with pytest.raises(ConfigError, match="resume=true goes on"):
+        Experiment(config, progress=False)
+    run(config_for(tmp_path, resume=True))
+    before = (config.folder / "result.json").read_bytes()
+    for resume in (False, True):
+        with pytest.raises(ConfigError, match="finished run"):
+            Experiment(config_for(tmp_path, resume=resume), progress=False)
+    assert (config.folder / "result.json").read_bytes() == before
+
+
+def test_checkpoints_without_a_state_are_not_written_over(tmp_path):
+    config = config_for(tmp_path)
+    interrupt(config, after=4)
+    shutil.rmtree(config.folder / "resume")
+    with pytest.raises(ConfigError, match="nothing to resume from"):
+        Experiment(config_for(tmp_path, resume=True), progress=False)
+
+
+def test_the_result_tells_the_whole_run(tmp_path):
+    config = config_for(tmp_path, video_episodes=1, benchmark="some", label="sac cnn", seed=3)
+    result = run(config)
+    values = json.loads((config.folder / "result.json").read_text())
+    assert (values["task"], values["label"], values["benchmark"], values["seed"]) == (
+        TINY["task"],
+        "sac cnn",
+        "some",
+        3,
+    )
+    assert values["config"]["env"]["robot"] == "kuka"
+    assert values["config"]["algorithm"]["gamma"] == 0.99
+    assert values["config"]["network"] == {"name": "cnn", **config.network_config.model_dump()}
+    assert values["final"]["success_rate"] == result.evaluation.success_rate
+    assert (values["final"]["policy"], values["final"]["updates"]) == ("last", 9)
+    assert values["curve"][0]["episodes"] == 2
+    assert values["versions"]["torch"] == torch.__version__
+    assert values["hardware"]["cores"] >= 1
+    assert values["hardware"]["cpu"]
+    assert set(values["files"]) == {"curve", "checkpoint", "video"}
+    assert all((config.folder / file).exists() for file in values["files"].values())
+    assert values["seconds"] == pytest.approx(result.seconds)
