@@ -173,7 +173,9 @@ class OpenLoopEnv(ManipulationEnv):
         """Return how things lie before an action, if it will be asked what undoes it."""
         if not self.config.deconstruct:
             return None
-        return watch(scene.task.objects, scene.motion.held, scene.motion.grasp), self._heightmap(scene)
+        return watch(scene.task.objects, scene.motion.held, scene.motion.grasp), self._heightmap(
+            scene
+        )
 
     def _remember_undo(self, scene: Scene, before: Watch, heights: np.ndarray) -> dict[str, Any]:
         """Return the memory with what undoes an action that has just settled.
