@@ -59,7 +59,8 @@ def _cell(task: str, settings: DictConfig, env: dict[str, Any]) -> str:
         )
     except ConfigError as error:
         return f"not possible: {error}"
-    return f"{scores.success_rate:.3f}, {scores.mean_length:.1f} steps"
+    lengths = f"{scores.mean_length:.1f} steps, median {scores.median_length:g}"
+    return f"{scores.success_rate:.3f}, {lengths}"
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -16,7 +17,7 @@ from torchrl.envs import EnvBase
 from ba_torchrl import __version__
 from ba_torchrl.config import ConfigError, EnvConfig, parse
 from ba_torchrl.data.deconstruction import is_reversible, reverse_episode
-from ba_torchrl.data.episodes import collect_episodes, is_success, mean_length, success_rate
+from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_vector
 
@@ -97,6 +98,8 @@ class ExpertScores(NamedTuple):
     success_rate: float
     mean_length: float
     """Steps of the episodes that reached the goal; nan if none did."""
+    median_length: float
+    """Likewise."""
 
 
 def expert_scores(
@@ -124,7 +127,8 @@ def expert_scores(
     finally:
         envs.close()
     solved = [episode for episode in played if is_success(episode)]
-    return ExpertScores(success_rate(played), mean_length(solved) if solved else math.nan)
+    lengths = [len(episode) for episode in solved] or [math.nan]
+    return ExpertScores(success_rate(played), statistics.fmean(lengths), statistics.median(lengths))
 
 
 def save_demonstrations(
