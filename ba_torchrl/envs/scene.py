@@ -19,7 +19,7 @@ from ba_torchrl.sim.world import (
     Snapshot,
     World,
 )
-from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace
+from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace, check_scales
 from ba_torchrl.tasks.deconstruction import Deconstruction
 from ba_torchrl.tasks.tray import add_tray
 
@@ -150,6 +150,8 @@ def check_task_parameters(task_id: str, config: EnvConfig) -> None:
     """
     task_class = TASKS[task_id]
     config.check_for(task_id, task_class.control, task_class.parameters)
+    if config.object_scale_range is not None:
+        check_scales(task_id, config.object_scale_range)
     least, most = task_class.num_objects_range
     numbers = range(least, most + 1, task_class.num_objects_step)
     if config.num_objects is not None and config.num_objects not in numbers:

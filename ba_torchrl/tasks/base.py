@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, PickPlaceCommand
+from ba_torchrl.config import ConfigError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.bodies import Body, Vector
 from ba_torchrl.sim.robots.base import Pose, Robot
@@ -115,6 +116,10 @@ class Task(ABC):
     max_steps: ClassVar[int]
     workspace: ClassVar[Workspace]
     scale_range: ClassVar[tuple[float, float]]
+    """Scale of the objects by default."""
+    scale_limits: ClassVar[tuple[float, float]]
+    """What it may be, whichever robot comes. Of smaller objects the fingers meet the floor, or the
+    middle is below the workspace; larger ones do not fit between fingers or beside each other."""
     num_objects: ClassVar[int] = 1
     """How many objects there are by default."""
     num_objects_range: ClassVar[tuple[int, int]] = (1, 1)
@@ -267,3 +272,22 @@ class Task(ABC):
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put a body on the floor, or on the tray's."""
         body.place((*xy, self.settings.surface_z_m - body.shape.bounds_m[0][2]), yaw_rad)
+
+
+def check_scales(task_id: str, scales: tuple[float, float]) -> None:
+    """Check that a task can be solved with objects of these scales.
+
+    Args:
+        task_id: as listed by `ba_torchrl.list_tasks`.
+        scales: the smallest and the largest.
+
+    Raises:
+        ConfigError: they go beyond the task's limits.
+    """
+    least, most = TASKS[task_id].scale_limits
+    low, high = scales
+    if round(low, 6) < least or round(high, 6) > most:
+        allowed = f"{least:g} to {most:g}" if least < most else f"{least:g} only"
+        raise ConfigError(
+            f"{task_id}: `object_scale_range` must lie within {allowed}, not ({low:g}, {high:g})"
+        )

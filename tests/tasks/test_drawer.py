@@ -247,14 +247,14 @@ def test_random_actions_keep_the_drawer_on_its_rail(make):
 
 
 def test_scaled_drawers_open_by_scaled_travel(make):
-    env = make(object_scale_range=0.8, expert=True)
-    assert env.scene.task.cabinet.rail.range_m == (0.0, pytest.approx(0.16))
-    np.testing.assert_allclose(env.scene.task.handle_pose[0][2], 0.064, atol=1e-6)
+    env = make(object_scale_range=0.9, expert=True)
+    assert env.scene.task.cabinet.rail.range_m == (0.0, pytest.approx(0.18))
+    np.testing.assert_allclose(env.scene.task.handle_pose[0][2], 0.072, atol=1e-6)
     state = env.reset()
     while not state["done"]:
         state = env.step(state.set("action", state["expert_action"]))["next"]
     assert state["success"]
-    assert 0.12 < env.scene.task.cabinet.travel_m < 0.15
+    assert 0.135 < env.scene.task.cabinet.travel_m < 0.17
 
 
 def test_the_vector_lists_gripper_cabinet_and_handle(make):

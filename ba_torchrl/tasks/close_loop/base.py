@@ -25,6 +25,7 @@ class CloseLoopTask(Task):
     max_steps = 50
     workspace = Workspace(x=(0.3, 0.6), y=(-0.15, 0.15), z=(0.01, 0.25))
     scale_range = (1.0, 1.0)
+    scale_limits = (0.6, 1.2)
 
     def cube(self, color: Color = RED) -> Box:
         """Return the shape of a cubic block."""

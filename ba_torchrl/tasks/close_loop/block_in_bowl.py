@@ -28,6 +28,7 @@ class BlockInBowl(CloseLoopTask):
     it with the next action. A bowl that has tipped over ends the episode.
     """
 
+    scale_limits = (0.75, 1.0)
     bowl_radius_m: ClassVar[float] = 0.08
     bowl_height_m: ClassVar[float] = 0.07
     floor_m: ClassVar[float] = 0.016

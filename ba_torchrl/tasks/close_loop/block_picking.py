@@ -20,6 +20,7 @@ from ba_torchrl.tasks.experts import grasp, lift
 class BlockPicking(CloseLoopTask):
     """A 5 cm block at a random pose; success when it is held with the tool 15 cm above ground."""
 
+    scale_limits = (0.6, 1.4)
     fits_tray = True
     lift_height_m: ClassVar[float] = 0.15
 

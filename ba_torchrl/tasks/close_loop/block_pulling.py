@@ -19,6 +19,8 @@ from ba_torchrl.tasks.experts import behind_point, push
 class BlockPulling(CloseLoopTask):
     """Two blocks of 8 x 8 x 5 cm; success when they touch."""
 
+    scale_limits = (0.6, 1.1)
+
     def build(self, world: World) -> None:
         """Load the blocks."""
         size = tuple(edge * self.settings.scale for edge in (0.08, 0.08, 0.05))

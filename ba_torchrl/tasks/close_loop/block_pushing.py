@@ -24,6 +24,7 @@ class BlockPushing(CloseLoopTask):
     The depth image shows the goal area as a dip of 2 cm in the floor.
     """
 
+    scale_limits = (0.5, 1.6)
     goal_size_m: ClassVar[float] = 0.09
     goal_radius_m: ClassVar[float] = 0.05
     least_distance_m: ClassVar[float] = 0.09

@@ -20,6 +20,7 @@ from ba_torchrl.tasks.experts import OPEN, grasp
 class BlockReaching(CloseLoopTask):
     """A 5 cm block at a random pose; success when the tool point is within 3 cm of its centre."""
 
+    scale_limits = (0.5, 1.6)
     fits_tray = True
     reach_m: ClassVar[float] = 0.03
 

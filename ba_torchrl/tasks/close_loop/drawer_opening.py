@@ -61,6 +61,7 @@ MARGIN_M = 0.01
 class DrawerOpening(CloseLoopTask):
     """A cabinet with one drawer at a random pose; success when it is open by more than 15 cm."""
 
+    scale_limits = (0.85, 1.4)
     goal_travel_m: ClassVar[float] = 0.15
     travel_range_m: ClassVar[tuple[float, float]] = (0.0, 0.2)
     friction_n: ClassVar[float] = 3.0

@@ -34,6 +34,7 @@ class ObjectGrasping(CloseLoopTask):
     in.
     """
 
+    scale_limits = (1.0, 1.0)
     num_objects = 5
     num_objects_range = (1, 15)
     fits_tray = True

@@ -16,6 +16,7 @@ class OpenLoopTask(Task):
     control: ClassVar[Literal["open_loop", "close_loop"]] = "open_loop"
     workspace = Workspace(x=(0.25, 0.65), y=(-0.2, 0.2), z=(0.0, 0.4))
     scale_range = (0.6, 0.6)
+    scale_limits = (0.55, 1.1)
     finger_opening: ClassVar[float] = 1.0
     """How far the fingers open before a pick, 0 to 1."""
 

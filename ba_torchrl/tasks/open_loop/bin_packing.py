@@ -90,6 +90,7 @@ class BinPacking(PackingTask):
     the bin, none of them over its rim.
     """
 
+    scale_limits = (0.78, 0.86)
     max_steps = 20
     num_objects = 8
     num_objects_range = (1, 10)

@@ -77,6 +77,7 @@ class BottleArrangement(PackingTask):
     A bottle that falls over ends the episode.
     """
 
+    scale_limits = (0.4, 0.8)
     max_steps = 20
     num_objects = 6
     num_objects_range = (6, 6)

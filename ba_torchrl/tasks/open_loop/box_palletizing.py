@@ -71,6 +71,7 @@ class BoxPalletizing(PackingTask):
     when all that came before count and nothing is held.
     """
 
+    scale_limits = (0.75, 1.0)
     max_steps = 40
     num_objects = 18
     num_objects_range = (6, 18)

@@ -91,6 +91,7 @@ class CovidTest(OpenLoopTask):
     the test area, or a swab and a tube there before the last tube was collected.
     """
 
+    scale_limits = (0.5, 0.66)
     max_steps = 30
     num_objects = 6
     num_objects_range = (6, 6)

@@ -17,6 +17,7 @@ class HouseBuilding3(StructureTask):
     The cuboid lies across the cubes, the roof on the cuboid, both above the cubes' middle.
     """
 
+    scale_limits = (0.55, 0.9)
     max_steps = 10
     num_objects = 4
     num_objects_range = (4, 4)

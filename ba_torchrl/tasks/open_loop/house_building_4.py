@@ -17,6 +17,7 @@ class HouseBuilding4(StructureTask):
     Two cubes carry the cuboid, which carries the other two, which carry the roof.
     """
 
+    scale_limits = (0.55, 0.66)
     max_steps = 20
     num_objects = 6
     num_objects_range = (6, 6)

@@ -18,6 +18,7 @@ class ImproviseHouseBuilding3(ImproviseTask):
     The cuboid lies across the shapes, the roof on the cuboid, both above the shapes' middle.
     """
 
+    scale_limits = (0.55, 0.9)
     max_steps = 10
     num_objects = 4
     num_objects_range = (4, 4)

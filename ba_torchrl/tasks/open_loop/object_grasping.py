@@ -50,6 +50,7 @@ class ObjectGrasping(OpenLoopTask):
     num_objects_range = (1, 20)
     is_chaotic = True
     scale_range = (1.0, 1.0)
+    scale_limits = (1.0, 1.0)
     parameters = PARAMETERS
 
     def build(self, world: World) -> None:
