@@ -59,6 +59,8 @@ def _cell(task: str, settings: DictConfig, env: dict[str, Any]) -> str:
         )
     except ConfigError as error:
         return f"not possible: {error}"
+    if not scores.success_rate:
+        return "0.000"
     lengths = f"{scores.mean_length:.1f} steps, median {scores.median_length:g}"
     return f"{scores.success_rate:.3f}, {lengths}"
 
