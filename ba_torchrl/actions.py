@@ -248,12 +248,13 @@ class OpenLoopActions:
         raise ValueError(f"no grid for the component {name!r}")
 
     def wrap(self, rz: float, ry: float, rx: float) -> tuple[float, float, float]:
-        """Return the equivalent angles within the ranges.
+        """Return the equivalent angles within the ranges; tilts beyond theirs are clipped.
 
         A half turn of the tool about its own axis swaps its fingers, which is the yaw plus pi with
         both tilts negated.
         """
         rz %= 2 * math.pi
+        ry, rx = (min(max(wrap_angle(tilt), -MAX_TILT_RAD), MAX_TILT_RAD) for tilt in (ry, rx))
         if self.half_rotation and rz > math.pi:
             return rz - math.pi, -ry, -rx
         return rz, ry, rx

@@ -150,3 +150,9 @@ def test_a_command_must_say_what_the_sequence_asks_for():
         layout.encode(PickPlaceCommand(None, 0.4, 0.0, 0.1))
     flat = OpenLoopActions("xyr", BOUNDS)
     np.testing.assert_allclose(flat.encode(PickPlaceCommand(None, 0.4, 0.0, None)), [0.4, 0.0, 0.0])
+
+
+def test_tilts_are_wrapped_and_then_clipped():
+    layout = OpenLoopActions("pxyzrrr", BOUNDS)
+    assert layout.wrap(0.0, 2.0, 2 * math.pi + 0.1) == pytest.approx((0.0, math.pi / 2, 0.1))
+    assert layout.wrap(0.0, -2.0, -0.3) == pytest.approx((0.0, -math.pi / 2, -0.3))

@@ -15,11 +15,11 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl import __version__
-from ba_torchrl.config import ConfigError, EnvConfig, parse
+from ba_torchrl.config import ConfigError
 from ba_torchrl.data.deconstruction import is_reversible, reverse_episode
 from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.factory import make_vector
+from ba_torchrl.envs.factory import make_vector, resolve
 
 Source = Literal["expert", "deconstruction"]
 """Where demonstrations come from."""
@@ -163,7 +163,7 @@ def save_demonstrations(
     torch.cat(numbered).memmap(path, copy_existing=True)
     metadata = {
         "task": task,
-        "env": _env_values(env),
+        "env": _env_values(task, env),
         "seed": seed,
         "source": source,
         "episodes": len(episodes),
@@ -213,7 +213,7 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
     except (OSError, json.JSONDecodeError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     found = {"task": metadata["task"], **metadata["env"]}
-    wanted = {"task": task, **_env_values(env)}
+    wanted = {"task": task, **_env_values(task, env)}
     differences = [
         f"{name}: collected with {found.get(name)!r}, needed {wanted.get(name)!r}"
         for name in sorted(found.keys() | wanted.keys())
@@ -225,8 +225,7 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
         )
 
 
-def _env_values(env: dict[str, Any]) -> dict[str, Any]:
+def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
     """Return every environment parameter that shapes the data, defaults filled in, as JSON."""
-    other = {"seed", *source_config("deconstruction")}
-    values = parse(EnvConfig, env, "env").model_dump(mode="json", exclude=other)
-    return json.loads(json.dumps(values))
+    other = {"seed", "render", *source_config("deconstruction")}
+    return json.loads(resolve(task, **env).model_dump_json(exclude=other))

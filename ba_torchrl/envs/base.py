@@ -87,6 +87,9 @@ class ManipulationEnv(EnvBase):
             else config.action_sequence
         )
         """One letter per action component."""
+        self.half_rotation = (
+            self.default_half_rotation if config.half_rotation is None else config.half_rotation
+        )
         self._configure()
         low, high = config.object_scale_range or self.task_class.scale_range
         self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
@@ -117,6 +120,8 @@ class ManipulationEnv(EnvBase):
     """Of `render`: its middle along x from the workspace's, its height, and how far away it is."""
     default_action_sequence: ClassVar[str]
     """`action_sequence` unless it is given."""
+    default_half_rotation: ClassVar[bool]
+    """`half_rotation` unless it is given."""
 
     @abstractmethod
     def _configure(self) -> None:

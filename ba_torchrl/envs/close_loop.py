@@ -33,6 +33,7 @@ class CloseLoopEnv(ManipulationEnv):
     """
 
     default_action_sequence = "pxyzr"
+    default_half_rotation = False
 
     def _configure(self) -> None:
         self.actions = CloseLoopActions(self.action_sequence, self.config.dpos, self.config.drot)
@@ -51,7 +52,7 @@ class CloseLoopEnv(ManipulationEnv):
     def reach(self) -> Reach:
         """What one action covers."""
         turn = self.config.drot if self.actions.has_yaw else 0.0
-        return Reach(self.config.dpos, turn, HALF_TURN if self.config.half_rotation else None)
+        return Reach(self.config.dpos, turn, HALF_TURN if self.half_rotation else None)
 
     def _make_motion(self, robot: Robot, task: Task) -> CloseLoopMotion:
         return CloseLoopMotion(robot, teleport=self.config.fast_mode)
@@ -79,7 +80,7 @@ class CloseLoopEnv(ManipulationEnv):
         (x, y, z), yaw = scene.robot.tool_pose()
         target = self.workspace.clip((x + command.dx_m, y + command.dy_m, z + command.dz_m))
         yaw += command.dyaw_rad
-        if self.config.half_rotation:
+        if self.half_rotation:
             yaw = min(max(yaw, HALF_TURN[0]), HALF_TURN[1])
         scene.motion.move_to(target, yaw)
         scene.motion.grip(command.opening)

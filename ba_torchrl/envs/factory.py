@@ -20,6 +20,30 @@ def make_env(task: str, **config: Any) -> ManipulationEnv:
     return CONTROLS[control](task, settings)
 
 
+def resolve(task: str, **config: Any) -> EnvConfig:
+    """Return the parameters of an environment, with the task's own defaults in place of None.
+
+    Those that stay None have no default: physics of their own, colours, a seed.
+
+    Args:
+        task: id of the task.
+        config: fields of `EnvConfig`.
+    """
+    task_class = TASKS[task]
+    control, box = CONTROLS[task_class.control], task_class.workspace
+    settings = parse(EnvConfig, config, f"configuration of {task}")
+    defaults = {
+        "action_sequence": control.default_action_sequence,
+        "half_rotation": control.default_half_rotation,
+        "workspace": (box.x, box.y, box.z),
+        "object_scale_range": task_class.scale_range,
+        "max_steps": task_class.max_steps,
+        "num_objects": task_class.num_objects,
+    }
+    missing = {name: value for name, value in defaults.items() if getattr(settings, name) is None}
+    return settings.model_copy(update=missing)
+
+
 def make_vector(
     task: str, num_envs: int, *, parallel: bool, start_method: str, **config: Any
 ) -> EnvBase:

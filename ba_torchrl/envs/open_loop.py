@@ -37,6 +37,7 @@ class OpenLoopEnv(ManipulationEnv):
     """
 
     default_action_sequence = "pxyr"
+    default_half_rotation = True
     picture_m = (0.0, 0.05, 0.85)
     # half a millimetre of creep in a stack of four, and at rest after three steps
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
@@ -52,7 +53,7 @@ class OpenLoopEnv(ManipulationEnv):
         self.actions = OpenLoopActions(
             self.action_sequence,
             (self.workspace.x, self.workspace.y, self.workspace.z),
-            half_rotation=self.config.half_rotation is not False,
+            half_rotation=self.half_rotation,
         )
 
     @property
@@ -186,7 +187,8 @@ class OpenLoopEnv(ManipulationEnv):
             heights: the heightmap before it.
         """
         memory = {name: value for name, value in self._memory.items() if name != "undo"}
-        command = before.undo(scene.motion.held, scene.motion.grasp)
+        lowest = scene.robot.gripper.lowest_tool_m()
+        command = before.undo(scene.motion.held, scene.motion.grasp, lowest)
         if command is None:
             return memory
         action = self.actions.encode(command)

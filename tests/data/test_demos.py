@@ -57,6 +57,16 @@ def test_either_source_loads_for_building(collected, tmp_path):
     assert set(metadata["versions"]) == {"ba_torchrl", "torch", "torchrl"}
 
 
+def test_defaults_may_be_written_out(collected, tmp_path):
+    _, episodes = collected
+    save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)
+    spelled = {"action_sequence": "pxyr", "half_rotation": True, "max_steps": 10, "robot": "kuka"}
+    loaded = load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, **spelled})
+    assert len(loaded) == len(episodes)
+    with pytest.raises(ConfigError, match="half_rotation: collected with True, needed False"):
+        load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "half_rotation": False})
+
+
 def test_another_configuration_is_refused_by_name(collected, tmp_path):
     _, episodes = collected
     save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)

@@ -500,6 +500,20 @@ def test_the_vector_of_poses_has_a_place_for_every_swab(make):
 # -- the expert --------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("seed", [307, 312, 317])
+def test_the_expert_leaves_what_lies_against_a_wall_for_last(make, seed):
+    env = make(max_steps=60)
+    state, rng = env.reset(seed=seed), np.random.default_rng(seed - 300)
+    for number in range(60):
+        action = state["expert_action"].clone()
+        if number < 6:
+            action[1:3] += torch.tensor(rng.normal(0, 0.015, 2), dtype=torch.float32)
+        state = env.step(state.set("action", action))["next"]
+        if state["done"]:
+            break
+    assert not state["truncated"]
+
+
 @pytest.mark.parametrize(
     "config",
     [{}, FIXED, {"action_sequence": "pxyzrrr"}],

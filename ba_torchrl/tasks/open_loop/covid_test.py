@@ -113,10 +113,12 @@ class CovidTest(OpenLoopTask):
         floors = [world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS]
         self.new_box, self.used_box, self.test_area = floors
         self._slabs = [(area, (0.0, 0.0), floor) for area, floor in zip(AREAS, floors, strict=True)]
+        self._walls: list[Body] = []
         for area in (NEW_BOX, USED_BOX):
             for place, size in _walls(area):
                 wall = world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}")
                 self._slabs.append((area, place, wall))
+                self._walls.append(wall)
         factor = self.settings.scale / self.scale_range[0]
         self._tube_m, self._swab_m = (
             (factor * length, factor * width) for length, width in (self.tube_m, self.swab_m)
@@ -342,7 +344,7 @@ class CovidTest(OpenLoopTask):
         return body.yaw_rad + math.pi / 2 if self.reach.turn_rad else 0.0
 
     def _room(self, body: Body) -> float:
-        others = [other for other in self.objects if other is not body]
+        others = [other for other in self.objects if other is not body] + self._walls
         yaw = self._grasp_yaw(body)
         return finger_room(self.robot, body, yaw, others, self.finger_opening)
 
