@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, Vector, radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.base import Reach, Workspace
-from ba_torchrl.tasks.building import Building
-from ba_torchrl.tasks.room import PutDown
 
 OPEN, CLOSED = 1.0, 0.0
 ALIGNED_M = 4e-3
@@ -175,8 +172,6 @@ SLACK_M = 8e-3
 """Part of that gap that may be missing on the way."""
 RELEASE_GAP_M = 1e-3
 """A body is let go this far above what it will rest on."""
-NO_ROOM_M = 1.0
-"""A piece between others is worth this much of a detour."""
 HALF_FINGER_DEPTH_M = 0.015
 """Half the extent of a fingertip, along the direction in which the fingers open."""
 
@@ -376,66 +371,6 @@ def finger_room(
                 ),
             )
     return float(gap)
-
-
-def assemble(
-    robot: Robot, building: Building, workspace: Workspace, reach: Reach, surface_z_m: float = 0.0
-) -> GripperCommand:
-    """Build a structure: pick the piece that comes next and place it, from any state.
-
-    Args:
-        robot: the robot.
-        building: what is to be built.
-        workspace: where pieces may be put down.
-        reach: of an action.
-        surface_z_m: height of the ground.
-    """
-    (x, y, _), yaw = robot.tool_pose()
-    held = robot.held_body() if robot.opening() < 0.9 else None
-    pieces = list(building.pieces)
-
-    def yaws(body: Body) -> list[float]:
-        return building.pieces[body].grasp_yaws(body) if reach.turn_rad else [yaw]
-
-    @cache
-    def effort(body: Body) -> float:
-        others = [other for other in pieces if other is not body]
-        room = max(finger_room(robot, body, option, others) for option in yaws(body))
-        return math.dist((x, y), body.position[:2]) + (0.0 if room > 0 else NO_ROOM_M)
-
-    border = 1.2 * building.block_m
-    put_down = PutDown(
-        (workspace.x[0] + border, workspace.x[1] - border),
-        (workspace.y[0] + border, workspace.y[1] - border),
-        gap_m=building.block_m,
-        z_m=surface_z_m,
-    )
-    move = building.next_move(put_down, held, effort)
-    if move is None:
-        return lift(reach.step_m, OPEN)
-    ceiling_m = workspace.z[1]
-    if move.body is not held:
-        return pick_up(
-            robot,
-            move.body,
-            reach,
-            yaws_rad=yaws(move.body),
-            obstacles=pieces,
-            ceiling_m=ceiling_m,
-        )
-    target_yaw = None
-    if move.yaw_rad is not None:
-        ahead = move.yaw_rad - move.piece.yaw_rad(held)
-        target_yaw = turned(yaw, yaw + ahead, reach, move.yaw_period_rad)
-    return carry_to(
-        robot,
-        held,
-        move.position,
-        reach,
-        yaw_rad=target_yaw,
-        obstacles=pieces,
-        ceiling_m=ceiling_m,
-    )
 
 
 def _height_needed(

@@ -10,10 +10,10 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Color
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.assembly import assemble
 from ba_torchrl.tasks.base import TASKS, Spot
 from ba_torchrl.tasks.building import Building
 from ba_torchrl.tasks.close_loop.base import BLUE, GREEN, RED, CloseLoopTask
-from ba_torchrl.tasks.experts import assemble
 from ba_torchrl.tasks.structures import CUBE, tower
 
 COLORS: tuple[Color, ...] = (RED, BLUE, (0.9, 0.6, 0.2, 1.0), GREEN)

@@ -11,11 +11,11 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Solid
 from ba_torchrl.sim.meshes import gable_mesh
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.assembly import assemble
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.building import Building
 from ba_torchrl.tasks.close_loop.base import GREEN, CloseLoopTask
 from ba_torchrl.tasks.close_loop.block_stacking import COLORS, scattered
-from ba_torchrl.tasks.experts import assemble
 from ba_torchrl.tasks.structures import CUBE, TRIANGLE, tower
 
 
