@@ -128,6 +128,8 @@ class EnvConfig(StrictModel):
     """Add this many points of the scene's surfaces to every observation."""
     object_set: str = Field(default="random", json_schema_extra=_SOME_TASKS)
     """Some tasks: which shapes the objects have; see `ba_torchrl.sim.assets`."""
+    object_type: Literal["cube", "cylinder"] = Field(default="cube", json_schema_extra=_SOME_TASKS)
+    """Some tasks: what the objects are, all of them."""
     asset_root: str | None = Field(default=None, json_schema_extra=_SOME_TASKS)
     """Some tasks: folder of a set of objects that does not ship with the package."""
     deconstruct: bool = Field(default=False, json_schema_extra=_SOME_TASKS)

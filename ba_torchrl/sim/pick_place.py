@@ -125,6 +125,8 @@ class PickPlace:
     def pick(self, position: Vector, rotation: Matrix) -> Body | None:
         """Grasp what is at a pose, lift it and go home.
 
+        The tool stays so high that its fingers can close above the floor.
+
         Args:
             position: of the tool point, metres.
             rotation: of the tool.
@@ -134,7 +136,7 @@ class PickPlace:
         """
         robot, limits = self.robot, self.limits
         robot.set_opening(self.opening)
-        if self._approach(position, rotation, 0.0):
+        if self._approach(self._over_floor(position, rotation), rotation, 0.0):
             self._close()
             reached = robot.tool_transform()[0]
             above = self._above(reached, rotation, limits.lift_m)
@@ -225,6 +227,11 @@ class PickPlace:
         """Return the point from which the tool comes down to ``position``."""
         up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
         return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
+
+    def _over_floor(self, position: Vector, rotation: Matrix) -> Vector:
+        """Return the point, or the first one above it, from which the fingers can close."""
+        x, y, z = position
+        return x, y, max(z, self.robot.gripper.lowest_tool_m(rotation, self.opening))
 
     def _tool_rotation(self) -> Matrix:
         turn = pybullet.getMatrixFromQuaternion(self.robot.tool_transform()[1])

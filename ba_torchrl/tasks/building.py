@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, Vector, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.access import Access, Hindrance, Move
 from ba_torchrl.tasks.room import PutDown, nearest_spot, reach_m, shortage_m
 from ba_torchrl.tasks.standing import Filling, Standing, middle, read_views
 from ba_torchrl.tasks.structures import UPRIGHT_RAD, Blueprint, Piece, Slot
@@ -25,24 +25,12 @@ SITE_POINTS = 7
 """What a structure will take up on the ground is told by this many points along a bridge."""
 CROWDED = 10.0
 """What a metre too near is worth in metres of way."""
+STUCK = 100
+"""What it is worth in detours that the hand can reach what it is to pick."""
 
 Crowding = Callable[[np.ndarray, Sequence[Body]], np.ndarray]
 """From sites [S, P, 2], each so many points on the ground that a structure will stand on, and the
 pieces that are still to be fetched then, to how many metres each site is too near them, [S]."""
-
-
-class Move(NamedTuple):
-    """What to pick and where to place it."""
-
-    body: Body
-    piece: Piece
-    position: Vector
-    """Where its origin goes."""
-    yaw_rad: float | None
-    """Its heading up to multiples of the period; None if any will do."""
-    yaw_period_rad: float
-    onto: tuple[Body, ...]
-    """What it will rest on; nothing stands for the ground."""
 
 
 class Building:
@@ -107,17 +95,19 @@ class Building:
         held: Body | None = None,
         effort: Callable[[Body], float] = lambda body: 0.0,
         crowding: Crowding | None = None,
+        hindrance: Hindrance | None = None,
     ) -> Move | None:
         """Return the move that brings the structure on, or None if it stands.
 
         What lies where it belongs stays; what is in the way, or on a piece that is needed, goes
-        to the ground first, from the top down.
+        to the ground first, from the top down. So does what keeps the hand from a piece.
 
         Args:
             put_down: where on the ground there is room.
             held: what the gripper holds: it is placed before anything else is picked.
             effort: metres to add to the way of a piece for picking it, to choose among equals.
             crowding: how much a site is too near to pieces; only free room counts if not given.
+            hindrance: what keeps the hand from pieces; nothing if not given.
         """
         standing = self._standing(held)
         fillings, most = standing.fullest()
@@ -128,19 +118,28 @@ class Building:
             return self._to_ground(min(strays, key=effort), put_down) if strays else None
         effort = cache(effort)
         piles = standing.piles()
+        access = Access(self.pieces, piles, held, hindrance)
+        holds = held in self.pieces
         best: tuple[tuple[int, float], Move | Body] | None = None
         for filling in fillings:
-            for detour, body, number in self._choices(filling, standing, piles):
-                if held in self.pieces and body is not held:
-                    detour, body, number = detour + 1, held, None
+            choices = [*self._choices(filling, standing, piles), *access.clearings(filling)]
+            # what is cheap at first sight spares the others a closer look
+            for detour, body, number in sorted(
+                choices, key=lambda choice: choice[0] + (holds and choice[1] is not held)
+            ):
+                first = holds and body is not held  # what is held goes to the ground before that
+                detour += first + (STUCK if body is not held and access.is_stuck(body) else 0)
                 if best is not None and detour > best[0][0]:
                     continue
                 move, way = body, 0.0
-                if number is not None:
+                if number is not None and not (first and hindrance is None):
                     move, crowd_m = self._into_slot(body, number, filling, put_down, crowding)
+                    detour += access.spoilt(move, filling)
                     way = math.dist(standing.views[body].position[:2], move.position[:2])
                     way += CROWDED * crowd_m
-                cost = (detour, way + (0.0 if body is held else effort(body)))
+                if first:
+                    move, way = held, 0.0
+                cost = (detour, way + (0.0 if holds else effort(body)))
                 if best is None or cost < best[0]:
                     best = cost, move
         assert best is not None  # the lowest empty slot can always be worked at

@@ -126,12 +126,14 @@ class Deconstruction(OpenLoopTask):
     def pick_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a pick, where an action leaves it open.
 
-        The next piece is held as it will be when it is picked from the ground.
+        The next piece is held as it will be when it is picked from the ground. Its base is that of
+        its middle: leaning, its lowest corner lies deeper, and it would be held too low.
         """
         base_m = 0.0
         if to_move := self._to_move():
             top = max(to_move, key=lambda body: body.position[2])
-            base_m = vertical_extent(top)[0] - self.settings.workspace.z[0]
+            middle = top.position[2] + top.shape.bounds_m[0][2]
+            base_m = max(vertical_extent(top)[0], middle) - self.settings.workspace.z[0]
         return self.task.pick_height_m(top_m - base_m) + base_m
 
     def place_height_m(self, top_m: float) -> float:
@@ -337,7 +339,10 @@ class Watch(NamedTuple):
     """Pose of what was held in the frame of the tool."""
 
     def undo(
-        self, held: Body | None, grasp: tuple[Vector, Quaternion] | None
+        self,
+        held: Body | None,
+        grasp: tuple[Vector, Quaternion] | None,
+        lowest_m: float = -math.inf,
     ) -> PickPlaceCommand | None:
         """Return what undoes the action that has just settled.
 
@@ -348,6 +353,7 @@ class Watch(NamedTuple):
         Args:
             held: what is held now.
             grasp: and how.
+            lowest_m: height of the tool below which fingers cannot close.
 
         Returns:
             None if nothing undoes it: it grasped or put down nothing, or another body moved.
@@ -361,8 +367,10 @@ class Watch(NamedTuple):
         pose, in_tool, primitive = (
             (self.poses[body], grasp, PLACE) if self.held is None else (body.pose, self.grasp, PICK)
         )
-        tool, turn = pybullet.multiplyTransforms(*pose, *pybullet.invertTransform(*in_tool))
-        return PickPlaceCommand(primitive, *tool, *tool_angles(turn))
+        (x, y, z), turn = pybullet.multiplyTransforms(*pose, *pybullet.invertTransform(*in_tool))
+        if primitive == PICK:
+            z = max(z, lowest_m)
+        return PickPlaceCommand(primitive, x, y, z, *tool_angles(turn))
 
 
 def watch(

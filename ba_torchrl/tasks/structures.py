@@ -69,6 +69,16 @@ ROOF = Piece("roof", math.pi, (0.0,), stays_upright=True)
 """A long gable, its ridge along y, held by the eaves."""
 TRIANGLE = Piece("triangle", math.pi, (math.pi / 2,), stays_upright=True)
 """A short gable, its ridge along y. Fingers hold it best by its ends, which are upright."""
+CYLINDER_SIDES = 16
+"""Of the polygon that stands for the circle."""
+CYLINDER = Piece(
+    "cylinder",
+    2 * math.pi / CYLINDER_SIDES,
+    tuple(2 * math.pi * i / CYLINDER_SIDES for i in range(CYLINDER_SIDES // 2)),
+    _both(_Z),
+    stays_upright=True,
+)
+"""An upright cylinder, two of its sides across x. On its side it would roll away."""
 
 
 class Span(NamedTuple):

@@ -313,6 +313,8 @@ def test_render_needs_a_display(monkeypatch):
         ({"in_hand_size": 40}, "open-loop"),
         ({"object_set": "household"}, "no meaning"),
         ({"asset_root": "somewhere"}, "no meaning"),
+        ({"object_type": "cylinder"}, "no meaning"),
+        ({"object_type": "ball"}, "'cube' or 'cylinder'"),
         ({"num_objects": 2}, "takes 1 "),
         ({"solver_iterations": 10}, "physics_mode='custom'"),
         ({"physics_mode": "custom"}, "time_step_s"),

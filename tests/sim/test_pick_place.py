@@ -1,4 +1,4 @@
-"""Picking and placing real blocks with the kuka."""
+"""Picking and placing real blocks, with the kuka unless a robot is named."""
 
 import math
 
@@ -25,9 +25,9 @@ PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-
 class Table:
     """A robot with blocks, and static things beside them."""
 
-    def __init__(self, count, *, static=(), teleport=True):
+    def __init__(self, count, *, static=(), teleport=True, robot="kuka"):
         self.world = World(PHYSICS)
-        self.robot = ROBOTS["kuka"](self.world)
+        self.robot = ROBOTS[robot](self.world)
         self.blocks = [self.world.add(Box(size_m=(B, B, B)), f"cube {i}") for i in range(count)]
         self.things = [
             self.world.add(Box(size_m=size, mass_kg=0.0), f"thing {i}")
@@ -133,6 +133,60 @@ def test_a_pick_of_nothing_moves_nothing(table):
         np.testing.assert_allclose(block.position, pose[0], atol=1e-4)
     assert t.robot.opening() == pytest.approx(1.0, abs=0.02)
     np.testing.assert_allclose(t.robot.joints, t.robot.home_joints)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("teleport", [True, False])
+def test_a_low_pick_holds(table, robot, teleport):
+    """Fingers that swing down as they close do not close against the floor."""
+    t = table(1, robot=robot, teleport=teleport)
+    pristine = t.world.snapshot()
+    block = t.blocks[0]
+    for z in (0.0, 0.005, 0.01):
+        t.world.restore(pristine)
+        t.hand.reset()
+        assert t.pick(*block.position[:2], z) is block, z
+        assert block.position[2] > HOME_Z_M
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.4, 0.0, 0.3), (0.4, -0.3, 0.2)])
+def test_fingertips_close_above_the_floor(table, robot, turn):
+    """Down to its lowest height a tool has its fingers clear, and hardly higher than it must be."""
+    t = table(1, robot=robot)
+    rotation = tool_rotation(*turn)
+    lowest = t.robot.gripper.lowest_tool_m(rotation)
+    if turn == (0.0, 0.0, 0.0):
+        assert lowest == t.robot.gripper.lowest_tool_m()
+
+    def gap_m(opening):
+        t.robot.teleport(t.robot.inverse_kinematics((0.5, 0.1, 0.3), rotation))
+        t.robot.set_opening(opening)
+        points = [
+            point
+            for link in frozenset.union(*t.robot.finger_links)
+            for point in pybullet.getClosestPoints(
+                t.robot.id, t.world.floor, 0.5, linkIndexA=link, physicsClientId=t.world.client
+            )
+        ]
+        return min(point[8] for point in points) - (0.3 - lowest)
+
+    gap = min(gap_m(opening) for opening in np.linspace(0.0, 1.0, 21))
+    if turn == (0.0, 0.0, 0.0):
+        assert gap == pytest.approx(1e-3, abs=5e-4)
+    else:  # what counts are the fingers' insides, not their thickness and chamfers
+        assert -0.01 < gap < 3e-3
+
+
+def test_a_pick_that_is_high_enough_goes_where_it_was_sent(table):
+    t = table(1)
+    lowest = t.robot.gripper.lowest_tool_m()
+    reached = []
+    close = t.hand._close
+    t.hand._close = lambda: (reached.append(t.robot.tool_transform()[0][2]), close())
+    for z in (lowest - 5e-3, lowest, lowest + 5e-3):
+        t.pick(0.5, 0.15, z)
+    assert reached == pytest.approx([lowest, lowest, lowest + 5e-3], abs=1e-5)
 
 
 def test_something_in_the_way_stops_the_hand(table):

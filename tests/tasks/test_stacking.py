@@ -1,4 +1,4 @@
-"""Block Stacking and House Building under close-loop control."""
+"""Block Stacking and House Building under close-loop control; stacks of cylinders in open loop."""
 
 import math
 
@@ -8,9 +8,12 @@ import torch
 
 import ba_torchrl
 from ba_torchrl.config import ConfigError
-from ba_torchrl.sim.bodies import vertical_extent
+from ba_torchrl.data.deconstruction import replay_scores
+from ba_torchrl.sim.bodies import vertical_extent, world_vertices
+from ba_torchrl.tasks.structures import CYLINDER
 
 STACKING, HOUSE = "close_loop/block_stacking", "close_loop/house_building"
+OPEN_STACKING = "open_loop/block_stacking"
 FIXED = {"random_orientation": False, "action_sequence": "pxyz"}
 
 
@@ -244,3 +247,117 @@ def test_expert_lets_go_of_what_is_needed_later(make):
         action = torch.from_numpy(env._expert_action(scene))
         state = env._step(env.full_action_spec.zero().set("action", action))
     assert state["success"]
+
+
+# -- cylinders ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cylinders(make):
+    """Return a task whose cylinders stand in a stack."""
+    task = make(OPEN_STACKING, object_type="cylinder").scene.task
+    for level, body in enumerate(task.objects):
+        body.place((0.45, 0.0, (level + 0.5) * 0.03), 0.7 * level)
+    task.world.settle()
+    return task
+
+
+def on_its_side(body, position):
+    body.move_to(position, (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))
+
+
+def test_cylinders_are_as_high_and_wide_as_blocks(cylinders):
+    for body in cylinders.objects:
+        vertices = body.shape.vertices
+        np.testing.assert_allclose(np.hypot(vertices[:, 0], vertices[:, 1]), 0.015)
+        np.testing.assert_allclose(np.abs(vertices[:, 2]), 0.015)
+
+
+def test_fingers_close_on_sides_of_a_cylinder_at_every_grasp_yaw(cylinders):
+    body = cylinders.objects[0]
+    body.place((0.3, 0.1, 0.015), 0.4)
+    yaws = CYLINDER.grasp_yaws(body)
+    assert len({round(yaw % math.pi, 6) for yaw in yaws}) == 8
+    for yaw in yaws:
+        along = (world_vertices(body)[:, :2] - (0.3, 0.1)) @ (math.cos(yaw), math.sin(yaw))
+        assert along.max() == pytest.approx(0.015 * math.cos(math.pi / 16))
+        assert (along > along.max() - 1e-9).sum() == 4  # the corners of a side
+
+
+def test_a_stack_of_cylinders_is_the_goal_whichever_end_is_up(cylinders):
+    assert cylinders.is_goal()
+    top = cylinders.objects[-1]
+    top.move_to(top.position, (1.0, 0.0, 0.0, 0.0))
+    cylinders.world.settle()
+    assert cylinders.is_goal()
+    assert cylinders.is_valid()
+
+
+@pytest.mark.parametrize("place", [(0.45, 0.031, 0.015), (0.48, 0.1, 0.015)])
+def test_a_cylinder_beside_the_stack_does_not_count(cylinders, place):
+    cylinders.objects[-1].place(place)
+    cylinders.world.settle()
+    assert not cylinders.is_goal()
+    assert cylinders.is_valid()
+
+
+def test_a_cylinder_over_the_edge_falls_and_ends_the_episode(cylinders):
+    cylinders.objects[-1].place((0.45, 0.018, 0.1055))
+    cylinders.world.settle()
+    assert not cylinders.is_goal()
+    assert not cylinders.is_valid()
+
+
+def test_a_cylinder_on_its_side_ends_the_episode_on_top_or_on_the_floor(cylinders):
+    for position in ((0.45, 0.0, 0.1051), (0.35, 0.1, 0.0151)):
+        on_its_side(cylinders.objects[-1], position)
+        cylinders.world.step(2)
+        assert cylinders.objects[-1].position[2] == pytest.approx(position[2], abs=1e-3)
+        assert not cylinders.is_goal()
+        assert not cylinders.is_valid()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"random_orientation": False, "action_sequence": "pxy"}, {"num_objects": 6}],
+    ids=["random orientations", "fixed", "six"],
+)
+def test_expert_stacks_cylinders_in_the_fewest_steps(settings):
+    env = ba_torchrl.make(
+        OPEN_STACKING, object_type="cylinder", obs_size=64, seed=0, expert=True, **settings
+    )
+    for _ in range(10):
+        td = env.reset()
+        while not td["done"]:
+            td = env.step(td.set("action", td["expert_action"]))["next"]
+        assert td["success"]
+        assert env._step_count == 2 * (len(env.scene.task.objects) - 1)
+    env.close()
+
+
+def test_a_stack_of_cylinders_taken_apart_can_be_built_again():
+    scores = replay_scores(OPEN_STACKING, 10, object_type="cylinder")
+    assert scores.reversible * scores.success_rate >= 0.9
+
+
+@pytest.mark.parametrize("task", [STACKING, "open_loop/house_building_1"])
+def test_cylinders_have_no_meaning_elsewhere(task):
+    with pytest.raises(ConfigError, match="no meaning"):
+        ba_torchrl.make(task, object_type="cylinder")
+
+
+def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
+    env = make(OPEN_STACKING, expert=True, max_steps=20)
+    cubes = env.scene.task.objects
+    for level, cube in enumerate(cubes[:3]):
+        cube.place((0.394, 0.046, (level + 0.5) * 0.03), 1.2)
+    cubes[3].place((0.362, 0.055, 0.015), 1.228)
+    env.scene.world.settle()
+    env.scene.world.step(2)
+    done, steps = False, 0
+    while not done:
+        action = torch.from_numpy(env._expert_action(env.scene))
+        outcome = env._step(env.full_action_spec.zero().set("action", action))
+        done, steps = bool(outcome["done"]), steps + 1
+    assert outcome["success"]
+    assert steps <= 12

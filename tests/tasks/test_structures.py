@@ -443,6 +443,34 @@ def test_effort_decides_among_equals(scene):
         assert move.body is favourite
 
 
+def test_what_keeps_the_hand_from_a_piece_goes_to_the_ground(scene):
+    """A stack of three stands beside the fourth: the hand reaches it beside a single cube only."""
+    s = scene(tower(*[CUBE] * 4))
+    for level, cube in enumerate(s.cubes[:3]):
+        s.put(cube, 0.45, 0.0, level)
+    loose = s.cubes[3]
+    s.put(loose, 0.45, 1.1 * B, 0)
+    s.world.settle()
+
+    def hindrance(body, other, place):
+        x, y, z = other.position if place is None else place
+        near = math.dist((x, y), body.position[:2]) < 2 * B
+        return [near and z - body.position[2] > B / 2]
+
+    assert s.building.next_move(AREA).body is loose
+    for top in (s.cubes[2], s.cubes[1]):
+        move = s.building.next_move(AREA, hindrance=hindrance)
+        assert move.body is top
+        assert move.onto == ()
+        top.place(move.position)
+        s.world.settle()
+    assert s.building.next_move(AREA, hindrance=hindrance).onto != ()
+    # nor is anything put where it would be in the way
+    move = s.building.next_move(AREA, held=s.cubes[2], hindrance=hindrance)
+    assert move.body is s.cubes[2]
+    assert move.onto == (s.cubes[1],)
+
+
 def test_a_structure_may_have_to_stand_on_something_else_than_the_floor():
     with World() as world:
         platform = world.add(Box(size_m=(0.2, 0.2, 0.02), mass_kg=0.0), "platform")

@@ -12,8 +12,10 @@ import pybullet
 from ba_torchrl.sim.world import World
 
 if TYPE_CHECKING:
-    from ba_torchrl.sim.robots.base import Robot
+    from ba_torchrl.sim.robots.base import Matrix, Robot
 
+FLOOR_GAP_M = 1e-3
+"""Distance that fingertips keep from the floor while they close."""
 TIPS_M = 0.01
 """The lowest part of the fingers, which counts as their tips."""
 
@@ -55,6 +57,26 @@ class Gripper:
         """Return the height at which the fingers end, given half the distance between them."""
         gaps, heights = zip(*self.arc, strict=True)
         return float(np.interp(half_gap_m, gaps, heights))
+
+    def lowest_tool_m(self, rotation: Matrix | None = None, opening: float = 1.0) -> float:
+        """Return how low the tool may be for the fingers to close without touching the floor.
+
+        Those that swing go down as they close: on the floor they would close against it.
+
+        Args:
+            rotation: of the tool; if None, it points down.
+            opening: how far the fingers are open at the start, 0 to 1.
+
+        Returns:
+            Height of the tool point above the floor, metres.
+        """
+        along, across, ahead = (0.0, 0.0, -1.0) if rotation is None else rotation[2]
+        widest = max(opening * self.half_gap_m, self.arc[0][0])
+        depths = [
+            abs(along) * min(gap, widest) + abs(across) * self.half_width_m + ahead * height
+            for gap, height in self.arc
+        ]
+        return max(depths) + FLOOR_GAP_M
 
 
 @cache

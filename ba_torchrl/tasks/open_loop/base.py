@@ -24,13 +24,21 @@ class OpenLoopTask(Task):
     def expert_command(self) -> PickPlaceCommand:
         """Return what the expert does now; a function of the scene, from any state."""
 
+    @property
+    def lowest_pick_m(self) -> float:
+        """Height of the tool, above the workspace's floor, at which fingers just clear the ground.
+
+        A lower pick is raised to it.
+        """
+        return self.robot.gripper.lowest_tool_m() - self.settings.workspace.z[0]
+
     def pick_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a pick, where an action leaves it open.
 
         Args:
             top_m: of the highest point around the target, above the workspace's floor.
         """
-        return max(top_m - BLOCK_M * self.settings.scale / 2, 0.01)
+        return max(top_m - BLOCK_M * self.settings.scale / 2, self.lowest_pick_m)
 
     def place_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a place, where an action leaves it open."""

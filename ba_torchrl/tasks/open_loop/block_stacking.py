@@ -5,23 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.pieces import cube
+from ba_torchrl.tasks.open_loop.pieces import cube, cylinder
 from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
-from ba_torchrl.tasks.structures import CUBE, Blueprint, tower
+from ba_torchrl.tasks.structures import Blueprint, tower
+
+OBJECTS = {"cube": cube, "cylinder": cylinder}
+"""What `object_type` may say."""
 
 
 @TASKS.register("open_loop/block_stacking")
 class BlockStacking(StructureTask):
-    """Cubes of 3 cm, four unless told otherwise; success when they stand in a stack."""
+    """Blocks of 3 cm, four unless told otherwise; success when they stand in a stack.
 
+    They are cubes, or cylinders, of which none may tip over.
+    """
+
+    parameters = StructureTask.parameters | {"object_type"}
     max_steps = 10
     num_objects = 4
     num_objects_range = (2, 8)
+    makes_room = True
 
     def blueprint(self) -> Blueprint:
         """Return the stack."""
-        return tower(*[CUBE] * self.settings.num_objects)
+        return tower(*(part.piece for part in self.parts()))
 
     def parts(self) -> Sequence[Part]:
-        """Return the cubes."""
-        return [cube(self.block_m)] * self.settings.num_objects
+        """Return the blocks."""
+        block = OBJECTS[self.settings.parameters["object_type"]]
+        return [block(self.block_m)] * self.settings.num_objects

@@ -138,7 +138,7 @@ class BoxPalletizing(PackingTask):
 
     def pick_height_m(self, top_m: float) -> float:
         """Return the height at which a box is held."""
-        return max(top_m - GRIP_M * self.unit, 0.01)
+        return max(top_m - GRIP_M * self.unit, self.lowest_pick_m)
 
     def get_state(self) -> Any:
         """Return which boxes are there, and where the others will come in."""

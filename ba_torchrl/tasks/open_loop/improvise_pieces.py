@@ -47,8 +47,6 @@ SHAPE_GAP_M = (-0.02, 0.008, 0.02)
 for, most. Below zero they stand side by side at an angle."""
 ROOM_M = 0.015
 """Gap between pieces at the start, beyond the circles around them."""
-LOWEST_PICK_M = 0.0125
-"""Height of the tool at which the fingertips just miss the floor."""
 SAMPLES = 4000
 SKIN_M = 2e-3
 """Points of a surface that is sampled, and the depth of those that a finger meets."""
@@ -56,8 +54,9 @@ WIDTH_WEIGHT = 2.0
 """What a metre of width costs, measured in cosines between sides and fingers."""
 ORANGE: Color = (0.9, 0.55, 0.2, 1.0)
 
-SHAPE = Piece("shape")
-"""Any of the random shapes."""
+SHAPE = Piece("shape", stays_upright=True)
+"""Any of the random shapes; one on its side carries nothing, and no pick about the vertical rights
+it."""
 UP = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
 
 
@@ -105,7 +104,7 @@ class ImproviseTask(StructureTask):
 
     def pick_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a pick; these pieces are low."""
-        return max(OpenLoopTask.pick_height_m(self, top_m), LOWEST_PICK_M)
+        return OpenLoopTask.pick_height_m(self, top_m)
 
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square searched for the highest point.
@@ -199,7 +198,7 @@ def shape_piece(shape: Shape) -> Piece:
         return float(square - WIDTH_WEIGHT * np.ptp(along))
 
     yaws = (np.arange(-18, 18) * math.pi / 36).tolist()
-    return Piece(SHAPE.kind, math.pi, (max(yaws, key=quality),), UP)
+    return Piece(SHAPE.kind, math.pi, (max(yaws, key=quality),), UP, stays_upright=True)
 
 
 def _hull(number: int) -> Mesh:

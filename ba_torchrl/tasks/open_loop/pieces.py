@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 from ba_torchrl.sim.bodies import Box, Color, Solid
-from ba_torchrl.sim.meshes import centroid, gable_mesh
+from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, moved
 from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.open_loop.structure import Part
-from ba_torchrl.tasks.structures import CUBE, CUBOID, ROOF, TRIANGLE, Piece, Span
+from ba_torchrl.tasks.structures import (
+    CUBE,
+    CUBOID,
+    CYLINDER,
+    CYLINDER_SIDES,
+    ROOF,
+    TRIANGLE,
+    Piece,
+    Span,
+)
 
 LENGTH = 4.0
 """Length of roof and cuboid."""
@@ -16,6 +27,7 @@ EAVES = 0.2
 RED: Color = (0.82, 0.22, 0.2, 1.0)
 BLUE: Color = (0.2, 0.4, 0.8, 1.0)
 GREEN: Color = (0.35, 0.7, 0.35, 1.0)
+ORANGE: Color = (0.9, 0.55, 0.15, 1.0)
 
 _SMALL, _LONG = 2.4, 3.4
 """Room around pieces."""
@@ -25,6 +37,16 @@ def cube(block_m: float) -> Part:
     """Return a cube."""
     return Part(
         CUBE, Box(size_m=(block_m,) * 3, color=RED), Spot(_SMALL * block_m, _SMALL * block_m)
+    )
+
+
+def cylinder(block_m: float) -> Part:
+    """Return an upright cylinder, as high as it is wide."""
+    radius, half = block_m / 2, block_m / 2
+    (upright,) = lathe_parts(((radius, -half), (radius, half)), CYLINDER_SIDES)
+    mesh = moved(upright, (0.0, 0.0, 0.0), math.pi / CYLINDER_SIDES)  # sides, not edges, across x
+    return Part(
+        CYLINDER, Solid(parts=(mesh,), color=ORANGE), Spot(_SMALL * block_m, _SMALL * block_m)
     )
 
 

@@ -48,6 +48,9 @@ class StructureTask(OpenLoopTask):
     parameters = frozenset({"deconstruct"})
     tipping_ends: ClassVar[bool] = True
     """Whether a piece on its side, such as a roof, ends the episode."""
+    makes_room: ClassVar[bool] = False
+    """Whether the expert takes down what keeps the hand from a piece: worth it for blocks, beside
+    long pieces it would go on for ever."""
 
     @abstractmethod
     def blueprint(self) -> Blueprint:
@@ -102,7 +105,10 @@ class StructureTask(OpenLoopTask):
     def expert_command(self) -> PickPlaceCommand:
         """Move the piece that comes next, from any state."""
         held = self.robot.held_body()
-        move = self.building.next_move(self._put_down(), held, self._effort, self._crowding)
+        hindrance = self._hindrance if self.makes_room else None
+        move = self.building.next_move(
+            self._put_down(), held, self._effort, self._crowding, hindrance
+        )
         if move is None:  # it stands: a pick from the bare corner changes nothing
             x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
             return PickPlaceCommand(PLACE if held is not None else PICK, x, y, 0.1)
@@ -110,7 +116,8 @@ class StructureTask(OpenLoopTask):
             return self._place(move)
         yaw = max(self.grasp_yaws(move.body), key=lambda yaw: self.room(move.body, yaw))
         x, y, z = move.body.position
-        return PickPlaceCommand(PICK, x, y, z, yaw)
+        lowest = self.settings.workspace.z[0] + self.lowest_pick_m
+        return PickPlaceCommand(PICK, x, y, max(z, lowest), yaw)
 
     def pick_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a pick.
@@ -154,12 +161,19 @@ class StructureTask(OpenLoopTask):
 
         It is infinite, or at least `AMPLE_M`, where nothing stands near.
         """
+        others = [other for other in self.bodies if other is not body]
+        return self._room_beside(body, yaw_rad, others, at)
+
+    def _room_beside(
+        self, body: Body, yaw_rad: float, others: Sequence[Body], at: Vector | None
+    ) -> float:
+        """Return the gap between the hand, open around a body, and some others."""
         x, y, z = body.position if at is None else at
         reach = math.hypot(*self.robot.hand_half_m) + AMPLE_M
         others = [
             other
-            for other in self.bodies
-            if other is not body and math.dist(other.position[:2], (x, y)) < reach + radius_m(other)
+            for other in others
+            if math.dist(other.position[:2], (x, y)) < reach + radius_m(other)
         ]
         room = finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
         for other in others:
@@ -197,6 +211,14 @@ class StructureTask(OpenLoopTask):
         gaps = np.maximum(along - half_along, across - half_across).min(axis=1)  # [S, rest, 3]
         gaps = np.minimum(gaps[:, :, :2].max(axis=2), gaps[:, :, 2])
         return np.maximum(SITE_GAP_M + self.block_m / 2 - gaps, 0.0).sum(axis=1)
+
+    def _hindrance(self, body: Body, other: Body, place: Vector | None) -> list[bool]:
+        """Return whether another piece is in the hand's way, for each yaw to grasp a body at."""
+        at = body.position
+        if place is not None:  # as seen from there
+            moved = zip(at, other.position, place, strict=True)
+            at = tuple(a + b - c for a, b, c in moved)
+        return [self._room_beside(body, yaw, [other], at) <= 0 for yaw in self.grasp_yaws(body)]
 
     def _effort(self, body: Body) -> float:
         """Prefer pieces that stand free."""

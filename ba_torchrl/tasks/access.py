@@ -1,0 +1,141 @@
+"""Access: whether the hand can reach a piece between others, and what would have to go first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from ba_torchrl.sim.bodies import Body, Vector
+from ba_torchrl.tasks.structures import Piece
+
+Hindrance = Callable[[Body, Body, Vector | None], Sequence[bool]]
+"""From a piece, another, and where that one will be if not where it is now, to whether it is in
+the hand's way, for each of the ways to grasp the first."""
+
+
+class Move(NamedTuple):
+    """What to pick and where to place it."""
+
+    body: Body
+    piece: Piece
+    position: Vector
+    """Where its origin goes."""
+    yaw_rad: float | None
+    """Its heading up to multiples of the period; None if any will do."""
+    yaw_period_rad: float
+    onto: tuple[Body, ...]
+    """What it will rest on; nothing stands for the ground."""
+
+
+class Access:
+    """The room that pieces leave the hand to grasp each other.
+
+    Args:
+        pieces: what each body is.
+        piles: all that lies on each, right on it or on what does.
+        held: what the gripper holds: it is in no one's way.
+        hindrance: what keeps the hand from pieces; nothing if not given.
+    """
+
+    def __init__(
+        self,
+        pieces: Mapping[Body, Piece],
+        piles: Mapping[Body, frozenset[Body]],
+        held: Body | None,
+        hindrance: Hindrance | None,
+    ) -> None:
+        self.pieces = pieces
+        self.piles = piles
+        self.held = held
+        self.hindrance = hindrance
+        self._obstacles: dict[Body, list[frozenset[Body]]] = {}
+
+    def obstacles(self, body: Body) -> list[frozenset[Body]]:
+        """Return what is in the hand's way, for each of the ways to grasp a body."""
+        if self.hindrance is None:
+            return [frozenset()]
+        if body not in self._obstacles:
+            others = [other for other in self.pieces if other is not body]
+            rows = [self.hindrance(body, other, None) for other in others]
+            self._obstacles[body] = [
+                frozenset(
+                    other
+                    for other, hinders in zip(others, way, strict=True)
+                    if hinders and other is not self.held
+                )
+                for way in zip(*rows, strict=True)
+            ] or [frozenset()]
+        return self._obstacles[body]
+
+    def is_stuck(self, body: Body) -> bool:
+        """Whether no way to grasp a body is free."""
+        return all(self.obstacles(body))
+
+    def clearings(self, filling: Sequence[Body | None]) -> Iterator[tuple[int, Body, None]]:
+        """Yield what could go to the ground to make room for the hand at a piece.
+
+        Args:
+            filling: the body in each slot; these need not be picked.
+
+        Yields:
+            How many pieces must go, the one to go first, and None for the ground.
+        """
+        for body in self.pieces:
+            if body not in filling and body is not self.held:
+                gone = self._in_the_way(body) or ()
+                for top in gone:
+                    if self.piles[top].isdisjoint(gone):
+                        yield len(gone), top, None
+
+    def spoilt(self, move: Move, filling: Sequence[Body | None]) -> int:
+        """Return the detours that a move brings: what it builds up beside a piece not yet fetched.
+
+        Args:
+            move: to judge.
+            filling: the body in each slot.
+        """
+        if self.hindrance is None:
+            return 0
+        after, most = self._after(move), 0
+        for other in self.pieces:
+            if other in filling or other is move.body or other is self.held:
+                continue
+            gone = after._in_the_way(other)
+            if gone is None and self._in_the_way(other) is not None:
+                most = len(self.pieces)
+            elif gone is not None and move.body in gone:
+                most = max(most, len(gone))
+        return most + 2 if most else 0  # taken down, and put up again
+
+    def _in_the_way(self, body: Body) -> frozenset[Body] | None:
+        """Return the fewest pieces that must go for the hand to reach a body, None if that fails.
+
+        What is in the way must itself be within reach, if not for the others that go.
+        """
+        found = []
+        for way in self.obstacles(body):
+            gone = way.union(*(self.piles[other] for other in way))
+            if body not in gone and all(
+                any(way <= gone for way in self.obstacles(other)) for other in gone
+            ):
+                found.append(gone)
+        return min(found, key=len, default=None)
+
+    def _after(self, move: Move) -> Access:
+        """Return how things will be after a move, whose body will be within reach."""
+        body, piles = move.body, dict(self.piles)
+        for other, pile in self.piles.items():
+            if other in move.onto or not pile.isdisjoint(move.onto):
+                piles[other] = pile | {body}
+        held = None if self.held is body else self.held
+        after = Access(self.pieces, piles, held, self.hindrance)
+        for other in self.pieces:
+            if other is body:
+                after._obstacles[other] = [frozenset()]
+                continue
+            hinders = self.hindrance(other, body, move.position)
+            after._obstacles[other] = [
+                way | {body} if is_there else way - {body}
+                for way, is_there in zip(self.obstacles(other), hinders, strict=True)
+            ]
+        return after
