@@ -30,7 +30,7 @@ def experiment(name, *overrides):
     return ExperimentConfig.parse(values)
 
 
-TASK_OF = {"sac": "close_loop/block_picking", "spatial_q": "open_loop/block_stacking"}
+TASK_OF = {"close_loop": "close_loop/block_picking", "open_loop": "open_loop/block_stacking"}
 
 
 @cache
@@ -56,7 +56,7 @@ def suits(algorithm, network):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("network", NETWORKS)
 def test_presets_compose_or_are_refused(algorithm, network):
-    task = TASK_OF[names_of("algorithm")[algorithm]]
+    task = TASK_OF[registries.ALGORITHMS[names_of("algorithm")[algorithm]].control]
     overrides = (f"task={task}", f"algorithm={algorithm}", f"network={network}", "seed=3")
     if not suits(algorithm, network):
         with pytest.raises(ConfigError, match="network"):
