@@ -2,6 +2,7 @@
 
 python recipes/speed.py
 python recipes/speed.py which=simulation repeats=50
+python recipes/speed.py which=learning/equi_sdqfd_update profile=true
 """
 
 from ba_torchrl._malloc import tune_malloc
@@ -20,7 +21,10 @@ def main(settings: DictConfig) -> None:
     """Measure, and compare with the budgets."""
     quiet_libraries()
     where = machine()  # the load before this starts adding to it
-    rows = measure(settings.which, settings.repeats)
+    profiles: dict[str, str] | None = {} if settings.profile else None
+    rows = measure(settings.which, settings.repeats, profiles=profiles)
+    for work, operations in (profiles or {}).items():
+        print(f"{work}\n{operations}")
     print(as_markdown(rows))
     print(f"\n{where}")
 

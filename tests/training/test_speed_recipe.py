@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pybullet
 import pytest
+import torch
+from tqdm import tqdm
 
 import ba_torchrl
 from ba_torchrl.config import ConfigError
@@ -14,7 +16,14 @@ from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.world import World
 from ba_torchrl.training.speed.numpy_camera import NumpyHeightCamera
-from ba_torchrl.training.speed.table import GROUPS, MEASUREMENTS, Row, as_markdown, measure
+from ba_torchrl.training.speed.table import (
+    GROUPS,
+    MEASUREMENTS,
+    Bench,
+    Row,
+    as_markdown,
+    measure,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -76,6 +85,23 @@ def test_every_measurement_belongs_to_a_group():
         measure("speed", repeats=1)
     with pytest.raises(ConfigError, match="1 or more"):
         measure("memory", repeats=0)
+
+
+def test_one_measurement_can_be_chosen():
+    (row,) = measure("memory/close_loop_replay", repeats=1, progress=False)
+    assert "close_loop" in row.work
+
+
+def test_a_profile_names_the_operations():
+    profiles: dict[str, str] = {}
+    matrix = torch.ones(64, 64)
+    with tqdm(disable=True) as bar:
+        bench = Bench(2, bar, profiles)
+        _, times = bench.time_against(lambda: None, {"product": lambda: matrix @ matrix})
+    assert len(times["product"]) == 2
+    assert set(profiles) == {"product"}
+    assert "aten::mm" in profiles["product"]
+    assert "[[64, 64], [64, 64]]" in profiles["product"]
 
 
 def test_empty_cells_stay_empty():

@@ -25,6 +25,8 @@ MEASUREMENTS: Registry[Measurement] = Registry("measurement", "ba_torchrl.traini
 WARM_UP = 3
 """Calls before the first one that counts: their memory is touched for the first time."""
 
+PROFILE_ROWS = 40
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -56,11 +58,13 @@ class Bench:
     Args:
         repeats: rounds of each measurement.
         bar: shows the rounds.
+        profiles: gets, for each call that is timed, where its time goes; none if not given.
     """
 
-    def __init__(self, repeats: int, bar: tqdm) -> None:
+    def __init__(self, repeats: int, bar: tqdm, profiles: dict[str, str] | None = None) -> None:
         self.repeats = repeats
         self._bar = bar
+        self._profiles = profiles
 
     def rounds(self) -> Iterator[int]:
         """Yield as many times as a measurement shall repeat itself."""
@@ -88,6 +92,8 @@ class Bench:
                 units.append(seconds(unit))
                 for name, call in calls.items():
                     times[name].append(seconds(call))
+        if self._profiles is not None:
+            self._profiles.update({name: operations(call) for name, call in calls.items()})
         return units, times
 
 
@@ -96,6 +102,22 @@ def seconds(call: Callable[[], Any]) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
+
+
+def operations(call: Callable[[], Any]) -> str:
+    """Return a table of the operations of PyTorch that take most of a call's time.
+
+    The seconds are of all threads together.
+    """
+    with torch.profiler.profile(record_shapes=True) as profile:
+        call()
+    averages = profile.key_averages(group_by_input_shape=True)
+    return averages.table(
+        sort_by="self_cpu_time_total",
+        row_limit=PROFILE_ROWS,
+        max_name_column_width=44,
+        max_shapes_column_width=88,
+    )
 
 
 @dataclass(frozen=True)
@@ -123,33 +145,36 @@ def measurement(
     return decorate
 
 
-def measure(which: str, repeats: int, progress: bool = True) -> list[Row]:
-    """Measure one group of the table, or "all".
+def measure(
+    which: str, repeats: int, progress: bool = True, profiles: dict[str, str] | None = None
+) -> list[Row]:
+    """Measure one group of the table, one of its measurements, or "all".
 
     Args:
-        which: the group.
+        which: the group, or the measurement as "group/name".
         repeats: rounds of each measurement.
         progress: show a progress bar.
+        profiles: gets, for each call that is timed, where its time goes; none if not given.
 
     Raises:
         ConfigError: there is no such group, or no round to measure in.
     """
-    if which not in (*GROUPS, "all"):
-        raise ConfigError(f"which: {which!r} is none of {', '.join(GROUPS)}, all")
+    known = (*GROUPS, "all", *MEASUREMENTS)
+    if which not in known:
+        raise ConfigError(f"which: {which!r} is none of {', '.join(known)}")
     if repeats < 1:
         raise ConfigError(f"repeats must be 1 or more, got {repeats}")
     jobs = [
         (MEASUREMENTS[name].function, arguments)
         for group in GROUPS
-        if which in (group, "all")
         for name in MEASUREMENTS
-        if name.startswith(f"{group}/")
+        if name.startswith(f"{group}/") and which in (group, name, "all")
         for arguments in _arguments(MEASUREMENTS[name])
     ]
     rows: list[Row] = []
     with tqdm(total=len(jobs) * repeats, disable=not progress, unit="round") as bar:
         for function, arguments in jobs:
-            rows += function(Bench(repeats, bar), *arguments)
+            rows += function(Bench(repeats, bar, profiles), *arguments)
     return rows
 
 
