@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.bodies import Body, Quaternion
+from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.robots.base import Pose, Robot, downward
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TaskSettings
+from ba_torchrl.tasks.base import Task, TaskSettings
+from ba_torchrl.tasks.grasps import GraspPlanner
 from ba_torchrl.tasks.pool import Pool
 from ba_torchrl.tasks.tray import FLOOR_Z_M, MARGIN_M, add_tray
-
-PARAMETERS = frozenset({"object_set", "asset_root"})
-"""What a task with clutter takes besides the parameters of all tasks."""
 
 FAILURES_ALLOWED = 3
 """Episodes in a row that take nothing, until new objects fall."""
@@ -121,29 +122,74 @@ class Clutter:
                 break
         self.robot.teleport(joints)
 
-    @property
-    def landmarks(self) -> list[Pose]:
-        """Poses of the objects; for those that are gone, the workspace's upper corner."""
-        workspace = self.settings.workspace
-        corner = (workspace.x[1], workspace.y[1], workspace.z[1])
-        poses = [(body.position, body.yaw_rad) for body in self.pool.present]
-        return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
-
-    def get_state(self) -> tuple[tuple[int, ...], int]:
-        """Return which objects are in use, and the failures in a row."""
-        return self.pool.get_state(), self.failures
-
-    def set_state(self, state: tuple[tuple[int, ...], int]) -> None:
-        """Take up what `get_state` returned."""
-        present, self.failures = state
-        self.pool.set_state(present)
-
     def _retreat(self) -> None:
         """Put the arm high above the heap, as high as it reaches."""
         robot, center_xy = self.robot, self.settings.workspace.center
         ways = (robot.inverse_kinematics((*center_xy, z), downward(0.0)) for z in RETREAT_Z_M)
         joints = next((found for found in ways if found is not None), robot.joints)
         robot.teleport(joints)
+
+
+class ClutterTask(Task):
+    """A task whose episodes each take something out of a heap, and go on with what is left.
+
+    New objects fall in once the tray is empty, an object left the workspace, or three episodes in a
+    row came to nothing.
+    """
+
+    is_chaotic = True
+    scale_limits = (1.0, 1.0)
+    parameters = frozenset({"object_set", "asset_root"})
+
+    @abstractmethod
+    def taken(self) -> Body | None:
+        """Return what this episode took out, if anything."""
+
+    def build(self, world: World) -> None:
+        """Load the tray and every shape of the object set."""
+        self.clutter = Clutter(world, self.robot, self.settings)
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Let new objects fall into the tray."""
+        self.clutter.drop(rng)
+
+    @property
+    def continues(self) -> bool:
+        """Whether something is left that is worth another try."""
+        return self.clutter.lasts(self.taken())
+
+    def resume(self) -> None:
+        """Put aside what was taken."""
+        self.clutter.go_on(self.taken())
+
+    @cached_property
+    def planner(self) -> GraspPlanner:
+        """What finds grasps; made when an expert is first asked."""
+        camera = HeightCamera(self.world.bodies)
+        bodies = self.clutter.pool.bodies
+        return GraspPlanner(bodies, camera, self.settings.workspace, self.robot.gripper)
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """What is in the tray, and what was taken last."""
+        return self.clutter.pool.present
+
+    @property
+    def landmarks(self) -> list[Pose]:
+        """Poses of the objects; for those that are gone, the workspace's upper corner."""
+        workspace = self.settings.workspace
+        corner = (workspace.x[1], workspace.y[1], workspace.z[1])
+        poses = [(body.position, body.yaw_rad) for body in self.objects]
+        return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
+
+    def get_state(self) -> tuple[tuple[int, ...], int]:
+        """Return which objects are in use, and the failures in a row."""
+        return self.clutter.pool.get_state(), self.clutter.failures
+
+    def set_state(self, state: tuple[tuple[int, ...], int]) -> None:
+        """Take up what `get_state` returned."""
+        present, self.clutter.failures = state
+        self.clutter.pool.set_state(present)
 
 
 def _apart(

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.cameras import HeightCamera
-from ba_torchrl.sim.robots.base import Pose
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.clutter import PARAMETERS, Clutter
+from ba_torchrl.tasks.clutter import ClutterTask
 from ba_torchrl.tasks.experts import ALIGNED_M, ALIGNED_RAD, CLOSED, OPEN, lift, towards
-from ba_torchrl.tasks.grasps import Grasp, GraspPlanner
+from ba_torchrl.tasks.grasps import Grasp
 from ba_torchrl.tasks.nudges import NEAR_M, Nudge, NudgePlanner
 
 WALL_PIXELS = 25
@@ -26,45 +21,20 @@ WALL_PIXELS = 25
 
 
 @TASKS.register("close_loop/object_grasping")
-class ObjectGrasping(CloseLoopTask):
-    """Random objects in a tray; success when one is held with the tool 15 cm above ground.
+class ObjectGrasping(ClutterTask, CloseLoopTask):
+    """Random objects in a tray; success when one is held with the tool 15 cm above ground."""
 
-    An episode goes on with what the last one left, less what it lifted, until the tray is empty,
-    an object left the workspace, or three episodes in a row came to nothing: then new objects fall
-    in.
-    """
-
-    scale_limits = (1.0, 1.0)
     num_objects = 5
     num_objects_range = (1, 15)
     fits_tray = True
-    is_chaotic = True
-    parameters = PARAMETERS
 
     lift_height_m: ClassVar[float] = 0.15
     risk_allowed: ClassVar[float] = 1.0
     """Where a grasp is riskier, the expert pushes the object first."""
 
-    def build(self, world: World) -> None:
-        """Load the tray and every shape of the object set."""
-        self.clutter = Clutter(world, self.robot, self.settings)
-
-    def randomise(self, rng: np.random.Generator) -> None:
-        """Let new objects fall into the tray."""
-        self.clutter.drop(rng)
-
-    @property
-    def continues(self) -> bool:
-        """Whether something is left that is worth another try."""
-        return self.clutter.lasts(self._lifted())
-
-    def resume(self) -> None:
-        """Put what was lifted aside."""
-        self.clutter.go_on(self._lifted())
-
     def is_goal(self) -> bool:
         """Whether any object is held and the tool higher than 15 cm."""
-        return self._lifted() is not None
+        return self.taken() is not None
 
     def expert_command(self) -> GripperCommand:
         """Close the fingers around the object that takes fewest actions, then go up.
@@ -121,32 +91,7 @@ class ObjectGrasping(CloseLoopTask):
             return lift(over_z - z, CLOSED)
         return towards(robot, (sx, sy, over_z), yaw, CLOSED)
 
-    @cached_property
-    def planner(self) -> GraspPlanner:
-        """What finds grasps; made when an expert is first asked."""
-        camera = HeightCamera(self.world.bodies)
-        bodies = self.clutter.pool.bodies
-        return GraspPlanner(bodies, camera, self.settings.workspace, self.robot.gripper)
-
-    @property
-    def objects(self) -> Sequence[Body]:
-        """What is in the tray."""
-        return self.clutter.pool.present
-
-    @property
-    def landmarks(self) -> Sequence[Pose]:
-        """The objects; in place of those that are gone, the workspace's upper corner."""
-        return self.clutter.landmarks
-
-    def get_state(self) -> Any:
-        """Return which objects are in use, and the failures in a row."""
-        return self.clutter.get_state()
-
-    def set_state(self, state: Any) -> None:
-        """Take up what `get_state` returned."""
-        self.clutter.set_state(state)
-
-    def _lifted(self) -> Body | None:
+    def taken(self) -> Body | None:
         """Return what is held, if the tool is high enough."""
         if self.robot.tool_pose()[0][2] <= self.lift_height_m:
             return None

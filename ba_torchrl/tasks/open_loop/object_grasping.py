@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property, partial
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.cameras import HeightCamera
-from ba_torchrl.sim.robots.base import Pose
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.clutter import PARAMETERS, Clutter
-from ba_torchrl.tasks.grasps import DEEPEST_M, PIXEL_M, YAWS, GraspPlanner
+from ba_torchrl.tasks.clutter import ClutterTask
+from ba_torchrl.tasks.grasps import DEEPEST_M, PIXEL_M, YAWS
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
 from ba_torchrl.tasks.tray import FLOOR_Z_M
 
@@ -36,39 +31,17 @@ NEAR_COST = 60.0
 
 
 @TASKS.register("open_loop/object_grasping")
-class ObjectGrasping(OpenLoopTask):
+class ObjectGrasping(ClutterTask, OpenLoopTask):
     """Random objects in a tray, 15 unless told otherwise; success when a pick took one.
 
-    An episode is one pick, and goes on with what the last one left, less what it took, until the
-    tray is empty, an object left the workspace, or three episodes in a row came to nothing: then
-    new objects fall in.
+    An episode is one pick.
     """
 
     max_steps = 1
     one_step = True
     num_objects = 15
     num_objects_range = (1, 20)
-    is_chaotic = True
     scale_range = (1.0, 1.0)
-    scale_limits = (1.0, 1.0)
-    parameters = PARAMETERS
-
-    def build(self, world: World) -> None:
-        """Load the tray and every shape of the object set."""
-        self.clutter = Clutter(world, self.robot, self.settings)
-
-    def randomise(self, rng: np.random.Generator) -> None:
-        """Let new objects fall into the tray."""
-        self.clutter.drop(rng)
-
-    @property
-    def continues(self) -> bool:
-        """Whether something is left that is worth another try."""
-        return self.clutter.lasts(self._picked())
-
-    def resume(self) -> None:
-        """Put what was picked aside."""
-        self.clutter.go_on(self._picked())
 
     def is_goal(self) -> bool:
         """Whether an object is held."""
@@ -97,7 +70,7 @@ class ObjectGrasping(OpenLoopTask):
         """Pick what is least likely to slip; after failures, what comes next if it is near."""
         workspace = self.settings.workspace
         x, y = workspace.center
-        if self._picked() is not None:  # the episode is over: all that is left is to put it back
+        if self.taken() is not None:  # the episode is over: all that is left is to put it back
             return PickPlaceCommand(PLACE, x, y, workspace.z[1] / 2)
         planner, present = self.planner, self.clutter.pool.present
         heights, tool = planner.heights(), ((x, y, workspace.z[1]), 0.0)
@@ -139,32 +112,7 @@ class ObjectGrasping(OpenLoopTask):
         yaw = yaws[np.ptp(across, axis=0).argmin()]
         return PickPlaceCommand(PICK, float(x), float(y), float(z), float(yaw))
 
-    @cached_property
-    def planner(self) -> GraspPlanner:
-        """What finds grasps; made when an expert is first asked."""
-        camera = HeightCamera(self.world.bodies)
-        bodies = self.clutter.pool.bodies
-        return GraspPlanner(bodies, camera, self.settings.workspace, self.robot.gripper)
-
-    @property
-    def objects(self) -> Sequence[Body]:
-        """What is in the tray, and what was picked last."""
-        return self.clutter.pool.present
-
-    @property
-    def landmarks(self) -> Sequence[Pose]:
-        """The objects; in place of those that are gone, the workspace's upper corner."""
-        return self.clutter.landmarks
-
-    def get_state(self) -> Any:
-        """Return which objects are in use, and the failures in a row."""
-        return self.clutter.get_state()
-
-    def set_state(self, state: Any) -> None:
-        """Take up what `get_state` returned."""
-        self.clutter.set_state(state)
-
-    def _picked(self) -> Body | None:
+    def taken(self) -> Body | None:
         """Return what the last pick took: cameras do not see it; contacts wait for a step."""
         return next((body for body in self.clutter.pool.present if body.is_hidden), None)
 
