@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from ba_torchrl.sim.bodies import Body, Vector
+import numpy as np
+
+from ba_torchrl.sim.bodies import Body, Vector, world_vertices
+from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.tasks.room import reach_m
 from ba_torchrl.tasks.structures import Piece
+
+SPARE_M = 2e-3
+"""Room between a piece and a finger that comes down close by it."""
 
 Hindrance = Callable[[Body, Body, Vector | None], Sequence[bool]]
 """From a piece, another, and where that one will be if not where it is now, to whether it is in
@@ -25,6 +33,81 @@ class Move(NamedTuple):
     yaw_period_rad: float
     onto: tuple[Body, ...]
     """What it will rest on; nothing stands for the ground."""
+
+
+class Hold(NamedTuple):
+    """A way to grasp a piece; distances are from its origin, along the gripper's x axis."""
+
+    yaw_rad: float
+    shift_m: float = 0.0
+    """Where the tool is; in the middle of the piece if zero."""
+    sweep_m: tuple[float, float] = (0.0, 0.0)
+    """What one finger sweeps on its way to the piece if the tool is off the middle."""
+    wedge_m: tuple[float, float] = (0.0, 0.0)
+    """Where the other one comes down then, close by the piece."""
+
+
+def edge_holds(gripper: Gripper, body: Body, yaw_rad: float, opening: float = 1.0) -> list[Hold]:
+    """Return the ways to come down with one finger close by a body, the other far from it.
+
+    The first needs no more room than its own width. Where that is wanting it wedges itself in all
+    the same: between the fingers the body can give way.
+
+    Args:
+        gripper: what is to grasp.
+        body: stands on the ground, so that it may slide.
+        yaw_rad: the gripper's, or its reverse.
+        opening: of the gripper, 0 to 1.
+
+    Returns:
+        One for each finger; none if the body nearly fills the gripper.
+    """
+    half_gap_m = opening * gripper.half_gap_m
+    finger_m = gripper.closed_half_m - gripper.arc[0][0]
+    holds = []
+    for yaw in (yaw_rad, yaw_rad + math.pi):
+        ahead = np.array([math.cos(yaw), math.sin(yaw)])
+        far_m, near_m = reach_m(body, np.stack([ahead, -ahead])).tolist()
+        shift_m = half_gap_m - near_m - SPARE_M
+        if shift_m > SPARE_M:
+            sweep_m = (far_m, shift_m + half_gap_m + finger_m)
+            holds.append(Hold(yaw, shift_m, sweep_m, (-near_m - SPARE_M - finger_m, -near_m)))
+    return holds
+
+
+def finger_way_room(
+    gripper: Gripper,
+    body: Body,
+    yaw_rad: float,
+    way_m: tuple[float, float],
+    others: Sequence[Body],
+    at: Vector | None = None,
+) -> float:
+    """Return the gap between a finger's way beside a body and what stands there.
+
+    It is in metres, negative where something is in the way.
+
+    Args:
+        gripper: its fingertips reach down to the ground.
+        body: what they are to close on.
+        yaw_rad: the gripper's.
+        way_m: ends of the way, from the body along the line on which the fingers close.
+        others: bodies that may be in the way.
+        at: where the body is, if not where it is now.
+    """
+    ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
+    below_m = -min(z for _, z in gripper.arc)
+    bx, by, bz = body.position if at is None else at
+    gap = math.inf
+    for other in others:
+        corners = world_vertices(other)
+        if corners[:, 2].max() < bz - below_m:
+            continue
+        px, py = corners[:, 0] - bx, corners[:, 1] - by
+        along, across = px * ux + py * uy, py * ux - px * uy
+        aside = max(across.min(), -across.max()) - gripper.half_width_m
+        gap = min(gap, max(along.min() - way_m[1], way_m[0] - along.max(), aside))
+    return float(gap)
 
 
 class Access:

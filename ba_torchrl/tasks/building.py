@@ -204,7 +204,7 @@ class Building:
             if beside is None:
                 return self._to_ground(body, put_down), 0.0
             return self._beside(body, beside, bridge, put_down, rest, crowding)
-        x, y, _ = middle(filling[i].position for i in slot.over or slot.on)
+        x, y, _ = middle(filling[i].position for i in self._over(number))
         z = max(vertical_extent(support)[1] for support in supports)
         z += body.position[2] - vertical_extent(body)[0]
         yaw, period = None, piece.yaw_period_rad
@@ -223,6 +223,16 @@ class Building:
         if crowding is not None and sum(other is not None for other in filling) == 1:
             crowd_m = float(crowding(np.array([[(x, y)]]), rest)[0])
         return Move(body, piece, (x, y, z), yaw, period, tuple(supports)), crowd_m
+
+    def _over(self, number: int) -> tuple[int, ...]:
+        """Return the slots over whose middle a piece goes: in a tower, the two beneath it.
+
+        Where these lean, the middle of the upper one alone would bring the tower down.
+        """
+        slots = self.blueprint.slots
+        on = slots[number].over or slots[number].on
+        below = slots[on[0]].on if len(on) == 1 else ()
+        return (*on, *below) if len(below) == 1 else on
 
     def _along(
         self, body: Body, support: Body, beside: Body | None, apart_m: float

@@ -361,3 +361,24 @@ def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
         done, steps = bool(outcome["done"]), steps + 1
     assert outcome["success"]
     assert steps <= 12
+
+
+@pytest.mark.parametrize(
+    ("robot", "gap_m"),
+    [("kuka", 0.01), ("kuka", 0.025), ("panda", 0.001), ("panda", 0.01), ("panda", 0.025)],
+)
+def test_expert_that_cannot_turn_takes_cubes_that_stand_side_by_side(make, robot, gap_m):
+    """In a row along the fingers' line each is in the others' way, grasped by its middle."""
+    fixed = {"action_sequence": "pxy", "random_orientation": False}
+    env = make(OPEN_STACKING, expert=True, max_steps=30, robot=robot, num_objects=3, **fixed)
+    for i, cube in enumerate(env.scene.task.objects):
+        cube.place((0.42 + i * (0.03 + gap_m), 0.02, 0.015))
+    env.scene.world.settle()
+    env.scene.world.step(2)
+    done, steps = False, 0
+    while not done:
+        action = torch.from_numpy(env._expert_action(env.scene))
+        outcome = env._step(env.full_action_spec.zero().set("action", action))
+        done, steps = bool(outcome["done"]), steps + 1
+    assert outcome["success"]
+    assert steps <= 20

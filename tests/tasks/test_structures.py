@@ -354,6 +354,22 @@ def test_a_move_says_where_and_how(scene):
     assert move.yaw_period_rad == pytest.approx(math.pi / 2)
 
 
+def test_a_leaning_tower_is_balanced(scene):
+    """Straight over a cube that hangs out by 14 of its 30 mm, the next would tip it."""
+    s = scene(tower(CUBE, CUBE, CUBE))
+    base, leaning, loose = s.cubes
+    s.put(base, 0.42, 0.05, 0)
+    s.put(leaning, 0.434, 0.05, 1)
+    s.put(loose, 0.5, -0.1, 0)
+    s.settle()
+    move = s.building.next_move(AREA)
+    assert (move.body, move.onto) == (loose, (leaning,))
+    assert move.position[:2] == pytest.approx((0.427, 0.05), abs=1e-3)
+    loose.place(move.position)
+    s.settle()
+    assert s.building.is_built()
+
+
 def test_two_short_towers_become_one_from_the_top_down(scene):
     s = scene(tower(CUBE, CUBE, CUBE, CUBE))
     for i, cube in enumerate(s.cubes):

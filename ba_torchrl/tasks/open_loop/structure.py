@@ -10,8 +10,9 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Shape, Vector, radius_m, world_vertices
+from ba_torchrl.sim.bodies import Body, Shape, Vector, radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.access import Hold, edge_holds, finger_way_room
 from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.building import CROWDED, Building, Move
 from ba_torchrl.tasks.experts import finger_room
@@ -29,6 +30,8 @@ FREE_YAWS = 8
 """Yaws of a half turn that are tried where any will do."""
 BLOCKED_M = 0.05
 """What it is worth in metres of way that the hand touches nothing else when it picks."""
+DRIVEN_M = 0.16
+"""A finger that wedges itself in between two blocks may drive one away by this much."""
 AMPLE_M = 0.02
 """More room than this is no better."""
 
@@ -114,8 +117,9 @@ class StructureTask(OpenLoopTask):
             return PickPlaceCommand(PLACE if held is not None else PICK, x, y, 0.1)
         if move.body is held:
             return self._place(move)
-        yaw = max(self.grasp_yaws(move.body), key=lambda yaw: self.room(move.body, yaw))
-        x, y, z = move.body.position
+        hold = self._best_hold(move.body)
+        yaw, z = hold.yaw_rad, move.body.position[2]
+        x, y = _tool_point(move.body.position, hold)
         lowest = self.settings.workspace.z[0] + self.lowest_pick_m
         return PickPlaceCommand(PICK, x, y, max(z, lowest), yaw)
 
@@ -162,24 +166,60 @@ class StructureTask(OpenLoopTask):
         It is infinite, or at least `AMPLE_M`, where nothing stands near.
         """
         others = [other for other in self.bodies if other is not body]
-        return self._room_beside(body, yaw_rad, others, at)
+        return self._room_beside(body, Hold(yaw_rad), others, at)
+
+    def _holds(self, body: Body) -> list[Hold]:
+        """Return the ways to grasp a body, the plain ones first."""
+        holds = [Hold(yaw) for yaw in self.grasp_yaws(body)]
+        # with a turn there is another way; off the ground it would drag along what it lies on
+        if not self.reach.turn_rad and self._is_on_ground(body):
+            gripper, opening = self.robot.gripper, self.finger_opening
+            for hold in tuple(holds):
+                holds += edge_holds(gripper, body, hold.yaw_rad, opening)
+        return holds
+
+    def _best_hold(self, body: Body) -> Hold:
+        """Return the easiest way to grasp a body."""
+        return max(self._holds(body), key=lambda hold: self._ease(body, hold))
+
+    def _is_on_ground(self, body: Body) -> bool:
+        return vertical_extent(body)[0] < self.settings.surface_z_m + self.block_m / 4
+
+    def _ease(self, body: Body, hold: Hold) -> tuple[float, bool, float]:
+        """Return how easy a way to grasp a body is.
+
+        Returns:
+            Metres that are wanting for it, negative; whether it is plain, which is best where
+            nothing is; and the room, a finger that wedges itself in counted as well.
+        """
+        others = [other for other in self.bodies if other is not body]
+        room = spare = self._room_beside(body, hold, others, None)
+        if hold.shift_m:
+            gripper, yaw = self.robot.gripper, hold.yaw_rad
+            spare = min(room, finger_way_room(gripper, body, yaw, hold.wedge_m, others))
+        return min(room, 0.0), not hold.shift_m, spare
 
     def _room_beside(
-        self, body: Body, yaw_rad: float, others: Sequence[Body], at: Vector | None
+        self, body: Body, hold: Hold, others: Sequence[Body], at: Vector | None
     ) -> float:
         """Return the gap between the hand, open around a body, and some others."""
-        x, y, z = body.position if at is None else at
+        at = body.position if at is None else at
+        (x, y), z = _tool_point(at, hold), at[2]
         reach = math.hypot(*self.robot.hand_half_m) + AMPLE_M
         others = [
             other
             for other in others
             if math.dist(other.position[:2], (x, y)) < reach + radius_m(other)
         ]
-        room = finger_room(self.robot, body, yaw_rad, others, self.finger_opening, at)
+        yaw = hold.yaw_rad
+        if hold.shift_m:
+            room = finger_way_room(self.robot.gripper, body, yaw, hold.sweep_m, others, at)
+        else:
+            room = finger_room(self.robot, body, yaw, others, self.finger_opening, at)
         for other in others:
             corners = world_vertices(other)
             if corners[:, 2].max() > z + HAND_OVER_TOOL_M:
-                cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+                cos, sin = math.cos(yaw), math.sin(yaw)
                 along_across = (corners[:, :2] - (x, y)) @ ((cos, -sin), (sin, cos))
                 low, high = along_across.min(axis=0), along_across.max(axis=0)
                 gaps = np.maximum(low, -high) - self.robot.hand_half_m
@@ -213,17 +253,29 @@ class StructureTask(OpenLoopTask):
         return np.maximum(SITE_GAP_M + self.block_m / 2 - gaps, 0.0).sum(axis=1)
 
     def _hindrance(self, body: Body, other: Body, place: Vector | None) -> list[bool]:
-        """Return whether another piece is in the hand's way, for each yaw to grasp a body at."""
+        """Return whether another piece is in the hand's way, for each way to grasp a body."""
         at = body.position
         if place is not None:  # as seen from there
             moved = zip(at, other.position, place, strict=True)
             at = tuple(a + b - c for a, b, c in moved)
-        return [self._room_beside(body, yaw, [other], at) <= 0 for yaw in self.grasp_yaws(body)]
+        return [self._room_beside(body, hold, [other], at) <= 0 for hold in self._holds(body)]
 
     def _effort(self, body: Body) -> float:
-        """Prefer pieces that stand free."""
-        room = max(self.room(body, yaw) for yaw in self.grasp_yaws(body))
-        return 0.0 if room > 0 else BLOCKED_M - CROWDED * room
+        """Prefer pieces that stand free, and of the others those that a wedge drives inwards."""
+        hold = self._best_hold(body)
+        lack_m, _, room_m = self._ease(body, hold)
+        if room_m > 0:
+            return 0.0
+        effort_m = BLOCKED_M - CROWDED * lack_m
+        if hold.shift_m and lack_m == 0:
+            x, y, _ = body.position
+            cos, sin = math.cos(hold.yaw_rad), math.sin(hold.yaw_rad)
+            end = (x + DRIVEN_M * cos, y + DRIVEN_M * sin)
+            spans = self.settings.workspace.x, self.settings.workspace.y
+            effort_m += max(
+                max(low - e, e - high, 0.0) for e, (low, high) in zip(end, spans, strict=True)
+            )
+        return effort_m
 
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
@@ -249,3 +301,11 @@ class StructureTask(OpenLoopTask):
         """Return the first of the yaws at which the fingers can part most freely."""
         rooms = [min(self.room(move.body, yaw, move.position), AMPLE_M) for yaw in yaws_rad]
         return yaws_rad[rooms.index(max(rooms))]
+
+
+def _tool_point(at: Vector, hold: Hold) -> tuple[float, float]:
+    """Return where the tool is to grasp what is at a place."""
+    return (
+        at[0] + hold.shift_m * math.cos(hold.yaw_rad),
+        at[1] + hold.shift_m * math.sin(hold.yaw_rad),
+    )
