@@ -56,6 +56,9 @@ def equivariant_unet(gspace: GSpace2D, fields: Sequence[int]) -> UNet:
 class _Head(nn.Module):
     """Regular fields to values: a hidden 3x3 layer of invariants if any, then one pixel wide.
 
+    The hidden layer keeps its size where the network is narrow: with four units in it, every
+    sixteenth head would be born with negative weights only, and values that no pixel exceeds.
+
     Args:
         gspace: images and their symmetry group.
         fields: number of regular fields.
@@ -67,7 +70,7 @@ class _Head(nn.Module):
         types: FieldTypes = [(gspace.regular_repr, fields)]
         self.hidden = None
         if out_repr.is_trivial():
-            hidden = [(gspace.trivial_repr, fields)]
+            hidden = [(gspace.trivial_repr, max(fields, _FIELDS[0]))]
             self.hidden = SteerableConv2d(gspace, types, hidden, 3, padding=1)
             types = hidden
         self.values = SteerableConv2d(gspace, types, [(out_repr, 1)], 1)
