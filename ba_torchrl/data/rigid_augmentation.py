@@ -23,6 +23,9 @@ ATTEMPTS = 10
 """Motions drawn for a transition until its action stays within the workspace."""
 
 _NEXT_PIXELS = (keys.NEXT, keys.PIXELS)
+_IN_HAND_KEYS = (keys.IN_HAND, (keys.NEXT, keys.IN_HAND))
+_IN_HAND_AXES = {1: ("xy",), 3: ("yz", "xz", "xy")}
+"""Axes of the gripper along rows and columns of each channel, by the number of channels."""
 
 
 class Motion(NamedTuple):
@@ -62,11 +65,27 @@ def move_images(images: Tensor, motion: Motion) -> Tensor:
     return moved
 
 
+def reverse_in_hand(images: Tensor, axes: str) -> Tensor:
+    """Return in-hand images with some axes of the gripper reversed.
+
+    Exact for heights; to a voxel for the three projections, whose smoothing leans to one side.
+
+    Args:
+        images: [B, C, h, w], C = 1 for heights, 3 for projections.
+        axes: of "x", along which the fingers close, "y" and "z".
+    """
+    channels = []
+    for channel, names in zip(images.unbind(1), _IN_HAND_AXES[images.shape[1]], strict=True):
+        channels.append(channel.flip([dim for dim in (-2, -1) if names[dim] in axes]))
+    return torch.stack(channels, dim=1)
+
+
 class RigidAugmentation(nn.Module):
     """Moves heightmap, next heightmap and action of sampled transitions by one random motion.
 
-    The in-hand image lies in the gripper's frame: it stays, but for mirror images. A transition
-    for which no motion was found that leaves its action within the workspace stays as it is.
+    The in-hand image lies in the gripper's frame: it stays, but for mirror images, and where a
+    yaw comes back into half a turn, which turns the gripper over. A transition for which no motion
+    was found that leaves its action within the workspace stays as it is.
 
     Args:
         motions: which, see `Motions`.
@@ -149,14 +168,15 @@ class RigidAugmentation(nn.Module):
         first, second = images.split(pixels.shape[1], dim=1)
         out.set(keys.PIXELS, first.contiguous()).set(_NEXT_PIXELS, second.contiguous())
         moved = action.clone()
-        moved[rows] = self._move(action[rows], motion)
+        moved[rows], turned_over = self._move(action[rows], motion)
         out.set(keys.ACTION, moved.to(device))
-        if motion.mirrored.any():
-            flipped = index[motion.mirrored.to(device)]
-            for key in (keys.IN_HAND, (keys.NEXT, keys.IN_HAND)):
-                image = tensordict[key].clone()
-                image[flipped] = image[flipped].flip(-1)
-                out.set(key, image)
+        for chosen, axes in ((motion.mirrored, "y"), (turned_over, "xy")):
+            if chosen.any():
+                these = index[chosen.to(device)]
+                for key in _IN_HAND_KEYS:
+                    image = out[key].clone()
+                    image[these] = reverse_in_hand(image[these], axes)
+                    out.set(key, image)
         return out
 
     def _draw(self, count: int) -> Motion:
@@ -182,12 +202,13 @@ class RigidAugmentation(nn.Module):
         offset = (self._positions(action, motion) - self._center).abs()
         return (offset <= self._side / 2).all(dim=-1)
 
-    def _move(self, action: Tensor, motion: Motion) -> Tensor:
-        """Return actions [B, A] moved, angles wrapped."""
+    def _move(self, action: Tensor, motion: Motion) -> tuple[Tensor, Tensor]:
+        """Return actions [B, A] moved, angles wrapped, and where that turns the gripper over."""
         moved = action.double()
         moved[:, self._xy] = self._positions(action, motion)
+        swapped = torch.zeros(len(action), dtype=torch.bool)
         if "rz" not in self.actions.components:
-            return moved.to(action)
+            return moved.to(action), swapped
         rz = self.actions.components.index("rz")
         yaw = torch.where(motion.mirrored, -moved[:, rz], moved[:, rz]) + motion.angle_rad
         yaw = yaw.remainder(2 * math.pi)
@@ -198,7 +219,7 @@ class RigidAugmentation(nn.Module):
                 tilt = self.actions.components.index(name)
                 moved[:, tilt] = torch.where(swapped, -moved[:, tilt], moved[:, tilt])
         moved[:, rz] = yaw
-        return moved.to(action)
+        return moved.to(action), swapped
 
     def get_extra_state(self) -> Tensor:
         """Return the generator's state, so that a checkpoint continues the same draws."""

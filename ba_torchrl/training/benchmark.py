@@ -5,15 +5,16 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from pydantic import Field
 
+from ba_torchrl.algorithms.base import Problem
 from ba_torchrl.config import ConfigError, StrictModel
-from ba_torchrl.envs.factory import make_env
 from ba_torchrl.record.results import (
     CONFIG_FILE,
     RESULT_FILE,
@@ -22,6 +23,7 @@ from ba_torchrl.record.results import (
     read_result,
 )
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.checkpoint import build_algorithm, problem_of
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.resume import check_same_run, resumable_updates
 
@@ -151,7 +153,7 @@ def plan(
             raise ConfigError(f"{task} with {algorithm} {network}: {error}") from None
     if not runs:
         raise ConfigError("the grid is empty: `skip` leaves everything out")
-    _check_environments(runs)
+    _check_parts(runs)
     return runs
 
 
@@ -211,18 +213,27 @@ def _mentioned(config: BenchmarkConfig) -> Iterator[tuple[str, Sequence[str]]]:
             yield axis, [names] if isinstance(names, str) else names
 
 
-def _check_environments(runs: Sequence[ExperimentConfig]) -> None:
-    """Make every environment of the grid once: some parameters are checked by tasks and robots."""
-    tried = set()
+def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
+    """Make every environment of the grid once, and every learner that differs from the others.
+
+    Some parameters are checked by tasks and robots, some sizes and actions by networks.
+    """
+    problems: dict[tuple[str, str], Problem] = {}
+    built = set()
     for run in runs:
         key = (run.task, json.dumps(run.env, sort_keys=True))
-        if key in tried:
-            continue
-        tried.add(key)
         try:
-            make_env(run.task, **run.env).close()
+            if key not in problems:
+                # alike but for what no network depends on
+                same = {"seed": 0, "max_depth_m": 1.0, "device": torch.device("cpu")}
+                problems[key] = replace(problem_of(run), **same)
+            problem = problems[key]
+            learner = repr((problem, run.algorithm_config, run.network_config))
+            if learner not in built:
+                built.add(learner)
+                build_algorithm(run, problem)
         except ConfigError as error:
-            raise ConfigError(f"{run.task}: {error}") from None
+            raise ConfigError(f"{run.task} with {run.label}: {error}") from None
 
 
 def _merged(*layers: Mapping[str, Any]) -> dict[str, Any]:

@@ -146,9 +146,32 @@ def load(path: str | Path, **changes: Any) -> tuple[ExperimentConfig, Algorithm]
     return config, algorithm
 
 
-def build_algorithm(config: ExperimentConfig) -> Algorithm:
-    """Build the untrained algorithm of an experiment."""
+def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) -> Algorithm:
+    """Build the untrained algorithm of an experiment.
+
+    Args:
+        config: of the experiment.
+        problem: what `problem_of` returns for it, if that is known.
+
+    Raises:
+        ConfigError: task, algorithm and network do not go together.
+    """
+    problem = problem or problem_of(config)
     torch.manual_seed(config.seed)
+    try:
+        return config.algorithm_config.build(config.network_config, problem)
+    except ConfigError:
+        raise
+    except ValueError as error:  # sizes and components that a network does not take
+        raise ConfigError(str(error)) from error
+
+
+def problem_of(config: ExperimentConfig) -> Problem:
+    """Return what the algorithm of an experiment must know of its environment.
+
+    Raises:
+        ConfigError: the environment cannot be made, or its images are not for networks.
+    """
     env = make_env(config.task, **config.env)
     try:
         pixels = env.observation_spec[keys.PIXELS]
@@ -160,7 +183,7 @@ def build_algorithm(config: ExperimentConfig) -> Algorithm:
         in_hand = None
         if keys.IN_HAND in env.observation_spec:
             in_hand = tuple(env.observation_spec[keys.IN_HAND].shape[:2])
-        problem = Problem(
+        return Problem(
             image_size=pixels.shape[-1],
             actions=env.actions,
             max_depth_m=float(pixels.space.high.max()),
@@ -171,9 +194,3 @@ def build_algorithm(config: ExperimentConfig) -> Algorithm:
         )
     finally:
         env.close()
-    try:
-        return config.algorithm_config.build(config.network_config, problem)
-    except ConfigError:
-        raise
-    except ValueError as error:  # sizes and components that a network does not take
-        raise ConfigError(str(error)) from error

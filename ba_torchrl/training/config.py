@@ -58,11 +58,11 @@ class ExperimentConfig(StrictModel):
     start_method: Literal["spawn", "fork"] = "spawn"
     """How those processes start."""
     demonstrations: int = Field(default=100, ge=0)
-    """Expert episodes in the replay from the start."""
+    """Expert episodes that are played for the replay, before the start."""
     demonstrations_source: Source = "expert"
     """Where they come from: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
-    """Leave out expert episodes that failed."""
+    """Leave out those that failed; so that there are fewer, where the expert is not perfect."""
     demonstrations_path: str | None = None
     """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
     pretrain_updates: int = Field(default=0, ge=0)

@@ -1,11 +1,18 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
 from ba_torchrl.actions import OpenLoopActions
-from ba_torchrl.data.rigid_augmentation import Motion, RigidAugmentation, move_images
+from ba_torchrl.data.rigid_augmentation import (
+    Motion,
+    RigidAugmentation,
+    move_images,
+    reverse_in_hand,
+)
+from ba_torchrl.sim.in_hand import IN_HAND_MODES, PickView
 
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
 SIZE = 32
@@ -151,15 +158,65 @@ def test_tilts_change_sides_when_a_half_turn_is_taken_back():
     assert 0.3 < signs.float().mean() < 0.7
 
 
-def test_the_in_hand_image_is_mirrored_with_the_scene_and_else_stays():
-    data = batch([(0.45, 0.0)] * 40)
-    turned = RigidAugmentation("cn", layout(), seed=0)(data)
-    assert torch.equal(turned["in_hand"], data["in_hand"])
+def view(turn, mirrored=False):
+    """A pick, at 0.3 from x to y, of an odd shape in a scene that is mirrored, then turned."""
+    heights = np.zeros((65, 65))
+    heights[30:42, 29:34], heights[31:34, 33:48], heights[37:40, 31:33] = 0.03, 0.05, 0.07
+    yaw = -0.3 if mirrored else 0.3
+    heights = np.rot90(np.fliplr(heights) if mirrored else heights, turn)
+    return heights.copy(), yaw + turn * math.pi / 2
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize(("mode", "share"), [("raw", 1e-6), ("sub", 1e-6), ("proj", 0.12)])
+def test_the_in_hand_image_is_what_the_moved_scene_would_have_shown(mode, share, turn, mirrored):
+    def seen(turn, mirrored=False, over=False):
+        heights, yaw = view(turn, mirrored)
+        yaw = yaw % math.pi if over else yaw
+        picked = PickView(heights, np.zeros_like(heights), (32.5, 32.5), 0.006, 0.03, yaw)
+        return torch.from_numpy(IN_HAND_MODES[mode]().draw(picked, 24).copy())[None].float()
+
+    image, wanted = seen(0), seen(turn, mirrored, over=True)
+    yaw = view(turn, mirrored)[1] % (2 * math.pi)
+    if mirrored:
+        image = reverse_in_hand(image, "y")
+    if yaw > math.pi:
+        image = reverse_in_hand(image, "xy")
+    error, before = ((one - wanted).abs().mean() / wanted.abs().mean() for one in (image, seen(0)))
+    assert error < share
+    if mirrored or yaw > math.pi:  # and without it would not have been
+        assert error < 0.7 * before
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_in_hand_image_follows_the_gripper(channels):
+    data = batch([(0.45, 0.0)] * 60, [0.3] * 60)
+    image = torch.arange(channels * 16.0).reshape(1, channels, 4, 4)
+    for key in ("in_hand", ("next", "in_hand")):
+        data[key] = image.repeat(60, 1, 1, 1)
+    over, mirror = reverse_in_hand(image, "xy"), reverse_in_hand(image, "y")
+    turned = RigidAugmentation("cn", layout(), seed=0, order=4)(data)
+    for first, second, action in zip(
+        turned["in_hand"], turned["next", "in_hand"], turned["action"], strict=True
+    ):
+        # 0.3 and 0.3 + pi / 2 are reached directly or by half a turn more, which turns it over
+        assert torch.equal(first, second)
+        assert torch.equal(first, image[0]) or torch.equal(first, over[0])
+        assert 0 <= action[3] <= math.pi
+    is_over = [torch.equal(one, over[0]) for one in turned["in_hand"]]
+    assert 18 < sum(is_over) < 42
     mirrored = RigidAugmentation("d4", layout(), seed=0)(data)
-    is_flipped = [torch.equal(image, data["in_hand"][0].flip(-1)) for image in mirrored["in_hand"]]
-    is_same = [torch.equal(image, data["in_hand"][0]) for image in mirrored["in_hand"]]
-    assert all(a != b for a, b in zip(is_flipped, is_same, strict=True))
-    assert 8 < sum(is_flipped) < 32
+    kinds = [image, mirror, over, reverse_in_hand(mirror, "xy")]
+    counts = [sum(torch.equal(one, kind[0]) for one in mirrored["in_hand"]) for kind in kinds]
+    assert sum(counts) == 60
+    assert min(counts) > 5
+
+
+def test_the_in_hand_image_stays_where_half_turns_differ():
+    data = batch([(0.45, 0.0)] * 20)
+    turned = RigidAugmentation("cn", layout(half_rotation=False), seed=0)(data)
+    assert torch.equal(turned["in_hand"], data["in_hand"])
 
 
 def test_actions_stay_within_the_workspace():

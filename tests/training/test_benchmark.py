@@ -23,6 +23,7 @@ from ba_torchrl.training.jobs import run_all
 
 ROOT = Path(__file__).parents[2]
 REACH, PICK = "close_loop/block_reaching", "close_loop/block_picking"
+PLACE = "open_loop/block_stacking"
 PRESETS = {
     ("algorithm", "sac"): {"name": "sac", "demonstration_weight": 0.0, "prioritized": False},
     ("algorithm", "sacfd"): {"name": "sac", "demonstration_weight": 1.0},
@@ -153,7 +154,7 @@ def test_what_is_skipped_is_not_in_the_grid(tmp_path):
         ({"common": {"network": {"widht": 1.0}}}, "with sac small: .*Did you mean 'width'"),
         ({"common": {"env": {"in_hand_size": 30}}}, f"{REACH}.*: 'in_hand_size' is for open-loop"),
         ({"common": {"env": {"robot": "sawyer"}}}, "kuka"),
-        ({"tasks": ["open_loop/block_stacking"]}, "'sac' learns close_loop tasks"),
+        ({"tasks": [PLACE]}, "'sac' learns close_loop tasks"),
         ({"per_task": {REACH: {"env": {"obs_sise": 64}}}}, "Did you mean 'obs_size'"),
     ],
 )
@@ -178,9 +179,7 @@ def shipped(name, *overrides):
         assert values.pop("dry_run") is False
         known = [name for name in BenchmarkConfig.model_fields if name in values]
         config = parse(BenchmarkConfig, {name: values.pop(name) for name in known}, "benchmark")
-        if name.startswith("close_loop"):
-            return config, values, plan(config, values, hydra_schema.preset)
-        return config, values, None
+        return config, values, plan(config, values, hydra_schema.preset)
 
 
 @pytest.mark.parametrize(
@@ -209,6 +208,19 @@ def test_close_loop_benchmarks_are_the_papers(name, actions, turned):
         0.4,
         1.0,
     )
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("networks=[fcn,asr]", "sdqfd asr: .*no rz"),
+        ("env.obs_size=90", "multiple of 16"),
+        ("algorithm.augmentation=d4", "no yaw to turn"),
+    ],
+)
+def test_networks_that_do_not_fit_are_refused_before_anything_starts(override, message):
+    with pytest.raises(ConfigError, match=f"(?s){PLACE} with .*{message}"):
+        shipped("open_loop_2d", f"tasks=[{PLACE}]", "network.width=0.1", override)
 
 
 def test_small_budgets_are_a_matter_of_overrides():
@@ -243,7 +255,7 @@ def test_unknown_presets_are_answered_with_those_there_are():
 
 @pytest.mark.parametrize("name", ["open_loop_2d", "open_loop_3d"])
 def test_open_loop_benchmarks_are_the_papers(name):
-    config, common, _ = shipped(name)
+    config, common, runs = shipped(name, "network.width=0.1")  # planning builds each network
     known = {task for task in list_tasks() if task.startswith("open_loop/")}
     left_out = {"open_loop/box_palletizing"} if name == "open_loop_2d" else set()
     assert set(config.tasks) == known - left_out
@@ -253,7 +265,10 @@ def test_open_loop_benchmarks_are_the_papers(name):
     assert (common["env"]["obs_size"], common["env"]["in_hand_size"]) == (128, 24)
     assert (common["demonstrations"], common["num_envs"]) == (200, 5)
     assert (common["total_updates"], common["eval_every"]) == (20_000, 500)
+    assert {run.algorithm_config.gamma for run in runs} == {0.95}
     if name == "open_loop_3d":
+        assert len(runs) == 12 * (5 + 3) * 4
+        assert {run.env_config.obs_size for run in runs if "rot_fcn" in run.label} == {90}
         assert config.per_network["rot_fcn"] == {"env": {"obs_size": 90}}
         assert config.skips(task=PICK, algorithm="dqn", network="fcn")
         assert not config.skips(task=PICK, algorithm="dqn", network="equi_asr")
