@@ -96,7 +96,10 @@ class EquivariantYawValues(nn.Module):
         self.convs = nn.ModuleList()
         types = [(gspace.trivial_repr, 1)]
         for fields, kernel_size, padding, _ in stages:
-            out = [(gspace.regular_repr, scaled_width(fields, config.width))]
+            # The last one keeps its size where the network is narrow: of few fields, the dynamic
+            # filter may leave nothing above zero, and with it no gradient.
+            width = config.width if len(self.convs) < len(stages) - 1 else max(config.width, 1.0)
+            out = [(gspace.regular_repr, scaled_width(fields, width))]
             self.convs.append(SteerableConv2d(gspace, types, out, kernel_size, padding=padding))
             types = out
         ((_, fields),) = types

@@ -175,6 +175,8 @@ def test_plain_networks_have_no_such_symmetry(name):
         ("fcn", XYR, {"num_rotations": 3}),
         ("equi_fcn", XY, {}),
         ("equi_fcn", XYR, {"num_rotations": 2}),
+        ("asr", XYR, {"num_rotations": 2}),
+        ("equi_asr", XYR, {"num_rotations": 4}),
     ],
 )
 def test_a_shift_by_the_stride_shifts_the_values(name, components, fields):
@@ -188,10 +190,15 @@ def test_a_shift_by_the_stride_shifts_the_values(name, components, fields):
     pixels = torch.zeros(1, 1, size, size)
     pixels[..., 136:148, 140:150] = torch.rand(12, 10)
     moved = pixels.roll((16, -16), dims=(-2, -1))
-    in_hand, holding = torch.zeros(1, 1, 24, 24), torch.tensor([[name == "equi_fcn"]])
+    in_hand, holding = torch.zeros(1, 1, 24, 24), torch.tensor([[name.startswith("equi")]])
     with torch.no_grad():
-        values = network.first(pixels, in_hand, holding)[0]
-        shifted = network.first(moved, in_hand, holding)[0]
+        values, state = network.first(pixels, in_hand, holding)
+        shifted, shifted_state = network.first(moved, in_hand, holding)
         assert_equal(shifted, values.roll((16, -16), dims=(-2, -1)))
+        if name == "equi_asr":  # the plain one's yaws depend on where in the image they are
+            chosen = torch.tensor([[140, 146]])
+            yaws = network.later(1, state, chosen)
+            shifted_yaws = network.later(1, shifted_state, chosen + torch.tensor([16, -16]))
+            assert_equal(shifted_yaws, yaws)
         half_stride = network.first(pixels.roll(3, dims=-1), in_hand, holding)[0]
     assert (half_stride - values.roll(3, dims=-1)).abs().max() > 1e-3 * values.abs().max()

@@ -192,6 +192,29 @@ def test_a_batch_of_one_primitive_only_learns(name, primitive):
     assert len(some) > 10
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_narrow_networks_are_born_with_values_above_their_bias(seed):
+    """Else many pixels tie at the greatest value, and only the bias could ever raise it."""
+    torch.manual_seed(seed)
+    spec = SpatialSpec(32, 24, 1, XY)
+    network = NETWORKS["equi_fcn"](width=0.125, precision="float32").build(spec)
+    pixels, in_hand, _, _ = batch(n=2)
+    for holding in (False, True):
+        with torch.no_grad():
+            values, _ = network.first(pixels, in_hand, torch.full((2, 1), holding))
+        best, second = values.flatten(1).topk(2).values.unbind(1)
+        assert (best > second).all()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_narrow_networks_are_born_with_yaws_that_differ(seed):
+    """Else everything is zero before the last layer, and stays so for want of a gradient."""
+    torch.manual_seed(seed)
+    network = NETWORKS["equi_asr"](width=0.125, num_rotations=4, precision="float32")
+    _, yaws = values_of(network.build(SpatialSpec(32, 24, 1, XYR)), *batch())
+    assert (yaws.std(dim=1) > 1e-3 * yaws.abs().max()).all()
+
+
 @pytest.mark.parametrize("name", ["asr", "equi_asr"])
 def test_the_second_level_trains_the_first_ones_encoder(name):
     network = build(name)
@@ -244,8 +267,8 @@ def test_bfloat16_values_keep_differences_below_its_grain():
                 bias.add_(1.5)
         (values,) = values_of(network, *batch())
         one_to_two = values[(values > 1) & (values < 2)]
-        assert one_to_two.numel() > 2000
-        assert one_to_two.unique().numel() > 1000
+        assert one_to_two.numel() > 500
+        assert one_to_two.unique().numel() > 0.5 * one_to_two.numel()
 
 
 @pytest.mark.parametrize("name", NAMES)
