@@ -268,7 +268,7 @@ def test_bfloat16_values_keep_differences_below_its_grain():
         (values,) = values_of(network, *batch())
         one_to_two = values[(values > 1) & (values < 2)]
         assert one_to_two.numel() > 500
-        assert one_to_two.unique().numel() > 0.5 * one_to_two.numel()
+        assert one_to_two.unique().numel() > 500
 
 
 @pytest.mark.parametrize("name", NAMES)
