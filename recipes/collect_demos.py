@@ -9,14 +9,13 @@ from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.config import ConfigError
 from ba_torchrl.data.deconstruction import replay_scores
 from ba_torchrl.data.demos import collect_demonstrations, save_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
-from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.record.logging import progress_bar, quiet_libraries
 from ba_torchrl.training import hydra_schema
 
 hydra_schema.register()
@@ -36,7 +35,7 @@ def main(settings: DictConfig) -> None:
         **{**env_settings, "seed": settings.seed, **source_config(settings.source)},
     )
     try:
-        with tqdm(total=settings.episodes, unit="episode") as bar:
+        with progress_bar(total=settings.episodes, unit="episode") as bar:
             episodes = collect_demonstrations(
                 env,
                 settings.episodes,

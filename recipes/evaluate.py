@@ -9,10 +9,9 @@ tune_malloc()  # before torch allocates anything
 
 import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
-from tqdm import tqdm  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
-from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
+from ba_torchrl.record.logging import progress_bar, quiet_libraries  # noqa: E402
 from ba_torchrl.record.video import write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import load  # noqa: E402
 from ba_torchrl.training.config import SeedUse  # noqa: E402
@@ -32,7 +31,7 @@ def main(settings: DictConfig) -> None:
         config.task, settings.num_envs, parallel=settings.parallel, **{**config.env, "seed": seed}
     )
     try:
-        with tqdm(total=settings.episodes, unit="episode") as bar:
+        with progress_bar(total=settings.episodes, unit="episode") as bar:
             evaluation = evaluate(env, policy, settings.episodes, seed, lambda _: bar.update())
     finally:
         env.close()

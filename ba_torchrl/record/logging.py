@@ -5,16 +5,19 @@ from __future__ import annotations
 import csv
 import importlib.util
 import logging
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from torchrl.record.loggers import Logger, get_logger
+from tqdm import tqdm
 
 Backend = Literal["csv", "tensorboard", "wandb"]
 
 SCALARS_FILE = "scalars.csv"
+FILE_INTERVAL_S = 10.0
 _COLUMNS = ("step", "name", "value")
 
 
@@ -66,6 +69,15 @@ def quiet_libraries() -> None:
     """Keep the libraries' notes out of a recipe's output; warnings and errors stay."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
+
+
+def progress_bar(**settings: Any) -> tqdm:
+    """Return a progress bar; into a file it writes now and then only.
+
+    Args:
+        settings: of ``tqdm``.
+    """
+    return tqdm(mininterval=0.1 if sys.stderr.isatty() else FILE_INTERVAL_S, **settings)
 
 
 class ScalarLog:

@@ -12,7 +12,6 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.config import ConfigError
@@ -24,7 +23,7 @@ from ba_torchrl.data.demos import (
 )
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
-from ba_torchrl.record.logging import ScalarLog
+from ba_torchrl.record.logging import ScalarLog, progress_bar
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
     CurvePoint,
@@ -88,7 +87,7 @@ class Experiment:
             config.folder, self.algorithm, self._progress, config.torch_device
         )
         self._started = time.perf_counter()
-        self._bar = tqdm(total=config.total_updates, disable=not progress, unit="update")
+        self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 
     def run(self) -> Result:
         """Train, evaluate, and write curve, video and checkpoint into the run folder."""

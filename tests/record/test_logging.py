@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from ba_torchrl.record import logging as record_logging
-from ba_torchrl.record.logging import ScalarLog, make_logger, read_scalars
+from ba_torchrl.record.logging import ScalarLog, make_logger, progress_bar, read_scalars
 
 
 class FakeLogger:
@@ -122,3 +122,12 @@ class TestReadScalars:
     def test_a_run_without_scalars(self, tmp_path):
         ScalarLog(tmp_path).close()
         assert read_scalars(tmp_path) == {}
+
+
+def test_a_progress_bar_in_a_file_writes_now_and_then_only(capsys):
+    with progress_bar(total=1000, unit="step") as bar:
+        for _ in range(1000):
+            bar.update()
+    written = capsys.readouterr().err
+    assert "1000/1000" in written
+    assert written.count("\r") < 5
