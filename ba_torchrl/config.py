@@ -172,9 +172,12 @@ class EnvConfig(StrictModel):
         if value is None:
             return None
         try:  # lists and arrays, as configuration files and the paper write them
-            return tuple(tuple(float(x) for x in pair) for pair in value)
+            pairs = tuple(tuple(float(x) for x in pair) for pair in value)
         except TypeError:
-            raise ValueError("must be three (low, high) pairs for x, y and z") from None
+            pairs = ()
+        if [len(pair) for pair in pairs] != [2, 2, 2]:
+            raise ValueError("must be three (low, high) pairs for x, y and z")
+        return pairs
 
     @field_validator("object_scale_range", mode="before")
     @classmethod

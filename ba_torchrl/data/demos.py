@@ -152,10 +152,13 @@ def save_demonstrations(
 
     Raises:
         ValueError: there are no episodes.
+        FileExistsError: the folder holds demonstrations.
     """
     if not episodes:
         raise ValueError("there are no episodes to save")
     path = Path(path)
+    if (path / _METADATA_FILE).exists():
+        raise FileExistsError(f"{path} holds demonstrations; choose another folder")
     numbered = [
         episode.copy().set(_EPISODE, torch.full((len(episode), 1), number))
         for number, episode in enumerate(episodes)
@@ -212,7 +215,10 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
         metadata = json.loads((path / _METADATA_FILE).read_text())
     except (OSError, json.JSONDecodeError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
-    found = {"task": metadata["task"], **metadata["env"]}
+    if not {"task", "env"} <= metadata.keys():
+        raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
+    # Fields that came into being since had no other value than their default.
+    found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
     wanted = {"task": task, **_env_values(task, env)}
     differences = [
         f"{name}: collected with {found.get(name)!r}, needed {wanted.get(name)!r}"

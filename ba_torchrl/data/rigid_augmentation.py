@@ -72,7 +72,7 @@ def reverse_in_hand(images: Tensor, axes: str) -> Tensor:
 
     Args:
         images: [B, C, h, w], C = 1 for heights, 3 for projections.
-        axes: of "x", along which the fingers close, "y" and "z".
+        axes: "x", along which the fingers close, "y" across, or both.
     """
     channels = []
     for channel, names in zip(images.unbind(1), _IN_HAND_AXES[images.shape[1]], strict=True):

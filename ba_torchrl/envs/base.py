@@ -80,7 +80,8 @@ class ManipulationEnv(EnvBase):
         self.workspace = (
             self.task_class.workspace if config.workspace is None else Workspace(*config.workspace)
         )
-        self.max_steps = self.task_class.max_steps if config.max_steps is None else config.max_steps
+        num_objects = config.num_objects or self.task_class.num_objects
+        self.max_steps = config.max_steps or self.task_class.step_limit(num_objects)
         self.action_sequence = (
             self.default_action_sequence
             if config.action_sequence is None

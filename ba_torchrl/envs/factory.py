@@ -37,7 +37,7 @@ def resolve(task: str, **config: Any) -> EnvConfig:
         "half_rotation": control.default_half_rotation,
         "workspace": (box.x, box.y, box.z),
         "object_scale_range": task_class.scale_range,
-        "max_steps": task_class.max_steps,
+        "max_steps": task_class.step_limit(settings.num_objects or task_class.num_objects),
         "num_objects": task_class.num_objects,
     }
     missing = {name: value for name, value in defaults.items() if getattr(settings, name) is None}

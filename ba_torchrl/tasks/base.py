@@ -141,6 +141,15 @@ class Task(ABC):
         self.world: World
         self.robot: Robot
 
+    @classmethod
+    def step_limit(cls, num_objects: int) -> int:
+        """Return the steps after which an episode is truncated by default.
+
+        Args:
+            num_objects: how many objects there are.
+        """
+        return cls.max_steps
+
     @abstractmethod
     def build(self, world: World) -> None:
         """Load the task's bodies into the world."""

@@ -134,7 +134,7 @@ class ClutterTask(Task):
     """A task whose episodes each take something out of a heap, and go on with what is left.
 
     New objects fall in once the tray is empty, an object left the workspace, or three episodes in a
-    row came to nothing.
+    row came to nothing, such as those that are reset before they end.
     """
 
     is_chaotic = True

@@ -38,7 +38,7 @@ class Pool:
         """Put all bodies aside."""
         self.present = []
         for i, body in enumerate(self.bodies):
-            _park(body, i)
+            park(body, i)
 
     def bring(self, body: Body) -> None:
         """Take a body into the scene; the caller gives it its pose."""
@@ -48,7 +48,7 @@ class Pool:
     def put_aside(self, body: Body) -> None:
         """Take a body out of the scene."""
         self.present.remove(body)
-        _park(body, self.bodies.index(body))
+        park(body, self.bodies.index(body))
 
     def get_state(self) -> tuple[int, ...]:
         """Return which bodies are in the scene."""
@@ -59,7 +59,13 @@ class Pool:
         self.present = [self.bodies[i] for i in state]
 
 
-def _park(body: Body, place: int) -> None:
+def park(body: Body, place: int) -> None:
+    """Put a body out of the way; see `Pool`.
+
+    Args:
+        body: gets hidden, too.
+        place: number of its column, of which each body has its own.
+    """
     row, column = divmod(place, COLUMNS)
     body.place((ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row, ASIDE_Z_M))
     body.is_hidden = True

@@ -74,3 +74,26 @@ def test_another_configuration_is_refused_by_name(collected, tmp_path):
         load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "in_hand_mode": "proj"})
     with pytest.raises(ConfigError, match="num_objects: collected with 2, needed 3"):
         load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "num_objects": 3})
+
+
+def test_a_field_that_came_into_being_later_counts_as_its_default(collected, tmp_path):
+    _, episodes = collected
+    save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=0)
+    file = tmp_path / "demonstrations.json"
+    metadata = json.loads(file.read_text())
+    assert metadata["env"].pop("object_type") == "cube"
+    file.write_text(json.dumps(metadata))
+    assert len(load_demonstrations(tmp_path, task=TASK, env=ENV)) == len(episodes)
+    with pytest.raises(ConfigError, match="object_type: collected with 'cube', needed 'cylinder'"):
+        load_demonstrations(tmp_path, task=TASK, env={**ENV, "object_type": "cylinder"})
+    del metadata["task"]
+    file.write_text(json.dumps(metadata))
+    with pytest.raises(ConfigError, match="does not say what was collected"):
+        load_demonstrations(tmp_path, task=TASK, env=ENV)
+
+
+def test_demonstrations_are_not_overwritten(collected, tmp_path):
+    _, episodes = collected
+    save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=0)
+    with pytest.raises(FileExistsError, match="choose another folder"):
+        save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=1)

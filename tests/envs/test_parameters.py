@@ -170,6 +170,43 @@ def test_workspace_check_looks_at_centres_or_outlines(make):
         assert env.scene.task.is_valid() == valid
 
 
+def test_workspace_check_holds_for_open_loop_tasks_too(make):
+    for check, valid in (("point", True), ("bounding_box", False)):
+        env = make("open_loop/block_stacking", workspace_check=check)
+        env.reset()
+        edge_m = env.workspace.x[1]
+        env.scene.task.objects[0].place((edge_m - 5e-3, 0.0, 0.015))
+        assert env.scene.task.is_valid() == valid
+
+
+def test_top_down_approach_is_the_pick_and_places(make):
+    for top_down in (False, True):
+        env = make("open_loop/block_stacking", top_down_approach=top_down)
+        env.reset()
+        assert env.scene.motion.top_down is top_down
+
+
+def test_in_hand_images_have_the_size_that_is_asked_for(make):
+    env = make("open_loop/block_stacking", in_hand_size=40, obs_size=64, expert=True)
+    state = env.reset()
+    assert state["in_hand"].shape == (1, 40, 40)
+    state = env.step(state.set("action", state["expert_action"]))["next"]
+    # a cube of 3 cm in the middle of an image of 40 pixels of 6.25 mm
+    image = state["in_hand"][0]
+    assert image[19:21, 19:21].min() == pytest.approx(0.03, abs=2e-3)
+    assert 12 <= (image > 0.02).sum() <= 100
+
+
+def test_blocks_get_the_steps_that_they_need(make):
+    for count, limit in ((4, 10), (6, 10), (7, 12), (8, 14)):
+        assert make("open_loop/block_stacking", num_objects=count).max_steps == limit
+    env = make("open_loop/block_stacking", num_objects=7, expert=True)
+    state = env.reset(seed=0)
+    while not state["done"]:
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+    assert state["success"]
+
+
 def test_close_loop_tray_raises_the_objects_and_shows(make):
     env, plain = make(close_loop_tray=True, obs_size=64), make(obs_size=64)
     depths = env.reset()[keys.PIXELS], plain.reset()[keys.PIXELS]

@@ -25,7 +25,7 @@ PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-
 class Table:
     """A robot with blocks, and static things beside them."""
 
-    def __init__(self, count, *, static=(), teleport=True, robot="kuka"):
+    def __init__(self, count, *, static=(), teleport=True, robot="kuka", top_down=False):
         self.world = World(PHYSICS)
         self.robot = ROBOTS[robot](self.world)
         self.blocks = [self.world.add(Box(size_m=(B, B, B)), f"cube {i}") for i in range(count)]
@@ -38,7 +38,7 @@ class Table:
         for i, block in enumerate(self.blocks):
             block.place((0.38 + 0.14 * (i // 2), -0.07 + 0.14 * (i % 2), B / 2))
         self.world.seal()
-        self.hand = PickPlace(self.robot, teleport=teleport)
+        self.hand = PickPlace(self.robot, teleport=teleport, top_down=top_down)
         self.hand.reset()
         self.world.settle()
 
@@ -112,6 +112,28 @@ def test_a_tilted_block_is_picked_along_its_normal(table, tilt_rad):
     assert block.tilt_rad == pytest.approx(abs(tilt_rad), abs=0.02)  # friction holds it there
     assert t.pick(*block.position, 0.0, 0.0, tilt_rad) is block
     assert block.position[2] > HOME_Z_M
+
+
+@pytest.mark.parametrize("top_down", [False, True])
+def test_a_tilted_pick_comes_along_its_axis_or_from_straight_above(table, top_down):
+    t = table(1, top_down=top_down)
+    block, ways = t.blocks[0], []
+    solve = t.robot.inverse_kinematics
+
+    def remember(position, *others):
+        ways.append(position)
+        return solve(position, *others)
+
+    t.robot.inverse_kinematics = remember
+    x, y, z = block.position
+    assert t.pick(x, y, z, 0.0, 0.0, 0.35) is block
+    way = np.array([point for point in ways if math.dist(point[:2], (x, y)) < 0.1])
+    aside = np.linalg.norm(way[:, :2] - (x, y), axis=1)
+    assert np.ptp(way[:, 2]) > 0.05
+    if top_down:
+        assert aside.max() < 2e-3
+    else:  # along the tool's axis
+        np.testing.assert_allclose(aside, math.tan(0.35) * (way[:, 2] - z), atol=4e-3)
 
 
 def test_out_of_reach_the_block_stays_in_the_gripper(table):

@@ -26,6 +26,11 @@ class BlockStacking(StructureTask):
     num_objects_range = (2, 8)
     makes_room = True
 
+    @classmethod
+    def step_limit(cls, num_objects: int) -> int:
+        """Return 10, or what the least number of picks and places takes if that is more."""
+        return max(cls.max_steps, 2 * (num_objects - 1))
+
     def blueprint(self) -> Blueprint:
         """Return the stack."""
         return tower(*(part.piece for part in self.parts()))

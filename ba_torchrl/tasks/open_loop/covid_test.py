@@ -15,6 +15,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, PlacementError
 from ba_torchrl.tasks.experts import RELEASE_GAP_M, finger_room
 from ba_torchrl.tasks.open_loop.base import OpenLoopTask
+from ba_torchrl.tasks.pool import park
 
 PURPLE: Color = (0.6, 0.45, 0.78, 1.0)
 GRAY: Color = (0.6, 0.6, 0.6, 1.0)
@@ -42,9 +43,6 @@ SPOT_ATTEMPTS = 50
 APART_M = 3e-3
 """Gap between a tube that a test was made with and all else."""
 REST_STEPS = 20
-ASIDE_M = (5.0, 0.0, 1e6)
-ASIDE_SPACING_M = 0.3
-"""Used swabs fall freely, from a height that takes days, each in its own column: see `Clutter`."""
 
 
 class Area(NamedTuple):
@@ -238,9 +236,7 @@ class CovidTest(OpenLoopTask):
 
     def _test(self, tube: Body, swab: Body) -> None:
         """Put the swab into the tube: it is gone, and the tube lies anywhere in the test area."""
-        x, y, z = ASIDE_M
-        swab.place((x + ASIDE_SPACING_M * self.swabs.index(swab), y, z))
-        swab.is_hidden = True
+        park(swab, self.swabs.index(swab))
         self._spent.append(swab)
         self._used.append(tube)
         # keyed on the round: what happened before has no part in it
