@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")
 _MANY_POINTS = 25
+LEAST_WIDTH_IN = 5.0
+"""Of a picture: the legend needs it, too."""
 
 
 def plot_learning_curve(
@@ -102,7 +104,10 @@ def plot_panels(
     columns = columns or min((5, 4, 3), key=lambda n: -len(panels) % n)
     columns = min(columns, len(panels))
     rows = math.ceil(len(panels) / columns)
-    figure = _figure((3.1 * columns + 0.6, 2.6 * rows + 0.6 + 0.25 * math.ceil(len(names) / 4)))
+    width_in = max(3.1 * columns + 0.6, LEAST_WIDTH_IN)
+    entry_in = 0.6 + 0.09 * max(map(len, names), default=0)
+    entries = max(int(width_in / entry_in), 1)  # of a row of the legend
+    figure = _figure((width_in, 2.6 * rows + 0.6 + 0.25 * math.ceil(len(names) / entries)))
     grid = figure.subplots(rows, columns, squeeze=False, sharey=ylim is not None)
     shown: dict[str, Line2D] = {}
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
@@ -121,7 +126,7 @@ def plot_panels(
         [shown[name] for name in labels],
         labels,
         loc="outside lower center",
-        ncols=min(4, max(len(labels), 1)),
+        ncols=min(entries, max(len(labels), 1)),
         frameon=False,
     )
     return _save(figure, path)

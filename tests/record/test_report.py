@@ -318,3 +318,14 @@ def test_the_recipe_takes_folders_as_they_are(tmp_path):
         "table.csv",
         "table.md",
     }
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_long_legends_stay_within_the_picture(tmp_path, count):
+    names = [f"an algorithm on its network {i}" for i in range(count)]
+    x = np.arange(5)
+    path = plot_panels({"task": dict.fromkeys(names, (x, x / 5))}, tmp_path / "p.png", names=names)
+    picture = imageio.imread(path)[..., :3] / 255
+    assert (picture[:, :2] > 0.99).all()
+    assert (picture[:, -2:] > 0.99).all()
+    assert (picture[-2:] > 0.99).all()
