@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, Vector, world_vertices
+from ba_torchrl.sim.bodies import Body, Vector
 from ba_torchrl.sim.robots.gripper import Gripper
-from ba_torchrl.tasks.room import reach_m
+from ba_torchrl.tasks.room import reach_m, room_on_ways
 from ba_torchrl.tasks.structures import Piece
 
 SPARE_M = 2e-3
@@ -95,19 +95,7 @@ def finger_way_room(
         others: bodies that may be in the way.
         at: where the body is, if not where it is now.
     """
-    ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
-    below_m = -min(z for _, z in gripper.arc)
-    bx, by, bz = body.position if at is None else at
-    gap = math.inf
-    for other in others:
-        corners = world_vertices(other)
-        if corners[:, 2].max() < bz - below_m:
-            continue
-        px, py = corners[:, 0] - bx, corners[:, 1] - by
-        along, across = px * ux + py * uy, py * ux - px * uy
-        aside = max(across.min(), -across.max()) - gripper.half_width_m
-        gap = min(gap, max(along.min() - way_m[1], way_m[0] - along.max(), aside))
-    return float(gap)
+    return room_on_ways(gripper, body, yaw_rad, (way_m,), others, at)
 
 
 class Access:

@@ -11,9 +11,10 @@ import math
 from collections.abc import Sequence
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Vector, radius_m, vertical_extent, world_vertices
+from ba_torchrl.sim.bodies import Body, Vector, radius_m, vertical_extent
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.base import Reach, Workspace
+from ba_torchrl.tasks.room import room_on_ways
 
 OPEN, CLOSED = 1.0, 0.0
 ALIGNED_M = 4e-3
@@ -349,28 +350,8 @@ def finger_room(
         at: where the body is, if not where it is now.
     """
     apart = HALF_FINGER_DEPTH_M + opening * (robot.finger_span_m / 2 - HALF_FINGER_DEPTH_M)
-    half_width, below_m = robot.gripper.half_width_m, -min(z for _, z in robot.gripper.arc)
-    bx, by, bz = body.position if at is None else at
-    ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
-    gap = math.inf
-    for other in others:
-        corners = world_vertices(other)
-        if corners[:, 2].max() < bz - below_m:
-            continue
-        px, py = corners[:, 0] - bx, corners[:, 1] - by
-        along, across = px * ux + py * uy, py * ux - px * uy
-        for side in (-1.0, 1.0):
-            center = side * apart
-            gap = min(
-                gap,
-                max(
-                    along.min() - center - HALF_FINGER_DEPTH_M,
-                    center - HALF_FINGER_DEPTH_M - along.max(),
-                    across.min() - half_width,
-                    -half_width - across.max(),
-                ),
-            )
-    return float(gap)
+    ways_m = [(x - HALF_FINGER_DEPTH_M, x + HALF_FINGER_DEPTH_M) for x in (-apart, apart)]
+    return room_on_ways(robot.gripper, body, yaw_rad, ways_m, others, at)
 
 
 def _height_needed(

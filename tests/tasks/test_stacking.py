@@ -346,12 +346,8 @@ def test_cylinders_have_no_meaning_elsewhere(task):
         ba_torchrl.make(task, object_type="cylinder")
 
 
-def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
-    env = make(OPEN_STACKING, expert=True, max_steps=20)
-    cubes = env.scene.task.objects
-    for level, cube in enumerate(cubes[:3]):
-        cube.place((0.394, 0.046, (level + 0.5) * 0.03), 1.2)
-    cubes[3].place((0.362, 0.055, 0.015), 1.228)
+def let_expert_go_on(env):
+    """The last outcome and the steps until the episode ends, from the scene as it was arranged."""
     env.scene.world.settle()
     env.scene.world.step(2)
     done, steps = False, 0
@@ -359,6 +355,16 @@ def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
         action = torch.from_numpy(env._expert_action(env.scene))
         outcome = env._step(env.full_action_spec.zero().set("action", action))
         done, steps = bool(outcome["done"]), steps + 1
+    return outcome, steps
+
+
+def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
+    env = make(OPEN_STACKING, expert=True, max_steps=20)
+    cubes = env.scene.task.objects
+    for level, cube in enumerate(cubes[:3]):
+        cube.place((0.394, 0.046, (level + 0.5) * 0.03), 1.2)
+    cubes[3].place((0.362, 0.055, 0.015), 1.228)
+    outcome, steps = let_expert_go_on(env)
     assert outcome["success"]
     assert steps <= 12
 
@@ -373,12 +379,6 @@ def test_expert_that_cannot_turn_takes_cubes_that_stand_side_by_side(make, robot
     env = make(OPEN_STACKING, expert=True, max_steps=30, robot=robot, num_objects=3, **fixed)
     for i, cube in enumerate(env.scene.task.objects):
         cube.place((0.42 + i * (0.03 + gap_m), 0.02, 0.015))
-    env.scene.world.settle()
-    env.scene.world.step(2)
-    done, steps = False, 0
-    while not done:
-        action = torch.from_numpy(env._expert_action(env.scene))
-        outcome = env._step(env.full_action_spec.zero().set("action", action))
-        done, steps = bool(outcome["done"]), steps + 1
+    outcome, steps = let_expert_go_on(env)
     assert outcome["success"]
     assert steps <= 20
