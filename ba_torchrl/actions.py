@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 
 
 class GripperCommand(NamedTuple):
@@ -42,10 +42,6 @@ class PickPlaceCommand(NamedTuple):
 
 
 PICK, PLACE = 0, 1
-
-
-class InvalidActionError(ValueError):
-    """An action of the wrong shape, or one that is not finite."""
 
 
 def wrap_angle(angle_rad: float, period_rad: float = 2 * math.pi) -> float:

@@ -10,11 +10,9 @@ from typing import Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from ba_torchrl.errors import ConfigError
+
 Interval = tuple[float, float]
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message says what is allowed."""
 
 
 def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigError:
@@ -94,7 +92,7 @@ class EnvConfig(StrictModel):
     in_hand_size: int = Field(default=24, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
     """Open loop: pixels along each side of the image of what is held."""
     in_hand_mode: str = Field(default="raw", json_schema_extra=_OPEN_LOOP)
-    """Open loop: what that image shows: "raw", "sub" or "proj"; see `ba_torchrl.sim.in_hand`."""
+    """Open loop: what that image shows: "raw", "sub" or "proj"; `ba_torchrl.sim.vision.in_hand`."""
     top_down_approach: bool = Field(default=False, json_schema_extra=_OPEN_LOOP)
     """Open loop: come from straight above even where the gripper is tilted."""
     fast_mode: bool = True
@@ -111,7 +109,7 @@ class EnvConfig(StrictModel):
     close_loop_tray: bool = Field(default=False, json_schema_extra=_CLOSE_LOOP)
     """Close loop: the objects lie in a tray as in Object Grasping."""
     view_type: str = Field(default="camera_center_xyz", json_schema_extra=_CLOSE_LOOP)
-    """Close loop: from where the depth image is taken; see `ba_torchrl.sim.views`."""
+    """Close loop: from where the depth image is taken; see `ba_torchrl.sim.vision.views`."""
     view_scale: float = Field(default=1.5, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
     """Close loop: width of the image as a multiple of the workspace's width."""
     dpos: float = Field(default=0.05, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
@@ -134,7 +132,7 @@ class EnvConfig(StrictModel):
     """Some tasks: folder of a set of objects that does not ship with the package."""
     deconstruct: bool = Field(default=False, json_schema_extra=_SOME_TASKS)
     """Some tasks: start with the structure standing and take it apart; every observation says how
-    to undo the last action. See `ba_torchrl.data.deconstruction`."""
+    to undo the last action. See `ba_torchrl.data.time_reversal`."""
     floor_color: Rgb | None = None
     """Colour of the floor in pictures, each component from 0 to 1; light by default, and in
     PyBullet's window and `rgb` a chequered blue."""

@@ -8,16 +8,9 @@ import pkgutil
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import UnknownNameError
 
 T = TypeVar("T")
-
-
-class UnknownNameError(ConfigError, KeyError):
-    """A name that a registry does not hold; the message lists those it holds."""
-
-    def __str__(self) -> str:
-        return str(self.args[0])
 
 
 class Registry(Generic[T]):

@@ -16,8 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 from ba_torchrl.config import parse
 from ba_torchrl.record.logging import quiet_libraries
 from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.benchmark import BenchmarkConfig, plan, status
-from ba_torchrl.training.jobs import run_all
+from ba_torchrl.training.grid.jobs import run_all
+from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 
 hydra_schema.register()
 

@@ -11,10 +11,10 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.config import ConfigError
-from ba_torchrl.data.deconstruction import replay_scores
 from ba_torchrl.data.demos import collect_demonstrations, save_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
+from ba_torchrl.data.time_reversal import replay_scores
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar, quiet_libraries
 from ba_torchrl.training import hydra_schema
 

@@ -15,7 +15,7 @@ from ba_torchrl.record.logging import progress_bar, quiet_libraries  # noqa: E40
 from ba_torchrl.record.video import write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import load  # noqa: E402
 from ba_torchrl.training.config import SeedUse  # noqa: E402
-from ba_torchrl.training.evaluation import acting_on, evaluate, film  # noqa: E402
+from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="evaluate", version_base="1.3")
@@ -41,7 +41,7 @@ def main(settings: DictConfig) -> None:
         f"of {config.task}, {evaluation.mean_length:.1f} steps each"
     )
     if settings.video is not None:
-        frames = film(config.task, config.env, policy, settings.video_episodes, seed)
+        frames = record_episodes(config.task, config.env, policy, settings.video_episodes, seed)
         print(f"  video  {write_video(settings.video, frames, fps=5)}")
 
 

@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
-from ba_torchrl.config import ConfigError
 from ba_torchrl.data.demos import expert_scores
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import quiet_libraries
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema

@@ -9,12 +9,12 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from ba_torchrl.config import ConfigError
 from ba_torchrl.data.demos import expert_policy
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import quiet_libraries
 from ba_torchrl.record.video import write_video
 from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.evaluation import film
+from ba_torchrl.training.evaluation import record_episodes
 
 POLICIES = {"expert": expert_policy, "random": None}
 
@@ -29,7 +29,7 @@ def main(settings: DictConfig) -> None:
         raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
     torch.manual_seed(settings.seed)
     env = OmegaConf.to_container(settings.env, resolve=True)
-    frames = film(
+    frames = record_episodes(
         settings.task,
         {**env, "expert": settings.policy == "expert"},
         POLICIES[settings.policy],

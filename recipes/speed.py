@@ -12,8 +12,8 @@ tune_malloc()  # before torch allocates anything: halves the time of an update o
 import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
+from ba_torchrl.profiling.table import as_markdown, machine, measure  # noqa: E402
 from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
-from ba_torchrl.training.speed.table import as_markdown, machine, measure  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="speed", version_base="1.3")

@@ -12,7 +12,7 @@ from ba_torchrl.actions import (
     PickPlaceCommand,
     wrap_angle,
 )
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 
 
 def test_components_follow_the_sequence_and_are_scaled():

@@ -1,8 +1,9 @@
 import pytest
 
 import ba_torchrl
-from ba_torchrl.config import ConfigError, EnvConfig, parse
-from ba_torchrl.registry import Registry, UnknownNameError
+from ba_torchrl.config import EnvConfig, parse
+from ba_torchrl.errors import ConfigError, UnknownNameError
+from ba_torchrl.registry import Registry
 
 
 def test_unknown_parameter_names_the_nearest_and_all_known():

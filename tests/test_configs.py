@@ -9,7 +9,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from ba_torchrl.algorithms import base as registries
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 

@@ -12,7 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
-from ba_torchrl.config import ConfigError, StrictModel
+from ba_torchrl.config import StrictModel
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.base import NETWORKS, NetworkConfig
 from ba_torchrl.registry import Registry
 

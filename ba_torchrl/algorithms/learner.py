@@ -14,9 +14,9 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from ba_torchrl.algorithms.base import Algorithm, AlgorithmConfig, Problem
-from ba_torchrl.data.replay import FrameReplayBuffer
-from ba_torchrl.data.sampler import ExpertPrioritizedSampler
-from ba_torchrl.data.split import ExpertSplitReplay
+from ba_torchrl.data.replay.buffer import FrameReplayBuffer
+from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.data.replay.symmetric import SymmetricReplay
 from ba_torchrl.envs import keys
 
 
@@ -71,7 +71,7 @@ class Learner(Algorithm):
         policy: TensorDictModuleBase,
         loss: LossModule,
         target_updater: TargetNetUpdater,
-        replay: FrameReplayBuffer | ExpertSplitReplay,
+        replay: FrameReplayBuffer | SymmetricReplay,
         augmentation: nn.Module,
     ) -> None:
         self.config = config

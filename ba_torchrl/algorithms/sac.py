@@ -12,9 +12,9 @@ from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
-from ba_torchrl.data.augmentation import SO2Augmentation
-from ba_torchrl.data.quantization import DepthQuantizer
-from ba_torchrl.data.replay import make_replay_buffer
+from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+from ba_torchrl.data.replay.buffer import make_replay_buffer
+from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
 from ba_torchrl.objectives.sacfd import SACfDLoss

@@ -11,10 +11,10 @@ from torchrl.objectives import HardUpdate
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
-from ba_torchrl.data.quantization import HalfPrecision
-from ba_torchrl.data.replay import FrameReplayBuffer, make_replay_buffer
-from ba_torchrl.data.rigid_augmentation import Motions, RigidAugmentation
-from ba_torchrl.data.split import ExpertSplitReplay
+from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidMotions
+from ba_torchrl.data.replay.buffer import FrameReplayBuffer, make_replay_buffer
+from ba_torchrl.data.replay.codecs import HalfPrecision
+from ba_torchrl.data.replay.symmetric import SymmetricReplay
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial import SpatialSpec
@@ -56,7 +56,7 @@ class SpatialQConfig(LearnerConfig):
     """Updates between copies of the network to its target."""
     replay: Literal["split", "prioritized", "uniform"] = "split"
     """Half of every batch from demonstrations, or by TD error with the experts' bonus, or any."""
-    augmentation: Motions = "none"
+    augmentation: RigidMotions = "none"
     """Rigid motions of sampled transitions: "translation", "cn", "d4" or "se2"."""
     augmentation_order: int = Field(default=16, ge=1)
     """n of "cn"."""
@@ -162,10 +162,10 @@ class SpatialQ(Learner):
 
 def _make_replay(
     config: SpatialQConfig, rounding: HalfPrecision, seed: int
-) -> FrameReplayBuffer | ExpertSplitReplay:
+) -> FrameReplayBuffer | SymmetricReplay:
     codecs = {keys.PIXELS: rounding, keys.IN_HAND: rounding}
     if config.replay == "split":
-        return ExpertSplitReplay(config.buffer_size, config.batch_size, codecs=codecs, seed=seed)
+        return SymmetricReplay(config.buffer_size, config.batch_size, codecs=codecs, seed=seed)
     return make_replay_buffer(
         config.buffer_size,
         config.batch_size,

@@ -15,11 +15,11 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl import __version__
-from ba_torchrl.config import ConfigError
-from ba_torchrl.data.deconstruction import is_reversible, reverse_episode
 from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
+from ba_torchrl.data.time_reversal import is_reversible, reverse_episode
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_vector, resolve
+from ba_torchrl.errors import ConfigError
 
 Source = Literal["expert", "deconstruction"]
 """Where demonstrations come from."""

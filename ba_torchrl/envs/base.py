@@ -14,8 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ba_torchrl.actions import InvalidActionError
-from ba_torchrl.config import ConfigError, EnvConfig
+from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.observations import ExtraObservations
 from ba_torchrl.envs.scene import (
@@ -23,14 +22,15 @@ from ba_torchrl.envs.scene import (
     Scene,
     SceneState,
     build_scene,
-    check_reach,
+    check_action_limits,
     check_task_parameters,
 )
+from ba_torchrl.errors import ConfigError, InvalidActionError, PlacementError, SimulationError
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.pictures import LIGHT_FLOOR, render_rgb
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
-from ba_torchrl.sim.world import Physics, SimulationError
-from ba_torchrl.tasks.base import SCALE_STEP, TASKS, PlacementError, Reach, Task, Workspace
+from ba_torchrl.sim.vision.rgb import LIGHT_FLOOR, render_rgb
+from ba_torchrl.sim.world import Physics
+from ba_torchrl.tasks.base import SCALE_STEP, TASKS, ActionLimits, Task, Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -111,13 +111,13 @@ class ManipulationEnv(EnvBase):
         self.base_seed = 0
         self._set_seed(config.seed)
         self._make_specs()
-        self._try_out()
+        self._check_feasible()
 
     # -- for subclasses ----------------------------------------------------------------------
 
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine in the mode "fast"."""
-    picture_m: ClassVar[tuple[float, float, float]] = (-0.06, 0.2, 1.05)
+    camera_pose: ClassVar[tuple[float, float, float]] = (-0.06, 0.2, 1.05)
     """Of `render`: its middle along x from the workspace's, its height, and how far away it is."""
     default_action_sequence: ClassVar[str]
     """`action_sequence` unless it is given."""
@@ -134,7 +134,7 @@ class ManipulationEnv(EnvBase):
 
     @property
     @abstractmethod
-    def reach(self) -> Reach:
+    def action_limits(self) -> ActionLimits:
         """What one action covers."""
 
     @property
@@ -187,7 +187,7 @@ class ManipulationEnv(EnvBase):
         """Return a picture of the scene for people, [height, width, 3] uint8."""
         x, y = self.workspace.center
         floor = self.config.floor_color or LIGHT_FLOOR
-        aside, z, distance = self.picture_m
+        aside, z, distance = self.camera_pose
         return render_rgb(
             self.scene.world,
             (x + aside, y, z),
@@ -209,11 +209,11 @@ class ManipulationEnv(EnvBase):
             SimulationError: the environment was not reset yet.
         """
         scene = self.scene
-        is_chaotic = self.task_class.is_chaotic
+        needs_fresh_world = self.task_class.needs_fresh_world
         state = EnvState(
             owner=self._identity,
             scale=next(key for key, value in self._scenes.items() if value is scene),
-            scene=scene.get_state(outlives_world=is_chaotic),
+            scene=scene.get_state(outlives_world=needs_fresh_world),
             observation=self._observation,
             memory=self._memory,
             base_seed=self.base_seed,
@@ -221,7 +221,7 @@ class ManipulationEnv(EnvBase):
             step_count=self._step_count,
             ends=self._ends,
         )
-        if is_chaotic:
+        if needs_fresh_world:
             self.set_state(state)
         return state
 
@@ -240,7 +240,7 @@ class ManipulationEnv(EnvBase):
         """
         if state.owner is not self._identity:
             raise SimulationError("the state is of another environment")
-        if self.task_class.is_chaotic:
+        if self.task_class.needs_fresh_world:
             self._drop_scenes()
         scene = self._scene_for(state.scale)
         scene.set_state(state.scene)
@@ -273,7 +273,7 @@ class ManipulationEnv(EnvBase):
         self._episode += 1
         self._step_count = 0
         afresh = self._episode == 1
-        if afresh and self.task_class.is_chaotic:
+        if afresh and self.task_class.needs_fresh_world:
             self._drop_scenes()
         self._scene = self._new_episode(rng, afresh)
         self._observation = self._observe(self._scene)
@@ -289,7 +289,7 @@ class ManipulationEnv(EnvBase):
         try:
             self._act(scene, action)
             scene.task.after_action()
-            success, valid = self._judge(scene)
+            success, valid = self._evaluate(scene)
             self._observation = self._observe(scene)
         except Exception:
             fault = True
@@ -298,7 +298,7 @@ class ManipulationEnv(EnvBase):
             self._consecutive_faults = 0
         terminated = not fault and (success or not valid)
         at_limit = self._step_count >= self.max_steps
-        if at_limit and self.task_class.one_step:
+        if at_limit and self.task_class.terminates_at_limit:
             terminated = not fault
         truncated = fault or (at_limit and not terminated)
         self._ends = {
@@ -336,9 +336,9 @@ class ManipulationEnv(EnvBase):
             {key: flag() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
         )
 
-    def _try_out(self) -> None:
+    def _check_feasible(self) -> None:
         """Fail now, not in a worker, if the objects or the robot do not fit the workspace."""
-        check_reach(
+        check_action_limits(
             self._scene_for(float(self._scales[-1])).robot, self.workspace, self._heights_to_reach
         )
         for scale in {float(self._scales[0]), float(self._scales[-1])}:
@@ -355,7 +355,7 @@ class ManipulationEnv(EnvBase):
                 self.task_id,
                 self.config,
                 workspace=self.workspace,
-                reach=self.reach,
+                limits=self.action_limits,
                 scale=scale,
                 physics=self.physics,
                 make_motion=self._make_motion,
@@ -402,7 +402,7 @@ class ManipulationEnv(EnvBase):
             "another workspace"
         )
 
-    def _judge(self, scene: Scene) -> tuple[bool, bool]:
+    def _evaluate(self, scene: Scene) -> tuple[bool, bool]:
         """Return whether the goal holds, once everything is at rest, and the scene is valid."""
         if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
             raise SimulationError("a body's position is not finite")

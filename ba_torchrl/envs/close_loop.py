@@ -12,10 +12,10 @@ from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
 from ba_torchrl.envs.scene import Scene
-from ba_torchrl.sim.motion import CloseLoopMotion
+from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.sim.views import VIEWS, ViewInput, ViewSetup
-from ba_torchrl.tasks.base import Reach, Task
+from ba_torchrl.sim.vision.views import VIEWS, ViewInput, ViewSetup
+from ba_torchrl.tasks.base import ActionLimits, Task
 
 START_HEIGHT_M = 0.2
 HALF_TURN = (-math.pi / 2, math.pi / 2)
@@ -29,7 +29,7 @@ class CloseLoopEnv(ManipulationEnv):
     An action moves the tool by at most `dpos` along each axis and turns it by at most `drot`,
     then opens or closes the gripper. By default the image is orthographic depth below a camera
     that stays above the tool and does not turn with it, the fingers drawn as squares of zero;
-    `ba_torchrl.sim.views` has others.
+    `ba_torchrl.sim.vision.views` has others.
     """
 
     default_action_sequence = "pxyzr"
@@ -49,13 +49,13 @@ class CloseLoopEnv(ManipulationEnv):
         )
 
     @property
-    def reach(self) -> Reach:
+    def action_limits(self) -> ActionLimits:
         """What one action covers."""
         turn = self.config.drot if self.actions.has_yaw else 0.0
-        return Reach(self.config.dpos, turn, HALF_TURN if self.half_rotation else None)
+        return ActionLimits(self.config.dpos, turn, HALF_TURN if self.half_rotation else None)
 
-    def _make_motion(self, robot: Robot, task: Task) -> CloseLoopMotion:
-        return CloseLoopMotion(robot, teleport=self.config.fast_mode)
+    def _make_motion(self, robot: Robot, task: Task) -> CloseLoopController:
+        return CloseLoopController(robot, teleport=self.config.fast_mode)
 
     @property
     def _heights_to_reach(self) -> tuple[float, ...]:

@@ -9,7 +9,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.config import EnvConfig, parse
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
-from ba_torchrl.envs.vector import make_vector_env
+from ba_torchrl.envs.vector.make import make_vector_env
 from ba_torchrl.tasks.base import TASKS
 
 

@@ -11,10 +11,9 @@ from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
-from ba_torchrl.actions import InvalidActionError
-from ba_torchrl.config import ConfigError
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_env
+from ba_torchrl.errors import ConfigError, InvalidActionError
 
 Observation = dict[str, np.ndarray]
 

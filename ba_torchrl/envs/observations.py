@@ -12,9 +12,10 @@ from torchrl.data import Bounded, TensorSpec, Unbounded
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.scene import Scene
-from ba_torchrl.sim.cameras import oblique_lens, point_cloud, side_lenses
-from ba_torchrl.sim.pictures import RGBD_RANGE_M, render_rgbd
-from ba_torchrl.sim.views import finger_posts
+from ba_torchrl.sim.vision.depth import point_cloud
+from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses
+from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_rgbd
+from ba_torchrl.sim.vision.views import finger_posts
 from ba_torchrl.tasks.base import Workspace
 
 

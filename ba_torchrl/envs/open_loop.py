@@ -10,16 +10,17 @@ import torch
 from torchrl.data import Binary, Bounded, Unbounded
 
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
-from ba_torchrl.config import ConfigError, EnvConfig
+from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, SETTLE_STEPS, ManipulationEnv
 from ba_torchrl.envs.scene import Scene
-from ba_torchrl.sim.in_hand import IN_HAND_MODES, PickView
-from ba_torchrl.sim.pick_place import PickPlace, PickPlaceLimits, tool_rotation
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics
-from ba_torchrl.tasks.base import Reach, Task
-from ba_torchrl.tasks.deconstruction import Watch, watch
+from ba_torchrl.tasks.base import ActionLimits, Task
+from ba_torchrl.tasks.structures.deconstruction import Watch, watch
 
 
 @CONTROLS.register("open_loop")
@@ -38,7 +39,7 @@ class OpenLoopEnv(ManipulationEnv):
 
     default_action_sequence = "pxyr"
     default_half_rotation = True
-    picture_m = (0.0, 0.05, 0.85)
+    camera_pose = (0.0, 0.05, 0.85)
     # half a millimetre of creep in a stack of four, and at rest after three steps
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 
@@ -57,9 +58,9 @@ class OpenLoopEnv(ManipulationEnv):
         )
 
     @property
-    def reach(self) -> Reach:
+    def action_limits(self) -> ActionLimits:
         """What one action covers: everything, but turns only if there is an angle."""
-        return Reach(math.inf, math.pi if "r" in self.action_sequence else 0.0)
+        return ActionLimits(math.inf, math.pi if "r" in self.action_sequence else 0.0)
 
     @property
     def pixel_m(self) -> float:

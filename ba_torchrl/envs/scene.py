@@ -7,21 +7,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from ba_torchrl.config import CUSTOM_PHYSICS, ConfigError, EnvConfig
+from ba_torchrl.config import CUSTOM_PHYSICS, EnvConfig
+from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.sim.bodies import Decal
-from ba_torchrl.sim.cameras import HeightCamera
-from ba_torchrl.sim.robots.base import ROBOTS, Robot, downward
-from ba_torchrl.sim.world import (
-    FINE_PHYSICS,
-    Physics,
-    SavedState,
-    SimulationError,
-    Snapshot,
-    World,
-)
-from ba_torchrl.tasks.base import TASKS, Reach, Task, TaskSettings, Workspace, check_scales
-from ba_torchrl.tasks.deconstruction import Deconstruction
-from ba_torchrl.tasks.tray import add_tray
+from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.vision.depth import HeightCamera
+from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SavedState, Snapshot, World
+from ba_torchrl.tasks.base import TASKS, ActionLimits, Task, TaskSettings, Workspace, check_scales
+from ba_torchrl.tasks.clutter.tray import add_tray
+from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 
 MARK_M = 1e-3
 """Thickness of the coloured sheet that marks the workspace."""
@@ -95,7 +90,7 @@ def build_scene(
     config: EnvConfig,
     *,
     workspace: Workspace,
-    reach: Reach,
+    limits: ActionLimits,
     scale: float,
     physics: Physics,
     make_motion: Callable[[Robot, Task], Motion],
@@ -106,7 +101,7 @@ def build_scene(
         task_id: as listed by `ba_torchrl.list_tasks`.
         config: the environment's parameters.
         workspace: where the task takes place.
-        reach: what one action covers.
+        limits: what one action covers.
         scale: of the objects.
         physics: settings of the engine, unless the parameters say otherwise.
         make_motion: from a robot and a task to what carries out actions.
@@ -125,7 +120,7 @@ def build_scene(
             scale=scale,
             random_orientation=config.random_orientation,
             bounding_box_check=config.workspace_check == "bounding_box",
-            reach=reach,
+            action_limits=limits,
             num_objects=(
                 task_class.num_objects if config.num_objects is None else config.num_objects
             ),
@@ -168,7 +163,7 @@ def check_task_parameters(task_id: str, config: EnvConfig) -> None:
         )
 
 
-def check_reach(robot: Robot, workspace: Workspace, heights_m: Sequence[float]) -> None:
+def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[float]) -> None:
     """Check that a robot reaches above every corner of the workspace.
 
     Raises:

@@ -11,16 +11,16 @@ from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.cnn import initialise_plain
-from ba_torchrl.modules.heights import (
+from ba_torchrl.modules.in_hand_encoders import InHandMap
+from ba_torchrl.modules.patches import centre_fit, patches
+from ba_torchrl.modules.spatial import Level, SpatialQNetwork, SpatialSpec
+from ba_torchrl.modules.spatial_inputs import (
     UNET_STRIDE,
     SpatialImageConfig,
     of_primitive,
     require_unet_size,
     require_yaw,
 )
-from ba_torchrl.modules.in_hand import InHandMap
-from ba_torchrl.modules.patches import centre_fit, patches
-from ba_torchrl.modules.spatial import Level, SpatialQNetwork, SpatialSpec
 from ba_torchrl.modules.trunk import scaled_width
 from ba_torchrl.modules.unet import PlainPixelValues
 

@@ -14,9 +14,9 @@ from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.cnn import initialise_plain
 from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
 from ba_torchrl.modules.equi_unet import EquivariantPixelValues
-from ba_torchrl.modules.heights import SpatialImageConfig, of_primitive
-from ba_torchrl.modules.in_hand import InHandVector
+from ba_torchrl.modules.in_hand_encoders import InHandVector
 from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, of_primitive
 from ba_torchrl.modules.steerable import (
     SteerableConv2d,
     SteerableLinear,

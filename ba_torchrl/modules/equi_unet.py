@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from ba_torchrl.modules.cnn import initialise_plain
 from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
-from ba_torchrl.modules.heights import SpatialImageConfig
-from ba_torchrl.modules.in_hand import InHandVector
+from ba_torchrl.modules.in_hand_encoders import InHandVector
 from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.spatial_inputs import SpatialImageConfig
 from ba_torchrl.modules.steerable import FieldTypes, SteerableConv2d
 from ba_torchrl.modules.trunk import scaled_width
 from ba_torchrl.modules.unet import ResidualBlock, UNet

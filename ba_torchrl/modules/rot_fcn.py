@@ -10,9 +10,9 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.heights import UNET_STRIDE, SpatialImageConfig, require_yaw, yaws_rad
 from ba_torchrl.modules.patches import sample, sampling_grid
 from ba_torchrl.modules.spatial import Level, SpatialQNetwork, SpatialSpec
+from ba_torchrl.modules.spatial_inputs import UNET_STRIDE, SpatialImageConfig, require_yaw, yaws_rad
 from ba_torchrl.modules.unet import PlainPixelValues
 
 

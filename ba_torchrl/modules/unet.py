@@ -9,9 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ba_torchrl.modules.cnn import CastConv2d, initialise_plain
-from ba_torchrl.modules.heights import SpatialImageConfig, of_primitive
-from ba_torchrl.modules.in_hand import InHandMap
+from ba_torchrl.modules.in_hand_encoders import InHandMap
 from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, of_primitive
 from ba_torchrl.modules.trunk import scaled_width
 
 _WIDTHS = (32, 64, 128, 256, 512)

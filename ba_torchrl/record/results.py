@@ -26,7 +26,7 @@ FAILURE_FILE = "failure.json"
 """What a benchmark leaves in the folder of a run that failed: ``reason``, ``when`` and ``log``."""
 PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
 
-CIRCUMSTANCES = frozenset(
+NON_LEARNING_FIELDS = frozenset(
     {
         "run_dir",
         "resume",
@@ -160,7 +160,7 @@ def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def differences(
     first: Mapping[str, Any],
     second: Mapping[str, Any],
-    besides: Collection[str] = CIRCUMSTANCES,
+    besides: Collection[str] = NON_LEARNING_FIELDS,
 ) -> dict[str, tuple[Any, Any]]:
     """Return the settings in which two runs' configurations differ, and both values.
 

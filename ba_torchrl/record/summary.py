@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import bootstrap
 
 from ba_torchrl.record.results import (
-    CIRCUMSTANCES,
+    NON_LEARNING_FIELDS,
     RunResult,
     differences,
     read_result,
@@ -255,7 +255,7 @@ def _grouped(runs: Sequence[Run]) -> list[Group]:
 
 
 def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
-    return differences(first.result.config, second.result.config, {*CIRCUMSTANCES, "seed"})
+    return differences(first.result.config, second.result.config, {*NON_LEARNING_FIELDS, "seed"})
 
 
 def _distinction(run: Run, others: Sequence[Run]) -> str:

@@ -7,15 +7,8 @@ from dataclasses import dataclass, replace
 
 import pybullet
 
-from ba_torchrl.sim.bodies import (
-    CONTACT_M,
-    Body,
-    Quaternion,
-    Shape,
-    Solid,
-    Vector,
-    yaw_quaternion,
-)
+from ba_torchrl.sim.bodies import CONTACT_M, Body, Shape, Solid
+from ba_torchrl.sim.geometry import Quaternion, Vector, yaw_quaternion
 
 _NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 _ORIGIN: Vector = (0.0, 0.0, 0.0)

@@ -13,21 +13,13 @@ from typing import ClassVar
 import numpy as np
 import pybullet
 
+from ba_torchrl.sim.geometry import IDENTITY, Quaternion, Vector, quaternion_yaw, yaw_quaternion
 from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, write_obj
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 Color = tuple[float, float, float, float]
-
-_NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 CONTACT_M = 5e-4
 """Bodies closer than this touch; PyBullet already lists pairs that are millimetres apart."""
-
-
-def yaw_quaternion(yaw_rad: float) -> Quaternion:
-    """Return the quaternion (x, y, z, w) of a turn about z."""
-    return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,7 +222,7 @@ class Body:
         return (
             pose
             if self._from_center is None
-            else pybullet.multiplyTransforms(*pose, self._from_center, _NO_TURN)
+            else pybullet.multiplyTransforms(*pose, self._from_center, IDENTITY)
         )
 
     @property
@@ -241,8 +233,7 @@ class Body:
     @property
     def yaw_rad(self) -> float:
         """Heading of the body's x axis in the plane."""
-        x, y, z, w = self.pose[1]
-        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return quaternion_yaw(self.pose[1])
 
     @property
     def tilt_rad(self) -> float:
@@ -258,7 +249,7 @@ class Body:
         """Put the body at rest at any pose."""
         if self._from_center is not None:
             position, orientation = pybullet.multiplyTransforms(
-                position, orientation, self.shape.center_of_mass_m, _NO_TURN
+                position, orientation, self.shape.center_of_mass_m, IDENTITY
             )
         pybullet.resetBasePositionAndOrientation(
             self.id, position, orientation, physicsClientId=self.client

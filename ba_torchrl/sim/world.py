@@ -13,12 +13,9 @@ from typing import Self
 import pybullet
 import pybullet_data
 
+from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.articulated import Articulated, Part, Rail
 from ba_torchrl.sim.bodies import Body, Color, Shape
-
-
-class SimulationError(RuntimeError):
-    """The simulation is in a state it must never reach."""
 
 
 @dataclass(frozen=True)

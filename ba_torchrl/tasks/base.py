@@ -11,10 +11,11 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, PickPlaceCommand
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError, PlacementError
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import Body, Vector
-from ba_torchrl.sim.robots.base import Pose, Robot
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import Vector, YawPose
+from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
 
 TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks")
@@ -36,10 +37,6 @@ class Spot(NamedTuple):
     """Twice the distance that its centre keeps from the border."""
     distance_m: float
     """Distance that its centre keeps from those placed before it."""
-
-
-class PlacementError(RuntimeError):
-    """No free place was found for the objects; the workspace is too small for them."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ class Workspace:
 
 
 @dataclass(frozen=True)
-class Reach:
+class ActionLimits:
     """What one action covers: experts plan their approach by it."""
 
     step_m: float
@@ -94,7 +91,7 @@ class TaskSettings:
     scale: float
     random_orientation: bool
     bounding_box_check: bool
-    reach: Reach
+    action_limits: ActionLimits
     num_objects: int
     surface_z_m: float = 0.0
     """Height of what the objects stand on."""
@@ -126,11 +123,11 @@ class Task(ABC):
     """How many there may be."""
     num_objects_step: ClassVar[int] = 1
     """They come in the least number and this many more, again and again."""
-    one_step: ClassVar[bool] = False
+    terminates_at_limit: ClassVar[bool] = False
     """Whether the step limit is the task: reaching it terminates the episode."""
     fits_tray: ClassVar[bool] = False
     """Whether everything has room in the tray of `close_loop_tray`."""
-    is_chaotic: ClassVar[bool] = False
+    needs_fresh_world: ClassVar[bool] = False
     """Whether so much collides that a seed or a state repeats its future exactly only in a new
     world: how the engine has sorted its lists of what may collide is in no saved state."""
     parameters: ClassVar[frozenset[str]] = frozenset()
@@ -176,7 +173,7 @@ class Task(ABC):
         """The bodies that must stay in the workspace."""
 
     @property
-    def landmarks(self) -> Sequence[Pose]:
+    def landmarks(self) -> Sequence[YawPose]:
         """Positions and yaws that the vector observation lists: by default the objects'."""
         return [(body.position, body.yaw_rad) for body in self.objects]
 
@@ -216,9 +213,9 @@ class Task(ABC):
         return BLOCK_M * self.settings.scale
 
     @property
-    def reach(self) -> Reach:
+    def action_limits(self) -> ActionLimits:
         """What one action of the expert covers."""
-        return self.settings.reach
+        return self.settings.action_limits
 
     def is_valid(self) -> bool:
         """Whether every object that is not in the gripper is inside the workspace."""

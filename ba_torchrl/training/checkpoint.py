@@ -12,9 +12,9 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Algorithm, Problem
-from ba_torchrl.config import ConfigError
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_env
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE
 from ba_torchrl.training.config import ExperimentConfig
 

@@ -12,9 +12,10 @@ import torch
 from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
-from ba_torchrl.config import ConfigError, EnvConfig, StrictModel, parse
+from ba_torchrl.config import EnvConfig, StrictModel, parse
 from ba_torchrl.data.demos import Source, check_demonstrations, source_config
 from ba_torchrl.envs.scene import check_task_parameters
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import is_available
 from ba_torchrl.tasks.base import TASKS
 

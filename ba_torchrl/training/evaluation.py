@@ -83,7 +83,7 @@ def evaluate(
 
 
 @torch.no_grad()
-def film(
+def record_episodes(
     task: str,
     env_settings: dict[str, Any],
     policy: Policy | None,

@@ -14,7 +14,6 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.config import ConfigError
 from ba_torchrl.data.demos import (
     as_transitions,
     collect_demonstrations,
@@ -23,6 +22,7 @@ from ba_torchrl.data.demos import (
 )
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import ScalarLog, progress_bar
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
@@ -37,7 +37,7 @@ from ba_torchrl.record.results import (
 from ba_torchrl.record.video import write_video
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
-from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate, film
+from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate, record_episodes
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
 
 logger = logging.getLogger(__name__)
@@ -219,7 +219,7 @@ class Experiment:
         video = None
         if config.video_episodes:
             video = config.folder / "evaluation.mp4"
-            frames = film(
+            frames = record_episodes(
                 config.task,
                 config.env,
                 self._greedy,

@@ -15,9 +15,10 @@ from omegaconf import OmegaConf
 from pydantic import BaseModel
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.config import ConfigError, EnvConfig
-from ba_torchrl.training.benchmark import SET_BY_THE_GRID, BenchmarkConfig
+from ba_torchrl.config import EnvConfig
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
+from ba_torchrl.training.grid.plan import SET_BY_THE_GRID, BenchmarkConfig
 
 
 def defaults_of(model: type[BaseModel]) -> dict[str, Any]:

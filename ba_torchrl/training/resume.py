@@ -19,7 +19,7 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
 from ba_torchrl.algorithms.base import Algorithm
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
 from ba_torchrl.training.checkpoint import read_config, write_config
 from ba_torchrl.training.config import ExperimentConfig

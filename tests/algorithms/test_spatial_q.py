@@ -9,8 +9,9 @@ import ba_torchrl
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
 from ba_torchrl.algorithms.spatial_q import SpatialQConfig
-from ba_torchrl.config import ConfigError, parse
+from ba_torchrl.config import parse
 from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.errors import ConfigError
 
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}

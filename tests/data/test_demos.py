@@ -4,13 +4,13 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.config import ConfigError
 from ba_torchrl.data.demos import (
     collect_demonstrations,
     load_demonstrations,
     save_demonstrations,
     source_config,
 )
+from ba_torchrl.errors import ConfigError
 
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}

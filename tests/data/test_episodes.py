@@ -2,7 +2,6 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.config import ConfigError
 from ba_torchrl.data.demos import (
     as_transitions,
     collect_demonstrations,
@@ -10,6 +9,7 @@ from ba_torchrl.data.demos import (
     save_demonstrations,
 )
 from ba_torchrl.data.episodes import collect_episodes, mean_length, quotas, success_rate
+from ba_torchrl.errors import ConfigError
 
 TASK = "close_loop/block_reaching"
 

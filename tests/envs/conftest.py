@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ba_torchrl.envs.vector import make_vector_env
+from ba_torchrl.envs.vector.make import make_vector_env
 
 # Spawned workers inherit this path and find the modules of the tests there.
 sys.path.insert(0, str(Path(__file__).parent))

@@ -14,10 +14,9 @@ from gymnasium.utils.passive_env_checker import env_render_passive_checker
 from torchrl.data import Categorical
 
 import ba_torchrl
-from ba_torchrl.actions import InvalidActionError
-from ba_torchrl.config import ConfigError
 from ba_torchrl.envs import gym
 from ba_torchrl.envs.registration import gym_id, register_tasks
+from ba_torchrl.errors import ConfigError, InvalidActionError
 
 TASKS = ba_torchrl.list_tasks()
 PICKING = "BulletArm/CloseLoopBlockPicking-v0"

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.config import ConfigError, EnvConfig
+from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.views import VIEWS
+from ba_torchrl.sim.vision.views import VIEWS
 
 PICKING = "close_loop/block_picking"
 

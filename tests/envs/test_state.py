@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.sim.world import SimulationError
+from ba_torchrl.errors import SimulationError
 
 
 def play(env, state, actions):
@@ -32,9 +32,9 @@ def test_a_state_and_its_actions_have_one_future(task):
     # enough steps, also where an episode has one
     env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=50)
     generator = torch.Generator().manual_seed(0)
-    for taken in (0, 3, 5):  # before, near and after a grasp
+    for grasped_object in (0, 3, 5):  # before, near and after a grasp
         state = env.reset()
-        for _ in range(taken):
+        for _ in range(grasped_object):
             state = env.step(state.set("action", state["expert_action"]))["next"]
             if state["done"]:
                 state = env.reset()

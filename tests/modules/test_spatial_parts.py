@@ -11,16 +11,16 @@ pytest.importorskip("escnn")
 from escnn import nn as enn
 
 from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
-from ba_torchrl.modules.heights import yaws_rad
-from ba_torchrl.modules.in_hand import InHandMap, InHandVector
+from ba_torchrl.modules.in_hand_encoders import InHandMap, InHandVector
 from ba_torchrl.modules.patches import centre_fit, patches, sample, sampling_grid
+from ba_torchrl.modules.spatial_inputs import yaws_rad
 from ba_torchrl.modules.steerable import (
     SteerableConv2d,
     planar_rotations,
     planar_rotations_and_flips,
     planar_yaws,
 )
-from ba_torchrl.sim.in_hand import crop
+from ba_torchrl.sim.vision.in_hand import crop
 
 
 def numpy_crop(image, row, column, size, yaw=0.0):

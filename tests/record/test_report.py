@@ -104,9 +104,9 @@ def test_a_rate_that_is_never_reached_has_no_time(tmp_path):
 
 
 def test_all_tasks_together_count_the_methods_that_ran_on_all(tmp_path):
-    for seed, (reach, pick) in enumerate([(1.0, 0.5), (0.8, 0.1)]):
+    for seed, (limits, pick) in enumerate([(1.0, 0.5), (0.8, 0.1)]):
         rates = (0.0, 0.0)
-        leave_run(tmp_path / f"reach{seed}", (*rates, reach), seed=seed)
+        leave_run(tmp_path / f"reach{seed}", (*rates, limits), seed=seed)
         leave_run(tmp_path / f"pick{seed}", (*rates, pick), seed=seed, task=PICK)
     leave_run(tmp_path / "other", (0.0, 0.0, 0.0), label="sac cnn")
     (section,), _ = load_sections([tmp_path])

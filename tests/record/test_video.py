@@ -8,7 +8,7 @@ from ba_torchrl.record.video import write_video
 imageio = pytest.importorskip("imageio.v3")
 
 
-def film(frames, height, width):
+def record_episodes(frames, height, width):
     """A bright square moves to the right over a dark background."""
     video = np.full((frames, height, width, 3), 30, dtype=np.uint8)
     for t in range(frames):
@@ -20,7 +20,7 @@ def film(frames, height, width):
     ("height", "width", "written"), [(64, 96, (64, 96)), (61, 75, (62, 76)), (360, 480, (360, 480))]
 )
 def test_mp4_shows_the_frames(tmp_path, height, width, written):
-    video = film(7, height, width)
+    video = record_episodes(7, height, width)
     path = write_video(tmp_path / "new" / "episode.mp4", list(video), fps=5)
     read = imageio.imread(path, plugin="FFMPEG")
     assert read.shape == (7, *written, 3)
@@ -29,7 +29,7 @@ def test_mp4_shows_the_frames(tmp_path, height, width, written):
 
 
 def test_gif_shows_the_frames(tmp_path):
-    video = film(5, 33, 41)
+    video = record_episodes(5, 33, 41)
     path = write_video(tmp_path / "episode.GIF", video, fps=4)
     read = imageio.imread(path, index=None)
     assert np.abs(read[..., :3].astype(int) - video).max() < 16
@@ -54,13 +54,13 @@ def test_refuses_other_frames(tmp_path, frames, message):
 
 def test_refuses_other_suffixes_and_speeds(tmp_path):
     with pytest.raises(ValueError, match=r"mp4 or \.gif"):
-        write_video(tmp_path / "episode.avi", film(2, 32, 32), fps=5)
+        write_video(tmp_path / "episode.avi", record_episodes(2, 32, 32), fps=5)
     with pytest.raises(ValueError, match="fps must be positive"):
-        write_video(tmp_path / "episode.mp4", film(2, 32, 32), fps=0)
+        write_video(tmp_path / "episode.mp4", record_episodes(2, 32, 32), fps=0)
 
 
 @pytest.mark.parametrize("package", ["imageio", "imageio_ffmpeg"])
 def test_missing_package_names_the_way_out(tmp_path, monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match=r"pip install 'ba-torchrl\[recipes\]'"):
-        write_video(tmp_path / "episode.mp4", film(2, 32, 32), fps=5)
+        write_video(tmp_path / "episode.mp4", record_episodes(2, 32, 32), fps=5)

@@ -4,12 +4,13 @@ import numpy as np
 import pybullet
 import pytest
 
+from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.articulated import Rail
 from ba_torchrl.sim.bodies import Box, Solid
-from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.meshes import box_mesh, moved, rod_mesh
 from ba_torchrl.sim.robots.kuka import Kuka
-from ba_torchrl.sim.world import SimulationError, World
+from ba_torchrl.sim.vision.depth import HeightCamera
+from ba_torchrl.sim.world import World
 
 RAIL = Rail(range_m=(0.0, 0.2), friction_n=3.0)
 

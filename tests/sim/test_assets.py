@@ -11,7 +11,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.assets import cache, graspnet, hulls, random_shapes
 from ba_torchrl.sim.assets.base import OBJECT_SETS, load_object_set
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
@@ -20,8 +20,8 @@ from ba_torchrl.sim.assets.household import ITEMS
 from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, moved, write_obj
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.tray import profile
+from ba_torchrl.tasks.close_loop_task import CloseLoopTask
+from ba_torchrl.tasks.clutter.tray import profile
 
 
 @pytest.fixture(autouse=True)

@@ -6,8 +6,9 @@ import pybullet
 import pytest
 
 import ba_torchrl
+from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.bodies import Box
-from ba_torchrl.sim.world import SimulationError, World
+from ba_torchrl.sim.world import World
 
 
 def test_worlds_do_not_share_anything():

@@ -214,7 +214,7 @@ def test_the_constructor_can_be_pickled(task):
 
 def test_step_limit_truncates_and_does_not_terminate(task):
     env = make(task, max_steps=3)
-    if env.task_class.one_step:
+    if env.task_class.terminates_at_limit:
         env.close()
         pytest.skip("the limit is the task")
     # close loop: stay, gripper open; open loop: place nothing
@@ -323,7 +323,7 @@ def test_expert_recovers_from_many_states(task):
 
 def check_recovery(task, episodes, least):
     env = make(task, expert=True)
-    if env.task_class.one_step:
+    if env.task_class.terminates_at_limit:
         env.close()
         pytest.skip("an episode has no second step")
     outcomes = []

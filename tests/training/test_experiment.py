@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, find_checkpoint, load
 from ba_torchrl.training.config import ExperimentConfig, SeedUse

@@ -4,7 +4,7 @@ import shutil
 import pytest
 import torch
 
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.training.checkpoint import find_checkpoint

@@ -8,7 +8,7 @@ from typing import ClassVar, overload
 
 import numpy as np
 
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.assets.hulls import volume_and_center
 from ba_torchrl.sim.bodies import Color, Solid

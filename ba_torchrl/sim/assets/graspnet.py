@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pybullet
 
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
 from ba_torchrl.sim.assets.cache import cached_parts
 from ba_torchrl.sim.assets.hulls import convex_hull, volume_and_center

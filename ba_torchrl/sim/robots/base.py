@@ -10,7 +10,8 @@ from typing import ClassVar
 import pybullet
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import CONTACT_M, Body, Quaternion, Vector
+from ba_torchrl.sim.bodies import CONTACT_M, Body
+from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector, YawPose, quaternion_yaw
 from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
 from ba_torchrl.sim.world import World
 
@@ -28,23 +29,13 @@ _FAR_M = 10.0
 QUERY_M = 2e-3
 """Distance up to which a fresh query looks for the surfaces in contact."""
 
-Matrix = tuple[Vector, Vector, Vector]
-Pose = tuple[Vector, float]
-"""Position of the tool point (metres) and yaw (radians), the gripper pointing down."""
-
-
-def downward(yaw_rad: float) -> Matrix:
-    """Return the rotation of a gripper that points down, its fingers along x at yaw 0."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    return ((cos, sin, 0.0), (sin, -cos, 0.0), (0.0, 0.0, -1.0))
-
 
 class Robot(ABC):
     """An arm with a parallel gripper in a world.
 
     The arm follows stiff position motors, so that it is where it was told to be after one step;
     whoever moves it keeps the steps small. Subclasses give the model's numbers and its inverse
-    kinematics. A robot is commanded in joint angles; `ba_torchrl.sim.motion` plans them.
+    kinematics. A robot is commanded in joint angles; `ba_torchrl.sim.control` plans them.
     """
 
     arm_joints: ClassVar[tuple[int, ...]]
@@ -186,11 +177,11 @@ class Robot(ABC):
             state[4], state[5], self.tool_offset_m, self.tool_orientation
         )
 
-    def tool_pose(self) -> Pose:
+    def tool_pose(self) -> YawPose:
         """Return the tool point and the gripper's yaw in [-pi, pi)."""
-        position, (x, y, z, w) = self.tool_transform()
-        # direction of the tool's x axis, along which the fingers open
-        return position, math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+        position, orientation = self.tool_transform()
+        # the fingers open along the tool's x axis
+        return position, quaternion_yaw(orientation)
 
     # -- gripper -----------------------------------------------------------------------------
 

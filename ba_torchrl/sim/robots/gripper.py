@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import pybullet
 
+from ba_torchrl.sim.geometry import Matrix, Vector, YawPose, downward
 from ba_torchrl.sim.world import World
-
-if TYPE_CHECKING:
-    from ba_torchrl.sim.robots.base import Matrix, Robot
 
 FLOOR_GAP_M = 1e-3
 """Distance that fingertips keep from the floor while they close."""
@@ -27,6 +26,28 @@ _BELOW_M, _ABOVE_M = 0.05, 0.1
 _CHAMFER_M = 2e-3
 _RAYS_AT_ONCE = 8192
 _POSITION = (0.45, 0.0, 0.25)
+
+
+class MeasurableRobot(Protocol):
+    """What the measurement needs of a `Robot`."""
+
+    id: int
+    client: int
+    world: World
+
+    def __init__(self, world: World) -> None: ...
+
+    def inverse_kinematics(self, position: Vector, rotation: Matrix) -> list[float] | None:
+        """Return arm joints that bring the tool to a pose."""
+
+    def teleport(self, joints: Sequence[float]) -> None:
+        """Put the arm at rest at joint angles."""
+
+    def set_opening(self, opening: float) -> None:
+        """Put the fingers at rest at an opening from 0 to 1."""
+
+    def tool_pose(self) -> YawPose:
+        """Return the tool point and the gripper's yaw."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +101,12 @@ class Gripper:
 
 
 @cache
-def measured_gripper(robot: type[Robot]) -> Gripper:
+def measured_gripper(robot: type[MeasurableRobot]) -> Gripper:
     """Return the outline of a robot's gripper.
 
     Rays from below find the collision shapes as contacts do, their margins included. It takes a
     world of its own and tenths of a second, once in a process.
     """
-    from ba_torchrl.sim.robots.base import downward  # the robot's module imports this one
-
     us = np.arange(0.0, _HALF_U_M + _SPACING_M / 2, _SPACING_M)
     vs = np.arange(-_HALF_V_M, _HALF_V_M + _SPACING_M / 2, _SPACING_M)
     with World() as world:
@@ -127,7 +146,9 @@ def _are_tips(heights: np.ndarray) -> np.ndarray:
     return heights < heights.min() + TIPS_M
 
 
-def _underside(robot: Robot, opening: float, us: np.ndarray, vs: np.ndarray) -> np.ndarray:
+def _underside(
+    robot: MeasurableRobot, opening: float, us: np.ndarray, vs: np.ndarray
+) -> np.ndarray:
     """Return heights [U, V] above the tool at which rays from below meet the gripper.
 
     Both sides count, and infinity stands for nothing there.

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import pybullet
 import pybullet_data
 
-from ba_torchrl.sim.bodies import Vector
-from ba_torchrl.sim.robots.base import ROBOTS, Matrix, Robot
+from ba_torchrl.sim.geometry import Matrix, Vector
+from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _SHOULDER_HEIGHT_M = 0.36
 _UPPER_ARM_M = 0.42

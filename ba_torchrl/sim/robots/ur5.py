@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 
 import pybullet
 
-from ba_torchrl.sim.bodies import Vector
-from ba_torchrl.sim.robots.base import ROBOTS, Matrix, Robot
+from ba_torchrl.sim.geometry import Matrix, Vector
+from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _MODELS = Path(__file__).parent / "models"
 

@@ -13,8 +13,8 @@ from ba_torchrl.sim.bodies import Body, Solid, vertical_extent
 from ba_torchrl.sim.meshes import bowl_parts, centroid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, Spot
-from ba_torchrl.tasks.close_loop.base import BLUE, CloseLoopTask
-from ba_torchrl.tasks.experts import CLOSED, OPEN, pick_up, towards, travel
+from ba_torchrl.tasks.close_loop_task import BLUE, CloseLoopTask
+from ba_torchrl.tasks.motion_primitives import CLOSED, OPEN, move_toward, pick_up, travel
 
 RELEASE_GAP_M = 4e-3
 """The block is let go of this far above the bowl's floor; it lands before the action ends."""
@@ -89,7 +89,7 @@ class BlockInBowl(CloseLoopTask):
         return pick_up(
             self.robot,
             self.block,
-            self.reach,
+            self.action_limits,
             yaws_rad=(self.block.yaw_rad, self.block.yaw_rad + math.pi / 2),
             obstacles=(self.bowl,),
             ceiling_m=self.settings.workspace.z[1],
@@ -105,15 +105,17 @@ class BlockInBowl(CloseLoopTask):
         floor_z = bowl_z - self.bowl.shape.height_m / 2 + self.floor_m * self.settings.scale
         if math.hypot(dx, dy) <= self.within_rim_m * self.settings.scale:
             down = low - floor_z - RELEASE_GAP_M
-            arrives = max(down, abs(dx), abs(dy)) <= self.reach.step_m
-            return towards(self.robot, (x + dx, y + dy, z - down), yaw, OPEN if arrives else CLOSED)
+            arrives = max(down, abs(dx), abs(dy)) <= self.action_limits.step_m
+            return move_toward(
+                self.robot, (x + dx, y + dy, z - down), yaw, OPEN if arrives else CLOSED
+            )
         top = vertical_extent(self.bowl)[1]
         return travel(
             self.robot,
             (x + dx, y + dy, z - low + top + self.clearance_m),
             yaw,
             CLOSED,
-            self.reach,
+            self.action_limits,
             below_m=z - low,
             obstacles=(self.bowl,),
             ceiling_m=self.settings.workspace.z[1],

@@ -12,8 +12,8 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.experts import grasp, lift
+from ba_torchrl.tasks.close_loop_task import CloseLoopTask
+from ba_torchrl.tasks.motion_primitives import grasp, lift
 
 
 @TASKS.register("close_loop/block_picking")
@@ -42,8 +42,8 @@ class BlockPicking(CloseLoopTask):
     def expert_command(self) -> GripperCommand:
         """Grasp the block, then go up."""
         if self.robot.held_body() is self.block and self.robot.opening() < 0.9:
-            return lift(self.reach.step_m)
-        return grasp(self.robot, self.block, self.reach)
+            return lift(self.action_limits.step_m)
+        return grasp(self.robot, self.block, self.action_limits)
 
     @property
     def objects(self) -> Sequence[Body]:

@@ -11,8 +11,8 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop.base import BLUE, RED, CloseLoopTask
-from ba_torchrl.tasks.experts import behind_point, push
+from ba_torchrl.tasks.close_loop_task import BLUE, RED, CloseLoopTask
+from ba_torchrl.tasks.motion_primitives import behind_point, push
 
 
 @TASKS.register("close_loop/block_pulling")
@@ -50,7 +50,7 @@ class BlockPulling(CloseLoopTask):
             pulled,
             other.position[:2],
             workspace=self.settings.workspace,
-            reach=self.reach,
+            limits=self.action_limits,
             opening=0.5,  # wide open, the fingers would straddle a corner
             stop_short_m=0.0,
         )

@@ -10,11 +10,11 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Decal
-from ba_torchrl.sim.robots.base import Pose
+from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import BLOCK_M, TASKS
-from ba_torchrl.tasks.close_loop.base import GREEN, CloseLoopTask
-from ba_torchrl.tasks.experts import push
+from ba_torchrl.tasks.close_loop_task import GREEN, CloseLoopTask
+from ba_torchrl.tasks.motion_primitives import push
 
 
 @TASKS.register("close_loop/block_pushing")
@@ -55,13 +55,13 @@ class BlockPushing(CloseLoopTask):
             self.block,
             self.goal.position[:2],
             workspace=self.settings.workspace,
-            reach=self.reach,
+            limits=self.action_limits,
             opening=0.5 - max(BLOCK_M - self.block_m, 0.0) / (2 * self.robot.gripper.half_gap_m),
             stop_short_m=0.035,
         )
 
     @property
-    def landmarks(self) -> Sequence[Pose]:
+    def landmarks(self) -> Sequence[YawPose]:
         """Block and goal."""
         return [(body.position, body.yaw_rad) for body in (self.block, self.goal)]
 

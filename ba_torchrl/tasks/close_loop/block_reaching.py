@@ -12,8 +12,8 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.experts import OPEN, grasp
+from ba_torchrl.tasks.close_loop_task import CloseLoopTask
+from ba_torchrl.tasks.motion_primitives import OPEN, grasp
 
 
 @TASKS.register("close_loop/block_reaching")
@@ -22,7 +22,7 @@ class BlockReaching(CloseLoopTask):
 
     scale_limits = (0.5, 1.6)
     fits_tray = True
-    reach_m: ClassVar[float] = 0.03
+    goal_distance_m: ClassVar[float] = 0.03
 
     def build(self, world: World) -> None:
         """Load the block."""
@@ -35,11 +35,11 @@ class BlockReaching(CloseLoopTask):
 
     def is_goal(self) -> bool:
         """Whether the tool point is within 3 cm of the block's centre."""
-        return math.dist(self.robot.tool_pose()[0], self.block.position) < self.reach_m
+        return math.dist(self.robot.tool_pose()[0], self.block.position) < self.goal_distance_m
 
     def expert_command(self) -> GripperCommand:
         """Go down around the block, without closing the fingers."""
-        return grasp(self.robot, self.block, self.reach)._replace(opening=OPEN)
+        return grasp(self.robot, self.block, self.action_limits)._replace(opening=OPEN)
 
     @property
     def objects(self) -> Sequence[Body]:

@@ -10,11 +10,11 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Color
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.assembly import assemble
 from ba_torchrl.tasks.base import TASKS, Spot
-from ba_torchrl.tasks.building import Building
-from ba_torchrl.tasks.close_loop.base import BLUE, GREEN, RED, CloseLoopTask
-from ba_torchrl.tasks.structures import CUBE, tower
+from ba_torchrl.tasks.close_loop_task import BLUE, GREEN, RED, CloseLoopTask
+from ba_torchrl.tasks.structures.blueprint import CUBE, tower
+from ba_torchrl.tasks.structures.close_loop import assemble
+from ba_torchrl.tasks.structures.planner import StructurePlanner
 
 COLORS: tuple[Color, ...] = (RED, BLUE, (0.9, 0.6, 0.2, 1.0), GREEN)
 
@@ -44,7 +44,9 @@ class BlockStacking(CloseLoopTask):
         self.blocks = [
             world.add(self.cube(color), f"block {i + 1}") for i, color in enumerate(COLORS[:count])
         ]
-        self.stack = Building(tower(*[CUBE] * count), world, {CUBE.kind: self.blocks}, self.block_m)
+        self.stack = StructurePlanner(
+            tower(*[CUBE] * count), world, {CUBE.kind: self.blocks}, self.block_m
+        )
 
     def randomise(self, rng: np.random.Generator) -> None:
         """Put the cubes anywhere with room for the fingers between them."""
@@ -60,7 +62,7 @@ class BlockStacking(CloseLoopTask):
         """Stack the cube that is handier on the highest."""
         settings = self.settings
         return assemble(
-            self.robot, self.stack, settings.workspace, self.reach, settings.surface_z_m
+            self.robot, self.stack, settings.workspace, self.action_limits, settings.surface_z_m
         )
 
     @property

@@ -13,16 +13,16 @@ from ba_torchrl.sim.bodies import Body, Box, Color, Solid, gap_m, press_n, verti
 from ba_torchrl.sim.meshes import box_mesh, moved
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import BLOCK_M, TASKS
-from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.experts import (
+from ba_torchrl.tasks.close_loop_task import CloseLoopTask
+from ba_torchrl.tasks.motion_primitives import (
     CLOSED,
     HALF_FINGER_DEPTH_M,
     HOVER_M,
     OPEN,
     lift,
+    move_toward,
+    nearest_equivalent_yaw,
     pick_up,
-    towards,
-    turned,
 )
 
 WALL: Color = (0.72, 0.7, 0.66, 1.0)
@@ -135,21 +135,24 @@ class CornerPicking(CloseLoopTask):
 
     def expert_command(self) -> GripperCommand:
         """Nudge the block out of the corner until fingers fit beside it, then grasp and lift it."""
-        robot, block, reach = self.robot, self.block, self.reach
+        robot, block, limits = self.robot, self.block, self.action_limits
         if robot.held_body() is block and robot.opening() < 0.9:
-            return lift(reach.step_m)
+            return lift(limits.step_m)
         yaw = robot.tool_pose()[1]
         is_pressing = robot.opening() < 0.5 and press_n(robot.id, block) > FIRM_N
-        yaws = [turned(yaw, block.yaw_rad + k * math.pi / 2, reach, math.pi) for k in (0, 1)]
+        yaws = [
+            nearest_equivalent_yaw(yaw, block.yaw_rad + k * math.pi / 2, limits, math.pi)
+            for k in (0, 1)
+        ]
         needed = DRAG_ROOM_M if is_pressing else ROOM_M
         yaws = [wanted for wanted in yaws if self.room_m(wanted) >= needed]
         if not yaws:
-            return self._drag() if is_pressing else self._press()
+            return self._pull() if is_pressing else self._press()
         if is_pressing:  # no turn yet, and steeply up: else the fingers would take the block along
             x, y, z = block.position
-            return towards(robot, (x, y, z + self.block_m / 2 + OPENING_HEIGHT_M), yaw, OPEN)
+            return move_toward(robot, (x, y, z + self.block_m / 2 + OPENING_HEIGHT_M), yaw, OPEN)
         ceiling = self.settings.workspace.z[1]
-        return pick_up(robot, block, reach, yaws_rad=yaws, ceiling_m=ceiling)
+        return pick_up(robot, block, limits, yaws_rad=yaws, ceiling_m=ceiling)
 
     def room_m(self, yaw_rad: float) -> float:
         """Return the gap between open fingers around the block and the walls.
@@ -161,20 +164,20 @@ class CornerPicking(CloseLoopTask):
         along = self.robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
         across = self.robot.gripper.half_width_m
         cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
-        reaches = (along * cos + across * sin, along * sin + across * cos)
+        extents = (along * cos + across * sin, along * sin + across * cos)
         place = self.to_corner(*self.block.position[:2])
         inner = (self.wall_m - self.base_m) / 2
         outer = inner - self.wall_m
         return min(
-            max(b - reach - inner, outer - b - reach)
-            for b, reach in zip(place, reaches, strict=True)
+            max(b - extent - inner, outer - b - extent)
+            for b, extent in zip(place, extents, strict=True)
         )
 
     def _press(self) -> GripperCommand:
         """Go over the block with closed fingers, come down to it, and press."""
-        robot, reach = self.robot, self.reach
+        robot, limits = self.robot, self.action_limits
         (x, y, z), yaw = robot.tool_pose()
-        target_yaw = turned(yaw, self.corner[2], reach, math.pi / 2)
+        target_yaw = nearest_equivalent_yaw(yaw, self.corner[2], limits, math.pi / 2)
         turn = wrap_angle(target_yaw - yaw)
         # the hand is wider than the block along the fingers, and has the wall beside it
         px, py = self.to_corner(*self.block.position[:2])
@@ -193,7 +196,7 @@ class CornerPicking(CloseLoopTask):
             gap = gap_m(robot.id, self.block)
             if gap <= 2 * NEAR_M:
                 return lift(-PRESS_M)
-            if gap <= reach.step_m:
+            if gap <= limits.step_m:
                 return lift(NEAR_M - gap)
         if z < low_z - TOUCH_M / 2 and aside > PRESS_ASIDE_M:
             return lift(low_z + TOUCH_M - z)  # not from the side: that pushes the block back
@@ -201,13 +204,13 @@ class CornerPicking(CloseLoopTask):
             low_z = vertical_extent(self.walls)[1] + TIP_BELOW_TOOL_M + HOVER_M
             if z < low_z - 1e-3:
                 return lift(low_z - z)
-        return towards(robot, (*target, low_z), target_yaw, CLOSED)
+        return move_toward(robot, (*target, low_z), target_yaw, CLOSED)
 
-    def _drag(self) -> GripperCommand:
+    def _pull(self) -> GripperCommand:
         """Drag the block away from both walls, straight towards its place."""
         goal = self.to_world(*(max(b, OUT_M) for b in self.to_corner(*self.block.position[:2])))
         dx, dy = (g - b for g, b in zip(goal, self.block.position, strict=False))
-        share = min(1.0, self.reach.step_m / max(abs(dx), abs(dy), 1e-6))
+        share = min(1.0, self.action_limits.step_m / max(abs(dx), abs(dy), 1e-6))
         return GripperCommand(CLOSED, share * dx, share * dy, 0.0, 0.0)
 
     @property

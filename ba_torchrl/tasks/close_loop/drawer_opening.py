@@ -9,22 +9,23 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.articulated import Rail
-from ba_torchrl.sim.bodies import Body, Color, Solid, Vector
+from ba_torchrl.sim.bodies import Body, Color, Solid
+from ba_torchrl.sim.geometry import Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
-from ba_torchrl.sim.robots.base import Pose
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import LAYOUT_ATTEMPTS, TASKS, PlacementError
-from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.experts import (
+from ba_torchrl.tasks.base import LAYOUT_ATTEMPTS, TASKS
+from ba_torchrl.tasks.close_loop_task import CloseLoopTask
+from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
     CLEARANCE_M,
     CLOSED,
     FINGER_HALF_M,
     lift,
-    towards,
-    turned,
+    move_toward,
+    nearest_equivalent_yaw,
 )
 
 CABINET_M: Vector = (0.22, 0.23, 0.11)
@@ -120,13 +121,13 @@ class DrawerOpening(CloseLoopTask):
         Behind and below the rod, between the posts, the fingers pull; straight above that place
         they go down; from anywhere else they go there, over whatever stands in the way.
         """
-        robot, reach, scale = self.robot, self.reach, self.settings.scale
+        robot, limits, scale = self.robot, self.action_limits, self.settings.scale
         (x, y, z), yaw = robot.tool_pose()
         (rx, ry, rz), heading = self.handle_pose
         ux, uy = math.cos(heading), math.sin(heading)
         ahead = (x - rx) * ux + (y - ry) * uy
         aside = abs((y - ry) * ux - (x - rx) * uy)
-        target_yaw = turned(yaw, heading + math.pi / 2, reach, math.pi)
+        target_yaw = nearest_equivalent_yaw(yaw, heading + math.pi / 2, limits, math.pi)
         turn = abs(wrap_angle(target_yaw - yaw))
         radius = ROD_DIAMETER_M / 2 * scale
         front = -ROD_OFFSET_M * scale
@@ -143,24 +144,24 @@ class DrawerOpening(CloseLoopTask):
         ):
             slack = -ahead - radius - finger
             farther = self._goal_m + MARGIN_M - self.cabinet.travel_m + slack
-            advance = ahead + min(farther, reach.step_m / max(abs(ux), abs(uy)))
+            advance = ahead + min(farther, limits.step_m / max(abs(ux), abs(uy)))
             target = (rx + advance * ux, ry + advance * uy, hook_z)
-            return towards(robot, target, target_yaw, CLOSED)
+            return move_toward(robot, target, target_yaw, CLOSED)
 
         behind = -radius - finger - PLAY_BEHIND_M
         hx, hy = rx + behind * ux, ry + behind * uy
         is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
         if is_beside and turn <= ALIGNED_RAD and is_closed:
-            return towards(robot, (hx, hy, hook_z), target_yaw, CLOSED)
+            return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
         across = 2 * finger if turn < SLIGHT_TURN_RAD else SPAN_HALF_M
         is_over_cabinet = ahead < front + across
         top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
         if z < top + CLEARANCE_M - 1e-3:
             return lift(top + CLEARANCE_M - z, robot.opening())
-        return towards(robot, (hx, hy, top + CLEARANCE_M), target_yaw, CLOSED)
+        return move_toward(robot, (hx, hy, top + CLEARANCE_M), target_yaw, CLOSED)
 
     @property
-    def handle_pose(self) -> Pose:
+    def handle_pose(self) -> YawPose:
         """Middle of the handle's rod, and the direction in which the drawer opens."""
         slider, scale = self.cabinet.slider, self.settings.scale
         (x, y, z), heading = slider.position, slider.yaw_rad
@@ -169,7 +170,7 @@ class DrawerOpening(CloseLoopTask):
         return (*middle, z + ROD_HEIGHT_M * scale), heading
 
     @property
-    def landmarks(self) -> Sequence[Pose]:
+    def landmarks(self) -> Sequence[YawPose]:
         """Cabinet and handle."""
         base = self.cabinet.base
         return [(base.position, base.yaw_rad), self.handle_pose]
@@ -223,9 +224,9 @@ def drawer_parts() -> tuple[Mesh, ...]:
     rise = RIM_M - low - DRAWER_WALL_M
     rim_z = low + DRAWER_WALL_M + rise / 2
     side_y = (outer - DRAWER_WALL_M) / 2
-    reach = ROD_OFFSET_M
+    limits = ROD_OFFSET_M
     post_y = (POST_GAP_M + POST_M) / 2
-    post = box_mesh((reach, POST_M, POST_M))
+    post = box_mesh((limits, POST_M, POST_M))
     rod = rod_mesh(ROD_LENGTH_M, ROD_DIAMETER_M)
     return (
         moved(box_mesh((length, outer, DRAWER_WALL_M)), (middle, 0.0, low + DRAWER_WALL_M / 2)),
@@ -236,9 +237,9 @@ def drawer_parts() -> tuple[Mesh, ...]:
             (back_x + DRAWER_WALL_M / 2, 0.0, rim_z),
         ),
         moved(box_mesh((WALL_M, outer, high - low)), (front_x - WALL_M / 2, 0.0, (low + high) / 2)),
-        moved(post, (front_x + reach / 2, post_y, ROD_HEIGHT_M)),
-        moved(post, (front_x + reach / 2, -post_y, ROD_HEIGHT_M)),
-        moved(rod, (front_x + reach, 0.0, ROD_HEIGHT_M)),
+        moved(post, (front_x + limits / 2, post_y, ROD_HEIGHT_M)),
+        moved(post, (front_x + limits / 2, -post_y, ROD_HEIGHT_M)),
+        moved(rod, (front_x + limits, 0.0, ROD_HEIGHT_M)),
     )
 
 

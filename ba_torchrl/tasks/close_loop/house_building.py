@@ -11,12 +11,12 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Solid
 from ba_torchrl.sim.meshes import gable_mesh
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.assembly import assemble
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.building import Building
-from ba_torchrl.tasks.close_loop.base import GREEN, CloseLoopTask
 from ba_torchrl.tasks.close_loop.block_stacking import COLORS, scattered
-from ba_torchrl.tasks.structures import CUBE, TRIANGLE, tower
+from ba_torchrl.tasks.close_loop_task import GREEN, CloseLoopTask
+from ba_torchrl.tasks.structures.blueprint import CUBE, TRIANGLE, tower
+from ba_torchrl.tasks.structures.close_loop import assemble
+from ba_torchrl.tasks.structures.planner import StructurePlanner
 
 
 @TASKS.register("close_loop/house_building")
@@ -43,7 +43,7 @@ class HouseBuilding(CloseLoopTask):
             center_of_mass_m=(0.0, 0.0, -edge / 6),
         )
         self.triangle = world.add(prism, "triangle")
-        self.house = Building(
+        self.house = StructurePlanner(
             tower(*[CUBE] * len(self.blocks), TRIANGLE),
             world,
             {CUBE.kind: self.blocks, TRIANGLE.kind: [self.triangle]},
@@ -74,7 +74,7 @@ class HouseBuilding(CloseLoopTask):
         """Stack the cubes, the handier ones first, then put the triangle on top."""
         settings = self.settings
         return assemble(
-            self.robot, self.house, settings.workspace, self.reach, settings.surface_z_m
+            self.robot, self.house, settings.workspace, self.action_limits, settings.surface_z_m
         )
 
     @property

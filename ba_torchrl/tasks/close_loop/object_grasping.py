@@ -10,11 +10,18 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop.base import CloseLoopTask
-from ba_torchrl.tasks.clutter import ClutterTask
-from ba_torchrl.tasks.experts import ALIGNED_M, ALIGNED_RAD, CLOSED, OPEN, lift, towards
-from ba_torchrl.tasks.grasps import Grasp
-from ba_torchrl.tasks.nudges import NEAR_M, Nudge, NudgePlanner
+from ba_torchrl.tasks.close_loop_task import CloseLoopTask
+from ba_torchrl.tasks.clutter.base import ClutterTask
+from ba_torchrl.tasks.clutter.grasp_planner import Grasp
+from ba_torchrl.tasks.clutter.push_planner import NEAR_M, Push, PushPlanner
+from ba_torchrl.tasks.motion_primitives import (
+    ALIGNED_M,
+    ALIGNED_RAD,
+    CLOSED,
+    OPEN,
+    lift,
+    move_toward,
+)
 
 WALL_PIXELS = 25
 """Border of the planner's height image that shows the tray's walls."""
@@ -34,28 +41,28 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     def is_goal(self) -> bool:
         """Whether any object is held and the tool higher than 15 cm."""
-        return self.taken() is not None
+        return self.grasped_object() is not None
 
     def expert_command(self) -> GripperCommand:
         """Close the fingers around the object that takes fewest actions, then go up.
 
         What cannot be grasped as it lies is pushed until it can.
         """
-        robot, reach, planner = self.robot, self.reach, self.planner
+        robot, limits, planner = self.robot, self.action_limits, self.planner
         if robot.opening() < 0.9 and robot.held_body() is not None:
-            return lift(reach.step_m)
+            return lift(limits.step_m)
         heights = planner.heights()
         tool = robot.tool_pose()
         # above everything, the walls' upper parts left out, which the way never crosses
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
-        grasp = planner.plan(self.clutter.pool.present, tool, reach, heights, self._slip_cost)
+        grasp = planner.plan(self.clutter.pool.present, tool, limits, heights, self._slip_cost)
         if grasp is None or grasp.risk > self.risk_allowed:
-            nudge = NudgePlanner(planner).plan(self.clutter.pool.present, tool, reach, heights)
-            if nudge is not None:
-                return self._push(nudge, over_z)
+            push = PushPlanner(planner).plan(self.clutter.pool.present, tool, limits, heights)
+            if push is not None:
+                return self._push(push, over_z)
         if grasp is None or robot.opening() < 0.9:
-            return lift(reach.step_m, OPEN)
+            return lift(limits.step_m, OPEN)
         return self._grasp(grasp, over_z)
 
     def _slip_cost(self, grasps: np.ndarray) -> np.ndarray:
@@ -64,34 +71,34 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     def _grasp(self, grasp: Grasp, over_z: float) -> GripperCommand:
         """Go above the object with open fingers, down, and close them on arrival."""
-        robot, reach = self.robot, self.reach
+        robot, limits = self.robot, self.action_limits
         (x, y, z), yaw = robot.tool_pose()
         gx, gy, gz = grasp.position
         aside = max(abs(gx - x), abs(gy - y))
         turn = abs(wrap_angle(grasp.yaw_rad - yaw))
         if aside <= ALIGNED_M and turn <= ALIGNED_RAD:
-            opening = CLOSED if z - gz <= reach.step_m else OPEN
-            return towards(robot, grasp.position, grasp.yaw_rad, opening)
+            opening = CLOSED if z - gz <= limits.step_m else OPEN
+            return move_toward(robot, grasp.position, grasp.yaw_rad, opening)
         if z < over_z - 1e-3:
             return lift(over_z - z, OPEN)
-        return towards(robot, (gx, gy, over_z), grasp.yaw_rad, OPEN)
+        return move_toward(robot, (gx, gy, over_z), grasp.yaw_rad, OPEN)
 
-    def _push(self, nudge: Nudge, over_z: float) -> GripperCommand:
+    def _push(self, push: Push, over_z: float) -> GripperCommand:
         """Go down beside an object with closed fingers, then against it."""
         robot = self.robot
         (x, y, z), yaw = robot.tool_pose()
-        sx, sy, sz = nudge.start
+        sx, sy, sz = push.start
         aside = max(abs(sx - x), abs(sy - y))
         is_closed = robot.opening() < 0.1
-        if is_closed and z <= sz + nudge.slack_m and aside <= NEAR_M:
-            return towards(robot, nudge.end, yaw, CLOSED)
+        if is_closed and z <= sz + push.slack_m and aside <= NEAR_M:
+            return move_toward(robot, push.end, yaw, CLOSED)
         if is_closed and aside <= ALIGNED_M:
-            return towards(robot, nudge.start, yaw, CLOSED)
+            return move_toward(robot, push.start, yaw, CLOSED)
         if z < over_z - 1e-3:
             return lift(over_z - z, CLOSED)
-        return towards(robot, (sx, sy, over_z), yaw, CLOSED)
+        return move_toward(robot, (sx, sy, over_z), yaw, CLOSED)
 
-    def taken(self) -> Body | None:
+    def grasped_object(self) -> Body | None:
         """Return what is held, if the tool is high enough."""
         if self.robot.tool_pose()[0][2] <= self.lift_height_m:
             return None

@@ -9,21 +9,22 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, Color, Shape, Solid, vertical_extent, world_vertices
-from ba_torchrl.sim.cameras import HeightCamera
 from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_mesh
+from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TASKS, PlacementError
-from ba_torchrl.tasks.open_loop.packing import RELEASE_GAP_M, PackingTask, open_box
-from ba_torchrl.tasks.open_loop.rectangles import (
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
+from ba_torchrl.tasks.packing.footprints import (
+    Footprint,
     Rectangle,
-    Room,
     narrowest,
     outline,
     random_rectangle,
     scatter,
 )
-from ba_torchrl.tasks.pool import Pool
 
 BIN_M = (0.176, 0.144, 0.08)
 WALL_M = 0.004
@@ -94,7 +95,7 @@ class BinPacking(PackingTask):
     max_steps = 20
     num_objects = 8
     num_objects_range = (1, 10)
-    is_chaotic = True
+    needs_fresh_world = True
 
     def build(self, world: World) -> None:
         """Load the bin, and as many objects of each shape as may be drawn."""
@@ -103,7 +104,7 @@ class BinPacking(PackingTask):
         self.container = world.add(open_box(size, wall, floor, (0.6, 0.62, 0.66, 1.0)), "bin")
         kinds = pieces(self.unit)
         copies = self.settings.num_objects
-        self.pool = Pool(
+        self.pool = BodyPool(
             world,
             [shape for shape in kinds.values() for _ in range(copies)],
             [f"{name} {i + 1}" for name in kinds for i in range(copies)],
@@ -120,9 +121,9 @@ class BinPacking(PackingTask):
             around = random_rectangle(self, rng, half_x, half_y, fixed_yaw_rad=math.pi / 2)
             kinds = rng.integers(len(self.pool.bodies) // count, size=count).tolist()
             chosen = [self.pool.bodies[kind * count + i] for i, kind in enumerate(kinds)]
-            rooms = [Room(*body.shape.bounds_m[1][:2], *hand) for body in chosen]
+            footprints = [Footprint(*body.shape.bounds_m[1][:2], *hand) for body in chosen]
             try:
-                places = scatter(self, rng, rooms, [around], clear_of=around)
+                places = scatter(self, rng, footprints, [around], clear_of=around)
                 break
             except PlacementError:
                 if attempt == LAYOUTS - 1:
@@ -130,7 +131,7 @@ class BinPacking(PackingTask):
         self.stand(self.container, (around.x, around.y), around.yaw_rad)
         self.pool.clear()
         for body, (xy, yaw) in zip(chosen, places, strict=True):
-            self.pool.bring(body)
+            self.pool.activate(body)
             self.stand(body, xy, yaw)
 
     def is_goal(self) -> bool:
@@ -195,8 +196,8 @@ class BinPacking(PackingTask):
         """Return the bin's inside, less a margin."""
         x, y, _ = self.container.position
         length, width, _ = (size * self.unit / 2 for size in BIN_M)
-        taken = WALL_M * self.unit + margin_m
-        return Rectangle(x, y, self.container.yaw_rad, length - taken, width - taken)
+        margin = WALL_M * self.unit + margin_m
+        return Rectangle(x, y, self.container.yaw_rad, length - margin, width - margin)
 
     def _walls(self) -> list[Rectangle]:
         inside, thin = self._inside(), WALL_M * self.unit / 2
@@ -211,13 +212,13 @@ class BinPacking(PackingTask):
     def _drop(self, held: Body) -> PickPlaceCommand:
         """Return the place that lets an object fall where it comes to lie lowest."""
         tool_yaw = self.robot.tool_pose()[1]
-        own = narrowest(held, None if self.reach.turn_rad else tool_yaw)[0]
+        own = narrowest(held, None if self.action_limits.turn_rad else tool_yaw)[0]
         heights = self._heights()
         best: tuple[float, tuple[float, float], float, float] | None = None
         for quarter in (0, 1):
             half = (own.half_x, own.half_y) if quarter == 0 else (own.half_y, own.half_x)
             turn = self._inside().yaw_rad + quarter * math.pi / 2 - own.yaw_rad
-            if not self.reach.turn_rad:
+            if not self.action_limits.turn_rad:
                 if abs(wrap_angle(turn + tool_yaw, math.pi)) > math.pi / 4:
                     continue  # the nearest of the two is what a gripper that does not turn has
                 turn = -tool_yaw

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.pieces import cube, cylinder
-from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
-from ba_torchrl.tasks.structures import Blueprint, tower
+from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
+from ba_torchrl.tasks.structures.open_loop import Part, StructureTask
+from ba_torchrl.tasks.structures.parts import cube, cylinder
 
 OBJECTS = {"cube": cube, "cylinder": cylinder}
 """What `object_type` may say."""
@@ -24,7 +24,7 @@ class BlockStacking(StructureTask):
     max_steps = 10
     num_objects = 4
     num_objects_range = (2, 8)
-    makes_room = True
+    clears_blocked_pieces = True
 
     @classmethod
     def step_limit(cls, num_objects: int) -> int:

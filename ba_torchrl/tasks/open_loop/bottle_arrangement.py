@@ -7,21 +7,22 @@ import math
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand
+from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
 from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TASKS, PlacementError
-from ba_torchrl.tasks.open_loop.packing import OPEN_M, RELEASE_GAP_M, Grasp, PackingTask, open_box
-from ba_torchrl.tasks.open_loop.rectangles import (
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.packing.base import OPEN_M, RELEASE_GAP_M, Grasp, PackingTask, open_box
+from ba_torchrl.tasks.packing.footprints import (
     TIP_M,
+    Footprint,
     Rectangle,
-    Room,
     finger_gap_m,
     random_rectangle,
     scatter,
 )
-from ba_torchrl.tasks.pool import Pool
-from ba_torchrl.tasks.structures import UPRIGHT_RAD
+from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)
 WALL_M = 0.01
@@ -104,7 +105,7 @@ class BottleArrangement(PackingTask):
             for profile, color in zip(BOTTLES_CM.values(), COLORS, strict=True)
         ]
         copies = self.settings.num_objects
-        self.pool = Pool(
+        self.pool = BodyPool(
             world,
             [shape for shape in self._kinds for _ in range(copies)],
             [f"{name} {i + 1}" for name in BOTTLES_CM for i in range(copies)],
@@ -115,7 +116,7 @@ class BottleArrangement(PackingTask):
         count = self.settings.num_objects
         length, width, _ = (size * self.unit for size in TRAY_M)
         half = BOTTLE_M * self.unit / 2
-        room = Room(half, half, margin_m=(APART_M - BOTTLE_M) * self.unit)
+        room = Footprint(half, half, margin_m=(APART_M - BOTTLE_M) * self.unit)
         for attempt in range(LAYOUTS):
             tray = random_rectangle(self, rng, length / 2, width / 2)
             # no bottle starts closer to the tray than to a bottle in it
@@ -131,7 +132,7 @@ class BottleArrangement(PackingTask):
         for i, (xy, yaw) in enumerate(places):
             kind = int(rng.integers(len(self._kinds)))
             bottle = self.pool.bodies[kind * count + i]
-            self.pool.bring(bottle)
+            self.pool.activate(bottle)
             self.stand(bottle, xy, yaw)
 
     def is_goal(self) -> bool:
@@ -162,7 +163,7 @@ class BottleArrangement(PackingTask):
             x, y = self._free_place(held)
             floor = self._floor_z_m()
             yaw = self.robot.tool_pose()[1]
-            if self.reach.turn_rad:
+            if self.action_limits.turn_rad:
                 others = self.obstacles(held, floor + self.depth_m(held) - TIP_M)
                 half = self.release_half_m(held)
                 yaw = max(
@@ -199,7 +200,7 @@ class BottleArrangement(PackingTask):
 
     def _yaws(self) -> list[float]:
         """Return the yaws to grasp or let go of a bottle at, a diagonal of the tray first."""
-        if not self.reach.turn_rad:
+        if not self.action_limits.turn_rad:
             return [0.0]
         first = self.container.yaw_rad + math.pi / 4
         return [first + math.pi * i / GRASP_YAWS for i in range(GRASP_YAWS)]

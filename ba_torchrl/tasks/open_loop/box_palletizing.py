@@ -8,21 +8,22 @@ from typing import Any
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, vertical_extent
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TASKS, PlacementError
-from ba_torchrl.tasks.open_loop.packing import ENOUGH_M, RELEASE_GAP_M, PackingTask
-from ba_torchrl.tasks.open_loop.rectangles import (
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.packing.base import ENOUGH_M, RELEASE_GAP_M, PackingTask
+from ba_torchrl.tasks.packing.footprints import (
+    Footprint,
     Rectangle,
-    Room,
     gap_m,
     narrowest,
     outline,
     random_rectangle,
     scatter,
 )
-from ba_torchrl.tasks.pool import Pool
-from ba_torchrl.tasks.structures import CUBOID, UPRIGHT_RAD
+from ba_torchrl.tasks.structures.blueprint import CUBOID, UPRIGHT_RAD
 
 PALLET_M = (0.232, 0.192, 0.03)
 BOX_M = (0.045, 0.072, 0.045)
@@ -84,7 +85,7 @@ class BoxPalletizing(PackingTask):
         self.container = world.add(Box(size_m=pallet, mass_kg=0.0, color=color), "pallet")
         shape = Box(size_m=box, color=(0.85, 0.66, 0.4, 1.0))
         count = self.settings.num_objects
-        self.pool = Pool(world, [shape] * count, [f"box {i + 1}" for i in range(count)])
+        self.pool = BodyPool(world, [shape] * count, [f"box {i + 1}" for i in range(count)])
         self._arrivals: list[tuple[tuple[float, float], float]] = []
         """Where each box comes in."""
 
@@ -93,7 +94,7 @@ class BoxPalletizing(PackingTask):
         half_x, half_y, _ = (size * self.unit / 2 for size in PALLET_M)
         width, length, _ = (size * self.unit / 2 for size in BOX_M)
         hand = tuple(size * self.unit for size in HAND_M)
-        room = Room(width, length, *hand)
+        room = Footprint(width, length, *hand)
         for attempt in range(LAYOUTS):
             pallet = random_rectangle(self, rng, half_x, half_y, fixed_yaw_rad=math.pi / 2)
             try:
@@ -172,7 +173,7 @@ class BoxPalletizing(PackingTask):
     def _bring(self) -> None:
         number = len(self.pool.present)
         box = self.pool.bodies[number]
-        self.pool.bring(box)
+        self.pool.activate(box)
         self.stand(box, *self._arrivals[number])
 
     def _pallet(self) -> Rectangle:

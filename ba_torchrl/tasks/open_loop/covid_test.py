@@ -9,13 +9,14 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, vertical_extent
-from ba_torchrl.sim.robots.base import Pose
+from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TASKS, PlacementError
-from ba_torchrl.tasks.experts import RELEASE_GAP_M, finger_room
-from ba_torchrl.tasks.open_loop.base import OpenLoopTask
-from ba_torchrl.tasks.pool import park
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.body_pool import move_out_of_scene
+from ba_torchrl.tasks.motion_primitives import RELEASE_GAP_M, finger_room
+from ba_torchrl.tasks.open_loop_task import OpenLoopTask
 
 PURPLE: Color = (0.6, 0.45, 0.78, 1.0)
 GRAY: Color = (0.6, 0.6, 0.6, 1.0)
@@ -191,7 +192,7 @@ class CovidTest(OpenLoopTask):
         return [*self.tubes, *(swab for swab in self.swabs if swab not in self._spent)]
 
     @property
-    def landmarks(self) -> Sequence[Pose]:
+    def landmarks(self) -> Sequence[YawPose]:
         """Areas, tubes and swabs; in place of swabs that are gone, the workspace's upper corner."""
         workspace = self.settings.workspace
         gone = ((workspace.x[1], workspace.y[1], workspace.z[1]), 0.0)
@@ -236,14 +237,14 @@ class CovidTest(OpenLoopTask):
 
     def _test(self, tube: Body, swab: Body) -> None:
         """Put the swab into the tube: it is gone, and the tube lies anywhere in the test area."""
-        park(swab, self.swabs.index(swab))
+        move_out_of_scene(swab, self.swabs.index(swab))
         self._spent.append(swab)
         self._used.append(tube)
         # keyed on the round: what happened before has no part in it
         rng = np.random.default_rng([self._seed, len(self._used)])
         others = [other for other in self.objects if other is not tube]
         for _ in range(SPOT_ATTEMPTS):
-            spot = tuple(float(rng.uniform(-reach, reach)) for reach in self.spot_m)
+            spot = tuple(float(rng.uniform(-half, half)) for half in self.spot_m)
             yaw = math.pi / 2 + self.random_yaw(rng, 2 * math.pi)
             self._lay(tube, self._to_world(self.test_area, spot), yaw)
             if all(gap_m(other.id, tube) > APART_M for other in others):
@@ -294,7 +295,7 @@ class CovidTest(OpenLoopTask):
     def _place(self, held: Body) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
         if held in self._used:
-            turns = bool(self.reach.turn_rad)
+            turns = bool(self.action_limits.turn_rad)
             spots = USED_ROWS if turns else USED_COLUMNS
             return self._place_on(held, self.used_box, spots, 0.0, rim_m=USED_BOX.size[2])
         kin = self.tubes if held in self.tubes else self.swabs
@@ -328,7 +329,7 @@ class CovidTest(OpenLoopTask):
             key=lambda spot: min(math.dist(spot, other[:2]) for other in others),
         )
         turn = -tool_yaw
-        if self.reach.turn_rad:
+        if self.action_limits.turn_rad:
             turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
         ox, oy = (b - t for b, t in zip(held.position[:2], tool[:2], strict=True))
         dx, dy = _turned((ox, oy), (0.0, 0.0), turn)
@@ -337,7 +338,7 @@ class CovidTest(OpenLoopTask):
         return PickPlaceCommand(PLACE, x - dx, y - dy, z, tool_yaw + turn)
 
     def _grasp_yaw(self, body: Body) -> float:
-        return body.yaw_rad + math.pi / 2 if self.reach.turn_rad else 0.0
+        return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0
 
     def _room(self, body: Body) -> float:
         others = [other for other in self.objects if other is not body] + self._walls

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.pieces import cube, pair_span, roof
-from ba_torchrl.tasks.open_loop.structure import Part, StructureTask
-from ba_torchrl.tasks.structures import CUBE, ROOF, Blueprint, Slot
+from ba_torchrl.tasks.structures.blueprint import CUBE, ROOF, Blueprint, Slot
+from ba_torchrl.tasks.structures.open_loop import Part, StructureTask
+from ba_torchrl.tasks.structures.parts import cube, pair_span, roof
 
 
 @TASKS.register("open_loop/house_building_2")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.improvise_pieces import SHAPE, ImproviseTask, shape_span
-from ba_torchrl.tasks.open_loop.pieces import roof
-from ba_torchrl.tasks.open_loop.structure import Part
-from ba_torchrl.tasks.structures import CUBOID, ROOF, Blueprint, Slot
+from ba_torchrl.tasks.structures.blueprint import CUBOID, ROOF, Blueprint, Slot
+from ba_torchrl.tasks.structures.improvise import SHAPE, ImproviseTask, shape_span
+from ba_torchrl.tasks.structures.open_loop import Part
+from ba_torchrl.tasks.structures.parts import roof
 
 
 @TASKS.register("open_loop/improvise_house_building_3")

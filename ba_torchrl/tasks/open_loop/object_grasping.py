@@ -10,10 +10,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.clutter import ClutterTask
-from ba_torchrl.tasks.grasps import DEEPEST_M, PIXEL_M, YAWS
-from ba_torchrl.tasks.open_loop.base import OpenLoopTask
-from ba_torchrl.tasks.tray import FLOOR_Z_M
+from ba_torchrl.tasks.clutter.base import ClutterTask
+from ba_torchrl.tasks.clutter.grasp_planner import DEEPEST_M, PIXEL_M, YAWS
+from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M
+from ba_torchrl.tasks.open_loop_task import OpenLoopTask
 
 USUAL_WIDTH_M = 0.045
 """Of an object between the fingers, where an action leaves the height open."""
@@ -38,7 +38,7 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
     """
 
     max_steps = 1
-    one_step = True
+    terminates_at_limit = True
     num_objects = 15
     num_objects_range = (1, 20)
     scale_range = (1.0, 1.0)
@@ -70,12 +70,14 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         """Pick what is least likely to slip; after failures, what comes next if it is near."""
         workspace = self.settings.workspace
         x, y = workspace.center
-        if self.taken() is not None:  # the episode is over: all that is left is to put it back
+        if (
+            self.grasped_object() is not None
+        ):  # the episode is over: all that is left is to put it back
             return PickPlaceCommand(PLACE, x, y, workspace.z[1] / 2)
         planner, present = self.planner, self.clutter.pool.present
         heights, tool = planner.heights(), ((x, y, workspace.z[1]), 0.0)
         penalty = partial(self._penalty, _highest(heights))
-        grasps = [planner.plan([b], tool, self.reach, heights, penalty) for b in present]
+        grasps = [planner.plan([b], tool, self.action_limits, heights, penalty) for b in present]
         found = sorted(filter(None, grasps), key=lambda grasp: grasp.cost)
         if not found:
             return self._squeeze()
@@ -105,24 +107,24 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         samples = [self.planner.placed_samples(body)[:, :3] for body in self.clutter.pool.present]
         samples.sort(key=lambda points: points[:, 2].max(), reverse=True)
         points = samples[self.clutter.failures % len(samples)]
-        yaws = np.arange(YAWS) * np.pi / YAWS if self.reach.turn_rad else np.zeros(1)
+        yaws = np.arange(YAWS) * np.pi / YAWS if self.action_limits.turn_rad else np.zeros(1)
         across = points[:, :2] @ np.array([np.cos(yaws), np.sin(yaws)])
         x, y = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
         z = self.pick_height_m(points[:, 2].max() - self.settings.workspace.z[0])
         yaw = yaws[np.ptp(across, axis=0).argmin()]
         return PickPlaceCommand(PICK, float(x), float(y), float(z), float(yaw))
 
-    def taken(self) -> Body | None:
+    def grasped_object(self) -> Body | None:
         """Return what the last pick took: cameras do not see it; contacts wait for a step."""
         return next((body for body in self.clutter.pool.present if body.is_hidden), None)
 
 
 def _highest(heights: np.ndarray) -> np.ndarray:
     """Return for each pixel of the planner's image the highest within `WINDOW_M`, metres."""
-    reach = round(WINDOW_M / PIXEL_M)
+    half = round(WINDOW_M / PIXEL_M)
     for axis in (0, 1):
         padding = [(0, 0), (0, 0)]
-        padding[axis] = (reach, reach)
+        padding[axis] = (half, half)
         padded = np.pad(heights, padding, mode="edge")
-        heights = sliding_window_view(padded, 2 * reach + 1, axis=axis).max(axis=-1)
+        heights = sliding_window_view(padded, 2 * half + 1, axis=axis).max(axis=-1)
     return heights

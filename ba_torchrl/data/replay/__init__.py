@@ -1,0 +1,1 @@
+"""Replay buffers, their codecs and samplers."""

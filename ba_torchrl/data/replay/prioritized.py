@@ -1,0 +1,180 @@
+"""The prioritised sampler of the replay, with a bonus for demonstrations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler
+from torchrl.data.replay_buffers.storages import Storage
+
+from ba_torchrl.data.replay import segment_tree
+from ba_torchrl.envs import keys
+
+segment_tree.install()
+
+_FILE = "sampler.pt"
+
+
+class ExpertPrioritizedSampler(PrioritizedSampler):
+    """Prioritised sampling that prefers demonstrations (appendix G.2).
+
+    A transition is drawn in proportion to (|td| + eps + bonus * is_expert) ^ alpha. New ones
+    get the largest |td| seen so far; the bonus is kept out of that maximum, which would
+    otherwise grow by one bonus per insertion. A draw comes with the weight
+    ``priority_weight`` = (p / p_min) ^ -beta, in (0, 1]; the loss divides it by the batch's
+    largest.
+
+    Args:
+        max_capacity: number of transitions of the storage.
+        generator: source of every draw.
+        alpha: exponent of the priorities.
+        beta: exponent of the weights at the start of a run; ``anneal`` takes it to one.
+        eps: added to every priority.
+        expert_bonus: added to the priority of demonstrations.
+        expert_key: entry that flags them.
+
+    Raises:
+        ValueError: an exponent or the bonus is negative, or ``eps`` is not positive.
+    """
+
+    def __init__(
+        self,
+        max_capacity: int,
+        *,
+        generator: torch.Generator,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+        eps: float = 1e-6,
+        expert_bonus: float = 1.0,
+        expert_key: NestedKey = keys.IS_EXPERT,
+    ) -> None:
+        if eps <= 0 or expert_bonus < 0:
+            raise ValueError(
+                f"eps must be positive and expert_bonus not negative, got {eps}, {expert_bonus}"
+            )
+        super().__init__(
+            max_capacity, alpha=alpha, beta=beta, eps=eps, dtype=torch.float64, reduction="mean"
+        )
+        self.generator = generator
+        self.expert_bonus = expert_bonus
+        self.expert_key = expert_key
+        self._initial_beta = beta
+
+    def anneal(self, fraction: float) -> None:
+        """Set beta between its first value and one.
+
+        Args:
+            fraction: how much of the run is over; clipped to [0, 1].
+        """
+        fraction = min(max(fraction, 0.0), 1.0)
+        self.beta = self._initial_beta + (1.0 - self._initial_beta) * fraction
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return ``batch_size`` indices drawn by priority, and their ``priority_weight`` [B].
+
+        Args:
+            storage: what is sampled.
+            batch_size: number of draws, with replacement.
+
+        Raises:
+            RuntimeError: the storage is empty.
+        """
+        count = len(storage)
+        if count == 0:
+            raise RuntimeError("cannot sample from an empty replay")
+        total, smallest = self._sum_tree.query(0, count), self._min_tree.query(0, count)
+        mass = total * torch.rand(batch_size, generator=self.generator, dtype=torch.float64)
+        index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass)).long()
+        index = index.clamp_max(count - 1)  # rounding of the total
+        leaf = torch.as_tensor(self._sum_tree[index])
+        return index, {"priority_weight": (leaf / smallest).pow(-self.beta).float()}
+
+    @torch.no_grad()
+    def update_priority(
+        self,
+        index: int | Tensor,
+        priority: float | Tensor,
+        *,
+        storage: Storage | None = None,
+    ) -> None:
+        """Set the priorities of some transitions.
+
+        Args:
+            index: their places in the storage.
+            priority: absolute TD error of each, or one for all; without the bonus.
+            storage: holds the expert flags; TorchRL's buffers pass it.
+
+        Raises:
+            ValueError: a priority is not finite, or the storage is needed and missing.
+        """
+        index = torch.as_tensor(index, dtype=torch.long).cpu().reshape(-1)
+        if not index.numel():
+            return
+        error = torch.as_tensor(priority, dtype=self.dtype).detach().cpu().reshape(-1).abs()
+        if not error.isfinite().all():
+            raise ValueError("a TD error is not finite: the run has diverged")
+        error = error.expand(index.shape)
+        largest = float(error.max())
+        if self._max_priority[0] is None or largest > self._max_priority[0]:
+            self._max_priority = (largest, int(index[error.argmax()]))
+        leaf = (error + self._eps + self._bonus(index, storage)).pow(self.alpha)
+        self._sum_tree[index] = leaf
+        self._min_tree[index] = leaf
+
+    def _bonus(self, index: Tensor, storage: Storage | None) -> Tensor | float:
+        if not self.expert_bonus:
+            return 0.0
+        if storage is None:
+            raise ValueError("update_priority needs the storage, for the expert flags")
+        if hasattr(storage, "column"):  # does not decode images
+            flags = storage.column(self.expert_key)[index]
+        else:
+            flags = storage[index][self.expert_key]
+        return self.expert_bonus * flags.reshape(-1).to(self.dtype)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return priorities, exponents and the generator's state, as tensors and numbers."""
+        everything = torch.arange(self._max_capacity)
+        return {
+            "leaves": torch.as_tensor(self._sum_tree[everything]).clone(),
+            "max_priority": self._max_priority,
+            "beta": self.beta,
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over what ``state_dict`` returned.
+
+        Args:
+            state_dict: of a sampler of the same capacity.
+
+        Raises:
+            ValueError: the capacities differ.
+        """
+        leaves = state_dict["leaves"]
+        if leaves.numel() != self._max_capacity:
+            raise ValueError(
+                f"the saved sampler has capacity {leaves.numel()}, this one {self._max_capacity}"
+            )
+        self._init()
+        written = leaves.nonzero().reshape(-1)  # every leaf of a transition is positive
+        if written.numel():
+            self._sum_tree[written] = leaves[written]
+            self._min_tree[written] = leaves[written]
+        largest, place = state_dict["max_priority"]
+        self._max_priority = None if largest is None else (largest, place)
+        self.beta = state_dict["beta"]
+        self.generator.set_state(state_dict["generator"].cpu())
+
+    def dumps(self, path: str | Path) -> None:
+        """Write the state into a folder, made if missing."""
+        Path(path).mkdir(parents=True, exist_ok=True)
+        torch.save(self.state_dict(), Path(path) / _FILE)
+
+    def loads(self, path: str | Path) -> None:
+        """Read the state from a folder that ``dumps`` wrote."""
+        self.load_state_dict(torch.load(Path(path) / _FILE, weights_only=True))

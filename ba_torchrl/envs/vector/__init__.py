@@ -1,0 +1,1 @@
+"""Vectors of environments, in this process or in worker processes."""

@@ -1,0 +1,83 @@
+"""Vectors of environments, in this process or in workers that may die without ending the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase, SerialEnv
+
+from ba_torchrl.envs.vector.batching import SeededVector, check_actions
+from ba_torchrl.envs.vector.parallel import VectorEnv
+
+__all__ = ["SerialVectorEnv", "VectorEnv", "check_actions", "make_vector_env"]
+
+MakeEnv = Callable[[], EnvBase]
+
+
+def make_vector_env(
+    make_env: MakeEnv | Sequence[MakeEnv],
+    num_envs: int,
+    *,
+    seed: int | None = None,
+    parallel: bool = True,
+    start_method: Literal["spawn", "fork"] = "spawn",
+    num_threads: int | None = None,
+    use_buffers: bool | None = None,
+    timeout_s: float = 60.0,
+    max_restarts: int = 5,
+) -> SerialVectorEnv | VectorEnv:
+    """Return ``num_envs`` environments as one, with batch size [num_envs], ready to be reset.
+
+    Args:
+        make_env: builds one environment, or a list with one such function per environment. A
+            `functools.partial` of an importable function or class suits every start method.
+        num_envs: number of environments.
+        seed: environment i is seeded with ``seed + i``, in this process and in workers alike.
+        parallel: whether each environment gets a process of its own.
+        start_method: how processes start. "fork" takes milliseconds, but needs a parent without
+            an open simulator and without CUDA; "spawn" takes seconds and always works.
+        num_threads: torch threads of this process while the environments are open; None leaves
+            them as they are.
+        use_buffers: whether data travel through shared memory (the default, best for steps of
+            a few milliseconds) or through pipes.
+        timeout_s: seconds after which a worker that does not answer is replaced.
+        max_restarts: how often in a row a worker may be replaced without a step in between.
+
+    Raises:
+        ValueError: ``num_envs`` is below one or differs from the number of functions.
+        RuntimeError: a worker could not be started.
+    """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+    if not callable(make_env) and len(make_env) != num_envs:
+        raise ValueError(f"{len(make_env)} functions were given for {num_envs} environments")
+    env: SerialVectorEnv | VectorEnv
+    if parallel:
+        env = VectorEnv(
+            num_envs,
+            make_env,
+            timeout_s=timeout_s,
+            max_restarts=max_restarts,
+            mp_start_method=start_method,
+            num_threads=num_threads,
+            use_buffers=True if use_buffers is None else use_buffers,
+        )
+    else:
+        env = SerialVectorEnv(num_envs, make_env)
+    env.start()
+    if seed is not None:
+        env.set_seed(seed)
+    return env
+
+
+class SerialVectorEnv(SeededVector, SerialEnv):
+    """Environments that step one after the other in this process."""
+
+    def _seed_env(self, index: int, seed: int) -> None:
+        self._envs[index].set_seed(seed, static_seed=True)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_actions(tensordict)
+        return super()._step(tensordict)

@@ -1,0 +1,361 @@
+"""VectorEnv: TorchRL's ParallelEnv, except that it outlives its workers."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from multiprocessing.connection import wait
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import multiprocessing as mp
+from torchrl.data.utils import CloudpickleWrapper
+from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
+from torchrl.envs.batched_envs import _run_worker_pipe_direct, _run_worker_pipe_shared_mem
+
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.vector.batching import SeededVector
+from ba_torchrl.envs.vector.worker import Worker, wait_until
+from ba_torchrl.errors import WorkerError
+
+logger = logging.getLogger(__name__)
+
+MakeEnv = Callable[[], EnvBase]
+
+_HEALTH_CHECK_S = 5e-3
+_LOSS = {
+    keys.REWARD: 0,
+    keys.TERMINATED: False,
+    keys.TRUNCATED: True,
+    keys.DONE: True,
+    keys.SUCCESS: False,
+    keys.FAULT: True,
+}
+
+
+class VectorEnv(SeededVector, ParallelEnv):
+    """Environments in worker processes; a worker that raises, dies or hangs is replaced.
+
+    The other workers keep their episodes. The step that lost an episode returns, for that
+    environment, the last valid observation with ``fault``, ``truncated`` and ``done`` set and a
+    reward of zero; TorchRL then resets it like any finished one. Actions are checked in this
+    process, before anything is sent. ``restarts`` counts the replacements.
+
+    Args:
+        num_workers: number of environments.
+        create_env_fn: builds one environment, or one such function per environment.
+        timeout_s: seconds after which a worker that does not answer is replaced.
+        max_restarts: how often in a row a worker may be replaced without a step in between.
+        parallel_options: further options of `torchrl.envs.ParallelEnv`.
+
+    Raises:
+        ValueError: the environments lack a ``truncated`` or a ``fault`` entry.
+    """
+
+    def __init__(
+        self,
+        num_workers: int,
+        create_env_fn: MakeEnv | Sequence[MakeEnv],
+        *,
+        timeout_s: float = 60.0,
+        max_restarts: int = 5,
+        **parallel_options: Any,
+    ) -> None:
+        parallel_options.setdefault("shutdown_timeout", 5.0)
+        super().__init__(num_workers, create_env_fn, **parallel_options)
+        missing = {keys.TRUNCATED, keys.FAULT} - {*self.done_keys, *self.observation_keys}
+        if missing:
+            raise ValueError(f"environments in workers need the entries {sorted(missing)}")
+        self.timeout_s = timeout_s
+        self.max_restarts = max_restarts
+        self.restarts = 0
+        self._failures_in_a_row = [0] * num_workers
+        self._replacements = [0] * num_workers  # since the last seed
+        self._lost: set[int] = set()  # replaced between two steps, not reported yet
+        self._threads_before = torch.get_num_threads()
+        self.parent_channels: list[Worker] = []
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process ids of the workers, by environment."""
+        return [worker.process.pid for worker in self.parent_channels]
+
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Step, and reset the environments that are done; see `EnvBase.step_and_maybe_reset`."""
+        if not self._use_buffers:
+            return super().step_and_maybe_reset(tensordict)  # calls _step and _reset
+        self._check_actions(tensordict)
+        with self._stepping():
+            return super().step_and_maybe_reset(tensordict)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """End the workers and give the torch threads back."""
+        was_open, threads = not self.is_closed, torch.get_num_threads()
+        super().close(raise_if_closed=raise_if_closed)
+        if was_open:
+            # TorchRL sets another number, assuming that it had lowered it.
+            torch.set_num_threads(threads if self.num_threads is None else self._threads_before)
+
+    def __getitem__(self, item: Any) -> EnvBase:
+        raise NotImplementedError("a VectorEnv has no views: a worker in one could not be replaced")
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_actions(tensordict)
+        with self._stepping():
+            return super()._step(tensordict)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if self.is_closed:
+            self.start()
+        self._replace_dead()
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if self._use_buffers and mask is not None and not mask.any():  # TorchRL would fail
+            return self.shared_tensordict_parent.select(*self._selected_reset_keys_filt).clone()
+        return super()._reset(tensordict, **kwargs)
+
+    def _seed_env(self, index: int, seed: int) -> None:
+        self._replacements[index] = 0
+        worker = self.parent_channels[index]
+        try:
+            worker.check()
+            _seed(worker, seed)
+        except WorkerError as error:
+            self._replace(index, error, seed)
+            self._lost.add(index)
+
+    def _start_workers(self) -> None:
+        if self._use_buffers and self._non_tensor_keys:
+            raise ValueError(f"use_buffers=False is needed for {self._non_tensor_keys}")
+        # TorchRL raises when it finds a dead process in `_workers`; ours are replaced instead.
+        self._workers: list[Any] = []
+        self._timeout = self.shutdown_timeout
+        self._shm_done_flags = mp.RawArray("b", self.num_workers)
+        self._lost.clear()
+        self.event = None  # of CUDA: these environments are on the CPU
+        try:
+            for index in range(self.num_workers):
+                self.parent_channels.append(self._launch(index))
+            for index, worker in enumerate(self.parent_channels):
+                try:
+                    worker.greet()
+                except WorkerError as error:
+                    raise RuntimeError(f"worker {index} could not be started: {error}") from None
+        except BaseException:
+            for worker in self.parent_channels:
+                worker.kill()
+            self.parent_channels = []
+            raise
+        self._threads_before = torch.get_num_threads()
+        if self.num_threads is not None:
+            torch.set_num_threads(self.num_threads)
+        self.is_closed = False
+        self.set_spec_lock_()
+
+    def _launch(self, index: int) -> Worker:
+        """Start worker ``index`` without waiting for it."""
+        make_env = self.create_env_fn[index]
+        if not isinstance(make_env, EnvCreator | CloudpickleWrapper):
+            make_env = CloudpickleWrapper(make_env)
+        options = {
+            "env_fun": make_env,
+            "env_fun_kwargs": self.create_env_kwargs[index],
+            "num_threads": self.num_sub_threads,
+            "filter_warnings": self._filter_warnings_subprocess(),
+        }
+        if not self._use_buffers:
+            options["consolidate"] = self.consolidate
+            return Worker(_run_worker_pipe_direct, options, self._mp_start_method, self.timeout_s)
+        self._shm_done_flags[index] = 0
+        options |= {
+            "worker_idx": index,
+            "shm_done_flags": self._shm_done_flags,
+            "shared_tensordict": self.shared_tensordicts[index],
+            "_selected_input_keys": self._selected_input_keys,
+            "_selected_reset_keys": self._selected_reset_keys,
+            "_selected_step_keys": self._selected_step_keys,
+            "_non_tensor_keys": self._non_tensor_keys,
+        }
+        return Worker(_run_worker_pipe_shared_mem, options, self._mp_start_method, self.timeout_s)
+
+    @property
+    def _events(self) -> list[Any]:
+        return [worker.event for worker in self.parent_channels]
+
+    def _shutdown_workers(self) -> None:
+        for worker in self.parent_channels:
+            worker.muted = False
+            worker.send(("close", None))
+        deadline = time.monotonic() + self.shutdown_timeout
+        for worker in self.parent_channels:
+            worker.join(deadline - time.monotonic())
+        self.parent_channels = []
+        if self._use_buffers:
+            del self.shared_tensordicts, self.shared_tensordict_parent
+            del self._shared_tensordict_parent_next, self._shared_tensordict_parent_root
+
+    @contextlib.contextmanager
+    def _stepping(self) -> Iterator[None]:
+        """Around a step: workers that died since the last command report a lost episode."""
+        if self.is_closed:
+            self.start()
+        self._replace_dead()
+        for index in self._lost:
+            self.parent_channels[index].muted = True
+        try:
+            yield
+        finally:
+            for worker in self.parent_channels:
+                worker.muted = False
+
+    def _replace_dead(self) -> None:
+        for index, worker in enumerate(self.parent_channels):
+            try:
+                worker.check()
+            except WorkerError as error:
+                self._replace(index, error)
+                self._lost.add(index)
+
+    def _replace(self, index: int, cause: WorkerError, seed: int | None = None) -> None:
+        """Put a new process in the place of worker ``index``; it still has to be reset."""
+        while True:
+            self._failures_in_a_row[index] += 1
+            if self._failures_in_a_row[index] > self.max_restarts:
+                self.close()
+                raise RuntimeError(
+                    f"worker {index} failed {self.max_restarts + 1} times without completing a "
+                    f"step; the last time {cause}. All workers were closed. Use parallel=False to "
+                    "see the error where it happens, or raise timeout_s or max_restarts"
+                )
+            self.restarts += 1
+            self._replacements[index] += 1
+            # The text only: a kept log record must not keep the dead worker through its traceback.
+            logger.warning(
+                "worker %d is replaced (restart %d): %s", index, self.restarts, str(cause)
+            )
+            self.parent_channels[index].kill()
+            worker = self.parent_channels[index] = self._launch(index)
+            try:
+                worker.greet()
+                _seed(worker, self._new_seed(index) if seed is None else seed)
+                return
+            except WorkerError as error:
+                cause = error
+
+    def _new_seed(self, index: int) -> int:
+        """Return a seed that no environment has had, the same whenever the run is repeated."""
+        known = self._base_seed is not None
+        entropy = [self._base_seed, index, self._replacements[index]] if known else None
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+    def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
+        workers = {index: self.parent_channels[index] for index in workers_range}
+        failures = self._collect([index for index in workers if not workers[index].muted])
+        for index, worker in workers.items():
+            if index in failures:
+                self._replace(index, failures[index])
+            elif not worker.muted and worker.command != "reset":
+                self._failures_in_a_row[index] = 0
+            if index in failures or worker.muted:
+                self._recover(index, worker.message)
+            self._lost.discard(index)
+
+    def _collect(self, indices: list[int]) -> dict[int, WorkerError]:
+        """Wait for the answers of workers; return the failures of those that gave none."""
+        pending = set(indices)
+        failures: dict[int, WorkerError] = {}
+        deadline = time.monotonic() + self.timeout_s
+        collect = self._collect_flags if self._use_buffers else self._collect_messages
+        try:
+            while pending:
+                failed = collect(pending)
+                if time.monotonic() > deadline:
+                    late = f"it did not finish within {self.timeout_s:g} s"
+                    failed = {index: WorkerError(late) for index in pending} | failed
+                failures |= failed
+                pending -= failed.keys()
+        except BaseException:
+            # An interrupt, say: later answers would be taken for those to the next command.
+            for index in pending:
+                self.parent_channels[index].abort()
+            raise
+        return failures
+
+    def _collect_flags(self, pending: set[int]) -> dict[int, WorkerError]:
+        """Take answered workers out of ``pending``; return, after a while, the dead ones."""
+        flags = self._shm_done_flags
+
+        def all_answered() -> bool:
+            for index in tuple(pending):
+                if flags[index]:
+                    flags[index] = 0
+                    pending.discard(index)
+            return not pending
+
+        failures: dict[int, WorkerError] = {}
+        if wait_until(all_answered, _HEALTH_CHECK_S):
+            return failures
+        for index in pending:
+            try:
+                self.parent_channels[index].check()
+            except WorkerError as error:
+                if not flags[index]:  # else it answered before it died
+                    failures[index] = error
+        return failures
+
+    def _collect_messages(self, pending: set[int]) -> dict[int, WorkerError]:
+        """Like `_collect_flags`, for workers that answer through their pipes."""
+        failures: dict[int, WorkerError] = {}
+        workers = {self.parent_channels[index].pipe: index for index in pending}
+        for pipe in wait(list(workers), _HEALTH_CHECK_S):
+            worker = self.parent_channels[workers[pipe]]
+            try:
+                worker.inbox.append(worker.read(0.0))  # TorchRL fetches it from there
+                pending.discard(workers[pipe])
+            except WorkerError as error:
+                failures[workers[pipe]] = error
+        return failures
+
+    def _recover(self, index: int, message: tuple[Any, Any]) -> None:
+        """Give the command in ``message`` the answer of an environment that lost its episode."""
+        command = message[0]
+        if command != "reset":
+            self._write_loss(index)
+            message = ("reset", (False, {}))
+        self.parent_channels[index].muted = False
+        if command == "step":  # the caller sees that it is done, and resets it
+            return
+        while True:
+            # A seed that the caller asked for is part of the message and stays.
+            self.parent_channels[index].send(message)
+            failures = self._collect([index])
+            if not failures:
+                return
+            self._replace(index, failures[index])
+
+    def _write_loss(self, index: int) -> None:
+        """Make the answer to a step that never happened."""
+        if self._use_buffers:
+            root = self.shared_tensordicts[index]
+            answer = root.get("next")
+        else:
+            root = self._last_worker_outputs[index]
+            answer = TensorDict(device=self.device)
+            for spec in (self.full_observation_spec, self.full_reward_spec, self.full_done_spec):
+                answer.update(spec[index].zero())
+            self.parent_channels[index].inbox.append(answer)
+        if root is not None:
+            for key in self.observation_keys:
+                answer.get(key).copy_(root.get(key))
+        for key in _LOSS.keys() & set(answer.keys()):
+            answer.get(key).fill_(_LOSS[key])
+
+
+def _seed(worker: Worker, seed: int) -> None:
+    worker.send(("seed", (seed, True)))
+    worker.recv()

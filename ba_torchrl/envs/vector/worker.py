@@ -1,0 +1,178 @@
+"""One worker process of a vector of environments, seen from the process that started it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import signal
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torchrl
+from torch import multiprocessing as mp
+
+from ba_torchrl.errors import WorkerError
+
+logger = logging.getLogger(__name__)
+
+_FAILED = "failed"
+_IDLE_TIMEOUT_S = 1e6  # TorchRL's workers give up after 10,000 s without a command
+_START_TIMEOUT_S = 120.0  # a spawned worker imports torch first
+_SPIN_S = 100e-6
+_NAP_S = 30e-6
+
+
+class Worker:
+    """A process that runs one of TorchRL's worker loops, and the pipe to it.
+
+    TorchRL uses it as if it were the pipe. It remembers the last command, holds answers that
+    were read ahead, and turns a broken pipe into a `WorkerError` when an answer is awaited.
+
+    Args:
+        loop: TorchRL's worker loop.
+        options: keyword arguments of ``loop``, but for the two ends of the pipe and the event.
+        start_method: "spawn" or "fork"; None means the default of this process.
+        timeout_s: seconds to wait for an answer.
+    """
+
+    def __init__(
+        self,
+        loop: Callable[..., None],
+        options: dict[str, Any],
+        start_method: str | None,
+        timeout_s: float,
+    ) -> None:
+        context = mp.get_context(start_method)
+        self.pipe, child_pipe = context.Pipe()
+        self.event = context.Event()
+        self.inbox: deque[Any] = deque()
+        self.message: tuple[Any, Any] = ("start", None)
+        self.muted = False  # it has no episode to go on with: commands go nowhere
+        self._timeout_s = timeout_s
+        options = {
+            **options,
+            "parent_pipe": self.pipe,
+            "child_pipe": child_pipe,
+            "mp_event": self.event,
+        }
+        # Daemonic: it must not outlive a parent that forgets to close it.
+        self.process = context.Process(target=_work, args=(loop, options), daemon=True)
+        self.process.start()
+        child_pipe.close()  # else the pipe would not break with the worker
+
+    @property
+    def command(self) -> str:
+        """The name of the last command."""
+        return self.message[0]
+
+    def greet(self) -> None:
+        """Wait until the environment is built.
+
+        Raises:
+            WorkerError: it could not be built.
+        """
+        self.read(_START_TIMEOUT_S)
+        self.send(("init", None))
+
+    def send(self, message: tuple[Any, Any]) -> None:
+        """Send a command and its argument; a dead worker is noticed by who awaits the answer."""
+        self.message = message
+        if self.muted:
+            return
+        try:
+            # Not `send`: that passes tensors as descriptors, which a dead worker never picks up.
+            self.pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
+        except OSError as error:
+            logger.debug("could not send %r: %s", message[0], error)
+
+    def recv(self) -> Any:
+        """Return the next answer.
+
+        Raises:
+            WorkerError: there will be none.
+        """
+        return self.inbox.popleft() if self.inbox else self.read(self._timeout_s)
+
+    def read(self, timeout_s: float) -> Any:
+        """Return the next message of the pipe.
+
+        Raises:
+            WorkerError: the worker is gone, or sends nothing for ``timeout_s`` seconds.
+        """
+        try:
+            if not self.pipe.poll(timeout_s):
+                raise WorkerError(f"it did not answer {self.command!r} within {timeout_s:g} s")
+            message = self.pipe.recv()
+        except (EOFError, OSError):
+            raise WorkerError(self._cause_of_death()) from None
+        if isinstance(message, tuple) and message[0] == _FAILED:
+            raise WorkerError(f"it raised\n{message[1]}")
+        return message
+
+    def check(self) -> None:
+        """Drop answers that nobody waits for any more.
+
+        Raises:
+            WorkerError: the worker is gone.
+        """
+        self.inbox.clear()
+        while self.process.exitcode is not None or self.pipe.poll():
+            self.read(0.0)
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the process to end by itself, then release what it held."""
+        self.process.join(max(timeout_s, 0.0))
+        self.kill()
+
+    def abort(self) -> None:
+        """End the process, whatever it does; the next `check` finds it dead."""
+        self.process.kill()  # a hanging simulator does not listen to anything softer
+        self.process.join()
+
+    def kill(self) -> None:
+        """End the process, whatever it does, and release what it held."""
+        self.abort()
+        self.process.close()
+        self.pipe.close()
+
+    def _cause_of_death(self) -> str:
+        self.process.join(1.0)
+        code = self.process.exitcode
+        if code is None:
+            return "it closed its pipe"
+        if code >= 0:
+            return f"its process ended with exit code {code}"
+        return f"its process was ended by {signal.Signals(-code).name}"
+
+
+def _work(loop: Callable[..., None], options: dict[str, Any]) -> None:
+    """Body of a worker: run TorchRL's loop and send its exception, if any, to the parent."""
+    # The parent decides what an interrupt means; handlers that it set are not the worker's.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    torchrl._utils.BATCHED_PIPE_TIMEOUT = _IDLE_TIMEOUT_S
+    pipe: Connection = options["child_pipe"]
+    try:
+        loop(**options)
+    except BaseException:
+        with contextlib.suppress(OSError):  # no parent is left to tell
+            pipe.send((_FAILED, traceback.format_exc()))
+        os._exit(1)  # the environment is broken: run none of its clean-up
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float) -> bool:
+    """Poll ``condition``, at first without a pause; return whether it came true in time."""
+    start = time.perf_counter()
+    while not condition():
+        elapsed = time.perf_counter() - start
+        if elapsed > timeout_s:
+            return False
+        if elapsed > _SPIN_S:
+            time.sleep(_NAP_S)  # the core belongs to the workers
+    return True

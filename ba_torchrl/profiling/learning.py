@@ -1,0 +1,170 @@
+"""Times of the learner, in convolutions; and the memory of its replay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from ba_torchrl import make_vector_env
+from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.replay.buffer import FrameStorage
+from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
+from ba_torchrl.envs import keys
+from ba_torchrl.profiling.table import Bench, Budget, Row, measurement, timed_row
+from ba_torchrl.training.checkpoint import build_algorithm
+from ba_torchrl.training.config import ExperimentConfig
+
+SEED = 0
+CAPACITY = 100_000
+
+
+class LearningUnit:
+    """One float32 3 x 3 convolution, 64 to 128 channels, 64 images of 64 x 64, and its gradient."""
+
+    def __init__(self) -> None:
+        self.convolution = nn.Conv2d(64, 128, 3, padding=1)
+        self.images = torch.randn(64, 64, 64, 64, requires_grad=True)
+
+    def __call__(self) -> None:
+        """Forward and backward."""
+        self.convolution(self.images).sum().backward()
+
+
+CLOSE_LOOP = {
+    "task": "close_loop/block_picking",
+    "algorithm": {"name": "sac", "demonstration_weight": 1.0, "batch_size": 64},
+}
+OPEN_LOOP = {
+    "task": "open_loop/block_stacking",
+    "algorithm": {"name": "spatial_q", "demonstrations": "sdqfd", "batch_size": 16},
+}
+
+
+def _learner(experiment: dict[str, Any], network: dict[str, Any], obs_size: int) -> Algorithm:
+    """Return a learner with the expert's transitions in its replay."""
+    config = ExperimentConfig.parse(
+        {
+            **experiment,
+            "env": {"obs_size": obs_size},
+            "network": network,
+            "seed": SEED,
+            "device": "cpu",
+        }
+    )
+    algorithm = build_algorithm(config)
+    for episode in _expert_episodes(config.task, obs_size, 20)[1]:
+        algorithm.extend(as_transitions(episode, is_expert=True))
+    return algorithm
+
+
+def _expert_episodes(task: str, obs_size: int, episodes: int) -> tuple[float, list[TensorDict]]:
+    """Return the image's largest value and the expert's episodes."""
+    env = make_vector_env(task, 1, parallel=False, obs_size=obs_size, seed=SEED, expert=True)
+    high = float(env.observation_spec[keys.PIXELS].space.high.max())
+    played = collect_demonstrations(env, episodes, seed=SEED)
+    env.close()
+    return high, played
+
+
+def _update(bench: Bench, work: str, learner: Algorithm, budget: Budget) -> list[Row]:
+    units, times = bench.time_against(LearningUnit(), {work: learner.update})
+    return [timed_row(work, "s", times[work], units, budget)]
+
+
+@measurement("learning/equi_sacfd_update")
+def equivariant_update(bench: Bench) -> list[Row]:
+    """The paper's largest close-loop learner."""
+    return _update(
+        bench,
+        "Equi SACfD update, batch 64, 128 px, C8, 64 fields",
+        _learner(CLOSE_LOOP, {"name": "equi", "group_order": 8, "n_hidden": 64}, 128),
+        Budget("13.5", 2.0, 1.3),
+    )
+
+
+@measurement("learning/equi_sacfd_update_small")
+def quickstart_update(bench: Bench) -> list[Row]:
+    """The learner of `make train`."""
+    return _update(
+        bench,
+        "Equi SACfD update, batch 64, 64 px, C8, 16 fields",
+        _learner(CLOSE_LOOP, {"name": "equi", "group_order": 8, "n_hidden": 16}, 64),
+        Budget("", None, 0.15),
+    )
+
+
+@measurement("learning/cnn_sacfd_update")
+def plain_update(bench: Bench) -> list[Row]:
+    """The close-loop learner without symmetry."""
+    return _update(
+        bench,
+        "CNN SACfD update, batch 64, 128 px",
+        _learner(CLOSE_LOOP, {"name": "cnn"}, 128),
+        Budget("1.57", 0.35, 0.2),
+    )
+
+
+@measurement("learning/equi_sdqfd_update")
+def equivariant_spatial_update(bench: Bench) -> list[Row]:
+    """The paper's open-loop learner."""
+    return _update(
+        bench,
+        "SDQfD Equi ASR update, batch 16, 128 px, 16 rotations",
+        _learner(OPEN_LOOP, {"name": "equi_asr"}, 128),
+        Budget("40.6", 7.0, 4.0),
+    )
+
+
+@measurement("learning/cnn_sdqfd_update")
+def plain_spatial_update(bench: Bench) -> list[Row]:
+    """The open-loop learner without symmetry."""
+    return _update(
+        bench,
+        "SDQfD CNN ASR update, batch 16, 128 px, 16 rotations",
+        _learner(OPEN_LOOP, {"name": "asr"}, 128),
+        Budget("3.9", 1.0, 0.5),
+    )
+
+
+def _replay_memory(
+    bench: Bench, task: str, codecs: Callable[[float], dict[str, ImageCodec]], budget: Budget
+) -> list[Row]:
+    """Bytes of the expert's episodes in the replay, scaled to its capacity."""
+    high, episodes = _expert_episodes(task, 128, bench.repeats)
+    storage = FrameStorage(CAPACITY, codecs(high))
+    stored = 0
+    for number in bench.rounds():
+        data = as_transitions(episodes[number], is_expert=True)
+        storage.set(torch.arange(stored, stored + len(data)), data)
+        stored += len(data)
+    megabytes = storage.nbytes / stored * CAPACITY / 1e6
+    notes = f"counted over {stored} transitions, {storage.nbytes / stored:.0f} bytes each"
+    work = f"100,000 transitions of 128 px, {task}"
+    return [Row(work, "MB", [megabytes], budget, None, notes)]
+
+
+@measurement("memory/close_loop_replay")
+def close_loop_memory(bench: Bench) -> list[Row]:
+    """Eight-bit depth."""
+    return _replay_memory(
+        bench,
+        "close_loop/block_picking",
+        lambda high: {keys.PIXELS: DepthQuantizer(high)},
+        Budget("3300", 1700.0, 500.0),
+    )
+
+
+@measurement("memory/open_loop_replay")
+def open_loop_memory(bench: Bench) -> list[Row]:
+    """Half-precision heightmaps and in-hand images."""
+    return _replay_memory(
+        bench,
+        "open_loop/block_stacking",
+        lambda high: dict.fromkeys((keys.PIXELS, keys.IN_HAND), HalfPrecision(high)),
+        Budget("13000", 3400.0, 500.0),
+    )

@@ -1,0 +1,161 @@
+"""Times of the simulator: steps, resets and images, in steps of PyBullet."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pybullet
+from torch import Tensor
+
+from ba_torchrl import list_tasks, make
+from ba_torchrl.envs import keys
+from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
+from ba_torchrl.profiling.table import Bench, Budget, Row, measurement, seconds, timed_row
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.vision.depth import HeightCamera
+from ba_torchrl.sim.world import World
+
+SEED = 0
+CAMERA_M = 1.0
+
+
+class SimulationUnit:
+    """One `stepSimulation` of kuka, floor and four cubes at rest."""
+
+    def __init__(self) -> None:
+        self.world = World()
+        self.robot = ROBOTS["kuka"](self.world)
+        box = Box(size_m=(0.05, 0.05, 0.05))
+        self.bodies = [self.world.add(box, f"cube {i}") for i in range(4)]
+        for i, body in enumerate(self.bodies):
+            body.place((0.39 + 0.12 * (i // 2), -0.06 + 0.12 * (i % 2), 0.025), 0.4 * i)
+        home = self.robot.inverse_kinematics((0.45, 0.0, 0.2), downward(0.0))
+        self.robot.teleport(home)
+        self.robot.set_opening(1.0)
+        self.world.settle()
+
+    def __call__(self) -> None:
+        """Take the step."""
+        self.world.step()
+
+
+BUDGETS: dict[str, tuple[Budget, Budget | None]] = {
+    "close_loop": (Budget("36-60", 5.0, 2.5), None),
+    "close_loop/block_picking": (Budget("31", 4.0, 1.5), None),
+    "close_loop/object_grasping": (Budget("79", 15.0, 8.0), None),
+    "open_loop/block_stacking": (Budget("82", 8.0, 3.0), None),
+    "open_loop/house_building_4": (Budget("96", 10.0, 4.0), None),
+    "open_loop/box_palletizing": (Budget("374", 35.0, 12.0), None),
+    "open_loop/covid_test": (Budget("388", 35.0, 12.0), None),
+    "open_loop/bin_packing": (Budget("181", 18.0, 8.0), None),
+    "open_loop/object_grasping": (Budget("2650", 200.0, 60.0), Budget("2210", 250.0, 150.0)),
+}
+"""Of a step and of a reset, for a task or for all the others of its kind."""
+
+
+def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
+    """Return the actions of the expert's first episodes."""
+    env = make(task, seed=SEED, expert=True)
+    played: list[list[Tensor]] = []
+    for _ in range(episodes):
+        state, actions = env.reset(), []
+        while not actions or not state[keys.DONE]:
+            actions.append(state[keys.EXPERT_ACTION].clone())
+            state = env.step(state.set(keys.ACTION, actions[-1]))[keys.NEXT]
+        played.append(actions)
+    env.close()
+    return played
+
+
+@measurement("simulation/step", over=list_tasks)
+def step_and_reset(bench: Bench, task: str) -> list[Row]:
+    """Steps and resets of a task, the actions the expert's but not asked for while the clock runs.
+
+    The same seed gives the same episodes, so the actions are recorded beforehand.
+    """
+    unit = SimulationUnit()
+    env = make(task, seed=SEED)
+    steps, resets, units, physics = [], [], [], []
+    episodes = _expert_actions(task, bench.repeats)
+    for number in bench.rounds():
+        units += [seconds(unit) for _ in range(5)]
+        start = time.perf_counter()
+        state = env.reset()
+        resets.append(time.perf_counter() - start)
+        for action in episodes[number]:
+            state[keys.ACTION] = action
+            before = env.scene.world.steps
+            start = time.perf_counter()
+            result = env.step(state)
+            steps.append(time.perf_counter() - start)
+            physics.append(env.scene.world.steps - before)
+            units.append(seconds(unit))
+            state = result[keys.NEXT]
+    size = env.observation_spec[keys.PIXELS].shape[-1]
+    env.close()
+    unit.world.close()
+    of_step, of_reset = BUDGETS.get(task, BUDGETS.get(task.split("/")[0], (None, None)))
+    notes = f"{np.mean(physics):.1f} physics steps per action, {len(steps)} actions"
+    return [
+        timed_row(f"{task}, step, {size} px", "ms", steps, units, of_step, notes),
+        timed_row(f"{task}, reset", "ms", resets, units, of_reset),
+    ]
+
+
+@measurement("simulation/depth_image")
+def depth_image(bench: Bench) -> list[Row]:
+    """One image of four cubes at 128 x 128: compiled, in NumPy, and by PyBullet."""
+    unit = SimulationUnit()
+    center, side_m, pixels = (0.45, 0.0), 0.45, 128
+    camera, plain = HeightCamera(unit.bodies), NumpyHeightCamera(unit.bodies)
+    view, projection = _looking_down(center, side_m)
+
+    def tiny_renderer() -> tuple:
+        return pybullet.getCameraImage(
+            pixels,
+            pixels,
+            view,
+            projection,
+            renderer=pybullet.ER_TINY_RENDERER,
+            physicsClientId=unit.world.client,
+        )
+
+    heights = camera.heightmap(center, side_m, pixels)
+    np.testing.assert_allclose(plain.heightmap(center, side_m, pixels), heights, atol=1e-12)
+    units, times = bench.time_against(
+        unit,
+        {
+            "compiled": lambda: camera.heightmap(center, side_m, pixels),
+            "NumPy": lambda: plain.heightmap(center, side_m, pixels),
+            "TinyRenderer, arm and floor visible": tiny_renderer,
+        },
+        repeats=10,
+    )
+    cubes = [body.id for body in unit.bodies]
+    pybullet.removeBody(unit.robot.id, physicsClientId=unit.world.client)  # it hides cubes
+    drawn = np.isin(np.reshape(tiny_renderer()[4], (pixels, pixels)), cubes)
+    off = int((drawn != (heights > 0)).sum())
+    unit.world.close()
+    notes = {
+        "NumPy": "equal to the compiled one within 1e-12 m",
+        "TinyRenderer, arm and floor visible": (
+            f"{off} pixels differ at the edges of {int((heights > 0).sum())}"
+        ),
+    }
+    return [
+        timed_row(f"depth image, 128 px, {name}", "ms", values, units, notes=notes.get(name, ""))
+        for name, values in times.items()
+    ]
+
+
+def _looking_down(center_m: tuple[float, float], side_m: float) -> tuple[list, list]:
+    """Return PyBullet's matrices of an orthographic view from above, rows along +x."""
+    x, y = center_m
+    view = pybullet.computeViewMatrix((x, y, CAMERA_M), (x, y, 0.0), (-1.0, 0.0, 0.0))
+    near, far = 0.1, 2 * CAMERA_M
+    projection = np.diag([2 / side_m, 2 / side_m, -2 / (far - near), 1.0])
+    projection[2, 3] = -(far + near) / (far - near)
+    return view, projection.T.reshape(-1).tolist()

@@ -1,0 +1,1 @@
+"""Motion of the arm: close-loop displacements, picks and places."""

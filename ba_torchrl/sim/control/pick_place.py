@@ -1,0 +1,393 @@
+"""Open-loop pick and place: the physics that a grasp and a release need, and no more.
+
+What touches nothing is not simulated: the arm is teleported above the object if the way down is
+free, the fingers are closed up to the last notch before they touch, and what is held is carried
+rigidly. Closing, lifting off, setting down and letting go are physics; a grasp holds by friction or
+it does not. With ``teleport`` off every centimetre is simulated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import pybullet
+
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.control.close_loop import ramp_fingers, smooth_step
+from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector
+from ba_torchrl.sim.robots.base import Robot
+
+
+@dataclass(frozen=True)
+class PickPlaceLimits:
+    """Distances and step counts of picking and placing."""
+
+    approach_m: float = 0.1
+    """Where a simulated approach starts, along the tool's axis."""
+    free_samples_m: tuple[float, ...] = (0.06, 0.03)
+    """Where on the way down it is tested that nothing is in the way, besides its end."""
+    acceleration_m_s2: float = 25.0
+    """Greatest acceleration of a simulated way; the arm's motors brake it in time."""
+    held_acceleration_m_s2: float = 15.0
+    """The same with something in the gripper."""
+    swing_rad_s2: float = 60.0
+    """Greatest acceleration of a joint in a simulated swing."""
+    held_swing_rad_s2: float = 30.0
+    notch: float = 0.075
+    """Share of the opening by which fingers close without simulation."""
+    closing_steps: int = 40
+    squeeze_steps: int = 3
+    """Steps after which closed fingers press with all their force, on more than one point."""
+    lift_m: float = 0.005
+    lift_steps: int = 4
+    """Least number of steps of a simulated way."""
+    transit_z_m: float = 0.3
+    """Height of the tool at which simulated swings start and end."""
+    margin_m: float = 5e-4
+    """Closer than this, a way is not free."""
+    hover_m: float = 0.003
+    """Height above its place from which an object is lowered."""
+    lower_steps: int = 2
+    release_opening: float = 0.12
+    """Share of the opening by which fingers part to let go."""
+    release_steps: int = 10
+    regrasp_steps: int = 5
+    """Steps after which a body that is not squeezed is no longer held."""
+    max_press_n: float = 40.0
+    """A simulated approach stops when it meets this force."""
+
+
+PEAK_ACCELERATION = 10 / math.sqrt(3)
+"""Of `smooth_step`, which covers 1 in a time of 1."""
+
+
+class HeldState(NamedTuple):
+    """What `PickPlace` remembers."""
+
+    held: int | None
+    """Its place among the world's bodies."""
+    grasp: tuple[Vector, Quaternion] | None
+
+
+def tool_rotation(rz_rad: float, ry_rad: float = 0.0, rx_rad: float = 0.0) -> Matrix:
+    """Return Rz Ry Rx of a tool that points down at zero angles."""
+    cz, sz = math.cos(rz_rad), math.sin(rz_rad)
+    cy, sy = math.cos(ry_rad), math.sin(ry_rad)
+    cx, sx = math.cos(rx_rad), math.sin(rx_rad)
+    # the columns of Rz Ry Rx, the last two negated: the tool's y and z axes at zero angles
+    return (
+        (cz * cy, -(cz * sy * sx - sz * cx), -(cz * sy * cx + sz * sx)),
+        (sz * cy, -(sz * sy * sx + cz * cx), -(sz * sy * cx - cz * sx)),
+        (-sy, -cy * sx, -cy * cx),
+    )
+
+
+class PickPlace:
+    """Picks and places with a robot.
+
+    Args:
+        robot: the robot.
+        teleport: skip the simulation of free travel.
+        opening: how far the fingers open, 0 to 1.
+        top_down: come from straight above even where the tool is tilted, instead of along its
+            axis.
+        limits: distances and step counts.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        teleport: bool = True,
+        opening: float = 1.0,
+        top_down: bool = False,
+        limits: PickPlaceLimits | None = None,
+    ) -> None:
+        self.robot = robot
+        self.world = robot.world
+        self.teleport = teleport
+        self.opening = opening
+        self.top_down = top_down
+        self.limits = limits or PickPlaceLimits()
+        self.held: Body | None = None
+        """What is in the gripper; it is hidden from cameras, as is the arm."""
+        self.grasp: tuple[Vector, Quaternion] | None = None
+        """Its pose in the frame of the tool."""
+
+    def reset(self) -> None:
+        """Empty the gripper and go home, without moving anything else."""
+        self._release()
+        self.robot.teleport(self.robot.home_joints)
+        self.robot.set_opening(self.opening)
+
+    def pick(self, position: Vector, rotation: Matrix) -> Body | None:
+        """Grasp what is at a pose, lift it and go home.
+
+        The tool stays so high that its fingers can close above the floor.
+
+        Args:
+            position: of the tool point, metres.
+            rotation: of the tool.
+
+        Returns:
+            What is held at the end; None if nothing is, or the pose is out of reach.
+        """
+        robot, limits = self.robot, self.limits
+        robot.set_opening(self.opening)
+        if self._approach(self._over_floor(position, rotation), rotation, 0.0):
+            self._close()
+            reached = robot.tool_transform()[0]
+            above = self._above(reached, rotation, limits.lift_m)
+            self._travel(reached, above, rotation, limits.lift_steps)
+            body = robot.held_body()
+            if body is not None:
+                self._take(body)
+                self._leave(rotation)
+        self._go_home()
+        if self.held is None:
+            robot.set_opening(self.opening)
+        return self.held
+
+    def place(self, position: Vector, rotation: Matrix) -> None:
+        """Set down what is held at a pose of the tool, let go and go home.
+
+        Out of reach, it stays in the gripper.
+        """
+        if self._approach(position, rotation, self.limits.hover_m):
+            reached = self.robot.tool_transform()[0]
+            down = self._above(reached, rotation, -self.limits.hover_m)
+            self._travel(reached, down, rotation, self.limits.lower_steps)
+            self._release()
+            self._open()
+            if not self.teleport:
+                self._leave(rotation)
+        self._go_home()
+        if self.held is None:
+            self.robot.set_opening(self.opening)
+
+    def get_state(self) -> HeldState:
+        """Return what is held, and how."""
+        held = None if self.held is None else self.world.bodies.index(self.held)
+        return HeldState(held, self.grasp)
+
+    def set_state(self, state: HeldState) -> None:
+        """Take up what `get_state` returned."""
+        self._release()
+        self.held = None if state.held is None else self.world.bodies[state.held]
+        self.grasp = state.grasp
+        if self.held is not None:
+            self.held.is_hidden = True
+
+    # -- what is held ------------------------------------------------------------------------
+
+    def _take(self, body: Body) -> None:
+        self.held = body
+        body.is_hidden = True
+        self._remember_grasp()
+
+    def _release(self) -> None:
+        if self.held is not None:
+            self.held.is_hidden = False
+        self.held = self.grasp = None
+
+    def _remember_grasp(self) -> None:
+        """Measure where in the gripper the body is now."""
+        to_tool = pybullet.invertTransform(*self.robot.tool_transform())
+        self.grasp = pybullet.multiplyTransforms(*to_tool, *self.held.pose)
+
+    def _carry(self, joints: Sequence[float]) -> None:
+        """Teleport the arm, and rigidly with it what is held."""
+        self.robot.teleport(joints)
+        if self.held is not None:
+            self.world.detect_collisions()  # contacts end: Bullet would not turn their normals
+            self.held.move_to(
+                *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self.grasp)
+            )
+
+    def check_grasp(self) -> None:
+        """Take note if what was held slipped out.
+
+        Contacts need a step or two to be found again where body and hand were put; only a body
+        that stays lost is.
+        """
+        if self.held is None:
+            return
+        for _ in range(self.limits.regrasp_steps):
+            if self.robot.held_body() is self.held:
+                self._remember_grasp()
+                return
+            self.world.step()
+        self._release()
+
+    # -- ways --------------------------------------------------------------------------------
+
+    def _above(self, position: Vector, rotation: Matrix, height_m: float) -> Vector:
+        """Return the point from which the tool comes down to ``position``."""
+        up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
+        return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
+
+    def _over_floor(self, position: Vector, rotation: Matrix) -> Vector:
+        """Return the point, or the first one above it, from which the fingers can close."""
+        x, y, z = position
+        return x, y, max(z, self.robot.gripper.lowest_tool_m(rotation, self.opening))
+
+    def _tool_rotation(self) -> Matrix:
+        turn = pybullet.getMatrixFromQuaternion(self.robot.tool_transform()[1])
+        return tuple(zip(*[iter(turn)] * 3, strict=True))
+
+    def _joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
+        return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
+
+    def _approach(self, position: Vector, rotation: Matrix, clearance_m: float) -> bool:
+        """Bring the tool ``clearance_m`` above a pose; return False if that is out of reach."""
+        limits = self.limits
+        end = self._above(position, rotation, clearance_m)
+        heights = (limits.approach_m, *limits.free_samples_m, 0.0)
+        way = [self._joints(self._above(end, rotation, height), rotation) for height in heights]
+        if any(joints is None for joints in way):
+            return False
+        if self.teleport:
+            for joints in way[1:]:
+                self._carry(joints)
+                if self._touches_anything():
+                    break
+            else:
+                return True
+            self._carry(way[0])
+        else:
+            self._swing_above(end, rotation)
+        self._travel(self._above(end, rotation, limits.approach_m), end, rotation, None)
+        self.check_grasp()
+        return True
+
+    def _leave(self, rotation: Matrix) -> None:
+        """Go up from where the tool is, in simulation unless nothing is in the way."""
+        start = self.robot.tool_transform()[0]
+        if self.teleport:
+            here = self.robot.joints
+            for height in reversed(self.limits.free_samples_m):
+                joints = self._joints(self._above(start, rotation, height), rotation)
+                if joints is None:
+                    break
+                self._carry(joints)
+                if self._touches_anything():
+                    break
+            else:
+                return
+            self._carry(here)
+        self._travel(start, self._above(start, rotation, self.limits.approach_m), rotation, None)
+        self.check_grasp()
+
+    def _swing_above(self, end: Vector, rotation: Matrix) -> None:
+        """Swing high above everything, then come down to where the approach starts."""
+        start = self._above(end, rotation, self.limits.approach_m)
+        high = (*start[:2], max(self.limits.transit_z_m, start[2]))
+        joints = self._joints(high, rotation)
+        if joints is None:
+            high, joints = start, self._joints(start, rotation)
+        self._swing(joints)
+        self._travel(high, start, rotation, None)
+
+    def _go_home(self) -> None:
+        if self.teleport:
+            self._carry(self.robot.home_joints)
+        else:
+            x, y, z = self.robot.tool_transform()[0]
+            rotation = self._tool_rotation()
+            if z < self.limits.transit_z_m:
+                self._travel((x, y, z), (x, y, self.limits.transit_z_m), rotation, None)
+            self._swing(self.robot.home_joints)
+            self.check_grasp()
+
+    def _travel(self, start: Vector, end: Vector, rotation: Matrix, count: int | None) -> None:
+        """Simulate a straight way of the tool; stop where it presses or leaves the reach.
+
+        Args:
+            start: of the tool point.
+            end: of the tool point.
+            rotation: of the tool.
+            count: number of steps; if None, as many as the limits of acceleration ask for.
+        """
+        limits = self.limits
+        if count is None:
+            most = limits.acceleration_m_s2
+            if self.held is not None:
+                most = limits.held_acceleration_m_s2
+            count = max(limits.lift_steps, self._count(math.dist(start, end), most))
+        goes_down = end[2] < start[2]
+        for i in range(1, count + 1):
+            place = smooth_step(i / count)
+            point = tuple(s + place * (e - s) for s, e in zip(start, end, strict=True))
+            joints = self._joints(point, rotation)
+            if joints is None:
+                return
+            before = self.robot.joints
+            self.robot.command(joints)
+            self.world.step()
+            if goes_down and self._press_n() > limits.max_press_n:
+                self.robot.command(before)
+                self.world.step()
+                return
+
+    def _swing(self, joints: Sequence[float]) -> None:
+        """Simulate a smooth move of the arm in joint angles."""
+        start = self.robot.joints
+        turns = [e - s for s, e in zip(start, joints, strict=True)]
+        limits = self.limits
+        most = limits.swing_rad_s2 if self.held is None else limits.held_swing_rad_s2
+        count = max(2, self._count(max(map(abs, turns)), most))
+        for i in range(1, count + 1):
+            place = smooth_step(i / count)
+            self.robot.command([s + place * t for s, t in zip(start, turns, strict=True)])
+            self.world.step()
+
+    def _count(self, length: float, acceleration: float) -> int:
+        """Return the number of steps for a smooth way whose acceleration is never above a limit."""
+        duration_s = math.sqrt(PEAK_ACCELERATION * length / acceleration)
+        return math.ceil(duration_s / self.world.physics.time_step_s)
+
+    # -- contacts ----------------------------------------------------------------------------
+
+    def _outer_contacts(self) -> list[tuple]:
+        """Return PyBullet's contact points of the hand, and what it holds, with all else."""
+        client, robot = self.world.client, self.robot.id
+        points = pybullet.getContactPoints(robot, physicsClientId=client)
+        if self.held is None:
+            return points
+        points += pybullet.getContactPoints(self.held.id, physicsClientId=client)
+        inner = {robot, self.held.id}
+        return [point for point in points if {point[1], point[2]} != inner]
+
+    def _touches_anything(self) -> bool:
+        self.world.detect_collisions()
+        return any(point[8] < self.limits.margin_m for point in self._outer_contacts())
+
+    def _press_n(self) -> float:
+        return sum(point[9] for point in self._outer_contacts() if abs(point[7][2]) > 0.6)
+
+    # -- fingers -----------------------------------------------------------------------------
+
+    def _close(self) -> None:
+        """Close the fingers until they meet something, or each other."""
+        if self.teleport:
+            free = self.opening
+            for i in range(1, math.ceil(self.opening / self.limits.notch) + 1):
+                opening = max(self.opening - i * self.limits.notch, 0.0)
+                self.robot.set_opening(opening)
+                if self._touches_anything():
+                    break
+                free = opening
+            self.robot.set_opening(free)
+        ramp_fingers(self.robot, 0.0, self.limits.closing_steps)
+        self.world.step(self.limits.squeeze_steps)
+
+    def _open(self) -> None:
+        """Let go of what is between the fingers, without pushing what stands beside it."""
+        limits = self.limits
+        if not self.teleport:
+            self.robot.renew_contacts()  # the hand turned since it closed
+        wanted = min(self.robot.opening() + limits.release_opening, self.opening)
+        ramp_fingers(self.robot, wanted, limits.release_steps)

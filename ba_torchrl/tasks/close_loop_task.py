@@ -1,0 +1,56 @@
+"""What the close-loop tasks share."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from ba_torchrl.errors import PlacementError
+from ba_torchrl.sim.bodies import Box, Color
+from ba_torchrl.tasks.base import BLOCK_M, Task, Workspace
+
+RED: Color = (0.82, 0.22, 0.2, 1.0)
+BLUE: Color = (0.2, 0.4, 0.8, 1.0)
+GREEN: Color = (0.35, 0.7, 0.35, 1.0)
+
+PAIR_ATTEMPTS = 2000
+"""Layouts tried before giving up; the rarest, two pulling blocks in line, come up in 1 of 30."""
+
+
+class CloseLoopTask(Task):
+    """A task controlled by small displacements of the gripper (appendix A.2, G.2)."""
+
+    control: ClassVar[Literal["open_loop", "close_loop"]] = "close_loop"
+    max_steps = 50
+    workspace = Workspace(x=(0.3, 0.6), y=(-0.15, 0.15), z=(0.01, 0.25))
+    scale_range = (1.0, 1.0)
+    scale_limits = (0.6, 1.2)
+
+    def cube(self, color: Color = RED) -> Box:
+        """Return the shape of a cubic block."""
+        edge = BLOCK_M * self.settings.scale
+        return Box(size_m=(edge, edge, edge), color=color)
+
+    def random_pair(
+        self, rng: np.random.Generator, paddings_m: tuple[float, float], apart_m: float
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return two random points at least ``apart_m`` apart, for two things on the floor.
+
+        With fixed orientations they share one x and are apart along y, so that a gripper that
+        cannot turn can push one towards the other.
+
+        Raises:
+            PlacementError: the workspace has no room for them.
+        """
+        for _ in range(PAIR_ATTEMPTS):
+            first, second = (self.random_point(rng, padding) for padding in paddings_m)
+            if not self.settings.random_orientation:
+                second = (first[0], second[1])
+            if math.dist(first, second) >= apart_m:
+                return first, second
+        raise PlacementError(
+            f"no room for two things {apart_m:.3f} m apart: enlarge `workspace` or lower "
+            "`object_scale_range`"
+        )

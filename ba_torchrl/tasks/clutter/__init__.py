@@ -1,0 +1,1 @@
+"""Tasks that take objects out of a heap in a tray."""

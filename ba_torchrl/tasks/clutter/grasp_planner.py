@@ -1,0 +1,359 @@
+"""Top-down grasps of objects in a heap, planned from their shapes and a height image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from ba_torchrl.actions import wrap_angle
+from ba_torchrl.sim.assets.hulls import surface_samples
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import Vector, YawPose
+from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.vision.depth import HeightCamera
+from ba_torchrl.tasks.base import ActionLimits, Workspace
+from ba_torchrl.tasks.motion_primitives import nearest_equivalent_yaw
+
+SPARE_M = 0.007
+"""Room between an open finger and what it closes on; less is a risk."""
+LEAST_SPARE_M = 0.002
+BESIDE_M = 3e-3
+"""Room on either side of the fingers' width: a pixel of the height image."""
+CLEARANCE_M = 4.5e-3
+DEEPEST_M = 0.047
+"""Height of what is grasped above the fingers' tips at most: deeper holds no better."""
+CROWD_M = 0.012
+"""Closing fingers press on what is this much higher than their tips."""
+SHALLOWEST_M = 0.006
+"""Least height of what is between the fingers above their tips."""
+LEAST_SQUARE = 0.3
+"""How nearly opposite the surfaces that the fingers meet are at least."""
+
+PATCH_M = 0.01
+"""Fingers that meet a face over this width, across the line on which they close, keep it from
+turning; on an edge or a corner it turns until it slips out."""
+
+WORST_RISK = 4.0
+"""Stands for no grasp at all."""
+MET_M = 3e-3
+"""Fingers meet what is this near to the outermost point between them."""
+
+YAWS = 16
+SAMPLES = 256
+PIXEL_M = 0.003
+BORDER_M = 0.06
+"""The height image reaches this far beyond the workspace."""
+
+
+class Grasp(NamedTuple):
+    """A tool pose around an object."""
+
+    body: Body
+    position: Vector
+    yaw_rad: float
+    risk: float
+    """0 for parallel sides in easy reach; beyond 1, rather not."""
+    cost: float
+    """Actions it takes, failures counted in."""
+
+
+class GraspPlanner:
+    """Finds the cheapest grasp in a heap.
+
+    Args:
+        pool: everything that may have to be grasped.
+        camera: sees everything that may be in the way.
+        workspace: where the tool may go.
+        gripper: what is to grasp.
+    """
+
+    def __init__(
+        self, pool: Sequence[Body], camera: HeightCamera, workspace: Workspace, gripper: Gripper
+    ) -> None:
+        self._camera = camera
+        self.workspace = workspace
+        self.gripper = gripper
+        self.band_half_m = gripper.half_width_m + BESIDE_M
+        """Half the width of what the fingers meet or pass."""
+        outline = np.array(sorted(gripper.outline, key=lambda point: point[1]))
+        self._jaws = _Jaws(
+            half_gap=gripper.half_gap_m,
+            band_half=self.band_half_m,
+            palm=gripper.palm_m,
+            depth=gripper.closed_half_m - gripper.arc[0][0],
+            arc_u=np.array([u for u, _ in gripper.arc]),
+            arc_z=np.array([z for _, z in gripper.arc]),
+            outline_u=outline[:, 0].copy(),
+            outline_z=outline[:, 1].copy(),
+        )
+        self._samples: dict[int, np.ndarray] = {}
+        self._pool = pool
+        x, y = workspace.center
+        self._side_m = max(workspace.x[1] - workspace.x[0], workspace.y[1] - workspace.y[0])
+        self._side_m += 2 * BORDER_M
+        self.corner = (x - self._side_m / 2, y - self._side_m / 2)
+
+        pixels = round(self._side_m / PIXEL_M)
+        self._plain = np.zeros((pixels, pixels))
+
+    def heights(self) -> np.ndarray:
+        """Return the height image that grasps are checked against, metres."""
+        pixels = round(self._side_m / PIXEL_M)
+        return self._camera.heightmap(self.workspace.center, self._side_m, pixels)
+
+    def plan(
+        self,
+        bodies: Sequence[Body],
+        tool: YawPose,
+        limits: ActionLimits,
+        heights: np.ndarray,
+        penalty: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> Grasp | None:
+        """Return the cheapest grasp of any of the bodies, or None if there is none.
+
+        Args:
+            bodies: to choose from.
+            tool: where the gripper is.
+            limits: of one action.
+            heights: from `heights`.
+            penalty: from grasps [N, 6] (x, y, z, yaw, risk, slip) to what they cost besides [N].
+        """
+        (x, y, z), yaw = tool
+        yaws = np.arange(YAWS) * np.pi / YAWS if limits.turn_rad else np.array([yaw])
+        best = None
+        low, high = self.workspace.z
+        for body in bodies:
+            found = _search(
+                self.placed_samples(body),
+                np.array(body.position),
+                yaws,
+                heights,
+                np.array(self.corner),
+                low,
+                high,
+                self._jaws,
+            )
+            extra = np.zeros(len(found)) if penalty is None else penalty(found)
+            for row, more in zip(found, extra.tolist(), strict=True):
+                gx, gy, gz, risk = row[0], row[1], row[2], row[4]
+                if not (
+                    self.workspace.x[0] <= gx <= self.workspace.x[1]
+                    and self.workspace.y[0] <= gy <= self.workspace.y[1]
+                ):
+                    continue
+                target_yaw = nearest_equivalent_yaw(yaw, row[3], limits, math.pi)
+                turn = abs(wrap_angle(target_yaw - yaw))
+                aside = max(abs(gx - x), abs(gy - y))
+                travel = max(
+                    aside / limits.step_m, turn / limits.turn_rad if limits.turn_rad else 0
+                )
+                travel += max(z - gz, 0.0) / limits.step_m
+                if aside > 0.015 or turn > 0.3:
+                    travel += max(0.1 - z, 0.0) / limits.step_m  # up first
+                cost = travel + 12 * risk + more
+                if best is None or cost < best.cost:
+                    best = Grasp(body, (gx, gy, gz), target_yaw, float(risk), float(cost))
+        return best
+
+    def risk_alone(self, samples: np.ndarray, tool: YawPose) -> float:
+        """Return the least risk of a grasp, at the gripper's yaw, of a body with nothing near.
+
+        Args:
+            samples: from `placed_samples`, or moved from there.
+            tool: where the gripper is.
+        """
+        low, high = self.workspace.z
+        found = _search(
+            samples,
+            samples[:, :3].mean(axis=0),
+            np.array([tool[1]]),
+            self._plain,
+            np.array(self.corner),
+            low,
+            high,
+            self._jaws,
+        )
+        return min(float(found[:, 4].min()), WORST_RISK) if len(found) else WORST_RISK
+
+    def placed_samples(self, body: Body) -> np.ndarray:
+        """Return points on a body's surface and their normals as it lies now, [N, 6]."""
+        key = id(body.shape)
+        if key not in self._samples:
+            self._samples[key] = np.hstack(surface_samples(body.shape.mesh(), SAMPLES))
+        local = self._samples[key]
+        position, quaternion = body.pose
+        rotation = _rotation(quaternion)
+        placed = np.empty_like(local)
+        placed[:, :3] = local[:, :3] @ rotation.T + position
+        placed[:, 3:] = local[:, 3:] @ rotation.T
+        return placed
+
+
+def _rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+class _Jaws(NamedTuple):
+    """A gripper's outline for compiled code, metres."""
+
+    half_gap: float
+    band_half: float
+    palm: float
+    depth: float
+    """Extent of a fingertip along the line on which it closes."""
+    arc_u: np.ndarray
+    arc_z: np.ndarray
+    outline_u: np.ndarray
+    outline_z: np.ndarray
+    """Ascending, so that a search may stop."""
+
+
+_OFFSETS_V = np.array([0.0, -0.012, 0.012, -0.024, 0.024])
+_OFFSETS_U = np.array([0.0, -0.02, 0.02, -0.04, 0.04])
+
+
+@numba.njit(cache=True)
+def _height(heights, corner, x, y):  # noqa: ANN001, ANN202 -- compiled
+    i = int((x - corner[0]) / PIXEL_M)
+    j = int((y - corner[1]) / PIXEL_M)
+    if i < 0 or j < 0 or i >= heights.shape[0] or j >= heights.shape[1]:
+        return 1.0
+    return heights[i, j]
+
+
+@numba.njit(cache=True)
+def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noqa: ANN001, ANN202
+    """Return the feasible grasps of one body, [N, 6]: x, y, z, yaw, risk between 0 and 1, slip.
+
+    Slip is the odds, as a logarithm from zero up, that the object turns between the fingers and
+    comes out: fitted to picks of random grasps of random shapes.
+    """
+    found = np.empty((yaws.shape[0] * _OFFSETS_V.shape[0] * _OFFSETS_U.shape[0], 6))
+    count = 0
+    n = samples.shape[0]
+    u = np.empty(n)
+    v = np.empty(n)
+    met = np.empty(n, dtype=np.bool_)
+    left_n, right_n = np.empty(4), np.empty(4)
+    top, highest = samples[:, 2].max(), heights.max()
+    half_gap, band_half = jaws.half_gap, jaws.band_half
+    band = (-band_half, 0.0, band_half)
+    for yaw in yaws:
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        for k in range(n):
+            dx, dy = samples[k, 0] - center[0], samples[k, 1] - center[1]
+            u[k] = cos * dx + sin * dy
+            v[k] = cos * dy - sin * dx
+        for v0 in _OFFSETS_V:
+            for u0 in _OFFSETS_U:
+                # what the fingers would close on, and how high it is
+                lowest_u, highest_u, peak = 1.0, -1.0, 0.0
+                for k in range(n):
+                    if abs(v[k] - v0) <= band_half and abs(u[k] - u0) < half_gap:
+                        lowest_u, highest_u = min(lowest_u, u[k]), max(highest_u, u[k])
+                        peak = max(peak, samples[k, 2])
+                if highest_u < lowest_u or highest_u - lowest_u > 2 * (half_gap - LEAST_SPARE_M):
+                    continue
+                middle = (highest_u + lowest_u) / 2
+                if u0 != 0.0 and abs(middle - u0) > 0.012:
+                    continue  # another offset finds the same
+                x = center[0] + cos * middle - sin * v0
+                y = center[1] + sin * middle + cos * v0
+                half_width = (highest_u - lowest_u) / 2
+                tip = np.interp(half_width, jaws.arc_u, jaws.arc_z)
+                # as low as floor, neighbours and palm allow
+                z = max(low_z + 0.002, peak - min(jaws.palm - CLEARANCE_M, DEEPEST_M + tip))
+                for m in range(jaws.outline_u.shape[0]):
+                    low = jaws.outline_z[m]
+                    if highest - low + CLEARANCE_M <= z or peak - (z + tip) < SHALLOWEST_M:
+                        break
+                    inside = jaws.outline_u[m] - jaws.depth
+                    if inside <= half_gap <= jaws.outline_u[m]:  # fingers may swing down here
+                        last = np.interp(max(half_width, inside), jaws.arc_u, jaws.arc_z)
+                        low = min(low, last)
+                    for fu in (-jaws.outline_u[m], jaws.outline_u[m]):
+                        for w in band:
+                            h = _height(
+                                heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w
+                            )
+                            z = max(z, h - low + CLEARANCE_M)
+                depth = peak - (z + tip)
+                if depth < SHALLOWEST_M or z > high_z:
+                    continue
+                covered = False
+                for w in band:
+                    for m in range(-2, 3):
+                        fu = m * 0.015
+                        h = _height(heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w)
+                        covered = covered or h > peak + 0.01
+                if covered:
+                    continue
+                # what the fingers would close on besides
+                crowd = 0
+                edge = half_width + 0.006
+                for m in range(3):
+                    beside = edge + (half_gap - edge) * m / 3
+                    end = z + np.interp(beside, jaws.arc_u, jaws.arc_z) + CROWD_M
+                    for fu in (-beside, beside):
+                        for w in band:
+                            h = _height(
+                                heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w
+                            )
+                            crowd += h > end
+                # surfaces that the fingers meet
+                left, right = 1.0, -1.0
+                for k in range(n):
+                    met[k] = (
+                        abs(v[k] - v0) <= band_half
+                        and abs(u[k] - middle) < half_gap
+                        and samples[k, 2] > z + tip
+                    )
+                    if met[k]:
+                        left, right = min(left, u[k]), max(right, u[k])
+                if right < left:
+                    continue
+                left_n[:] = 0.0
+                right_n[:] = 0.0
+                left_v0, left_v1, right_v0, right_v1 = 1.0, -1.0, 1.0, -1.0
+                for k in range(n):
+                    if met[k] and u[k] < left + MET_M:
+                        left_n[:3] += samples[k, 3:]
+                        left_n[3] += 1.0
+                        left_v0, left_v1 = min(left_v0, v[k]), max(left_v1, v[k])
+                    if met[k] and u[k] > right - MET_M:
+                        right_n[:3] += samples[k, 3:]
+                        right_n[3] += 1.0
+                        right_v0, right_v1 = min(right_v0, v[k]), max(right_v1, v[k])
+                left_n /= left_n[3]
+                right_n /= right_n[3]
+                square = -(left_n[0] * right_n[0] + left_n[1] * right_n[1] + left_n[2] * right_n[2])
+                facing = min(
+                    cos * right_n[0] + sin * right_n[1], -cos * left_n[0] - sin * left_n[1]
+                )
+                if square < LEAST_SQUARE or facing < LEAST_SQUARE:
+                    continue
+                risk = 2.5 * (1 - square) + 1.5 * max(0.0, 0.75 - facing)
+                spare = half_gap - half_width
+                risk += 0.4 * max(0.0, SPARE_M - spare) / SPARE_M
+                risk += 0.1 * crowd
+                risk += 0.3 * max(0.0, 0.025 - depth) / 0.015
+                risk += 6 * (abs(v0) + 0.5 * abs(middle))
+                risk += 0.5 * max(0.0, top - peak) / 0.02
+                found[count, 0], found[count, 1], found[count, 2] = x, y, z
+                patch = min(left_v1 - left_v0, right_v1 - right_v0, PATCH_M)
+                askew = cos * (left_n[1] + right_n[1]) - sin * (left_n[0] + right_n[0])
+                slip = 2.3 * (1 - patch / PATCH_M) + 3.4 * abs(askew) + 60 * abs(v0)
+                found[count, 3], found[count, 4], found[count, 5] = yaw, risk, slip
+                count += 1
+    return found[:count]

@@ -1,0 +1,1 @@
+"""Tasks that bring objects into a container."""

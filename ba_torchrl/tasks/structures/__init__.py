@@ -1,0 +1,1 @@
+"""Tasks that build a structure from pieces."""

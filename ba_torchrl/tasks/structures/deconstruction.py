@@ -1,0 +1,387 @@
+"""Deconstruction: structures taken apart, step by step, so that the reverse builds them.
+
+An episode starts with the structure standing, and ends when its pieces lie apart on the ground.
+Every action leaves something that undoes it; in reverse order these actions build the structure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pybullet
+
+from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
+from ba_torchrl.sim.geometry import Quaternion, Vector, YawPose
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import Spot
+from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.structures.blueprint import Slot
+from ba_torchrl.tasks.structures.open_loop import StructureTask
+
+APART_BLOCKS = 2.4
+"""Pieces that lie apart keep this distance of their centres, as at the start of an episode."""
+GAP_M = 0.02
+"""They also leave this much between their outlines."""
+AMPLE_GAP_M = 5e-3
+AMPLE_ROOM_M = 5e-3
+"""A site for a piece leaves this much more to its neighbours, and to the fingers."""
+SPAN_SHARE = 0.5
+"""Pairs stand up to this share of the way from the span aimed for to the greatest allowed."""
+SITES = 300
+"""Random sites that are tried for a piece; the best of them is good enough."""
+BEARINGS = 16
+"""Directions along which the gap between two outlines is measured."""
+MOVED_M = 5e-3
+"""What moves less than this stays where it is."""
+LEVEL_RAD = 0.02
+"""A tool that leans less than this points straight down."""
+
+_DIRECTIONS = np.array(
+    [[math.cos(a), math.sin(a)] for a in np.arange(BEARINGS) * math.pi / BEARINGS]
+).T
+
+
+class Deconstruction(OpenLoopTask):
+    """A structure's task backwards: the goal stands at the start, and must be taken apart.
+
+    Args:
+        task: what builds the structure; its bodies, limits and heights hold here too.
+    """
+
+    def __init__(self, task: StructureTask) -> None:
+        super().__init__(task.settings)
+        self.task = task
+        self.finger_opening = task.finger_opening
+
+    def build(self, world: World) -> None:
+        """Load the pieces."""
+        self.task.world, self.task.robot = self.world, self.robot
+        self.task.build(world)
+
+    def randomise(self, rng: np.random.Generator) -> None:
+        """Stand the structure somewhere, its pieces drawn as for building it."""
+        self.task.randomise(rng)
+        planner = self.task.planner
+        slots = planner.blueprint.slots
+        pool = list(planner.pieces)
+        bodies = []
+        for slot in slots:
+            mates = [body for body in pool if planner.pieces[body].kind == slot.piece.kind]
+            bodies.append(mates[rng.integers(len(mates))])
+            pool.remove(bodies[-1])
+        grounded = [
+            i
+            for i, slot in enumerate(slots)
+            if not slot.on
+            and (planner.blueprint.partner(i) is None or planner.blueprint.partner(i) > i)
+        ]
+        room = 2 * max(map(radius_m, bodies)) + self.block_m
+        centers = dict(
+            zip(grounded, self.random_points(rng, [Spot(room, room)] * len(grounded)), strict=True)
+        )
+        for number, slot in enumerate(slots):
+            self._stand_in(number, slot, bodies, centers.get(number), rng)
+
+    def is_start(self) -> bool:
+        """Whether the structure stands."""
+        return self.task.is_valid() and self.task.is_goal() and not self.is_goal()
+
+    def is_goal(self) -> bool:
+        """Whether all lies on the ground, apart, and nothing is held."""
+        return self.robot.held_body() is None and not self._to_move()
+
+    def is_valid(self) -> bool:
+        """Whether the scene is one of the task's."""
+        return self.task.is_valid()
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The pieces."""
+        return self.task.objects
+
+    @property
+    def landmarks(self) -> Sequence[YawPose]:
+        """What the task's vector observation lists."""
+        return self.task.landmarks
+
+    def get_state(self) -> Any:
+        """Return what the task remembers."""
+        return self.task.get_state()
+
+    def set_state(self, state: Any) -> None:
+        """Take up what `get_state` returned."""
+        self.task.set_state(state)
+
+    def pick_height_m(self, top_m: float) -> float:
+        """Return the height of the tool for a pick, where an action leaves it open.
+
+        The next piece is held as it will be when it is picked from the ground. Its base is that of
+        its middle: leaning, its lowest corner lies deeper, and it would be held too low.
+        """
+        base_m = 0.0
+        if to_move := self._to_move():
+            top = max(to_move, key=lambda body: body.position[2])
+            middle = top.position[2] + top.shape.bounds_m[0][2]
+            base_m = max(vertical_extent(top)[0], middle) - self.settings.workspace.z[0]
+        return self.task.pick_height_m(top_m - base_m) + base_m
+
+    def place_height_m(self, top_m: float) -> float:
+        """Return the height of the tool for a place, where an action leaves it open."""
+        return self.task.place_height_m(top_m)
+
+    def window_m(self, held: Body | None) -> float:
+        """Return half the width of the square searched for the highest point."""
+        return self.task.window_m(held)
+
+    def expert_command(self) -> PickPlaceCommand:
+        """Take the highest piece, put it on free ground; a function of the scene."""
+        held = self.robot.held_body()
+        if held is not None:
+            return self._put_away(held)
+        to_move = self._to_move()
+        if not to_move:  # a pick from the bare corner changes nothing
+            x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
+            return PickPlaceCommand(PICK, x, y, 0.1)
+
+        def level(body: Body) -> int:
+            return round(2 * (body.position[2] - self.settings.surface_z_m) / self.block_m)
+
+        top = max(map(level, to_move))
+        options = [
+            (self.task.room(body, yaw), -i, body, yaw)
+            for i, body in enumerate(to_move)
+            if level(body) == top
+            for yaw in self.task.grasp_yaws(body)
+        ]
+        _, _, body, yaw = max(options, key=lambda option: option[:2])
+        x, y, _ = body.position
+        floor = self.settings.workspace.z[0]
+        z = self.pick_height_m(vertical_extent(body)[1] - floor) + floor
+        return PickPlaceCommand(PICK, x, y, z, yaw)
+
+    # -- the structure -----------------------------------------------------------------------
+
+    def _stand_in(
+        self,
+        number: int,
+        slot: Slot,
+        bodies: Sequence[Body],
+        center: tuple[float, float] | None,
+        rng: np.random.Generator,
+    ) -> None:
+        """Put a body into its slot; those in the slots before are in theirs.
+
+        Args:
+            number: of the slot.
+            slot: the slot.
+            bodies: the body in each slot.
+            center: where on the ground it goes, or the middle of its pair.
+            rng: generator.
+        """
+        planner, body = self.task.planner, bodies[number]
+        piece, partner = planner.pieces[body], planner.blueprint.partner(number)
+        supports = [bodies[i] for i in slot.on]
+        if partner is not None and partner < number:
+            xy = bodies[partner].position[:2]
+        elif supports:
+            xy = _middle([bodies[i].position[:2] for i in slot.over or slot.on])
+        else:
+            xy = center
+        yaw = self.random_yaw(rng, 2 * math.pi) - piece.grasp_yaws_rad[0]
+        if len(supports) == 2:
+            (ax, ay, _), (bx, by, _) = (support.position for support in supports)
+            yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
+        elif supports and slot.inherits_yaw and self.settings.random_orientation:
+            yaw = planner.pieces[supports[0]].yaw_rad(supports[0])
+        self.task.stand(body, xy, yaw)
+        if supports:
+            lift = max(vertical_extent(support)[1] for support in supports)
+            x, y, z = body.position
+            body.place((x, y, z + lift - self.settings.surface_z_m), yaw)
+        if partner is not None and partner < number:
+            self._part(number, bodies, rng)
+
+    def _part(self, number: int, bodies: Sequence[Body], rng: np.random.Generator) -> None:
+        """Part two bodies that stand in one place, as a bridge needs it."""
+        planner = self.task.planner
+        slots = planner.blueprint.slots
+        bridge = slots[planner.blueprint.bridge_on(number)]
+        pair = [bodies[i] for i in bridge.on]
+        if slots[number].on:  # along the piece that carries them, which is long along y
+            support = bodies[slots[number].on[0]]
+            heading = planner.pieces[support].yaw_rad(support)
+        else:
+            heading = self.random_yaw(rng, 2 * math.pi) - bridge.piece.grasp_yaws_rad[0]
+        line = np.array([-math.sin(heading), math.cos(heading)])
+        share = rng.uniform(0.0, SPAN_SHARE)
+        apart = (1 - share) * bridge.span.aim_m + share * bridge.span.most_m
+        if bridge.span.gap_m is not None:  # as near as that only with the free sides to each other
+            for body in pair:
+                grasp_yaw = planner.pieces[body].grasp_yaws_rad[0]
+                body.place(body.position, heading - grasp_yaw + math.pi * rng.integers(2))
+            first, second = (
+                (world_vertices(body)[:, :2] - body.position[:2]) @ line for body in pair
+            )
+            apart += first.max() - second.min()
+        for body, side in zip(pair, (-0.5, 0.5), strict=True):
+            x, y, z = body.position
+            dx, dy = (side * apart * line).tolist()
+            body.place((x + dx, y + dy, z), body.yaw_rad)
+
+    # -- taking it apart ---------------------------------------------------------------------
+
+    def _to_move(self) -> list[Body]:
+        """Return the pieces that are not on the ground, or too near another."""
+        bodies = list(self.objects)
+        shadows = {body: _shadow(world_vertices(body)[:, :2]) for body in bodies}
+        ground = self.settings.surface_z_m + self.block_m / 4
+
+        def is_near(body: Body, other: Body) -> bool:
+            return (
+                math.dist(body.position[:2], other.position[:2]) < APART_BLOCKS * self.block_m
+                or _gap_m(shadows[body], shadows[other]) < GAP_M
+            )
+
+        return [
+            body
+            for body in bodies
+            if vertical_extent(body)[0] > ground
+            or any(is_near(body, other) for other in bodies if other is not body)
+        ]
+
+    def _put_away(self, held: Body) -> PickPlaceCommand:
+        """Return the place on the first of many random sites that has room enough."""
+        tool, tool_yaw = self.robot.tool_pose()
+        others = [other for other in self.objects if other is not held]
+        shadows = [_shadow(world_vertices(other)[:, :2]) for other in others]
+        outline = world_vertices(held)[:, :2] - held.position[:2]
+        border = radius_m(held) + self.block_m / 4
+        ranges = [
+            (low + border, high - border)
+            for low, high in (self.settings.workspace.x, self.settings.workspace.y)
+        ]
+        z = self.settings.surface_z_m + held.position[2] - vertical_extent(held)[0]
+        rng = self._generator()
+        best, place = -math.inf, None
+        for _ in range(SITES):
+            x, y = (float(rng.uniform(low, high)) for low, high in ranges)
+            yaw = self._tool_yaw(held, tool_yaw, rng)
+            cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
+            slack = min(
+                math.dist((x, y), other.position[:2]) - APART_BLOCKS * self.block_m - GAP_M
+                for other in others
+            )
+            if slack <= best:
+                continue
+            turned = outline @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+            gap = min(_gap_m(_shadow(turned), shadow) for shadow in shadows)
+            room = self.task.room(held, yaw, (x, y, z))
+            slack = min(slack, gap - GAP_M - AMPLE_GAP_M, room - AMPLE_ROOM_M)
+            if slack > best:
+                best = slack
+                ox, oy, oz = (b - t for b, t in zip(held.position, tool, strict=True))
+                place = PickPlaceCommand(
+                    PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
+                )
+            if slack >= 0:
+                break
+        assert place is not None  # the first site is better than nothing
+        return place
+
+    def _tool_yaw(self, held: Body, tool_yaw_rad: float, rng: np.random.Generator) -> float:
+        """Return the gripper's yaw for a place: any, or the one that gives a fixed orientation."""
+        if not self.action_limits.turn_rad:
+            return 0.0
+        if self.settings.random_orientation:
+            return float(rng.uniform(0.0, math.pi))
+        piece = self.task.planner.pieces[held]
+        ahead = -piece.grasp_yaws_rad[0] - piece.yaw_rad(held)
+        return tool_yaw_rad + wrap_angle(ahead, piece.yaw_period_rad)
+
+    def _generator(self) -> np.random.Generator:
+        """Return a generator keyed on the scene."""
+        poses = np.array([body.position for body in self.objects])
+        return np.random.default_rng(np.frombuffer(poses.tobytes(), np.uint32).tolist())
+
+
+def _middle(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    return tuple(sum(values) / len(values) for values in zip(*points, strict=True))
+
+
+def _shadow(points: np.ndarray) -> np.ndarray:
+    """Return the extent of points [V, 2] along every bearing, [2, BEARINGS]."""
+    along = points @ _DIRECTIONS
+    return np.stack([along.min(axis=0), along.max(axis=0)])
+
+
+def _gap_m(one: np.ndarray, other: np.ndarray) -> float:
+    """Return a distance that two convex outlines surely keep, from their shadows."""
+    return float(np.maximum(one[0] - other[1], other[0] - one[1]).max())
+
+
+class Watch(NamedTuple):
+    """How things lay before an action, to tell afterwards what undoes it."""
+
+    poses: Mapping[Body, tuple[Vector, Quaternion]]
+    held: Body | None
+    grasp: tuple[Vector, Quaternion] | None
+    """YawPose of what was held in the frame of the tool."""
+
+    def undo(
+        self,
+        held: Body | None,
+        grasp: tuple[Vector, Quaternion] | None,
+        lowest_m: float = -math.inf,
+    ) -> PickPlaceCommand | None:
+        """Return what undoes the action that has just settled.
+
+        The tool goes where it has the body, grasped as it was, in the pose from which it was
+        picked or in which it came to lie; that differs from where the action itself went if the
+        body slipped or settled.
+
+        Args:
+            held: what is held now.
+            grasp: and how.
+            lowest_m: height of the tool below which fingers cannot close.
+
+        Returns:
+            None if nothing undoes it: it grasped or put down nothing, or another body moved.
+        """
+        if (self.held is None) == (held is None):
+            return None
+        body = held if self.held is None else self.held
+        for other, (before, _) in self.poses.items():
+            if other is not body and math.dist(before, other.position) > MOVED_M:
+                return None
+        pose, in_tool, primitive = (
+            (self.poses[body], grasp, PLACE) if self.held is None else (body.pose, self.grasp, PICK)
+        )
+        (x, y, z), turn = pybullet.multiplyTransforms(*pose, *pybullet.invertTransform(*in_tool))
+        if primitive == PICK:
+            z = max(z, lowest_m)
+        return PickPlaceCommand(primitive, x, y, z, *tool_angles(turn))
+
+
+def watch(
+    bodies: Sequence[Body], held: Body | None, grasp: tuple[Vector, Quaternion] | None
+) -> Watch:
+    """Return how bodies lie now, and what is held how."""
+    return Watch({body: body.pose for body in bodies}, held, grasp)
+
+
+def tool_angles(orientation: Quaternion) -> tuple[float, float, float]:
+    """Return rz, ry and rx of a tool: the inverse of `tool_rotation`.
+
+    Args:
+        orientation: of the tool (x, y, z, w).
+    """
+    turn = pybullet.getMatrixFromQuaternion(orientation)
+    rz = math.atan2(turn[3], turn[0])
+    ry = math.asin(min(max(-turn[6], -1.0), 1.0))
+    rx = math.atan2(-turn[7], -turn[8])
+    ry, rx = (0.0 if abs(angle) < LEVEL_RAD else angle for angle in (ry, rx))
+    return rz, ry, rx

@@ -1,0 +1,115 @@
+"""Room on the ground: for a piece beside others, and for fingers beside a piece."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
+from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.robots.gripper import Gripper
+
+SPOT_STEP_M = 0.02
+"""Spots are looked for in steps of this length."""
+
+
+class PlacementArea(NamedTuple):
+    """Where on the ground pieces may be put."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    gap_m: float
+    """Room wanted around a piece."""
+    z_m: float = 0.0
+    line_yaw_rad: float | None = None
+    """Direction in which two pieces for a bridge must stand; None if any will do."""
+
+
+def nearest_spot(body: Body, others: Sequence[Body], area: PlacementArea) -> Vector:
+    """Return where a body's origin goes to stand, as it is turned, at the nearest spot with room.
+
+    Where there is none, it is the spot that lacks least.
+
+    Args:
+        body: to put down.
+        others: to keep away from.
+        area: where there may be room.
+    """
+    x, y, z = body.position
+    spots = np.array([(a, b) for a in _steps(*area.x) for b in _steps(*area.y)])
+    aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
+    best = np.lexsort((aways, placement_deficit_m(spots, body, others, area)))[0]
+    return (*spots[best].tolist(), area.z_m + z - vertical_extent(body)[0])
+
+
+def placement_deficit_m(
+    spots: np.ndarray, body: Body, others: Sequence[Body], area: PlacementArea
+) -> np.ndarray:
+    """Return how much room is wanting at spots [S, 2]: outside the area, or beside others.
+
+    Args:
+        spots: to look at, metres.
+        body: to put down.
+        others: to keep away from.
+        area: where there may be room.
+
+    Returns:
+        [S], metres.
+    """
+    low, high = np.array([area.x, area.y]).T
+    outside = np.maximum(np.maximum(low - spots, spots - high), 0.0).max(axis=1)
+    if not others:
+        return outside
+    at = np.array([other.position[:2] for other in others])
+    gaps = np.hypot(*(spots[:, None] - at).transpose(2, 0, 1))
+    room = (gaps - [radius_m(other) for other in others]).min(axis=1)
+    return outside + np.maximum(area.gap_m + radius_m(body) - room, 0.0)
+
+
+def extent_along_m(body: Body, ways: np.ndarray) -> np.ndarray:
+    """Return how far a body, as it lies, reaches from its origin in directions [N, 2], [N]."""
+    return ((world_vertices(body)[:, :2] - body.position[:2]) @ ways.T).max(axis=0)
+
+
+def _steps(low: float, high: float) -> list[float]:
+    count = max(1, round((high - low) / SPOT_STEP_M))
+    return [low + (high - low) * i / count for i in range(count + 1)]
+
+
+def finger_path_clearance_m(
+    gripper: Gripper,
+    body: Body,
+    yaw_rad: float,
+    ways_m: Sequence[tuple[float, float]],
+    others: Sequence[Body],
+    at: Vector | None = None,
+) -> float:
+    """Return the gap between the ways of fingertips beside a body and what stands there.
+
+    It is in metres, negative where something is in the way.
+
+    Args:
+        gripper: what is as low as its fingertips lies under them, and in no one's way.
+        body: what they are to close on.
+        yaw_rad: the gripper's.
+        ways_m: ends of the ways, from the body along the line on which the fingers close.
+        others: bodies that may be in the way.
+        at: where the body is, if not where it is now.
+    """
+    ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
+    below_m = -min(z for _, z in gripper.arc)
+    bx, by, bz = body.position if at is None else at
+    gap = math.inf
+    for other in others:
+        corners = world_vertices(other)
+        if corners[:, 2].max() < bz - below_m:
+            continue
+        px, py = corners[:, 0] - bx, corners[:, 1] - by
+        along, across = px * ux + py * uy, py * ux - px * uy
+        aside = max(across.min(), -across.max()) - gripper.half_width_m
+        for low, high in ways_m:
+            gap = min(gap, max(along.min() - high, low - along.max(), aside))
+    return float(gap)

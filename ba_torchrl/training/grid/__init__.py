@@ -1,0 +1,1 @@
+"""Grids of runs: the plan, the jobs, and the process of one run."""

@@ -1,0 +1,147 @@
+"""Jobs: the runs of a benchmark, each in a process of its own (POSIX systems only).
+
+Finished runs are skipped and interrupted ones resumed, so that the same command continues a grid
+wherever it was stopped. A run that fails is recorded and does not stop the others.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.results import FAILURE_FILE, RESULT_FILE, now
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.grid.plan import status
+
+LOG_FILE = "run.log"
+LOG_LINES = 20
+"""Of a failed run's output that are recorded."""
+POLL_S = 0.2
+WORKER = (sys.executable, "-m", "ba_torchrl.training.grid.run_one")
+
+
+def run_all(
+    runs: Sequence[ExperimentConfig],
+    *,
+    jobs: int = 1,
+    max_hours: float | None = None,
+    progress: bool = True,
+    worker: Sequence[str] = WORKER,
+) -> dict[Path, str]:
+    """Run what is not done yet.
+
+    Args:
+        runs: what `plan` returned.
+        jobs: how many at the same time.
+        max_hours: time limit of each.
+        progress: show a progress bar over the runs.
+        worker: command that reads a run's configuration as JSON from its standard input.
+
+    Returns:
+        By run folder, why it failed; empty if all went well.
+
+    Raises:
+        ConfigError: a folder holds a run with other settings, in which case nothing was started;
+            or another process is at a run.
+    """
+    waiting = deque(run for run in runs if status(run).state != "done")
+    running: list[_Job] = []
+    failures: dict[Path, str] = {}
+    bar = tqdm(total=len(runs), initial=len(runs) - len(waiting), unit="run", disable=not progress)
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                running.append(_Job(waiting.popleft(), worker, max_hours))
+                bar.set_postfix_str(", ".join(f"{job}" for job in running))
+            time.sleep(POLL_S)
+            for job in [job for job in running if job.has_ended()]:
+                running.remove(job)
+                reason = job.close()
+                if reason is not None:
+                    failures[job.run.folder] = reason
+                    tqdm.write(f"failed: {job}: {reason}; see {job.run.folder / LOG_FILE}")
+                bar.update()
+    finally:
+        for job in running:
+            job.stop()
+        bar.close()
+    return failures
+
+
+class _Job:
+    """A run in a process of its own."""
+
+    def __init__(
+        self, run: ExperimentConfig, worker: Sequence[str], max_hours: float | None
+    ) -> None:
+        self.run = run
+        self._deadline = None if max_hours is None else time.monotonic() + 3600 * max_hours
+        self._timed_out = False
+        run.folder.mkdir(parents=True, exist_ok=True)
+        self._log = (run.folder / LOG_FILE).open("a")
+        try:  # the process inherits the lock, and keeps it even if this one dies
+            fcntl.flock(self._log, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._log.close()
+            raise ConfigError(f"another process is at the run in {run.folder}") from None
+        (run.folder / FAILURE_FILE).unlink(missing_ok=True)
+        self._process = subprocess.Popen(
+            worker,
+            stdin=subprocess.PIPE,
+            stdout=self._log,
+            stderr=self._log,
+            text=True,
+            start_new_session=True,  # a group that can be ended as a whole, with its environments
+        )
+        try:
+            with self._process.stdin as stdin:
+                stdin.write(run.model_dump_json())
+        except BrokenPipeError:
+            pass  # it ended before it read; its exit status tells
+
+    def __str__(self) -> str:
+        return f"{self.run.task} {self.run.label} seed {self.run.seed}"
+
+    def has_ended(self) -> bool:
+        """Whether the process is over; one beyond its time limit is ended."""
+        if self._deadline is not None and time.monotonic() > self._deadline:
+            self._timed_out = True
+            self.stop()
+        return self._process.poll() is not None
+
+    def close(self) -> str | None:
+        """Record how the process ended; return why it failed, None if it did not."""
+        self._log.close()
+        code = self._process.returncode
+        if (self.run.folder / RESULT_FILE).exists():
+            return None
+        reason = f"exit status {code}"
+        if self._timed_out:
+            reason = "took longer than max_hours"
+        elif code < 0:
+            reason = f"killed by {signal.Signals(-code).name}"
+        lines = (self.run.folder / LOG_FILE).read_text(errors="replace").splitlines()
+        last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+        if code > 0 and last:
+            reason += f": {last}"
+        failure = {"reason": reason, "when": now(), "log": lines[-LOG_LINES:]}
+        (self.run.folder / FAILURE_FILE).write_text(json.dumps(failure, indent=2) + "\n")
+        return reason
+
+    def stop(self) -> None:
+        """End the process and those that it started, now."""
+        if self._process.poll() is None:
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self._log.close()

@@ -1,0 +1,250 @@
+"""Benchmark: a grid of tasks, algorithms, networks and seeds, which `training.jobs` runs."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from pydantic import Field
+
+from ba_torchrl.algorithms.base import Problem
+from ba_torchrl.config import StrictModel
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.results import (
+    CONFIG_FILE,
+    RESULT_FILE,
+    differences,
+    failure_reason,
+    read_result,
+)
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.checkpoint import build_algorithm, problem_of
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.resume import check_same_run, resumable_updates
+
+SET_BY_THE_GRID = ("task", "seed", "label", "run_dir", "resume", "benchmark")
+"""Fields of `ExperimentConfig` that differ from run to run."""
+
+Overrides = dict[str, dict[str, Any]]
+Preset = Callable[[Literal["algorithm", "network"], str], dict[str, Any]]
+"""From a group and a name to the values of that preset file; raises with the known names."""
+State = Literal["done", "interrupted", "failed", "missing"]
+
+
+class BenchmarkConfig(StrictModel):
+    """A grid of runs. Its lists are the grid's axes; all other fields are overrides."""
+
+    name: str
+    """Of the benchmark, for reports."""
+    folder: str
+    """Of all its runs."""
+    tasks: list[str] = Field(min_length=1)
+    """Ids of tasks."""
+    algorithms: list[str] = Field(min_length=1)
+    """Names of preset files in ``configs/algorithm``."""
+    networks: list[str] = Field(min_length=1)
+    """Names of preset files in ``configs/network``."""
+    seeds: int | list[int] = 4
+    """How many, from 0 on, or which."""
+    skip: list[dict[str, str | list[str]]] = Field(default_factory=list)
+    """What to leave out of the grid: each entry names a ``task``, an ``algorithm``, a ``network``
+    or several of these, one or a list of each; runs that match all it names are left out."""
+    per_task: Overrides = Field(default_factory=dict)
+    """By task, what differs from the fields common to all runs."""
+    per_algorithm: Overrides = Field(default_factory=dict)
+    """By algorithm; wins over `per_task`."""
+    per_network: Overrides = Field(default_factory=dict)
+    """By network; wins over `per_algorithm`."""
+    jobs: int = Field(default=1, ge=1)
+    """Runs at the same time."""
+    max_hours: float | None = Field(default=None, gt=0)
+    """Time limit of a run; one that takes longer is stopped, counts as failed, and is resumed by
+    the next call."""
+
+    def seed_list(self) -> list[int]:
+        """Return the seeds of the grid."""
+        return list(range(self.seeds)) if isinstance(self.seeds, int) else self.seeds
+
+    def skips(self, **cell: str) -> bool:
+        """Whether the grid leaves out a cell.
+
+        Args:
+            cell: its ``task``, ``algorithm`` and ``network``.
+        """
+        return any(
+            all(
+                cell[axis] in ([names] if isinstance(names, str) else names) for axis, names in rule
+            )
+            for rule in (entry.items() for entry in self.skip)
+        )
+
+
+@dataclass(frozen=True)
+class Status:
+    """Where a run of the grid stands."""
+
+    state: State
+    detail: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.state}: {self.detail}" if self.detail else self.state
+
+
+def plan(
+    config: BenchmarkConfig, common: Mapping[str, Any], preset: Preset
+) -> list[ExperimentConfig]:
+    """Return every run of a grid, checked: all tasks and methods with the first seed come first.
+
+    Args:
+        config: the grid.
+        common: fields of `ExperimentConfig` that all runs share. Those of ``algorithm`` and
+            ``network`` go over the presets, without a name.
+        preset: loads the presets.
+
+    Returns:
+        `ExperimentConfig` of each run.
+
+    Raises:
+        ConfigError: a name is unknown, a value cannot be used, or parts do not go together.
+    """
+    _check_axes(config, preset)
+    presets = {
+        (group, name): preset(group, name)
+        for group, names in (("algorithm", config.algorithms), ("network", config.networks))
+        for name in names
+    }
+    runs = []
+    for seed, *cell in product(
+        config.seed_list(), config.tasks, config.algorithms, config.networks
+    ):
+        task, algorithm, network = cell
+        if config.skips(task=task, algorithm=algorithm, network=network):
+            continue
+        values = _merged(
+            {
+                "algorithm": presets["algorithm", algorithm],
+                "network": presets["network", network],
+            },
+            common,
+            config.per_task.get(task, {}),
+            config.per_algorithm.get(algorithm, {}),
+            config.per_network.get(network, {}),
+        )
+        taken = [name for name in SET_BY_THE_GRID if name in values]
+        if taken:
+            raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
+        where = Path(config.folder, task.replace("/", "_"), f"{algorithm}_{network}", f"seed{seed}")
+        values |= {
+            "task": task,
+            "seed": seed,
+            "label": f"{algorithm} {network}",
+            "benchmark": config.name,
+            "run_dir": str(where),
+            "resume": True,
+        }
+        try:
+            runs.append(ExperimentConfig.parse(values))
+        except ConfigError as error:
+            raise ConfigError(f"{task} with {algorithm} {network}: {error}") from None
+    if not runs:
+        raise ConfigError("the grid is empty: `skip` leaves everything out")
+    _check_parts(runs)
+    return runs
+
+
+def status(run: ExperimentConfig) -> Status:
+    """Return where a run stands.
+
+    Raises:
+        ConfigError: its folder holds a run with other settings.
+    """
+    folder = run.folder
+    if (folder / RESULT_FILE).exists():
+        result = read_result(folder)
+        found = differences(result.config, run.resolved())
+        if found:
+            lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
+            raise ConfigError(
+                f"{folder} holds a run with other settings; choose another folder:\n  "
+                + "\n  ".join(lines)
+            )
+        return Status("done", f"success {result.final.success_rate:.2f}")
+    if (folder / CONFIG_FILE).exists():
+        check_same_run(run)
+    reason = failure_reason(folder)
+    if reason is not None:
+        return Status("failed", reason)
+    if (folder / CONFIG_FILE).exists():
+        updates = resumable_updates(folder) or 0
+        return Status("interrupted", f"goes on after update {updates} of {run.total_updates}")
+    return Status("missing")
+
+
+def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
+    """Refuse unknown names on every axis and in every override, and names that come twice."""
+    known: dict[str, Callable[[str], Any]] = {
+        "task": TASKS.__getitem__,
+        "algorithm": lambda name: preset("algorithm", name),
+        "network": lambda name: preset("network", name),
+    }
+    axes = {"task": config.tasks, "algorithm": config.algorithms, "network": config.networks}
+    for axis, names in (*axes.items(), ("seed", config.seed_list())):
+        if len(set(names)) < len(names) or not names:
+            raise ConfigError(f"{axis}s: {names} is empty or names one twice")
+    for axis, names in (*axes.items(), *_mentioned(config)):
+        if axis not in known:
+            raise ConfigError(f"skip: unknown axis {axis!r}. Known: {', '.join(known)}")
+        for name in names:
+            known[axis](name)
+
+
+def _mentioned(config: BenchmarkConfig) -> Iterator[tuple[str, Sequence[str]]]:
+    """Yield (axis, names) of whatever overrides and ``skip`` speak of."""
+    yield "task", list(config.per_task)
+    yield "algorithm", list(config.per_algorithm)
+    yield "network", list(config.per_network)
+    for entry in config.skip:
+        for axis, names in entry.items():
+            yield axis, [names] if isinstance(names, str) else names
+
+
+def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
+    """Make every environment of the grid once, and every learner that differs from the others.
+
+    Some parameters are checked by tasks and robots, some sizes and actions by networks.
+    """
+    problems: dict[tuple[str, str], Problem] = {}
+    built = set()
+    for run in runs:
+        key = (run.task, json.dumps(run.env, sort_keys=True))
+        try:
+            if key not in problems:
+                # alike but for what no network depends on
+                same = {"seed": 0, "max_depth_m": 1.0, "device": torch.device("cpu")}
+                problems[key] = replace(problem_of(run), **same)
+            problem = problems[key]
+            learner = repr((problem, run.algorithm_config, run.network_config))
+            if learner not in built:
+                built.add(learner)
+                build_algorithm(run, problem)
+        except ConfigError as error:
+            raise ConfigError(f"{run.task} with {run.label}: {error}") from None
+
+
+def _merged(*layers: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested settings, later ones over earlier ones."""
+    out: dict[str, Any] = {}
+    for layer in layers:
+        for key, value in layer.items():
+            if isinstance(value, Mapping):
+                before = out.get(key)
+                out[key] = _merged(before if isinstance(before, Mapping) else {}, value)
+            else:
+                out[key] = copy.copy(value)
+    return out

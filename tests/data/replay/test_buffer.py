@@ -1,0 +1,368 @@
+"""The frame-sharing replay: contents, memory, checks, checkpoints."""
+
+import copy
+import resource
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.checkpoint import Checkpoint
+
+import ba_torchrl
+from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.replay.buffer import make_replay_buffer
+from ba_torchrl.data.replay.codecs import DepthQuantizer
+from ba_torchrl.data.replay.frames import FrameTable
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ReplaySchemaError
+
+QUANTIZER = DepthQuantizer(0.32)
+
+
+def buffer(capacity=50, batch_size=8, seed=0, **settings):
+    return make_replay_buffer(
+        capacity, batch_size, codecs={keys.PIXELS: QUANTIZER}, seed=seed, **settings
+    )
+
+
+def episode(length, rng, size=8, expert=False, truncated=False):
+    """Transitions of one episode: the next image of a step is the image of the following one."""
+    frames = torch.from_numpy(rng.random((length + 1, 1, size, size), dtype=np.float32) * 0.32)
+    holding = torch.from_numpy(rng.random((length + 1, 1)) > 0.5)
+    last = torch.arange(length)[:, None] == length - 1
+    return TensorDict(
+        {
+            keys.PIXELS: frames[:-1],
+            keys.HOLDING: holding[:-1],
+            keys.ACTION: torch.from_numpy(rng.random((length, 5), dtype=np.float32)),
+            keys.IS_EXPERT: torch.full((length, 1), expert),
+            keys.NEXT: {
+                keys.PIXELS: frames[1:],
+                keys.HOLDING: holding[1:],
+                keys.REWARD: last.float(),
+                keys.TERMINATED: last & (not truncated),
+                keys.TRUNCATED: last & truncated,
+                keys.DONE: last,
+                keys.FAULT: torch.zeros(length, 1, dtype=torch.bool),
+            },
+        },
+        [length],
+    )
+
+
+def assert_same(stored, original):
+    for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
+        assert stored[key].dtype == torch.float32
+        assert (stored[key] - original[key]).abs().max() <= QUANTIZER.max_error_m * 1.001
+    for key in (keys.HOLDING, keys.ACTION, keys.IS_EXPERT, (keys.NEXT, keys.TRUNCATED)):
+        assert torch.equal(stored[key], original[key])
+
+
+def frames_needed(transitions):
+    """Different frames among transitions, by their codes."""
+    codes = set()
+    for t in transitions:
+        for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
+            codes.add(QUANTIZER.encode(t[key]).numpy().tobytes())
+    return len(codes)
+
+
+def test_a_plain_episode_shares_its_frames():
+    rb, rng = buffer(), np.random.default_rng(0)
+    data = episode(10, rng)
+    index = rb.extend(data)
+    assert index.tolist() == list(range(10))
+    assert_same(rb[:], data)
+    assert rb.storage.frame_count == 11
+    one = rb.storage[3]
+    assert one[keys.PIXELS].shape == (1, 8, 8)
+    assert_same(one[None], data[3:4])
+
+
+@pytest.mark.parametrize("capacity", [7, 16, 50])
+def test_random_interleavings_and_wrap_around(capacity):
+    """Four environments step side by side, end at their own times, beside demos and single adds."""
+    rb, rng = buffer(capacity), np.random.default_rng(1)
+    expected = [None] * capacity
+    cursor = 0
+
+    def put(batch):
+        nonlocal cursor
+        places = rb.extend(batch)
+        for i, place in enumerate(places.tolist()):
+            assert place == (cursor + i) % capacity
+            expected[place] = batch[i].clone()
+        cursor += len(batch)
+
+    streams = [[] for _ in range(4)]
+    for _ in range(40):
+        kind = rng.random()
+        if kind < 0.15:
+            put(episode(int(rng.integers(1, 6)), rng, expert=True))
+        else:
+            steps = []
+            for stream in streams:
+                if rng.random() < 0.2:
+                    stream.clear()  # a reset before the end: the chain breaks
+                if not stream:
+                    stream.extend(episode(int(rng.integers(1, 6)), rng).unbind(0))
+                steps.append(stream.pop(0))
+            put(torch.stack(steps))
+        held = [t for t in expected if t is not None]
+        assert len(rb) == len(held)
+        assert rb.storage.frame_count == frames_needed(held)
+        assert_same(rb[:], torch.stack(held))
+    sample = rb.sample(30)
+    assert_same(sample, torch.stack([expected[i] for i in sample["index"].tolist()]))
+
+
+def test_a_batch_larger_than_the_capacity_keeps_its_end():
+    rb, rng = buffer(6), np.random.default_rng(2)
+    data = episode(20, rng)
+    rb.extend(data)
+    assert len(rb) == 6
+    stored = rb[:]
+    order = stored[keys.ACTION][:, 0]
+    for i in range(14, 20):
+        place = i % 6
+        assert_same(stored[place : place + 1], data[i : i + 1])
+    assert len(order.unique()) == 6
+    assert rb.storage.frame_count == 7
+
+
+def test_equal_frames_of_different_episodes_are_kept_once():
+    rb, rng = buffer(), np.random.default_rng(3)
+    data = episode(5, rng)
+    for _ in range(4):
+        rb.extend(data)
+    assert len(rb) == 20
+    assert rb.storage.frame_count == 6
+
+
+def test_frame_table_counts_frees_and_reuses():
+    table = FrameTable(torch.Size([1, 2, 2]))
+    a, b, c, d = (np.full(4, i, dtype=np.uint8) for i in range(4))
+    assert [table.acquire(f) for f in (a, b, a, c)] == [0, 1, 0, 2]
+    table.release(0)
+    assert len(table) == 3
+    table.release(0)
+    assert len(table) == 2
+    assert table.acquire(d) == 0
+    assert table.read(torch.tensor([[0, 1]])).tolist() == [[[[[3, 3], [3, 3]]], [[[1, 1], [1, 1]]]]]
+    assert table.acquire(a) == 3
+    table.clear()
+    assert len(table) == table.nbytes == 0
+    assert table.acquire(b) == 0
+
+
+@pytest.mark.parametrize("kind", ["noise", "flat", "ramp"])
+def test_any_frame_comes_back_as_it_was(kind):
+    table, rng = FrameTable(torch.Size([1, 128, 128])), np.random.default_rng(4)
+    frame = {
+        "noise": rng.integers(0, 256, 128 * 128, dtype=np.uint8),
+        "flat": np.full(128 * 128, 200, dtype=np.uint8),
+        "ramp": (np.arange(128 * 128) // 64).astype(np.uint8),
+    }[kind]
+    slot = table.acquire(frame)
+    assert np.array_equal(table.read(torch.tensor(slot)).numpy().reshape(-1), frame)
+    # what does not compress takes hardly more than the frame itself
+    assert table.nbytes < 128 * 128 * 1.02 if kind == "noise" else table.nbytes < 1000
+
+
+def test_counted_bytes_are_those_allocated():
+    rng = np.random.default_rng(5)
+    frames = rng.integers(0, 256, (20_000, 16), dtype=np.uint8)
+    table = FrameTable(torch.Size([16]))
+    tracemalloc.start()
+    for frame in frames:
+        table.acquire(frame)
+    allocated, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert allocated == pytest.approx(table.nbytes, rel=0.25)
+
+
+def test_incompressible_images_fit_as_well():
+    """100,000 transitions of 128 px of pure noise take 1.7 GB from 50 steps per episode on."""
+    rng = np.random.default_rng(4)
+    for length, limit in [(7, 19_200), (50, 17_100)]:
+        rb = buffer(200)
+        while len(rb) < 150:
+            rb.extend(episode(length, rng, size=128))
+        assert rb.storage.frame_count == len(rb) + len(rb) // length
+        assert rb.storage.nbytes / len(rb) <= limit
+
+
+@pytest.mark.parametrize("task", [t for t in ba_torchrl.list_tasks() if t.startswith("close_loop")])
+def test_memory_of_expert_episodes(task):
+    """100,000 transitions of 128 px take 0.5 GB at most, however short the episodes are."""
+    env = ba_torchrl.make_vector_env(task, 1, parallel=False, seed=0, expert=True)
+    pixels = env.observation_spec[keys.PIXELS]
+    quantizer = DepthQuantizer(float(pixels.space.high.max()))
+    episodes = collect_demonstrations(env, 3, seed=0)
+    env.close()
+    rb = make_replay_buffer(200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
+    for data in episodes:
+        rb.extend(as_transitions(data, is_expert=True))
+    assert rb.storage.nbytes / len(rb) <= 5_000
+    original = torch.cat(episodes)
+    for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
+        assert torch.equal(rb[:][key], quantizer(original[key]))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads resident memory as Linux reports it")
+def test_reserved_memory_costs_nothing_until_used():
+    def resident():
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * resource.getpagesize()
+
+    rng = np.random.default_rng(5)
+    data = [episode(50, rng, size=128) for _ in range(6)]
+    small = buffer(100_000)
+    small.extend(data[0])
+    start, counted = resident(), small.storage.nbytes
+    for d in data[1:]:
+        small.extend(d)
+    growth, counted = resident() - start, small.storage.nbytes - counted
+    assert 2e6 < counted < 1e7
+    assert growth < counted + 3e7  # the allocator's own slack
+
+
+def test_overwriting_reuses_frames():
+    rb, rng = buffer(20), np.random.default_rng(6)
+    for _ in range(50):
+        rb.extend(episode(5, rng))
+    assert rb.storage.frame_count == 24
+    assert rb.storage._frames[keys.PIXELS].nbytes < 30 * (100 + 64 + 60)  # slots are used again
+
+
+@pytest.mark.parametrize("prioritized", [True, False])
+def test_samples_come_as_float_metres_with_index(prioritized):
+    rb, rng = buffer(prioritized=prioritized), np.random.default_rng(7)
+    data = torch.cat([episode(6, rng, expert=True), episode(6, rng)])
+    rb.extend(data)
+    sample = rb.sample()
+    assert sample.batch_size == (8,)
+    assert_same(sample, data[sample["index"]])
+    assert (keys.NEXT, keys.FAULT) not in sample.keys(True)
+    assert ("priority_weight" in sample) == prioritized
+    if prioritized:
+        sample[keys.TD_ERROR] = torch.rand(8, 1)
+        rb.update_tensordict_priority(sample)
+    again = buffer(prioritized=prioritized)
+    again.extend(data)
+    assert torch.equal(again.sample()["index"], sample["index"])
+    sample[keys.PIXELS].zero_()  # a sample is a copy
+    assert_same(rb[:], data)
+
+
+def test_experts_are_preferred():
+    rb, rng = buffer(100), np.random.default_rng(8)
+    rb.extend(torch.cat([episode(50, rng, size=2, expert=True), episode(50, rng, size=2)]))
+    expert = torch.cat([rb.sample(500)[keys.IS_EXPERT] for _ in range(10)])
+    wanted = 2**0.6 / (2**0.6 + 1)
+    assert expert.float().mean().item() == pytest.approx(wanted, abs=0.03)
+
+
+def test_faults_never_enter():
+    rb, rng = buffer(), np.random.default_rng(9)
+    data = episode(6, rng)
+    data[keys.NEXT, keys.FAULT][[1, 4]] = True
+    before = data.clone()
+    assert rb.extend(data).tolist() == [0, 1, 2, 3]
+    assert rb.faults_dropped == 2
+    assert_same(rb[:], data[[0, 2, 3, 5]])
+    assert set(data.keys(True)) == set(before.keys(True))  # the caller's data is left alone
+    assert rb.extend(data[[1]]).numel() == 0
+    assert rb.add(data[4]).numel() == 0
+    assert rb.add(data[5]).tolist() == [4]
+    assert rb.faults_dropped == 4
+    assert len(rb) == rb.write_count == 5
+
+
+def test_schema_drift_is_refused():
+    rb, rng = buffer(), np.random.default_rng(10)
+    data = episode(4, rng)
+    rb.extend(data)
+    missing = data.exclude(keys.HOLDING)
+    extra = data.clone().set("colour", torch.zeros(4))
+    other_type = data.clone().set(keys.ACTION, data[keys.ACTION].double())
+    other_shape = data.clone().set(keys.PIXELS, torch.zeros(4, 1, 9, 9))
+    for bad, words in [
+        (missing, "missing 'holding'"),
+        (extra, "unexpected 'colour'"),
+        (other_type, "float64"),
+        (other_shape, "stored as float32"),
+        (data.reshape(2, 2), "one batch dimension"),
+    ]:
+        with pytest.raises(ReplaySchemaError, match=words):
+            rb.extend(bad)
+    assert len(rb) == 4
+    assert_same(rb[:], data)
+    with pytest.raises(ReplaySchemaError, match="lack"):
+        buffer().extend(data.exclude(keys.PIXELS))
+    rb.extend(data.exclude((keys.NEXT, keys.FAULT)))  # the flag is not part of what is stored
+
+
+@pytest.mark.parametrize("how", ["state_dict", "dumps", "Checkpoint"])
+def test_checkpoint_round_trip(how, tmp_path):
+    rb, rng = buffer(30), np.random.default_rng(11)
+    for _ in range(9):  # wrapped, with freed frames
+        rb.extend(episode(5, rng, expert=rng.random() < 0.5))
+    sample = rb.sample()
+    sample[keys.TD_ERROR] = torch.rand(8, 1) * 3
+    rb.update_tensordict_priority(sample)
+    other = buffer(30, seed=5)
+    other.extend(episode(12, rng))  # what it held is replaced
+    if how == "state_dict":
+        other.load_state_dict(copy.deepcopy(rb.state_dict()))
+    elif how == "dumps":
+        rb.dumps(tmp_path / "replay")
+        other = buffer(30, seed=5)
+        other.loads(tmp_path / "replay")
+    else:
+        Checkpoint(replay_buffer=rb).save(tmp_path / "checkpoint")
+        Checkpoint(replay_buffer=other).load(tmp_path / "checkpoint")
+    assert_same(other[:], rb[:])
+    assert other.storage.frame_count == rb.storage.frame_count
+    following = episode(5, rng)
+    for b in (rb, other):
+        b.extend(following)
+    assert_same(other[:], rb[:])
+    assert other.storage.frame_count == rb.storage.frame_count
+    for _ in range(3):
+        one, two = rb.sample(), other.sample()
+        assert torch.equal(one["index"], two["index"])
+        assert torch.equal(one["priority_weight"], two["priority_weight"])
+
+
+def test_an_empty_replay_can_be_saved(tmp_path):
+    rb = buffer()
+    rb.dumps(tmp_path / "replay")
+    other = buffer()
+    other.loads(tmp_path / "replay")
+    assert len(other) == 0
+    with pytest.raises(RuntimeError, match="empty"):
+        other.sample()
+
+
+def test_empty_forgets_everything():
+    rb, rng = buffer(), np.random.default_rng(12)
+    rb.extend(episode(5, rng))
+    rb.empty()
+    assert len(rb) == rb.storage.frame_count == 0
+    data = episode(3, rng)
+    rb.extend(data)
+    assert_same(rb[:], data)
+
+
+def test_column_reads_flags_without_images(monkeypatch):
+    rb, rng = buffer(), np.random.default_rng(13)
+    with pytest.raises(KeyError, match="empty"):
+        rb.storage.column(keys.IS_EXPERT)
+    rb.extend(torch.cat([episode(2, rng, expert=True), episode(2, rng)]))
+    monkeypatch.setattr(FrameTable, "read", lambda *_: pytest.fail("decoded images"))
+    assert rb.storage.column(keys.IS_EXPERT).flatten().tolist() == [True, True, False, False]
+    rb.update_priority(torch.arange(4), torch.ones(4))

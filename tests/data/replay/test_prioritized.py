@@ -1,0 +1,232 @@
+"""Segment trees and the expert-prioritised sampler, against the formulas."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import prioritized
+
+from ba_torchrl.data.replay import segment_tree
+from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.envs import keys
+
+EPS = 1e-6
+
+
+def back_ends():
+    """Our trees, and TorchRL's native ones where its extension loads."""
+    yield pytest.param((segment_tree.SumTree, segment_tree.MinTree), id="numpy")
+    yield pytest.param((segment_tree.SumTreeFp32, segment_tree.MinTreeFp32), id="numpy-fp32")
+    native = prioritized.SumSegmentTreeFp64, prioritized.MinSegmentTreeFp64
+    if native[0] is not segment_tree.SumTree:
+        yield pytest.param(native, id="native")
+
+
+@pytest.mark.parametrize("trees", back_ends())
+@pytest.mark.parametrize("capacity", [1, 7, 64, 1000])
+def test_trees_against_plain_arrays(trees, capacity):
+    rng = np.random.default_rng(0)
+    total, smallest = trees[0](capacity), trees[1](capacity)
+    values = np.zeros(capacity)
+    for size in (1, min(3, capacity), capacity):  # single paths, and whole levels
+        index = torch.from_numpy(rng.permutation(capacity)[:size])
+        new = torch.from_numpy(rng.random(size) + 0.1)
+        total[index], smallest[index] = new, new
+        values[index] = new
+    assert np.asarray(total[torch.arange(capacity)]) == pytest.approx(values, rel=1e-6)
+    for _ in range(20):
+        low, high = sorted(rng.integers(0, capacity + 1, 2))
+        if low == high:
+            continue
+        assert total.query(int(low), int(high)) == pytest.approx(values[low:high].sum(), rel=1e-6)
+        assert smallest.query(int(low), int(high)) == pytest.approx(
+            values[low:high].min(), rel=1e-6
+        )
+    mass = rng.random(200) * values.sum()
+    expected = np.searchsorted(np.cumsum(values), mass, side="left")
+    found = np.asarray(total.scan_lower_bound(torch.from_numpy(mass)))
+    assert (found == expected).mean() > 0.99  # a mass on an edge may round to either side
+    assert np.abs(found - expected).max() <= 1
+    assert total.scan_lower_bound(float(mass[0])) in (expected[0] - 1, expected[0], expected[0] + 1)
+
+
+def test_single_values_and_unset_leaves():
+    total, smallest = segment_tree.SumTree(5), segment_tree.MinTree(5)
+    total[2], smallest[2] = 4.0, 4.0
+    assert total[2] == 4
+    assert total[0] == 0
+    assert total.query(0, 5) == smallest.query(0, 5) == 4
+    assert smallest.query(0, 2) == np.inf
+    assert total.scan_lower_bound(3.0) == 2
+    assert len(total) == 5
+    clone = copy.deepcopy(total)
+    total[2] = 1.0
+    assert clone.query(0, 5) == 4
+    with pytest.raises(IndexError):
+        total[5] = 1.0
+
+
+def test_install_keeps_native_trees(monkeypatch):
+    marker = type("Native", (), {})
+    monkeypatch.setattr(prioritized, "SumSegmentTreeFp32", marker)
+    monkeypatch.setattr(prioritized, "MinSegmentTreeFp64", None)
+    segment_tree.install()
+    assert prioritized.SumSegmentTreeFp32 is marker
+    assert prioritized.MinSegmentTreeFp64 is segment_tree.MinTree
+
+
+def make(flags, bonus=1.0, seed=0, capacity=None, **settings):
+    """A buffer of small transitions whose expert flags are given."""
+    capacity = capacity or len(flags)
+    sampler = ExpertPrioritizedSampler(
+        capacity,
+        generator=torch.Generator().manual_seed(seed),
+        expert_bonus=bonus,
+        **settings,
+    )
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity), sampler=sampler, batch_size=4000
+    )
+    buffer.extend(transitions(flags))
+    return buffer, sampler
+
+
+def transitions(flags):
+    flags = torch.tensor(flags)[:, None]
+    return TensorDict({keys.IS_EXPERT: flags, "x": torch.arange(len(flags))}, [len(flags)])
+
+
+FLAGS = [True, False, True, False, False, True, False, False]
+ERRORS = [0.0, 0.1, 0.3, 2.0, 0.5, 0.9, 0.05, 1.0]
+
+
+def formula(errors, flags, bonus, alpha=0.6):
+    return np.array([(e + EPS + bonus * f) ** alpha for e, f in zip(errors, flags, strict=True)])
+
+
+@pytest.mark.parametrize("bonus", [1.0, 0.0, 2.5])
+def test_draws_and_weights_follow_the_formula(bonus):
+    buffer, sampler = make(FLAGS, bonus)
+    sampler.anneal(0.5)
+    assert sampler.beta == pytest.approx(0.7)
+    update = TensorDict({"index": torch.arange(8), "td_error": torch.tensor(ERRORS)[:, None]}, [8])
+    buffer.update_tensordict_priority(update)
+    leaf = formula(ERRORS, FLAGS, bonus)
+    probability = leaf / leaf.sum()
+    draws = torch.cat([buffer.sample()["x"] for _ in range(10)])
+    counts = np.bincount(draws.numpy(), minlength=8)
+    expected = len(draws) * probability
+    chi_square = ((counts - expected) ** 2 / expected)[expected > 5].sum()
+    assert chi_square < 24.3  # 0.999 quantile for 7 degrees of freedom
+    sample = buffer.sample()
+    weights = (leaf / leaf.min()) ** -0.7
+    assert sample["priority_weight"].dtype == torch.float32
+    assert sample["priority_weight"].shape == (4000,)
+    assert sample["priority_weight"].numpy() == pytest.approx(weights[sample["x"]], rel=1e-5)
+    # The same up to a factor as the textbook's (N P)^-beta, whose largest is then one.
+    textbook = (8 * probability) ** -0.7
+    assert weights == pytest.approx(textbook / textbook.max(), rel=1e-9)
+
+
+def leaves(sampler, n):
+    return np.asarray(sampler._sum_tree[torch.arange(n)])
+
+
+def test_new_transitions_get_largest_error_and_bonus():
+    buffer, sampler = make([True, False], capacity=10)
+    assert leaves(sampler, 2) == pytest.approx(formula([1, 1], [1, 0], 1.0))
+    buffer.update_priority(torch.tensor([0, 1]), torch.tensor([3.0, 0.5]))
+    buffer.extend(transitions([False, True]))
+    expected = formula([3.0, 0.5, 3.0, 3.0], [1, 0, 0, 1], 1.0)
+    assert leaves(sampler, 4) == pytest.approx(expected)
+
+
+def test_largest_error_does_not_run_away():
+    buffer, sampler = make([True] * 4, bonus=1.0, capacity=16)
+    for i in range(200):
+        buffer.extend(transitions([i % 2 == 0]))
+        sample = buffer.sample(4)
+        sample["td_error"] = torch.full((4, 1), 0.2)
+        buffer.update_tensordict_priority(sample)
+    assert sampler.default_priority == pytest.approx(1.0)
+    assert leaves(sampler, 16).max() <= (1 + EPS + 1) ** 0.6 + 1e-9
+
+
+def test_overwritten_place_follows_the_new_flag():
+    buffer, sampler = make([True, True], capacity=2)
+    buffer.extend(transitions([False]))
+    assert leaves(sampler, 2) == pytest.approx(formula([1, 1], [0, 1], 1.0))
+
+
+def test_draws_do_not_touch_global_generators():
+    one, _ = make(FLAGS, seed=3)
+    two, _ = make(FLAGS, seed=3)
+    torch_state, numpy_state = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    first = one.sample()["x"]
+    assert torch.equal(torch.get_rng_state(), torch_state)
+    assert (np.random.get_state()[1] == numpy_state).all()  # noqa: NPY002
+    torch.manual_seed(99)
+    assert torch.equal(two.sample()["x"], first)
+    other, _ = make(FLAGS, seed=4)
+    assert not torch.equal(other.sample()["x"], first)
+
+
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_checkpoint_continues_the_same_draws(on_disk, tmp_path):
+    buffer, sampler = make(FLAGS, capacity=12)
+    sampler.anneal(0.25)
+    buffer.update_priority(torch.arange(8), torch.tensor(ERRORS))
+    buffer.sample()
+    if on_disk:
+        sampler.dumps(tmp_path / "sampler")
+    state = copy.deepcopy(sampler.state_dict())
+    expected = buffer.sample()
+    other, restored = make(FLAGS, capacity=12, seed=77)
+    if on_disk:
+        restored.loads(tmp_path / "sampler")
+    else:
+        restored.load_state_dict(state)
+    actual = other.sample()
+    assert torch.equal(actual["x"], expected["x"])
+    assert torch.equal(actual["priority_weight"], expected["priority_weight"])
+    assert restored.default_priority == sampler.default_priority == 2.0
+    _, wrong = make(FLAGS)
+    with pytest.raises(ValueError, match="capacity"):
+        wrong.load_state_dict(state)
+
+
+def test_large_checkpoint_is_quick():
+    """TorchRL writes leaf by leaf: 28 s for this size with NumPy trees."""
+    import time
+
+    sampler = ExpertPrioritizedSampler(100_000, generator=torch.Generator(), expert_bonus=0)
+    sampler.update_priority(torch.arange(100_000), torch.rand(100_000))
+    other = ExpertPrioritizedSampler(100_000, generator=torch.Generator(), expert_bonus=0)
+    start = time.perf_counter()
+    other.load_state_dict(sampler.state_dict())
+    assert time.perf_counter() - start < 2
+    assert other._sum_tree.query(0, 100_000) == pytest.approx(sampler._sum_tree.query(0, 100_000))
+
+
+def test_anneal_covers_the_run():
+    _, sampler = make(FLAGS)
+    assert sampler.beta == 0.4
+    for fraction, beta in [(0, 0.4), (0.5, 0.7), (1, 1.0), (3, 1.0), (-1, 0.4)]:
+        sampler.anneal(fraction)
+        assert sampler.beta == pytest.approx(beta)
+
+
+def test_refusals():
+    buffer, sampler = make(FLAGS)
+    with pytest.raises(ValueError, match="not finite"):
+        buffer.update_priority(torch.tensor([0]), torch.tensor([float("nan")]))
+    with pytest.raises(ValueError, match="storage"):
+        sampler.update_priority(torch.tensor([0]), 1.0)
+    with pytest.raises(ValueError, match="eps"):
+        ExpertPrioritizedSampler(4, generator=torch.Generator(), eps=0)
+    empty = ExpertPrioritizedSampler(4, generator=torch.Generator())
+    with pytest.raises(RuntimeError, match="empty"):
+        empty.sample(LazyTensorStorage(4), 2)

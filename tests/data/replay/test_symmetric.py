@@ -1,0 +1,138 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ba_torchrl.data.replay.codecs import HalfPrecision
+from ba_torchrl.data.replay.symmetric import SymmetricReplay
+
+CODEC = HalfPrecision(0.25)
+
+
+def transitions(numbers, is_expert):
+    """Transitions whose action is their number, and whose images show it."""
+    count = len(numbers)
+    value = torch.tensor(numbers, dtype=torch.float32)
+
+    def image(offset, size):
+        return (value / 1024 + offset).reshape(-1, 1, 1, 1).expand(-1, 1, size, size).clone()
+
+    flag = torch.zeros(count, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "pixels": image(0.0, 8),
+            "in_hand": image(0.01, 4),
+            "holding": flag,
+            "action": value[:, None],
+            "is_expert": flag | is_expert,
+            "next": {
+                "pixels": image(0.02, 8),
+                "in_hand": image(0.03, 4),
+                "holding": flag,
+                "reward": torch.zeros(count, 1),
+                "done": flag,
+                "terminated": flag,
+                "truncated": flag,
+                "fault": flag,
+            },
+        },
+        batch_size=[count],
+    )
+
+
+def replay(capacity=100, batch_size=8, seed=0):
+    codecs = {"pixels": CODEC, "in_hand": CODEC}
+    return SymmetricReplay(capacity, batch_size, codecs=codecs, seed=seed)
+
+
+def filled(**settings):
+    made = replay(**settings)
+    made.extend(transitions(range(10), True))
+    made.extend(transitions(range(50, 90), False))
+    return made
+
+
+def test_every_batch_is_half_and_half():
+    made = filled()
+    assert len(made) == 50
+    seen = set()
+    for _ in range(100):
+        batch = made.sample()
+        assert batch.batch_size == (8,)
+        assert batch["is_expert"].flatten().tolist() == [True] * 4 + [False] * 4
+        numbers = batch["action"].flatten().tolist()
+        assert all(number < 10 for number in numbers[:4])
+        assert all(number >= 50 for number in numbers[4:])
+        seen |= set(numbers)
+    assert seen == {*range(10), *range(50, 90)}  # uniform over both sides
+
+
+def test_of_an_odd_batch_the_demonstrations_get_one_more():
+    assert filled(batch_size=7).sample()["is_expert"].sum() == 4
+
+
+@pytest.mark.parametrize("is_expert", [True, False])
+def test_one_side_fills_the_batch_while_the_other_is_empty(is_expert):
+    made = replay()
+    made.extend(transitions(range(5), is_expert))
+    assert (made.sample()["is_expert"] == is_expert).all()
+    assert made.sample().batch_size == (8,)
+
+
+def test_demonstrations_are_never_overwritten():
+    made = filled(capacity=20)
+    for start in range(0, 300, 30):
+        made.extend(transitions(range(100 + start, 130 + start), False))
+    assert len(made) == 10 + 20
+    numbers = {int(n) for _ in range(100) for n in made.sample()["action"]}
+    assert numbers == {*range(10), *range(380, 400)}
+
+
+def test_mixed_transitions_go_to_their_sides():
+    made = replay()
+    mixed = torch.cat([transitions([1], True), transitions([2, 3], False), transitions([4], True)])
+    made.extend(mixed)
+    assert len(made.expert) == len(made.online) == 2
+
+
+def test_images_come_back_within_the_codec_s_error():
+    made = filled()
+    batch = made.sample()
+    for key, offset in [
+        ("pixels", 0.0),
+        ("in_hand", 0.01),
+        (("next", "pixels"), 0.02),
+        (("next", "in_hand"), 0.03),
+    ]:
+        expected = batch["action"].reshape(-1, 1, 1, 1) / 1024 + offset
+        assert batch[key].dtype == torch.float32
+        assert (batch[key] - expected).abs().max() <= CODEC.max_error_m
+
+
+def test_the_seed_repeats_the_draws_and_a_saved_replay_goes_on(tmp_path):
+    first, same, other = filled(seed=1), filled(seed=1), filled(seed=2)
+    batch = first.sample()["action"]
+    assert torch.equal(batch, same.sample()["action"])
+    assert not torch.equal(batch, other.sample()["action"])
+    first.dumps(tmp_path)
+    restored = replay(seed=5)
+    restored.loads(tmp_path)
+    assert len(restored) == len(first)
+    for _ in range(3):
+        assert torch.equal(first.sample()["action"], restored.sample()["action"])
+    numbers = {int(n) for _ in range(200) for n in restored.sample()["action"]}
+    assert numbers == {*range(10), *range(50, 90)}
+
+
+def test_an_empty_or_a_full_replay_says_so():
+    with pytest.raises(RuntimeError, match="empty"):
+        replay().sample()
+    made = replay(capacity=6)
+    made.extend(transitions(range(5), True))
+    with pytest.raises(ValueError, match="2 more demonstrations do not fit: 1 places of 6"):
+        made.extend(transitions(range(2), True))
+
+
+def test_shared_frames_are_kept_once():
+    made = replay()
+    made.extend(transitions([7] * 6, False))
+    assert made.online.storage.frame_count == 4  # one per kind and moment

@@ -1,0 +1,309 @@
+import math
+
+import numpy as np
+import pybullet
+import pytest
+import torch
+from tensordict import TensorDict
+
+import ba_torchrl
+from ba_torchrl.actions import PICK, PLACE
+from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.episodes import collect_episodes
+from ba_torchrl.data.time_reversal import is_reversible, replay_scores, reverse_episode
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.sim.control.pick_place import tool_rotation
+from ba_torchrl.sim.geometry import downward
+from ba_torchrl.tasks.structures.deconstruction import Watch, tool_angles
+
+TASK = "open_loop/house_building_2"
+STRUCTURES = [
+    "open_loop/block_stacking",
+    *(f"open_loop/house_building_{i}" for i in (1, 2, 3, 4)),
+    *(f"open_loop/improvise_house_building_{i}" for i in (2, 3)),
+]
+
+
+def flags(*values):
+    return torch.tensor(values)[:, None]
+
+
+def images(*values):
+    return torch.tensor(values, dtype=torch.float32)[:, None, None, None].expand(-1, 1, 2, 2)
+
+
+@pytest.fixture
+def taken_apart():
+    """Two picks and places, made up: state t shows the number t."""
+    return TensorDict(
+        {
+            "pixels": images(0, 1, 2, 3),
+            "in_hand": images(0, 101, 0, 103),
+            "holding": flags(False, True, False, True),
+            "expert_action": torch.zeros(4, 2),
+            "action": torch.zeros(4, 2),
+            "undo_action": torch.zeros(4, 2),
+            "undo_in_hand": images(0, 0, 52, 0),
+            "can_undo": flags(False, True, True, True),
+            "success": flags(False, False, False, False),
+            "fault": flags(False, False, False, False),
+            "done": flags(False, False, False, False),
+            "terminated": flags(False, False, False, False),
+            "truncated": flags(False, False, False, False),
+            "step_count": flags(0, 1, 2, 3),
+            "next": {
+                "pixels": images(1, 2, 3, 4),
+                "in_hand": images(101, 0, 103, 0),
+                "holding": flags(True, False, True, False),
+                "expert_action": torch.zeros(4, 2),
+                "undo_action": torch.tensor([[1.0, 10], [0, 21], [1, 32], [0, 43]]),
+                "undo_in_hand": images(0, 52, 0, 54),
+                "can_undo": flags(True, True, True, True),
+                "success": flags(False, False, False, True),
+                "fault": flags(False, False, False, False),
+                "reward": flags(0.0, 0.0, 0.0, 1.0),
+                "done": flags(False, False, False, True),
+                "terminated": flags(False, False, False, True),
+                "truncated": flags(False, False, False, False),
+                "step_count": flags(1, 2, 3, 4),
+            },
+        },
+        batch_size=[4],
+    )
+
+
+def test_time_runs_backwards(taken_apart):
+    built = reverse_episode(taken_apart)
+    assert built["pixels"][:, 0, 0, 0].tolist() == [4, 3, 2, 1]
+    assert built["next", "pixels"][:, 0, 0, 0].tolist() == [3, 2, 1, 0]
+    assert built["action"].tolist() == [[0, 43], [1, 32], [0, 21], [1, 10]]
+    assert built["holding"].flatten().tolist() == [False, True, False, True]
+    assert built["next", "holding"].flatten().tolist() == [True, False, True, False]
+
+
+def test_what_is_held_is_shown_as_its_pick_sees_it(taken_apart):
+    built = reverse_episode(taken_apart)
+    # state 3 is held from the pick in state 4, state 1 from the pick in state 2
+    assert built["in_hand"][:, 0, 0, 0].tolist() == [0, 54, 0, 52]
+    assert built["next", "in_hand"][:, 0, 0, 0].tolist() == [54, 0, 52, 0]
+
+
+def test_the_last_step_has_the_reward_and_ends(taken_apart):
+    built = reverse_episode(taken_apart)
+    at_end = [False, False, False, True]
+    assert built["next", "reward"].flatten().tolist() == [0, 0, 0, 1]
+    for key in ("success", "done", "terminated"):
+        assert built["next", key].flatten().tolist() == at_end
+        assert not built[key].any()
+    assert not built["next", "truncated"].any()
+    assert built["step_count"].flatten().tolist() == [0, 1, 2, 3]
+    assert built["next", "step_count"].flatten().tolist() == [1, 2, 3, 4]
+
+
+def test_the_recording_is_left_alone(taken_apart):
+    before = taken_apart.clone()
+    built = reverse_episode(taken_apart)
+    built["pixels"] = built["pixels"] + 1
+    built["next", "pixels"] = built["next", "pixels"] + 1
+    assert (taken_apart == before).all()
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        (("next", "can_undo"), (True, False, True, True)),
+        (("next", "success"), (False, False, False, False)),
+        ("holding", (False, True, True, True)),
+        (("next", "holding"), (True, False, True, True)),
+    ],
+)
+def test_what_did_not_go_by_turns_is_refused(taken_apart, key, values):
+    taken_apart[key] = flags(*values)
+    assert not is_reversible(taken_apart)
+    with pytest.raises(ValueError, match="cannot be reversed"):
+        reverse_episode(taken_apart)
+
+
+def test_angles_of_a_tool():
+    for angles in [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (1.0, -0.2, 0.5)]:
+        rotation = np.array(tool_rotation(*angles))
+        quaternion = (math.sin(math.pi / 2), 0.0, 0.0, math.cos(math.pi / 2))
+        for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
+            angle = angles[axis[::-1].index(1)]
+            turn = pybullet.getQuaternionFromAxisAngle(axis, angle)
+            _, quaternion = pybullet.multiplyTransforms((0, 0, 0), turn, (0, 0, 0), quaternion)
+        np.testing.assert_allclose(
+            np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3)), rotation, atol=1e-6
+        )
+        np.testing.assert_allclose(tool_angles(quaternion), angles, atol=1e-6)
+    assert tool_rotation(0.3)[0] == pytest.approx(downward(0.3)[0])
+
+
+class Piece:
+    """A body that lies somewhere."""
+
+    def __init__(self, x, y, z, turn=(0.0, 0.0, 0.0, 1.0)):
+        self.pose = ((x, y, z), turn)
+
+    @property
+    def position(self):
+        return self.pose[0]
+
+
+def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
+    down = pybullet.getQuaternionFromEuler((math.pi, 0.0, 0.0))
+    body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
+    # held 4 mm beside its middle, along the tool's x axis
+    grasp = ((0.004, 0.0, 0.0), pybullet.invertTransform((0, 0, 0), down)[1])
+    before = Watch({body: body.pose, other: other.pose}, None, None)
+    body.pose = ((0.6, 0.0, 0.4), body.pose[1])
+    undo = before.undo(body, grasp)
+    assert undo.primitive == PLACE
+    assert undo[1:4] == pytest.approx((0.396, 0.1, 0.05))
+    assert undo.angles_rad == pytest.approx((0.0, 0.0, 0.0))
+
+    held = Watch({body: body.pose, other: other.pose}, body, grasp)
+    quarter = pybullet.getQuaternionFromEuler((0.0, 0.0, math.pi / 2))
+    body.pose = ((0.3, -0.1, 0.015), quarter)
+    undo = held.undo(None, None)
+    assert undo.primitive == PICK
+    assert undo[1:4] == pytest.approx((0.3, -0.104, 0.015))
+    assert undo.rz_rad == pytest.approx(math.pi / 2)
+    assert held.undo(None, None, lowest_m=0.014) == undo
+    assert held.undo(None, None, lowest_m=0.017) == undo._replace(z_m=0.017)
+    assert before.undo(body, grasp, lowest_m=0.2).z_m == pytest.approx(0.05)  # a place
+
+
+def test_nothing_undoes_an_action_that_moved_nothing_or_two_things():
+    body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
+    grasp = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    before = Watch({body: body.pose, other: other.pose}, None, None)
+    assert before.undo(None, None) is None
+    other.pose = ((0.5, 0.004, 0.015), other.pose[1])
+    assert before.undo(body, grasp) is not None
+    other.pose = ((0.5, 0.006, 0.015), other.pose[1])
+    assert before.undo(body, grasp) is None
+
+
+@pytest.mark.parametrize("task", STRUCTURES)
+def test_reversed_actions_build_the_structure(task):
+    scores = replay_scores(task, 8, seed=100)
+    assert scores.reversible >= 0.75
+    assert scores.success_rate >= 0.75
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", STRUCTURES)
+def test_reversed_actions_build_nine_structures_of_ten(task):
+    scores = replay_scores(task, 100, seed=0)
+    assert scores.reversible >= 0.9
+    assert scores.success_rate >= 0.95
+
+
+@pytest.mark.parametrize("config", [{"action_sequence": "pxyzrrr"}, {"in_hand_mode": "proj"}])
+def test_other_parameters(config):
+    scores = replay_scores(TASK, 4, **config)
+    assert scores.reversible == scores.success_rate == 1
+
+
+def test_low_pieces_are_picked_at_heights_that_the_actions_give():
+    """The lowest cuboids are 2 cm high: held by their middle, fingers would meet the floor."""
+    scores = replay_scores(
+        "open_loop/improvise_house_building_3", 8, seed=50, action_sequence="pxyzr"
+    )
+    assert scores.reversible >= 0.75
+    assert scores.success_rate >= 0.85
+
+
+def test_fixed_orientations_without_turning():
+    config = {"random_orientation": False, "action_sequence": "pxy"}
+    scores = replay_scores("open_loop/house_building_1", 5, **config)
+    assert scores.reversible == scores.success_rate == 1
+
+
+@pytest.mark.parametrize("mode", ["raw", "sub", "proj"])
+def test_episodes_come_out_as_the_experts_do(mode):
+    """Played forward in an environment for building, they give what the reversal says."""
+    config = {"seed": 5, "in_hand_mode": mode}
+    env = ba_torchrl.make(TASK, deconstruct=True, expert=True, **config)
+    plain = ba_torchrl.make(TASK, expert=True, **config)
+    try:
+        apart = env.rollout(10, lambda td: td.set("action", td["expert_action"].clone()))
+        built = reverse_episode(apart)
+        reference = plain.rollout(10, lambda td: td.set("action", td["expert_action"].clone()))
+        reference = reference.exclude("expert_action", ("next", "expert_action"))
+        assert set(built.keys(True, True)) == set(reference.keys(True, True))
+        for key in built.keys(True, True):
+            assert built[key].dtype == reference[key].dtype, key
+            assert built[key].shape[1:] == reference[key].shape[1:], key
+        for body, start in zip(plain.scene.task.objects, env.scene.task.objects, strict=True):
+            body.move_to(*start.pose)
+        plain.scene.world.settle(max_steps=100)
+        plain.scene.motion.reset()
+        plain._memory = {}
+        for step in built:
+            played = plain.step(TensorDict({"action": step["action"]}))["next"]
+            assert played["holding"] == step["next", "holding"]
+            assert played["success"] == step["next", "success"]
+            assert played["reward"] == step["next", "reward"]
+            # a pixel at an edge may fall to the other side
+            off = (played["pixels"] - step["next", "pixels"]).abs() > 3e-3
+            assert off.float().mean() < 0.01
+            if mode != "proj":
+                off = (played["in_hand"] - step["next", "in_hand"]).abs() > 3e-3
+                assert off.float().mean() < 0.1
+            assert (played["in_hand"].sum() > 0) == (step["next", "in_hand"].sum() > 0)
+    finally:
+        env.close()
+        plain.close()
+
+
+def test_the_start_is_the_goal_and_the_end_is_apart():
+    env = ba_torchrl.make("open_loop/house_building_3", deconstruct=True, expert=True, seed=0)
+    try:
+        state = env.reset()
+        task = env.scene.task
+        assert task.task.is_goal()
+        assert not task.is_goal()
+        assert not state["can_undo"]
+        first = state["expert_action"]
+        assert torch.equal(env.reset(seed=0)["expert_action"], first)
+        for _ in range(6):
+            state = env.step(state.set("action", state["expert_action"].clone()))["next"]
+            assert state["can_undo"]
+        assert state["terminated"]
+        assert task.is_goal()
+        assert not task.task.is_goal()
+        bodies = list(task.objects)
+        for i, body in enumerate(bodies):
+            for other in bodies[:i]:
+                assert math.dist(body.position[:2], other.position[:2]) > 0.07
+    finally:
+        env.close()
+
+
+def test_collected_side_by_side():
+    env = ba_torchrl.make_vector_env(
+        TASK, 2, parallel=False, expert=True, deconstruct=True, seed=0, obs_size=64
+    )
+    try:
+        episodes = collect_demonstrations(env, 3, seed=0, source="deconstruction")
+        played = collect_episodes(
+            env, lambda td: td.set("action", td["expert_action"].clone()), 3, seed=0
+        )
+        with pytest.raises(ConfigError, match="expert, deconstruction"):
+            collect_demonstrations(env, 1, source="dream")
+    finally:
+        env.close()
+    assert [len(episode) for episode in episodes] == [4, 4, 4]
+    for episode, original in zip(episodes, played, strict=True):
+        assert torch.equal(episode["pixels"][0], original["next", "pixels"][-1])
+    transitions = as_transitions(episodes[0], is_expert=True)
+    assert keys.IN_HAND in transitions
+    assert (keys.NEXT, keys.IN_HAND) in transitions.keys(include_nested=True)
+
+
+def test_tasks_without_a_structure_refuse():
+    with pytest.raises(ConfigError, match="no meaning for close_loop/block_picking"):
+        ba_torchrl.make("close_loop/block_picking", deconstruct=True)

@@ -1,0 +1,195 @@
+import logging
+import multiprocessing
+import os
+import signal
+from functools import partial
+
+import pytest
+import torch
+from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
+
+from ba_torchrl.envs.vector.make import VectorEnv
+
+
+class TestFailures:
+    @BUFFERS
+    @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
+    def test_in_a_step(self, make_fakes, tmp_path, use_buffers, order, caplog):
+        env = make_fakes(3, folder=tmp_path, use_buffers=use_buffers, timeout_s=1.0)
+        before = env.step(act(env, env.reset()))["next"].exclude("reward")
+        pids = env.worker_pids
+        (tmp_path / f"{pids[1]}.step").write_text(order)
+        with caplog.at_level(logging.WARNING, logger="ba_torchrl.envs.vector.parallel"):
+            result = env.step(act(env, before.clone()))
+        assert_lost(result, 1, before)
+        for index in (0, 2):
+            assert_stepped(result, index, before)
+        assert env.restarts == 1
+        assert env.worker_pids[0] == pids[0]
+        assert env.worker_pids[1] != pids[1]
+        assert not os.path.exists(f"/proc/{pids[1]}")
+        cause = {"raise": "the simulator exploded", "hang": "within 1 s", "kill": "SIGKILL"}[order]
+        assert "worker 1 is replaced" in caplog.text
+        assert cause in caplog.text
+        # The episodes of the others go on, the lost one starts anew.
+        _, state = env.step_and_maybe_reset(
+            act(env, env.maybe_reset(env._step_mdp(result)).exclude("action"))
+        )
+        assert state["step_count"].flatten().tolist() == [3, 1, 3]
+
+    @BUFFERS
+    @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
+    def test_in_step_and_maybe_reset(self, make_fakes, tmp_path, use_buffers, order):
+        env = make_fakes(3, folder=tmp_path, use_buffers=use_buffers, timeout_s=1.0)
+        _, before = env.step_and_maybe_reset(act(env, env.reset()))
+        (tmp_path / f"{env.worker_pids[2]}.step").write_text(order)
+        result, state = env.step_and_maybe_reset(act(env, before.clone()))
+        assert_lost(result, 2, before)
+        assert_stepped(result, 0, before)
+        assert state["step_count"].flatten().tolist() == [2, 2, 0]
+        assert not state["done"].any()
+        assert not state["fault"].any()
+        assert not torch.equal(state["pixels"][2], before["pixels"][2])
+        result, state = env.step_and_maybe_reset(act(env, state))
+        assert state["step_count"].flatten().tolist() == [3, 3, 1]
+        assert env.restarts == 1
+
+    @BUFFERS
+    @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
+    def test_in_a_reset_are_retried(self, make_fakes, tmp_path, use_buffers, order):
+        env = make_fakes(2, folder=tmp_path, use_buffers=use_buffers, timeout_s=1.0)
+        expected = env.reset(seed=3)["pixels"]
+        (tmp_path / f"{env.worker_pids[0]}.reset").write_text(order)
+        state = env.reset(seed=3)
+        assert env.restarts == 1
+        assert torch.equal(state["pixels"], expected)  # a seed that was asked for is kept
+        assert not state["done"].any()
+        assert_stepped(env.step(act(env, state.clone())), 0, state)
+
+    @BUFFERS
+    @pytest.mark.parametrize("method", ["step", "step_and_maybe_reset"])
+    def test_between_two_steps(self, make_fakes, use_buffers, method):
+        env = make_fakes(3, use_buffers=use_buffers)
+        before = env.reset()
+        os.kill(env.worker_pids[1], signal.SIGKILL)
+        result = getattr(env, method)(act(env, before.clone()))
+        result = result if method == "step" else result[0]
+        assert_lost(result, 1, before)
+        assert_stepped(result, 2, before)
+        assert env.restarts == 1
+
+    @BUFFERS
+    def test_a_death_is_reported_after_a_reset_of_others(self, make_fakes, use_buffers):
+        env = make_fakes(2, use_buffers=use_buffers)
+        before = env.reset()
+        os.kill(env.worker_pids[1], signal.SIGKILL)
+        mask = torch.tensor([[True], [False]])
+        state = env.reset(before.clone().set("_reset", mask))
+        result = env.step(act(env, state.clone()))
+        assert_stepped(result, 0, state)
+        assert_lost(result, 1, before)
+
+    @BUFFERS
+    def test_a_death_before_a_full_reset_leaves_no_trace(self, make_fakes, use_buffers):
+        env = make_fakes(2, use_buffers=use_buffers)
+        env.reset()
+        os.kill(env.worker_pids[1], signal.SIGKILL)
+        state = env.reset()
+        result = env.step(act(env, state.clone()))
+        for index in (0, 1):
+            assert_stepped(result, index, state)
+        assert env.restarts == 1
+
+    def test_all_at_once(self, make_fakes, tmp_path):
+        env = make_fakes(3, folder=tmp_path)
+        before = env.reset()
+        for pid in env.worker_pids:
+            (tmp_path / f"{pid}.step").write_text("kill")
+        result = env.step(act(env, before.clone()))
+        for index in range(3):
+            assert_lost(result, index, before)
+        assert env.restarts == 3
+
+    def test_fresh_seeds_are_the_same_in_every_run(self, make_fakes, tmp_path):
+        def run(seed):
+            env = make_fakes(2, seed=seed)
+            first = env.reset()["pixels"][1]
+            pixels = [first]
+            for _ in range(2):
+                os.kill(env.worker_pids[1], signal.SIGKILL)
+                pixels.append(env.reset()["pixels"][1])
+            return torch.stack(pixels)
+
+        pixels = run(4)
+        assert torch.equal(run(4), pixels)
+        assert len(torch.cat([pixels, run(5)]).unique(dim=0)) == 6
+
+    @BUFFERS
+    def test_without_end_raise(self, make_fakes, tmp_path, use_buffers):
+        env = make_fakes(2, folder=tmp_path, use_buffers=use_buffers, max_restarts=2)
+        state = env.reset()
+        (tmp_path / "all.step").write_text("always raise")
+        for _ in range(2):
+            _, state = env.step_and_maybe_reset(act(env, state))
+        with pytest.raises(RuntimeError, match=r"(?s)3 times.*exploded.*parallel=False"):
+            env.step_and_maybe_reset(act(env, state))
+        assert env.is_closed
+        assert multiprocessing.active_children() == []
+
+    def test_with_steps_in_between_do_not_add_up(self, make_fakes, tmp_path):
+        env = make_fakes(1, folder=tmp_path, max_restarts=1)
+        state = env.reset()
+        for _ in range(3):
+            (tmp_path / f"{env.worker_pids[0]}.step").write_text("raise")
+            _, state = env.step_and_maybe_reset(act(env, state))
+            _, state = env.step_and_maybe_reset(act(env, state))
+        assert env.restarts == 3
+
+    def test_in_endless_resets_raise(self, make_fakes, tmp_path):
+        env = make_fakes(2, folder=tmp_path, max_restarts=2)
+        (tmp_path / "all.reset").write_text("always raise")
+        with pytest.raises(RuntimeError, match="worker 0 failed 3 times"):
+            env.reset()
+        assert env.is_closed
+
+    def test_to_build_raise_with_the_cause(self, tmp_path):
+        env = VectorEnv(2, partial(FakeEnv, folder=tmp_path), mp_start_method="fork")
+        (tmp_path / "build").touch()
+        with pytest.raises(RuntimeError, match=r"(?s)could not be started.*no simulator today"):
+            env.start()
+        assert multiprocessing.active_children() == []
+
+    def test_to_rebuild_are_retried_then_raise(self, make_fakes, tmp_path):
+        env = make_fakes(2, folder=tmp_path, max_restarts=1)
+        state = act(env, env.reset())
+        (tmp_path / "build").touch()
+        os.kill(env.worker_pids[0], signal.SIGKILL)
+        with pytest.raises(RuntimeError, match=r"(?s)failed 2 times.*no simulator today"):
+            env.step(state)
+
+    @BUFFERS
+    def test_an_interrupted_step_leaves_no_stale_answer(self, make_fakes, use_buffers, monkeypatch):
+        env = make_fakes(2, use_buffers=use_buffers)
+        before = env.reset()
+
+        def interrupt(pending):
+            raise KeyboardInterrupt
+
+        name = "_collect_flags" if use_buffers else "_collect_messages"
+        with monkeypatch.context() as patch:
+            patch.setattr(env, name, interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                env.step(act(env, before.clone()))
+        state = env.reset()
+        assert_stepped(env.step(act(env, state.clone())), 0, state)
+
+    def test_a_question_that_cannot_be_answered_is_an_error_and_no_end(self, make_fakes):
+        env = make_fakes(2)
+        state = env.reset()
+        assert list(env.horizon) == [1000, 1000]
+        os.kill(env.worker_pids[0], signal.SIGKILL)
+        with pytest.raises(RuntimeError, match="SIGKILL"):
+            list(env.horizon)
+        result = env.step(act(env, state.clone()))
+        assert_lost(result, 0, state)
+        assert_stepped(result, 1, state)

@@ -1,0 +1,238 @@
+import gc
+import multiprocessing
+import os
+import signal
+import time
+from functools import partial
+
+import pytest
+import torch
+from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
+from torchrl.collectors import Collector
+
+from ba_torchrl.envs.vector.make import VectorEnv, make_vector_env
+
+
+class TestSeeds:
+    def pixels(self, env, **kwargs):
+        first = env.reset(**kwargs)["pixels"]
+        rollout = env.rollout(3, auto_reset=True, break_when_any_done=False)
+        return torch.cat([first[:, None], rollout["pixels"]], 1)
+
+    @pytest.mark.parametrize("options", [{}, {"use_buffers": False}], ids=["buffers", "pipes"])
+    def test_serial_and_parallel_agree(self, make_fakes, options):
+        serial = make_fakes(3, seed=5, parallel=False)
+        parallel = make_fakes(3, seed=5, **options)
+        expected = self.pixels(serial)
+        assert torch.equal(self.pixels(parallel), expected)
+        assert len(expected[:, 0].unique(dim=0)) == 3
+        assert serial.set_seed(8) == parallel.set_seed(8) == 11
+        assert torch.equal(self.pixels(serial), self.pixels(parallel))
+        assert torch.equal(self.pixels(serial, seed=40), self.pixels(parallel, seed=40))
+
+    @pytest.mark.parametrize("parallel", [False, True])
+    def test_environment_i_has_seed_plus_i(self, make_fakes, parallel):
+        env = make_fakes(3, seed=5, parallel=parallel)
+        at_start = env.reset()["pixels"]
+        again = env.reset(seed=6)["pixels"]
+        assert torch.equal(again[:2], at_start[1:])
+        env.set_seed(5)
+        assert torch.equal(env.reset()["pixels"], at_start)
+
+    @pytest.mark.parametrize("parallel", [False, True])
+    @pytest.mark.parametrize("seed", [-1, 1.5, True])
+    def test_refuses_what_is_no_seed(self, make_fakes, parallel, seed):
+        env = make_fakes(1, parallel=parallel)
+        with pytest.raises(ValueError, match="natural number"):
+            env.set_seed(seed)
+        with pytest.raises(ValueError, match="natural number"):
+            env.reset(seed=seed)
+
+
+class TestResets:
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    def test_partial(self, make_fakes, options):
+        env = make_fakes(3, **options)
+        state = env.reset()
+        state = env.step(act(env, state))["next"].exclude("reward")
+        mask = torch.tensor([[False], [True], [False]])
+        after = env.reset(state.clone().set("_reset", mask))
+        assert after["step_count"].flatten().tolist() == [1, 0, 1]
+        same = (after["pixels"] == state["pixels"]).flatten(1).all(1)
+        assert same.tolist() == [True, False, True]
+
+    def test_of_none_changes_nothing(self, make_fakes):
+        env = make_fakes()
+        state = env.step(act(env, env.reset()))["next"].exclude("reward")
+        mask = torch.zeros(2, 1, dtype=torch.bool)
+        after = env.reset(state.clone().set("_reset", mask))
+        assert torch.equal(after["pixels"], state["pixels"])
+        assert after["step_count"].flatten().tolist() == [1, 1]
+
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    def test_rollout_goes_on_past_ends(self, make_fakes, options):
+        env = make_fakes(horizon=3, **options)
+        rollout = env.rollout(7, break_when_any_done=False)
+        assert rollout.batch_size == (2, 7)
+        assert rollout["next", "step_count"][0].flatten().tolist() == [1, 2, 3, 1, 2, 3, 1]
+        assert rollout["next", "truncated"][1].flatten().tolist() == [False, False, True] * 2 + [
+            False
+        ]
+
+    def test_steps_of_some(self, make_fakes):
+        env = make_fakes(2)
+        state = act(env, env.reset())
+        state["_step"] = torch.tensor([True, False])
+        result = env.step(state)
+        assert result["next", "step_count"].flatten().tolist() == [1, 0]
+
+
+class TestActions:
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    @pytest.mark.parametrize("method", ["step", "step_and_maybe_reset"])
+    @pytest.mark.parametrize(
+        ("action", "message"),
+        [
+            (torch.tensor([[0.0, 0.0], [0.0, torch.nan]]), "environment 1 holds NaN"),
+            (torch.tensor([[0.0, torch.inf], [0.0, 0.0]]), "environment 0 holds an infinite"),
+            (torch.zeros(2, 3), r"environment 0 has shape \[3\]"),
+            (torch.zeros(2, 2, dtype=torch.int64), "environment 0 has type torch.int64"),
+            (None, "there is no action"),
+        ],
+    )
+    def test_bad_ones_move_nothing(self, make_fakes, options, method, action, message):
+        env = make_fakes(2, **options)
+        state = env.reset()
+        bad = state.clone() if action is None else state.clone().set("action", action)
+        allowed = r"float32 tensor of shape \[2\], from \[-1.0, -1.0\] to \[1.0, 1.0\]"
+        with pytest.raises(ValueError, match=rf"{message}.*{allowed}"):
+            getattr(env, method)(bad)
+        result = env.step(act(env, state))
+        assert result["next", "step_count"].flatten().tolist() == [1, 1]
+        assert getattr(env, "restarts", 0) == 0
+
+    def test_of_environments_that_do_not_step_are_ignored(self, make_fakes):
+        env = make_fakes(2)
+        state = act(env, env.reset())
+        state["action"][1] = torch.nan
+        state["_step"] = torch.tensor([True, False])
+        assert env.step(state)["next", "step_count"].flatten().tolist() == [1, 0]
+
+    def test_beyond_the_bounds_are_the_environments_business(self, make_fakes):
+        env = make_fakes(2)
+        assert env.step(act(env, env.reset(), 5.0))["next", "reward"].flatten().tolist() == [10, 10]
+
+
+class TestWithTheRestOfTorchRL:
+    @BUFFERS
+    def test_a_collector_survives_a_kill(self, make_fakes, use_buffers):
+        env = make_fakes(2, use_buffers=use_buffers, horizon=5)
+        collector = Collector(env, None, frames_per_batch=20, total_frames=60)
+        batches = []
+        for batch in collector:
+            batches.append(batch.clone())
+            if len(batches) == 1:
+                os.kill(env.worker_pids[0], signal.SIGKILL)
+        collector.shutdown()
+        data = torch.cat(batches, 1)
+        assert data.batch_size == (2, 30)
+        faults = data["next", "fault"].squeeze(-1)
+        assert faults.sum(1).tolist() == [1, 0]
+        assert faults[0].nonzero().item() == 10
+        assert data["next", "truncated"].squeeze(-1)[faults].all()
+        # After the fault the episode starts from its first frame.
+        assert data["step_count"][0, 11].item() == 0
+        assert data["step_count"][1].flatten().tolist() == [0, 1, 2, 3, 4] * 6
+
+    def test_spawn(self, make_fakes):
+        env = make_fakes(2, seed=3, start_method="spawn", timeout_s=60.0)
+        expected = make_fakes(2, seed=3, parallel=False).reset()
+        before = env.reset()
+        assert torch.equal(before["pixels"], expected["pixels"])
+        os.kill(env.worker_pids[1], signal.SIGKILL)
+        result, state = env.step_and_maybe_reset(act(env, before.clone()))
+        assert_lost(result, 1, before)
+        assert_stepped(result, 0, before)
+        assert state["step_count"].flatten().tolist() == [1, 0]
+
+    def test_observations_are_copies(self, make_fakes):
+        env = make_fakes(2)
+        state = env.reset()
+        kept = state["pixels"].clone()
+        env.step(act(env, state.clone()))
+        env.reset()
+        assert torch.equal(state["pixels"], kept)
+
+
+class TestResources:
+    @BUFFERS
+    def test_restarts_and_close_leak_nothing(self, use_buffers):
+        def live():
+            env = make_vector_env(FakeEnv, 2, seed=0, start_method="fork", use_buffers=use_buffers)
+            state = env.reset()
+            for _ in range(4):
+                os.kill(env.worker_pids[0], signal.SIGKILL)
+                _, state = env.step_and_maybe_reset(act(env, state))
+            assert len(multiprocessing.active_children()) == 2
+            pids = env.worker_pids
+            env.close()
+            assert multiprocessing.active_children() == []
+            assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
+
+        def held():
+            gc.collect()
+            return len(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task"))
+
+        live()  # opens what stays open for good
+        before = held()
+        live()
+        assert held() == before
+
+    def test_close_does_not_wait_for_a_hanging_worker(self, make_fakes, tmp_path):
+        env = make_fakes(2, folder=tmp_path)
+        env.shutdown_timeout = 0.5
+        act(env, env.reset())
+        (tmp_path / f"{env.worker_pids[1]}.step").write_text("hang")
+        env.parent_channels[1].send(("step", {}))
+        start = time.perf_counter()
+        env.close()
+        assert time.perf_counter() - start < 3
+
+    @pytest.mark.parametrize("num_threads", [None, 1])
+    def test_threads_of_this_process(self, make_fakes, num_threads):
+        before = torch.get_num_threads()
+        torch.set_num_threads(2)
+        try:
+            env = make_fakes(2, num_threads=num_threads)
+            assert torch.get_num_threads() == (num_threads or 2)
+            env.close()
+            assert torch.get_num_threads() == 2
+        finally:
+            torch.set_num_threads(before)
+
+
+def test_refuses_impossible_sizes():
+    with pytest.raises(ValueError, match="at least 1"):
+        make_vector_env(FakeEnv, 0)
+    with pytest.raises(ValueError, match="2 functions were given for 3"):
+        make_vector_env([FakeEnv, FakeEnv], 3)
+
+
+def test_takes_a_function_per_environment(make_fakes):
+    factories = [partial(FakeEnv, horizon=2), partial(FakeEnv, horizon=3)]
+    env = make_vector_env(factories, 2, seed=0, start_method="fork")
+    try:
+        rollout = env.rollout(3, break_when_any_done=False)
+        assert rollout["next", "truncated"].squeeze(-1).tolist() == [
+            [False, True, False],
+            [False, False, True],
+        ]
+    finally:
+        env.close()
+
+
+def test_refuses_environments_that_cannot_report_a_fault():
+    from torchrl.envs import GymEnv
+
+    with pytest.raises(ValueError, match="fault"):
+        VectorEnv(1, partial(GymEnv, "CartPole-v1"), mp_start_method="fork")

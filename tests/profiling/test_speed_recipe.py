@@ -1,0 +1,109 @@
+"""The table of times: its rows, not its times."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pytest
+import torch
+from tqdm import tqdm
+
+import ba_torchrl
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
+from ba_torchrl.profiling.table import (
+    GROUPS,
+    MEASUREMENTS,
+    Bench,
+    Row,
+    as_markdown,
+    measure,
+)
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.vision.depth import HeightCamera
+from ba_torchrl.sim.world import World
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_recipe_prints_the_simulation_rows(tmp_path):
+    done = subprocess.run(
+        [sys.executable, ROOT / "recipes" / "speed.py", "which=simulation", "repeats=1"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    header, rule, *rows, empty, where = done.stdout.strip().split("\n")
+    assert set(rule) == {"|", "-"}
+    assert empty == ""
+    assert "torch" in where
+    columns = header.count("|")
+    assert all(row.count("|") == columns for row in rows)
+    work = [row.split("|")[1].strip() for row in rows]
+    tasks = ba_torchrl.list_tasks()
+    assert len(work) == len(set(work)) == 2 * len(tasks) + 3
+    for task in tasks:
+        (step,) = (row for row in rows if f"| {task}, step, 128 px |" in row)
+        assert "physics steps per action" in step
+        assert sum(f"| {task}, reset |" in row for row in rows) == 1
+    picking = next(row for row in rows if "close_loop/block_picking, step" in row).split("|")
+    assert [cell.strip() for cell in picking[6:9]] == ["31", "4", "1.5"]  # from the budgets
+    assert all(float(cell) > 0 for cell in picking[3:6])
+
+
+def test_memory_is_counted():
+    rows = measure("memory", repeats=2, progress=False)
+    assert [row.unit for row in rows] == ["MB", "MB"]
+    assert all(5 < row.values[0] <= row.budget.aim for row in rows)
+
+
+def test_the_numpy_camera_agrees_with_the_compiled_one():
+    rng = np.random.default_rng(0)
+    with World() as world:
+        bodies = [world.add(Box(size_m=tuple(rng.uniform(0.02, 0.1, 3))), f"{i}") for i in range(6)]
+        cameras = [HeightCamera(bodies), NumpyHeightCamera(bodies)]
+        for _ in range(5):
+            for body in bodies:  # tilted, overlapping, some beyond the border
+                turn = rng.normal(size=4)
+                pybullet.resetBasePositionAndOrientation(
+                    body.id,
+                    rng.uniform((-0.2, -0.2, 0), (0.2, 0.2, 0.1)),
+                    turn / np.linalg.norm(turn),
+                    physicsClientId=world.client,
+                )
+            one, two = (camera.heightmap((0.02, -0.01), 0.3, 96) for camera in cameras)
+            assert (one > 0).mean() > 0.05
+            np.testing.assert_allclose(one, two, atol=1e-9)
+
+
+def test_every_measurement_belongs_to_a_group():
+    assert {name.split("/")[0] for name in MEASUREMENTS} == set(GROUPS)
+    with pytest.raises(ConfigError, match="simulation, learning, memory, all"):
+        measure("speed", repeats=1)
+    with pytest.raises(ConfigError, match="1 or more"):
+        measure("memory", repeats=0)
+
+
+def test_one_measurement_can_be_chosen():
+    (row,) = measure("memory/close_loop_replay", repeats=1, progress=False)
+    assert "close_loop" in row.work
+
+
+def test_a_profile_names_the_operations():
+    profiles: dict[str, str] = {}
+    matrix = torch.ones(64, 64)
+    with tqdm(disable=True) as bar:
+        bench = Bench(2, bar, profiles)
+        _, times = bench.time_against(lambda: None, {"product": lambda: matrix @ matrix})
+    assert len(times["product"]) == 2
+    assert set(profiles) == {"product"}
+    assert "aten::mm" in profiles["product"]
+    assert "[[64, 64], [64, 64]]" in profiles["product"]
+
+
+def test_empty_cells_stay_empty():
+    table = as_markdown([Row("something", "s", [1.0, 2.0, 6.0])])
+    assert table.splitlines()[-1] == "| something | 2 s | 3 | 1 |  |  |  |  |  |"

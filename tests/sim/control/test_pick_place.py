@@ -1,0 +1,309 @@
+"""Picking and placing real blocks, with the kuka unless a robot is named."""
+
+import math
+
+import numpy as np
+import pybullet
+import pytest
+
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.control.pick_place import (
+    PEAK_ACCELERATION,
+    PickPlace,
+    PickPlaceLimits,
+    smooth_step,
+    tool_rotation,
+)
+from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.world import Physics, World
+
+B = 0.03
+HOME_Z_M = 0.3
+PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-5)
+
+
+class Table:
+    """A robot with blocks, and static things beside them."""
+
+    def __init__(self, count, *, static=(), teleport=True, robot="kuka", top_down=False):
+        self.world = World(PHYSICS)
+        self.robot = ROBOTS[robot](self.world)
+        self.blocks = [self.world.add(Box(size_m=(B, B, B)), f"cube {i}") for i in range(count)]
+        self.things = [
+            self.world.add(Box(size_m=size, mass_kg=0.0), f"thing {i}")
+            for i, (size, _) in enumerate(static)
+        ]
+        for body, (_, position) in zip(self.things, static, strict=True):
+            body.place(position)
+        for i, block in enumerate(self.blocks):
+            block.place((0.38 + 0.14 * (i // 2), -0.07 + 0.14 * (i % 2), B / 2))
+        self.world.seal()
+        self.hand = PickPlace(self.robot, teleport=teleport, top_down=top_down)
+        self.hand.reset()
+        self.world.settle()
+
+    def pick(self, x, y, z, rz=0.0, ry=0.0, rx=0.0):
+        body = self.hand.pick((x, y, z), tool_rotation(rz, ry, rx))
+        self.world.settle()
+        self.hand.check_grasp()
+        return body
+
+    def place(self, x, y, z, rz=0.0, ry=0.0, rx=0.0):
+        self.hand.place((x, y, z), tool_rotation(rz, ry, rx))
+        self.world.settle()
+        self.hand.check_grasp()
+
+
+@pytest.fixture
+def table():
+    made = []
+
+    def make(*args, **options):
+        made.append(Table(*args, **options))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.world.close()
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 3e-3])
+def test_a_stack_of_four_stands_every_time(table, offset_m):
+    """Grasped off its middle by 3 mm, a block is placed off by as much, and the stack stands."""
+    t = table(4)
+    pristine = t.world.snapshot()
+    rng = np.random.default_rng(0)
+    base, *others = t.blocks
+    for _ in range(20):
+        t.world.restore(pristine)
+        t.hand.reset()
+        for block in t.blocks:
+            x, y, z = block.position
+            block.place((x + rng.uniform(-0.01, 0.01), y, z), rng.uniform(-0.7, 0.7))
+        t.world.settle()
+        for level, block in enumerate(others, start=1):
+            x, y, z = block.position
+            yaw = block.yaw_rad
+            side = rng.uniform(-math.pi, math.pi)
+            held = t.pick(x + offset_m * math.cos(side), y + offset_m * math.sin(side), z, yaw)
+            assert held is block
+            assert block.is_hidden
+            assert block.position[2] > HOME_Z_M
+            t.place(*base.position[:2], (level + 0.5) * B, base.yaw_rad)
+            assert not block.is_hidden
+        x, y, _ = base.position
+        for level, block in enumerate(others, start=1):
+            assert block.position[2] == pytest.approx((level + 0.5) * B, abs=1.5e-3)
+            assert math.dist(block.position[:2], (x, y)) < offset_m + 3e-3
+            assert block.tilt_rad < 0.05
+        assert t.world.is_still()
+
+
+@pytest.mark.parametrize("tilt_rad", [-math.pi / 8, -math.pi / 16, math.pi / 16, math.pi / 8])
+def test_a_tilted_block_is_picked_along_its_normal(table, tilt_rad):
+    slope = (0.2, 0.2, 0.02)
+    t = table(1, static=[(slope, (0.5, 0.0, 0.06))])
+    turn = pybullet.getQuaternionFromEuler((tilt_rad, 0.0, 0.0))
+    t.things[0].move_to((0.5, 0.0, 0.06), turn)
+    normal = np.reshape(pybullet.getMatrixFromQuaternion(turn), (3, 3))[:, 2]
+    block = t.blocks[0]
+    block.move_to(tuple(np.array((0.5, 0.0, 0.06)) + (0.01 + B / 2) * normal), turn)
+    t.world.settle()
+    assert block.tilt_rad == pytest.approx(abs(tilt_rad), abs=0.02)  # friction holds it there
+    assert t.pick(*block.position, 0.0, 0.0, tilt_rad) is block
+    assert block.position[2] > HOME_Z_M
+
+
+@pytest.mark.parametrize("top_down", [False, True])
+def test_a_tilted_pick_comes_along_its_axis_or_from_straight_above(table, top_down):
+    t = table(1, top_down=top_down)
+    block, ways = t.blocks[0], []
+    solve = t.robot.inverse_kinematics
+
+    def remember(position, *others):
+        ways.append(position)
+        return solve(position, *others)
+
+    t.robot.inverse_kinematics = remember
+    x, y, z = block.position
+    assert t.pick(x, y, z, 0.0, 0.0, 0.35) is block
+    way = np.array([point for point in ways if math.dist(point[:2], (x, y)) < 0.1])
+    aside = np.linalg.norm(way[:, :2] - (x, y), axis=1)
+    assert np.ptp(way[:, 2]) > 0.05
+    if top_down:
+        assert aside.max() < 2e-3
+    else:  # along the tool's axis
+        np.testing.assert_allclose(aside, math.tan(0.35) * (way[:, 2] - z), atol=4e-3)
+
+
+def test_out_of_reach_the_block_stays_in_the_gripper(table):
+    t = table(1)
+    block = t.blocks[0]
+    assert t.pick(*block.position) is block
+    t.place(1.4, 0.0, 0.1)
+    assert t.hand.held is block
+    assert block.position[2] > HOME_Z_M
+    assert t.pick(1.4, 0.0, 0.1) is block  # nor does a pick out there lose it
+
+
+def test_a_pick_of_nothing_moves_nothing(table):
+    t = table(2)
+    before = [block.pose for block in t.blocks]
+    assert t.pick(0.5, 0.15, B / 2) is None
+    assert t.hand.held is None
+    for block, pose in zip(t.blocks, before, strict=True):
+        np.testing.assert_allclose(block.position, pose[0], atol=1e-4)
+    assert t.robot.opening() == pytest.approx(1.0, abs=0.02)
+    np.testing.assert_allclose(t.robot.joints, t.robot.home_joints)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("teleport", [True, False])
+def test_a_low_pick_holds(table, robot, teleport):
+    """Fingers that swing down as they close do not close against the floor."""
+    t = table(1, robot=robot, teleport=teleport)
+    pristine = t.world.snapshot()
+    block = t.blocks[0]
+    for z in (0.0, 0.005, 0.01):
+        t.world.restore(pristine)
+        t.hand.reset()
+        assert t.pick(*block.position[:2], z) is block, z
+        assert block.position[2] > HOME_Z_M
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.4, 0.0, 0.3), (0.4, -0.3, 0.2)])
+def test_fingertips_close_above_the_floor(table, robot, turn):
+    """Down to its lowest height a tool has its fingers clear, and hardly higher than it must be."""
+    t = table(1, robot=robot)
+    rotation = tool_rotation(*turn)
+    lowest = t.robot.gripper.lowest_tool_m(rotation)
+    if turn == (0.0, 0.0, 0.0):
+        assert lowest == t.robot.gripper.lowest_tool_m()
+
+    def gap_m(opening):
+        t.robot.teleport(t.robot.inverse_kinematics((0.5, 0.1, 0.3), rotation))
+        t.robot.set_opening(opening)
+        points = [
+            point
+            for link in frozenset.union(*t.robot.finger_links)
+            for point in pybullet.getClosestPoints(
+                t.robot.id, t.world.floor, 0.5, linkIndexA=link, physicsClientId=t.world.client
+            )
+        ]
+        return min(point[8] for point in points) - (0.3 - lowest)
+
+    gap = min(gap_m(opening) for opening in np.linspace(0.0, 1.0, 21))
+    if turn == (0.0, 0.0, 0.0):
+        assert gap == pytest.approx(1e-3, abs=5e-4)
+    else:  # what counts are the fingers' insides, not their thickness and chamfers
+        assert -0.01 < gap < 3e-3
+
+
+def test_a_pick_that_is_high_enough_goes_where_it_was_sent(table):
+    t = table(1)
+    lowest = t.robot.gripper.lowest_tool_m()
+    reached = []
+    close = t.hand._close
+    t.hand._close = lambda: (reached.append(t.robot.tool_transform()[0][2]), close())
+    for z in (lowest - 5e-3, lowest, lowest + 5e-3):
+        t.pick(0.5, 0.15, z)
+    assert reached == pytest.approx([lowest, lowest, lowest + 5e-3], abs=1e-5)
+
+
+def test_something_in_the_way_stops_the_hand(table):
+    """The tool is sent to the floor through a block that does not give way."""
+    t = table(1, static=[((0.2, 0.2, 0.1), (0.5, 0.0, 0.05))])
+    lowest = []
+    step = t.world.step
+
+    def watch(count=1):
+        step(count)
+        lowest.append(t.robot.tool_transform()[0][2])
+
+    t.world.step = watch
+    assert t.pick(0.5, 0.0, 0.02) is None
+    # the fingertips reach a centimetre below the tool point and stop on the block's top
+    assert min(lowest) == pytest.approx(0.1 + 0.011, abs=0.01)
+    np.testing.assert_allclose(t.things[0].position, (0.5, 0.0, 0.05), atol=1e-9)
+
+
+def test_a_block_is_not_pressed_through_what_it_is_placed_on(table):
+    t = table(2)
+    block, below = t.blocks
+    assert t.pick(*block.position) is block
+    x, y, _ = below.position
+    t.place(x, y, B / 2)  # where the other block is
+    assert t.hand.held is None
+    assert below.position[2] == pytest.approx(B / 2, abs=1e-3)
+    assert block.position[2] > B / 2 - 1e-3
+    assert min(block.position[2], below.position[2]) > B / 2 - 1e-3
+
+
+def test_a_state_is_taken_up_where_it_was_left(table):
+    t = table(2)
+    block, below = t.blocks
+    assert t.pick(*block.position) is block
+    world, robot, hand = t.world.snapshot(), t.robot.get_state(), t.hand.get_state()
+    x, y, _ = below.position
+    ends = []
+    for _ in range(2):
+        t.place(x, y, 1.5 * B)
+        ends.append([b.pose for b in t.blocks])
+        assert not block.is_hidden
+        t.world.restore(world)
+        t.robot.set_state(robot)
+        t.hand.set_state(hand)
+        assert t.hand.held is block
+        assert block.is_hidden
+    assert ends[0][0][0][2] == pytest.approx(1.5 * B, abs=1e-3)
+    np.testing.assert_allclose(
+        [pose[0] for pose in ends[0]], [pose[0] for pose in ends[1]], atol=1e-4
+    )
+
+
+def test_all_of_it_can_be_simulated(table):
+    t = table(2, teleport=False)
+    block, below = t.blocks
+    steps = t.world.steps
+    assert t.pick(*block.position) is block
+    assert t.world.steps - steps > 100
+    t.place(*below.position[:2], 1.5 * B, math.pi / 2)
+    assert t.hand.held is None
+    assert block.position[2] == pytest.approx(1.5 * B, abs=1e-3)
+    assert math.dist(block.position[:2], below.position[:2]) < 3e-3
+
+
+def test_what_slips_out_is_no_longer_held(table):
+    t = table(1)
+    block = t.blocks[0]
+    assert t.pick(*block.position) is block
+    block.place((0.5, 0.1, B / 2))
+    t.hand.check_grasp()
+    assert t.hand.held is None
+    assert not block.is_hidden
+
+
+def test_simulated_ways_keep_their_acceleration():
+    u = np.linspace(0.0, 1.0, 20001)
+    place = np.array([smooth_step(x) for x in u.tolist()])
+    acceleration = np.diff(place, n=2) / (u[1] - u[0]) ** 2
+    assert place[0] == 0.0
+    assert place[-1] == 1.0
+    assert np.abs(acceleration).max() == pytest.approx(PEAK_ACCELERATION, rel=1e-3)
+    assert PickPlaceLimits().held_acceleration_m_s2 < PickPlaceLimits().acceleration_m_s2
+
+
+def test_tool_rotation_is_the_product_of_its_turns():
+    rz, ry, rx = 0.7, -0.3, 0.4
+    turns = [
+        np.reshape(
+            pybullet.getMatrixFromQuaternion(pybullet.getQuaternionFromAxisAngle(axis, angle)),
+            (3, 3),
+        )
+        for axis, angle in (((0, 0, 1), rz), ((0, 1, 0), ry), ((1, 0, 0), rx))
+    ]
+    down = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(
+        tool_rotation(rz, ry, rx), turns[0] @ turns[1] @ turns[2] @ down, atol=1e-6
+    )

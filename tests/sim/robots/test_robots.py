@@ -1,0 +1,391 @@
+"""Every robot keeps the same promises; a new robot is tested here without being named."""
+
+import math
+
+import numpy as np
+import pybullet
+import pytest
+
+import ba_torchrl
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.control.close_loop import CloseLoopController
+from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.world import World
+
+CLOSE_LOOP = ((0.3, -0.15, 0.01), (0.6, 0.15, 0.25))
+OPEN_LOOP = ((0.25, -0.2, 0.0), (0.65, 0.2, 0.4))
+TILT = math.pi / 8
+FLOOR_OVERLAP_M = {"kuka": 4e-3}
+"""The tips of the one closing on an arc from above would dip into the floor of the workspace."""
+
+
+@pytest.fixture(params=list(ROBOTS))
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def robot_class(name):
+    return ROBOTS[name]
+
+
+@pytest.fixture
+def world():
+    with World() as world:
+        yield world
+
+
+def turned(axis, angle):
+    axis = np.eye(3)["xyz".index(axis)]
+    cross = np.cross(np.eye(3), axis)
+    return np.eye(3) - math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def rotation_of(quaternion):
+    return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+
+
+def angle_between(a, b):
+    return math.acos(np.clip((np.trace(a.T @ b) - 1) / 2, -1, 1))
+
+
+def block_scene(world, robot_class, edge=0.05, yaw=0.0, xy=(0.45, 0.0)):
+    robot = robot_class(world)
+    block = world.add(Box(size_m=(edge, edge, edge)), "block")
+    world.seal()
+    motion = CloseLoopController(robot)
+    motion.reset(((*xy, 0.2), 0.0))
+    block.place((*xy, edge / 2), yaw)
+    world.settle()
+    return robot, block, motion
+
+
+def in_hand(robot, block):
+    """Return the block's position in the frame of the tool."""
+    to_tool = pybullet.invertTransform(*robot.tool_transform())
+    return np.array(pybullet.multiplyTransforms(*to_tool, *block.pose)[0])
+
+
+@pytest.mark.parametrize(
+    ("box", "tilt", "share"),
+    [
+        (CLOSE_LOOP, 0.0, 1.0),
+        (CLOSE_LOOP, TILT, 0.98),
+        (OPEN_LOOP, 0.0, 0.95),
+        (OPEN_LOOP, TILT, 0.9),
+    ],
+    ids=["close loop", "close loop, tilted", "open loop", "open loop, tilted"],
+)
+def test_inverse_kinematics_reaches_the_workspace(world, robot_class, box, tilt, share):
+    robot = robot_class(world)
+    rng = np.random.default_rng(0)
+    solved = 0
+    for _ in range(400):
+        position = rng.uniform(*box)
+        rotation = turned("x", rng.uniform(-tilt, tilt)) @ turned("y", rng.uniform(-tilt, tilt))
+        rotation = rotation @ np.array(downward(rng.uniform(-math.pi, math.pi)))
+        joints = robot.inverse_kinematics(tuple(position.tolist()), rotation.tolist())
+        if joints is None:
+            continue
+        solved += 1
+        robot.teleport(joints)
+        reached, quaternion = robot.tool_transform()
+        np.testing.assert_allclose(reached, position, atol=1e-4)
+        assert angle_between(rotation_of(quaternion), rotation) < 2e-3
+    assert solved >= share * 400
+
+
+def test_every_corner_of_the_close_loop_workspace_is_reached(world, robot_class):
+    robot = robot_class(world)
+    for corner in np.stack(np.meshgrid(*zip(*CLOSE_LOOP, strict=True)), -1).reshape(-1, 3):
+        for yaw in np.linspace(-math.pi, math.pi, 9):
+            joints = robot.inverse_kinematics(tuple(corner.tolist()), downward(yaw))
+            robot.teleport(joints)
+            position, measured = robot.tool_pose()
+            np.testing.assert_allclose(position, corner, atol=1e-4)
+            assert math.cos(measured - yaw) > 1 - 1e-6
+
+
+def test_out_of_reach_is_none(world, robot_class):
+    assert robot_class(world).inverse_kinematics((1.5, 0.0, 0.2), downward(0.0)) is None
+
+
+def test_solutions_change_smoothly_along_a_way(world, robot_class):
+    robot = robot_class(world)
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        start, end = rng.uniform(*CLOSE_LOOP), rng.uniform(*CLOSE_LOOP)
+        yaw, turn = rng.uniform(-math.pi, math.pi), rng.uniform(-1, 1)
+        count = math.ceil(math.dist(start, end) / 0.003)
+        joints = None
+        for i in range(count + 1):
+            place = i / count
+            before = joints
+            joints = robot.inverse_kinematics(
+                tuple((start + place * (end - start)).tolist()),
+                downward(yaw + place * turn),
+                before,
+            )
+            if before is not None:
+                assert np.abs(np.subtract(joints, before)).max() < 0.1 + abs(turn) / count
+
+
+def test_a_tilted_approach_does_not_fling_the_arm(world, robot_class):
+    robot = robot_class(world)
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        goal = rng.uniform((0.3, -0.15, 0.02), (0.6, 0.15, 0.2))
+        rotation = turned("x", rng.uniform(-TILT, TILT)) @ turned("y", rng.uniform(-TILT, TILT))
+        rotation = rotation @ np.array(downward(rng.uniform(0, math.pi)))
+        joints = None
+        for height in np.linspace(0.1, 0.0, 41):  # along the tool's axis, in steps of 2.5 mm
+            before = joints
+            point = tuple((goal - height * rotation[:, 2]).tolist())
+            joints = robot.inverse_kinematics(point, rotation.tolist(), before)
+            if before is not None and joints is not None:
+                assert np.abs(np.subtract(joints, before)).max() < 1.0
+
+
+def test_simulated_motion_arrives(world, robot_class):
+    robot = robot_class(world)
+    world.seal()
+    motion = CloseLoopController(robot, teleport=False)
+    motion.reset(((0.45, 0.0, 0.2), 0.0))
+    rng = np.random.default_rng(3)
+    yaw = 0.0
+    for _ in range(40):
+        target = rng.uniform((0.3, -0.15, 0.02), (0.6, 0.15, 0.25))
+        yaw += rng.uniform(-math.pi / 4, math.pi / 4)
+        motion.move_to(tuple(target.tolist()), yaw)
+        position, measured = robot.tool_pose()
+        assert math.dist(position, target) < 3e-3
+        assert abs(math.remainder(measured - yaw, 2 * math.pi)) < math.radians(1)
+
+
+def free_width(robot, height):
+    """Return how wide a thing fits between the fingers, ``height`` above the tool point."""
+    (x, y, z), yaw = robot.tool_pose()
+    ends = [(x + s * math.cos(yaw), y + s * math.sin(yaw), z + height) for s in (-0.1, 0.1)]
+    hits = pybullet.rayTestBatch([(x, y, z + height)] * 2, ends, physicsClientId=robot.world.client)
+    assert all(hit[0] == robot.id for hit in hits)
+    return 0.1 * sum(hit[2] for hit in hits)
+
+
+def test_fingers_clear_the_floor_and_open_wide_enough(world, name, robot_class):
+    robot = robot_class(world)
+    world.seal()
+    for opening in (1.0, 0.5, 0.0):
+        robot.teleport(robot.inverse_kinematics((0.45, 0.0, 0.01), downward(0.3)))
+        robot.set_opening(opening)
+        assert not robot.is_near_anything(-FLOOR_OVERLAP_M.get(name, 0.0))
+        assert robot.opening() == pytest.approx(opening, abs=1e-3)
+        if opening == 1.0:
+            world.detect_collisions()
+            assert 0.07 < free_width(robot, 0.012) < 0.087
+    # closed, the tips end a little below the tool point
+    gap = min(
+        point[8]
+        for links in robot.finger_links
+        for link in links
+        for point in pybullet.getClosestPoints(
+            robot.id, world.floor, 0.1, link, physicsClientId=world.client
+        )
+    )
+    assert gap < 4e-3
+
+
+@pytest.mark.parametrize("edge", [0.05, 0.03])
+@pytest.mark.parametrize("yaw_deg", [0, 30, 77, 90, -45])
+def test_grasp_holds_while_moving_and_turning_and_releases(world, robot_class, edge, yaw_deg):
+    yaw = math.radians(yaw_deg)
+    robot, block, motion = block_scene(world, robot_class, edge, yaw)
+    motion.move_to((0.45, 0.0, 0.2), yaw)
+    motion.move_to((0.45, 0.0, edge / 2), yaw)
+    assert robot.held_body() is None
+    motion.grip(0.0)
+    assert robot.held_body() is block
+    assert 0.2 < robot.opening() < 0.85
+    start = in_hand(robot, block)
+    way = [(0, 0, 0.05)] * 3 + [
+        (0.05, 0.05, 0),
+        (-0.05, 0.05, 0),
+        (-0.05, -0.05, 0),
+        (0.05, -0.05, 0),
+    ]
+    for i, delta in enumerate(way):
+        if i >= 3:
+            yaw += math.pi / 4
+        position = robot.tool_pose()[0]
+        motion.move_to(tuple(p + d for p, d in zip(position, delta, strict=True)), yaw)
+        assert robot.held_body() is block
+        assert np.abs(in_hand(robot, block) - start).max() < 3e-3
+    assert block.position[2] > 0.15
+    motion.grip(1.0)
+    world.settle()
+    assert robot.held_body() is None
+    assert robot.opening() > 0.97
+    assert block.position[2] == pytest.approx(edge / 2, abs=1e-3)
+
+
+def test_a_frictionless_block_slips_out(world, robot_class):
+    robot = robot_class(world)
+    block = world.add(Box(size_m=(0.05, 0.05, 0.05), friction=0.0), "block")
+    world.seal()
+    motion = CloseLoopController(robot)
+    motion.reset(((0.45, 0.0, 0.2), 0.0))
+    block.place((0.45, 0.0, 0.025), 0.0)
+    motion.move_to((0.45, 0.0, 0.025), 0.0)
+    motion.grip(0.0)
+    motion.move_to((0.45, 0.0, 0.2), 0.0)
+    world.settle()
+    assert robot.held_body() is None
+    assert block.position[2] < 0.1
+
+
+def test_closed_on_nothing_holds_nothing(world, robot_class):
+    robot, _, motion = block_scene(world, robot_class)
+    motion.move_to((0.45, 0.12, 0.02), 0.5)
+    motion.grip(0.0)
+    assert robot.opening() < 0.05
+    assert robot.held_body() is None
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.5])
+def test_pressing_on_top_holds_nothing_and_hurts_nothing(world, robot_class, opening, request):
+    if robot_class is ROBOTS["kuka"] and opening == 0.5:
+        reason = "its half-open tips sink 4 mm into the block's edges, which looks like a grasp"
+        request.applymarker(pytest.mark.xfail(reason=reason, strict=False))
+    robot, block, motion = block_scene(world, robot_class)
+    motion.grip(opening)
+    for _ in range(3):
+        motion.move_to((0.45, 0.0, 0.01), 0.0)
+        assert robot.held_body() is None
+    world.settle()
+    assert robot.tool_pose()[0][2] > 0.045
+    assert math.dist(block.position[:2], (0.45, 0.0)) < 5e-3
+    # no deeper than the stride of 3.3 mm in which the hand meets the block and one of creeping
+    assert block.position[2] == pytest.approx(0.025, abs=3.9e-3)
+
+
+def test_pushing_with_a_finger_holds_nothing(world, robot_class):
+    robot, block, motion = block_scene(world, robot_class)
+    block.place((0.45, 0.06, 0.025), math.pi / 4)
+    motion.grip(0.5)
+    motion.move_to((0.45, -0.02, 0.2), 0.0)
+    motion.move_to((0.45, -0.02, 0.03), 0.0)
+    for _ in range(3):
+        motion.move_to((0.45, robot.tool_pose()[0][1] + 0.04, 0.03), 0.0)
+        assert robot.held_body() is None
+    assert block.position[1] > 0.1
+
+
+def test_turning_without_end_never_meets_a_joint_limit(world, robot_class):
+    robot, _, motion = block_scene(world, robot_class)
+    for i in range(1, 41):
+        yaw = i * math.pi / 4
+        motion.move_to((0.45, 0.0, 0.2), yaw)
+        position, measured = robot.tool_pose()
+        assert position == pytest.approx((0.45, 0.0, 0.2), abs=1e-3)
+        assert math.cos(measured - yaw) > 0.999
+
+
+def test_home_is_out_of_the_picture(world, robot_class):
+    robot = robot_class(world)
+    robot.teleport(robot.home_joints)
+    robot.set_opening(1.0)
+    world.detect_collisions()
+    for link in (robot.hand_link, *robot.finger_links[0], *robot.finger_links[1]):
+        low, high = pybullet.getAABB(robot.id, link, physicsClientId=world.client)
+        beside = high[0] < 0.25 or low[0] > 0.65 or high[1] < -0.2 or low[1] > 0.2
+        assert beside or low[2] > 0.4
+    assert robot.tool_pose()[0][2] > 0.4
+    # top-down poses are within a simple swing from home
+    joints = robot.inverse_kinematics((0.45, 0.0, 0.1), downward(0.0), robot.home_joints)
+    assert np.abs(np.subtract(joints, robot.home_joints)).max() < math.pi
+
+
+def test_the_arm_passes_through_things(world, robot_class):
+    robot = robot_class(world)
+    blocks = [
+        world.add(Box(size_m=(0.1, 0.1, 0.1)), f"block {i}") for i in range(len(robot.arm_joints))
+    ]
+    world.seal()
+    robot.teleport(robot.inverse_kinematics((0.5, 0.0, 0.2), downward(0.0)))
+    robot.set_opening(1.0)
+    for link, block in zip(robot.arm_joints[:-2], blocks, strict=False):
+        state = pybullet.getLinkState(robot.id, link, physicsClientId=world.client)
+        block.place(state[0])
+    world.detect_collisions()
+    points = pybullet.getContactPoints(robot.id, physicsClientId=world.client)
+    assert {point[3] for point in points} <= {robot.hand_link, *range(robot.hand_link, 20)}
+    assert not {point[3] for point in points} & set(robot.passive_links)
+
+
+def drive(world, robot, blocks, motion):
+    """Play a fixed random sequence and return everything there is to see of it."""
+    world.restore_pristine()
+    motion.reset(((0.45, 0.0, 0.2), 0.0))
+    for block, xy in zip(blocks, ((0.4, -0.06), (0.48, 0.05)), strict=True):
+        block.place((*xy, 0.025), 0.3)
+    world.settle()
+    rng = np.random.default_rng(4)
+    trace = []
+    for _ in range(25):
+        (x, y, z), yaw = robot.tool_pose()
+        dx, dy, dz = rng.uniform(-0.05, 0.05, 3)
+        target = np.clip((x + dx, y + dy, z + dz - 0.015), *CLOSE_LOOP)
+        motion.move_to(tuple(target.tolist()), yaw + rng.uniform(-0.7, 0.7))
+        motion.grip(float(rng.choice([0.0, 1.0])))
+        trace += [*robot.measured_joints(), robot.opening()]
+        for block in blocks:
+            trace += [*block.position, *block.pose[1]]
+    return trace
+
+
+def test_pokes_are_harmless_and_repeat_bit_by_bit(robot_class):
+    traces = []
+    with World() as first, World() as second:
+        for world in (first, second):
+            robot = robot_class(world)
+            blocks = [world.add(Box(size_m=(0.05, 0.05, 0.05)), name) for name in "ab"]
+            world.seal()
+            motion = CloseLoopController(robot)
+            traces += [drive(world, robot, blocks, motion) for _ in range(2)]
+            assert all(math.dist(block.position[:2], (0.45, 0.0)) < 0.35 for block in blocks)
+    assert np.isfinite(traces[0]).all()
+    assert all(trace == traces[0] for trace in traces[1:])
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+def test_a_turned_hand_still_lets_go(world, robot_class, quarter_turns):
+    robot, block, motion = block_scene(world, robot_class)
+    motion.move_to((0.45, 0.0, 0.025), 0.0)
+    motion.grip(0.0)
+    motion.move_to((0.45, 0.0, 0.1), 0.0)
+    for i in range(1, 2 * quarter_turns + 1):
+        motion.move_to((0.45 + 0.03 * (i % 2), 0.0, 0.1), i * math.pi / 4)
+    assert robot.held_body() is block
+    motion.grip(1.0)
+    world.step(60)
+    assert robot.opening() > 0.97
+    assert block.position[2] == pytest.approx(0.025, abs=1e-3)
+
+
+@pytest.mark.parametrize("task", ["reaching", "picking", "pushing", "pulling"])
+@pytest.mark.parametrize(
+    "variant",
+    [{}, {"random_orientation": False, "action_sequence": "pxyz"}],
+    ids=["with yaw", "without yaw"],
+)
+@pytest.mark.parametrize("robot", list(ROBOTS))
+def test_experts_succeed_with_every_robot(robot, task, variant):
+    env = ba_torchrl.make(
+        f"close_loop/block_{task}", robot=robot, expert=True, seed=0, obs_size=16, **variant
+    )
+    act = lambda td: td.set("action", td["expert_action"])  # noqa: E731
+    episodes = [env.rollout(50, act) for _ in range(10)]
+    faults = env.faults
+    env.close()
+    assert faults == 0
+    assert all(episode["next", "success"][-1] for episode in episodes)

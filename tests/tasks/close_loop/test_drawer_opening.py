@@ -1,0 +1,315 @@
+import math
+
+import numpy as np
+import pybullet
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.sim.bodies import Box, Solid
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.close_loop.drawer_opening import cabinet_parts, drawer_parts
+
+TASK = "close_loop/drawer_opening"
+FIXED = {"random_orientation": False, "action_sequence": "pxyz"}
+
+
+@pytest.fixture
+def make():
+    envs = []
+
+    def build(**config):
+        env = ba_torchrl.make(TASK, **{"obs_size": 16, "seed": 0, **config})
+        env.reset()
+        envs.append(env)
+        return env
+
+    yield build
+    for env in envs:
+        env.close()
+
+
+def local_heights(travel, pose, center, side, pixels):
+    """Heights worked out from the measures alone, and where a pixel is too near an edge to tell."""
+    (x, y), yaw = pose
+    steps = (np.arange(pixels) + 0.5) * side / pixels - side / 2
+    px, py = np.meshgrid(center[0] + steps - x, center[1] + steps - y, indexing="ij")
+    u, v = px * math.cos(yaw) + py * math.sin(yaw), py * math.cos(yaw) - px * math.sin(yaw)
+    image, unsure = np.zeros_like(u), np.zeros_like(u, dtype=bool)
+
+    def rectangle(u_range, v_range, height):
+        gaps = np.minimum.reduce([u - u_range[0], u_range[1] - u, v - v_range[0], v_range[1] - v])
+        image[gaps > 0] = np.maximum(image, np.broadcast_to(height, u.shape))[gaps > 0]
+        unsure[abs(gaps) < 1e-4] = True
+
+    d = u - travel
+    out = (travel - 0.097, travel + 0.1)
+    rectangle(out, (-0.102, 0.102), 0.019)  # the drawer's floor
+    rectangle(out, (0.096, 0.102), 0.085)  # its sides, back and front
+    rectangle(out, (-0.102, -0.096), 0.085)
+    rectangle((out[0], out[0] + 0.006), (-0.102, 0.102), 0.085)
+    rectangle((travel + 0.1, travel + 0.11), (-0.102, 0.102), 0.097)
+    rectangle((travel + 0.11, travel + 0.16), (0.035, 0.043), 0.084)  # posts
+    rectangle((travel + 0.11, travel + 0.16), (-0.043, -0.035), 0.084)
+    arc = np.sqrt(np.clip(0.0075**2 - (d - 0.16) ** 2, 0, None))
+    rectangle((travel + 0.1525, travel + 0.1675), (-0.05, 0.05), 0.08 + arc)  # rod
+    rectangle((-0.11, 0.11), (-0.115, 0.115), 0.11)  # the cabinet hides what is inside
+    return image, unsure
+
+
+@pytest.mark.parametrize("travel", [0.0, 0.1, 0.2])
+def test_the_image_shows_cabinet_drawer_and_handle_in_their_measures(make, travel):
+    env = make()
+    scene = env.scene
+    scene.task.cabinet.place((0.42, 0.03, 0.0), 0.7, travel)
+    image = scene.camera.heightmap((0.48, 0.05), 0.6, 200)
+    expected, unsure = local_heights(travel, ((0.42, 0.03), 0.7), (0.48, 0.05), 0.6, 200)
+    assert unsure.mean() < 0.02
+    np.testing.assert_allclose(image[~unsure], expected[~unsure], atol=2.5e-3)
+    flat = ~unsure & ~((expected > 0.08) & (expected < 0.0876))  # the rod is a polygon
+    np.testing.assert_allclose(image[flat], expected[flat], atol=1e-6)
+
+
+def test_the_policy_sees_the_drawer_move(make):
+    env = make(obs_size=64)
+    cabinet = env.scene.task.cabinet
+    state, stay = env.reset(), torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])
+    cabinet.place(cabinet.base.position, cabinet.base.yaw_rad, 0.1)
+    after = env.step(state.clone().set("action", stay))["next"]
+    changed = (after["pixels"] - state["pixels"]).abs() > 0.01
+    assert 0.01 < changed.float().mean() < 0.3
+
+
+def test_the_drawer_is_hollow_and_open_on_top(make):
+    block = Box(size_m=(0.03, 0.03, 0.03))
+    with World() as world:
+        env = make()
+        shapes = [part.shape for part in env.scene.task.cabinet.parts]
+        cabinet = world.add_articulated(*shapes, env.scene.task.cabinet.rail, "cabinet")
+        dropped = world.add(block, "block")
+        cabinet.place((0.0, 0.0, 0.0), travel_m=0.2)
+        dropped.place((0.18, 0.03, 0.13))
+        world.step(120)
+        assert dropped.position[2] == pytest.approx(0.019 + 0.015, abs=2e-3)  # on its floor
+        cabinet.place((0.0, 0.0, 0.0), travel_m=0.2)
+        dropped.place((0.0, 0.0, 0.14))
+        world.step(120)
+        assert dropped.position[2] == pytest.approx(0.11 + 0.015, abs=2e-3)  # on the cabinet
+
+
+def test_the_cabinet_is_hollow_in_front_and_between_its_walls():
+    with World() as world:
+        cabinet = world.add(Solid(parts=cabinet_parts(), mass_kg=0.0), "cabinet")
+        cabinet.place((0.0, 0.0, 0.0))
+        world.detect_collisions()
+
+        def first_hit(start, end):
+            (hit,) = pybullet.rayTestBatch([start], [end], physicsClientId=world.client)
+            return None if hit[0] != cabinet.id else hit[3]
+
+        assert first_hit((0.3, 0.0, 0.055), (-0.3, 0.0, 0.055))[0] == pytest.approx(-0.1, abs=1e-3)
+        for start, end, axis, expected in (
+            ((0, 0, 0.055), (0, 0.3, 0.055), 1, 0.105),
+            ((0, 0, 0.055), (0, -0.3, 0.055), 1, -0.105),
+            ((0, 0, 0.055), (0, 0, 0.3), 2, 0.1),
+            ((0, 0, 0.055), (0, 0, -0.05), 2, 0.01),
+        ):
+            assert first_hit(start, end)[axis] == pytest.approx(expected, abs=1e-3)
+
+
+def test_sizes():
+    low, high = Solid(parts=cabinet_parts()).bounds_m
+    np.testing.assert_allclose(np.subtract(high, low), (0.22, 0.23, 0.11))
+    rod = drawer_parts()[-1].vertices
+    np.testing.assert_allclose(np.ptp(rod, axis=0), (0.015, 0.1, 0.015))
+    np.testing.assert_allclose(rod.mean(axis=0), (0.11 + 0.05, 0.0, 0.08), atol=1e-9)
+
+
+def test_layouts_open_towards_the_centre_with_room_for_the_handle(make):
+    for config in ({}, FIXED):
+        env = make(**config)
+        task, yaws = env.scene.task, []
+        rng = np.random.default_rng(0)
+        for _ in range(300):
+            task.randomise(rng)
+            (x, y, z), yaw = task.cabinet.base.position, task.cabinet.base.yaw_rad
+            ux, uy = math.cos(yaw), math.sin(yaw)
+            back = (0.45 - x) * ux + (0.0 - y) * uy
+            aside = (0.45 - x) * -uy + (0.0 - y) * ux
+            assert 0.15 <= back <= 0.2
+            assert abs(aside) <= 0.1
+            assert z == 0
+            (hx, hy, _), _ = task.handle_pose
+            for s in (-0.02, 0.15):
+                assert task.settings.workspace.contains((hx + s * ux, hy + s * uy, 0.08))
+            yaws.append(yaw)
+        if config:
+            assert {round(abs(yaw), 3) for yaw in yaws} == {round(math.pi / 2, 3)}
+            assert 100 < sum(yaw > 0 for yaw in yaws) < 200
+        else:
+            assert (np.histogram(yaws, 6, (-math.pi, math.pi))[0] > 25).all()
+
+
+def test_a_workspace_without_room_for_the_handle_is_refused():
+    with pytest.raises(ba_torchrl.errors.ConfigError, match="handle"):
+        ba_torchrl.make(TASK, workspace=((0.4, 0.5), (-0.05, 0.05), (0.01, 0.25)))
+
+
+def test_the_goal_is_fifteen_centimetres(make):
+    env = make()
+    task, cabinet = env.scene.task, env.scene.task.cabinet
+    assert not task.is_goal()
+    pose = (cabinet.base.position, cabinet.base.yaw_rad)
+    for travel, expected in ((0.149, False), (0.151, True)):
+        cabinet.place(*pose, travel)
+        env.scene.world.settle()
+        assert task.is_goal() is expected
+
+
+def test_a_drawer_that_springs_back_is_no_success(make):
+    """Success counts once everything is at rest."""
+    env = make()
+    cabinet = env.scene.task.cabinet
+    cabinet.place(cabinet.base.position, cabinet.base.yaw_rad, 0.152)
+    pybullet.resetJointState(cabinet.id, 0, 0.152, -0.5, physicsClientId=env.scene.world.client)
+    assert env.scene.task.is_goal()
+    success, valid = env._evaluate(env.scene)
+    assert valid
+    assert not success
+    assert cabinet.travel_m < 0.15
+
+
+def at_handle(env, ahead, height, opening, turn):
+    """Put cabinet and gripper: the rod along y at x = 0.41, opening towards -x."""
+    scene = env.scene
+    scene.task.cabinet.place((0.57, 0.0, 0.0), math.pi)
+    scene.motion.reset(((0.41 - ahead, 0.0, height), turn), opening)
+    return scene
+
+
+def test_a_hooked_drawer_follows_the_fingers_and_stays(make):
+    scene = at_handle(make(), -0.026, 0.07, 0.0, math.pi / 2)
+    travels = []
+    for _ in range(6):
+        (x, y, z), yaw = scene.robot.tool_pose()
+        scene.motion.move_to((x - 0.05, y, z), yaw)
+        travels.append(scene.task.cabinet.travel_m)
+    # 8.5 mm of play first, then 5 cm each, and no farther than the rail
+    np.testing.assert_allclose(travels, [0.0415, 0.0915, 0.1415, 0.1915, 0.2, 0.2], atol=4e-3)
+    scene.world.settle()
+    assert scene.task.cabinet.travel_m == pytest.approx(0.2, abs=2e-3)
+    for _ in range(6):
+        (x, y, z), yaw = scene.robot.tool_pose()
+        scene.motion.move_to((x + 0.05, y, z), yaw)
+    scene.world.settle()
+    assert scene.task.cabinet.travel_m == pytest.approx(0.0, abs=2e-3)
+
+
+def test_fingers_closed_across_the_rod_pull_it_but_hold_nothing(make):
+    scene = at_handle(make(), 0.0, 0.08, 0.2, 0.0)
+    scene.motion.grip(0.0)
+    assert scene.robot.held_body() is None
+    for _ in range(3):
+        (x, y, z), yaw = scene.robot.tool_pose()
+        scene.motion.move_to((x - 0.05, y, z), yaw)
+    assert scene.task.cabinet.travel_m == pytest.approx(0.15, abs=3e-3)
+
+
+def test_the_guard_spares_a_handle_that_cannot_move_that_way(make):
+    scene = at_handle(make(), 0.0, 0.14, 0.0, math.pi / 2)
+    for _ in range(3):  # onto the rod from above
+        (x, y, z), yaw = scene.robot.tool_pose()
+        scene.motion.move_to((x, y, z - 0.05), yaw)
+    assert scene.robot.tool_pose()[0][2] > 0.08
+    assert scene.task.handle_pose[0][2] == pytest.approx(0.08, abs=1e-6)
+    scene = at_handle(make(), -0.026, 0.07, 0.0, math.pi / 2)
+    for _ in range(3):  # along the rod, into a post
+        (x, y, z), yaw = scene.robot.tool_pose()
+        scene.motion.move_to((x, y + 0.05, z), yaw)
+    assert scene.robot.tool_pose()[0][1] < 0.035
+    np.testing.assert_allclose(scene.task.cabinet.base.position, (0.57, 0.0, 0.0), atol=1e-9)
+
+
+def test_random_actions_keep_the_drawer_on_its_rail(make):
+    env = make()
+    rng = np.random.default_rng(0)
+    for episode in range(6):
+        state = env.reset()
+        scene = env.scene
+        handle, heading = scene.task.handle_pose  # start where it matters
+        scene.motion.reset(((*handle[:2], 0.15), heading))
+        while not state["done"]:
+            action = rng.choice([-1.0, 1.0], 5) if episode % 2 else rng.uniform(-1, 1, 5)
+            state = env.step(state.set("action", torch.tensor(action, dtype=torch.float32)))
+            state = state["next"]
+            assert -5e-3 < scene.task.cabinet.travel_m < 0.205
+    assert env.faults == 0
+
+
+def test_scaled_drawers_open_by_scaled_travel(make):
+    env = make(object_scale_range=0.9, expert=True)
+    assert env.scene.task.cabinet.rail.range_m == (0.0, pytest.approx(0.18))
+    np.testing.assert_allclose(env.scene.task.handle_pose[0][2], 0.072, atol=1e-6)
+    state = env.reset()
+    while not state["done"]:
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+    assert state["success"]
+    assert 0.135 < env.scene.task.cabinet.travel_m < 0.17
+
+
+def test_the_vector_lists_gripper_cabinet_and_handle(make):
+    env = make(obs_type="vec")
+    vector = env.reset()["observation"].numpy()
+    assert vector.shape == (1 + 4 * 3,)
+    (x, y, z), yaw = env.scene.task.handle_pose
+    expected = ((x - 0.45) / 0.15, y / 0.15, (z - 0.13) / 0.12, yaw / math.pi)
+    np.testing.assert_allclose(vector[-4:], expected, atol=1e-5)
+
+
+def test_episodes_repeat_in_a_used_and_in_a_fresh_world(make):
+    def episode(env, seed):
+        state, seen, rng = env.reset(seed=seed), [], np.random.default_rng(seed)
+        while not state["done"] and len(seen) < 16:
+            action = state["expert_action"]
+            if len(seen) % 4 == 3:
+                action = torch.from_numpy(rng.uniform(-1, 1, 5).astype(np.float32))
+            state = env.step(state.set("action", action))["next"]
+            seen.append(state["pixels"].clone())
+        scene = env.scene
+        return torch.stack(seen), scene.task.cabinet.travel_m, scene.robot.measured_joints()
+
+    def same(one, other):
+        return torch.equal(one[0], other[0]) and one[1:] == other[1:]
+
+    used, fresh = make(expert=True, obs_size=32), make(expert=True, obs_size=32)
+    first = {seed: episode(used, seed) for seed in range(25)}
+    assert same(episode(fresh, 7), first[7])
+    for seed in np.random.default_rng(0).permutation(25).tolist():
+        assert same(episode(used, seed), first[seed])
+
+
+def test_a_state_brings_back_the_opened_drawer(make):
+    env = make(expert=True)
+    state = env.reset()
+    while env.scene.task.cabinet.travel_m < 0.05:
+        state = env.step(state.set("action", state["expert_action"]))["next"]
+    kept, travel = env.get_state(), env.scene.task.cabinet.travel_m
+    handle = env.scene.task.handle_pose
+    env.reset()
+    assert env.scene.task.cabinet.travel_m == pytest.approx(0.0, abs=1e-6)
+    env.set_state(kept)
+    assert env.scene.task.cabinet.travel_m == travel
+    assert env.scene.task.handle_pose == handle
+
+
+@pytest.mark.parametrize("config", [{}, FIXED], ids=["random", "fixed"])
+def test_the_expert_is_as_fast_as_the_published_planner(make, config):
+    env = make(expert=True, **config)
+    lengths = []
+    for _ in range(40):
+        state = env.reset()
+        while not state["done"]:
+            state = env.step(state.set("action", state["expert_action"]))["next"]
+        assert state["success"]
+        lengths.append(int(state["step_count"]))
+    assert np.mean(lengths) <= 1.1 * 8.6

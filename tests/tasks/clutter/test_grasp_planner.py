@@ -1,0 +1,176 @@
+"""The grasp planner on scenes whose best grasp is worked out by hand, with different grippers."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
+from ba_torchrl.tasks.base import ActionLimits, Workspace
+from ba_torchrl.tasks.clutter import grasp_planner
+from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M, DEEPEST_M, PIXEL_M, GraspPlanner
+from ba_torchrl.tasks.clutter.push_planner import PushPlanner
+
+WORKSPACE = Workspace((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))
+REACH = ActionLimits(0.05, math.pi / 4)
+TOOL = ((0.45, 0.0, 0.2), 0.0)
+FLOOR_M = 2e-3
+
+JAW = Gripper(
+    half_gap_m=0.04,
+    half_width_m=0.01,
+    closed_half_m=0.016,
+    palm_m=0.07,
+    arc=((0.0, -0.01), (0.04, -0.01)),
+    outline=(
+        *((u, 0.07) for u in np.arange(0.0, 0.04, 0.005).tolist()),
+        *((u, -0.01) for u in (0.04, 0.045, 0.05, 0.055)),
+    ),
+    closed_outline=(*((u, -0.01) for u in (0.0, 0.005, 0.01, 0.015)), (0.05, 0.07), (0.09, 0.07)),
+)
+"""Fingers that slide, 1 cm past the tool."""
+SWING = replace(
+    JAW,
+    arc=((0.0, -0.01), (0.04, 0.006)),
+    outline=(*JAW.outline[:-4], *((u, 0.006) for u in (0.04, 0.045, 0.05, 0.055))),
+)
+"""Fingers that end above the tool when they are open, and go down as they close."""
+
+
+@dataclass
+class Lying:
+    """A body as far as the planner knows it."""
+
+    shape: Box
+    position: tuple[float, float, float]
+    yaw_rad: float = 0.0
+
+    @property
+    def pose(self):
+        half = self.yaw_rad / 2
+        return self.position, (0.0, 0.0, math.sin(half), math.cos(half))
+
+
+def block(size_m, xy=(0.45, 0.0), yaw_rad=0.0):
+    return Lying(Box(size_m=size_m), (*xy, FLOOR_M + size_m[2] / 2), yaw_rad)
+
+
+def scene(gripper, *bodies):
+    """Return a planner and the height image of upright boxes on a flat floor."""
+    planner = GraspPlanner(bodies, None, WORKSPACE, gripper)
+    heights = np.full_like(planner._plain, FLOOR_M)
+    i, j = np.indices(heights.shape)
+    x = planner.corner[0] + (i + 0.5) * PIXEL_M
+    y = planner.corner[1] + (j + 0.5) * PIXEL_M
+    for body in bodies:
+        dx, dy = x - body.position[0], y - body.position[1]
+        cos, sin = math.cos(body.yaw_rad), math.sin(body.yaw_rad)
+        inside = (abs(cos * dx + sin * dy) <= body.shape.size_m[0] / 2) & (
+            abs(cos * dy - sin * dx) <= body.shape.size_m[1] / 2
+        )
+        heights[inside] = FLOOR_M + body.shape.size_m[2]
+    return planner, heights
+
+
+def plan(gripper, target, *others):
+    planner, heights = scene(gripper, target, *others)
+    return planner.plan([target], TOOL, REACH, heights)
+
+
+def test_a_slab_is_grasped_across_in_its_middle():
+    for yaw in (0.0, 0.7, 1.3, 1.9):
+        target = block((0.03, 0.11, 0.03), yaw_rad=yaw)
+        grasp = plan(JAW, target)
+        assert grasp.body is target
+        # closing fingers turn a body by this much into their grasp
+        assert abs(math.cos(grasp.yaw_rad - yaw)) > 0.7
+        assert math.dist(grasp.position[:2], target.position[:2]) < 0.01
+
+
+@pytest.mark.parametrize("gripper", [JAW, SWING], ids=["slides", "swings"])
+@pytest.mark.parametrize("palm_m", [0.02, 0.03, 0.07])
+def test_the_palm_stays_above_a_tall_block_and_the_fingers_reach_deep(gripper, palm_m):
+    inner = [(u, min(z, palm_m)) for u, z in gripper.outline]
+    gripper = replace(gripper, palm_m=palm_m, outline=tuple(inner))
+    target = block((0.03, 0.03, 0.1))
+    top = FLOOR_M + 0.1
+    grasp = plan(gripper, target)
+    # at half a gap of 15 mm
+    deepest = DEEPEST_M + gripper.tip_m(0.015)
+    assert grasp.position[2] == pytest.approx(top - min(palm_m - CLEARANCE_M, deepest), abs=1e-3)
+
+
+def test_open_fingers_stay_above_what_is_beside():
+    target = block((0.03, 0.11, 0.06))
+    beside = [block((0.03, 0.2, 0.03), (0.45 + x, 0.0)) for x in (-0.06, 0.06)]
+    assert plan(JAW, target).position[2] < 0.03
+    grasp = plan(JAW, target, *beside)
+    # their top, the length of the fingers below the tool, and some room
+    assert grasp.position[2] >= FLOOR_M + 0.03 + 0.01 + CLEARANCE_M - 1e-6
+
+
+def test_fingers_that_swing_down_keep_off_what_is_under_their_way():
+    """Open they would fit beside the block above its neighbours, but not once they close on it."""
+    target = block((0.03, 0.11, 0.06))
+    beside = [block((0.03, 0.2, 0.03), (0.45 + x, 0.0)) for x in (-0.065, 0.065)]
+    grasp = plan(SWING, target, *beside)
+    # over the neighbours' inner edge, 50 mm off, a finger 16 mm deep is at half a gap of 34 mm
+    swung = SWING.tip_m(0.034)
+    assert swung < 0.006
+    assert grasp.position[2] >= FLOOR_M + 0.03 - swung + CLEARANCE_M - 1e-3
+
+
+@pytest.mark.parametrize("half_gap_m", [0.025, 0.04])
+def test_what_is_wider_than_the_gap_is_left(half_gap_m):
+    gripper = replace(
+        JAW,
+        half_gap_m=half_gap_m,
+        arc=((0.0, -0.01), (half_gap_m, -0.01)),
+    )
+    for width, fits in ((2 * half_gap_m - 0.01, True), (2 * half_gap_m + 0.004, False)):
+        assert (plan(gripper, block((width, width, 0.03))) is not None) is fits
+
+
+def test_a_flat_body_is_out_of_reach_of_fingers_that_end_high():
+    flat = block((0.07, 0.07, 0.012))
+    assert plan(JAW, flat) is not None
+    high = replace(SWING, arc=((0.0, 0.0), (0.04, 0.006)))
+    assert plan(high, flat) is None
+
+
+def test_the_risk_of_a_body_alone_depends_on_the_yaw():
+    target = block((0.03, 0.11, 0.03))
+    planner, _ = scene(JAW, target)
+    samples = planner.placed_samples(target)
+    across = planner.risk_alone(samples, (TOOL[0], 0.0))
+    along = planner.risk_alone(samples, (TOOL[0], math.pi / 2))
+    assert across < 0.5
+    assert along == grasp_planner.WORST_RISK
+
+
+@pytest.mark.parametrize("name", list(ROBOTS))
+def test_pushing_fingers_stand_off_the_floor_and_behind_the_body(name):
+    gripper = measured_gripper(ROBOTS[name])
+    target = block((0.03, 0.03, 0.03), (0.4, 0.0))
+    planner, heights = scene(gripper, target)
+    push = PushPlanner(planner).plan([target], TOOL, REACH, heights)
+    tips = push.start[2] + gripper.tip_m(0.0)
+    assert FLOOR_M + 2e-3 < tips < FLOOR_M + 0.01
+    assert math.dist(push.start[:2], target.position[:2]) > 0.015 + gripper.closed_half_m
+
+
+def test_a_wide_hand_is_kept_off_a_wall_where_another_push_will_do():
+    target, wall_x = block((0.03, 0.03, 0.03), (0.45, 0.05)), 0.5325
+    wall = block((0.2, 0.4, 0.09), (wall_x + 0.1, 0.0))
+    rooms = []
+    for height in (0.09, 0.03):  # of what reaches 9 cm to both sides, over the tool
+        gripper = replace(JAW, closed_outline=(*JAW.closed_outline[:-1], (0.09, height)))
+        planner, heights = scene(gripper, target, wall)
+        push = PushPlanner(planner).plan([target], TOOL, REACH, heights)
+        rooms.append(wall_x - 0.09 - max(push.start[0], push.end[0]))
+    over_the_wall, beside_it = rooms
+    assert over_the_wall < 0
+    assert beside_it > 0

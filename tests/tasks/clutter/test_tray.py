@@ -1,0 +1,99 @@
+"""The tray: its profile, what slides in it and what stays, and that it is tight."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ba_torchrl
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.vision.depth import HeightCamera
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, RIM_Z_M, add_tray, profile
+
+CENTER = (0.45, 0.02)
+
+
+@pytest.fixture
+def world():
+    with World() as world:
+        add_tray(world, CENTER, 0.3)
+        yield world
+
+
+def height(heights, x, y, side=0.5, pixels=500):
+    i = int((x - (CENTER[0] - side / 2)) / side * pixels)
+    j = int((y - (CENTER[1] - side / 2)) / side * pixels)
+    return heights[i, j]
+
+
+def test_it_returns_the_height_of_its_floor():
+    with World() as world:
+        assert add_tray(world, CENTER, 0.3) == FLOOR_Z_M == 0.002
+
+
+def test_floor_is_22_cm_wide_and_grows_with_the_workspace():
+    assert profile(0.3)[0][0] == pytest.approx((0.3 - 0.05) / 2)
+    assert profile(0.4)[0][0] - profile(0.3)[0][0] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("direction", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_profile_from_above(world, direction):
+    heights = HeightCamera(world.bodies).heightmap(CENTER, 0.5, 500)
+
+    def at(distance):
+        return height(heights, *(c + distance * d for c, d in zip(CENTER, direction, strict=True)))
+
+    assert at(0.0) == pytest.approx(FLOOR_Z_M)
+    assert at(0.12) == pytest.approx(FLOOR_Z_M)
+    lip = 0.125 + 0.0075
+    assert at(lip) == pytest.approx(FLOOR_Z_M + 0.0075 * math.tan(math.radians(20)), abs=5e-4)
+    wall = (at(0.2) - at(0.16)) / 0.04
+    assert wall == pytest.approx(1.0, abs=0.03)  # 45 degrees
+    assert heights.max() == pytest.approx(RIM_Z_M, abs=2e-3)
+
+
+def test_corners_are_closed(world):
+    heights = HeightCamera(world.bodies).heightmap(CENTER, 0.46, 460)
+    inside = heights[5:-5, 5:-5]
+    assert inside.min() >= FLOOR_Z_M - 1e-9
+    diagonal = np.diagonal(heights)[: len(heights) // 2]
+    assert np.all(np.diff(diagonal[8:]) <= 1e-9)  # falls from rim to floor without a gap
+
+
+def test_blocks_slide_off_the_walls_and_stay_on_the_floor(world):
+    block = Box(size_m=(0.03, 0.03, 0.03), friction=0.6)
+    on_wall, on_floor = world.add(block, "on the wall"), world.add(block, "on the floor")
+    on_wall.place((CENTER[0] + 0.19, CENTER[1], 0.1))
+    on_floor.place((CENTER[0] - 0.05, CENTER[1] - 0.05, FLOOR_Z_M + 0.015))
+    world.settle(600)
+    assert on_wall.position[0] < CENTER[0] + 0.15
+    assert math.dist(on_floor.position, (CENTER[0] - 0.05, CENTER[1] - 0.05, 0.017)) < 2e-3
+
+
+def test_nothing_falls_through(world):
+    blocks = [world.add(Box(size_m=(0.02, 0.04, 0.02)), f"block {i}") for i in range(8)]
+    rng = np.random.default_rng(0)
+    for block in blocks:
+        x, y = (c + rng.uniform(-0.1, 0.1) for c in CENTER)
+        block.move_to((x, y, 0.4), (0.3, 0.1, 0.0, 0.9487))
+        world.step(30)
+    world.settle(600)
+    for block in blocks:
+        assert 0.008 < block.position[2] < 0.08
+        assert max(abs(p - c) for p, c in zip(block.position, CENTER, strict=False)) < 0.16
+
+
+def test_other_close_loop_tasks_can_have_it():
+    env = ba_torchrl.make("close_loop/block_picking", close_loop_tray=True, seed=0, obs_size=32)
+    for _ in range(5):
+        env.reset()
+        assert {"tray floor", "tray walls"} <= {body.name for body in env.scene.world.bodies}
+        assert env.scene.task.block.position[2] == pytest.approx(0.025 + FLOOR_Z_M, abs=2e-3)
+    env.close()
+
+
+def test_tasks_without_room_refuse_it():
+    with pytest.raises(ConfigError, match="close_loop_tray"):
+        ba_torchrl.make("close_loop/drawer_opening", close_loop_tray=True)

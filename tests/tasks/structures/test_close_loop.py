@@ -1,0 +1,384 @@
+"""Block Stacking and House Building under close-loop control; stacks of cylinders in open loop."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.data.time_reversal import replay_scores
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.sim.bodies import vertical_extent, world_vertices
+from ba_torchrl.tasks.structures.blueprint import CYLINDER
+
+STACKING, HOUSE = "close_loop/block_stacking", "close_loop/house_building"
+OPEN_STACKING = "open_loop/block_stacking"
+FIXED = {"random_orientation": False, "action_sequence": "pxyz"}
+
+
+@pytest.fixture
+def make():
+    envs = []
+
+    def build(task, **config):
+        env = ba_torchrl.make(task, **{"obs_size": 16, "seed": 0, **config})
+        env.reset()
+        envs.append(env)
+        return env
+
+    yield build
+    for env in envs:
+        env.close()
+
+
+def wait(env):
+    """Take a step in which the open gripper does not move."""
+    action = torch.zeros(env.action_spec.shape)
+    action[0] = 1.0
+    return env._step(env.full_action_spec.zero().set("action", action))
+
+
+def follow(env):
+    """Let the expert play to the end of the episode; return its last step."""
+    state = wait(env)
+    while not state["done"]:
+        action = torch.from_numpy(env._expert_action(env.scene))
+        state = env._step(env.full_action_spec.zero().set("action", action))
+    return state
+
+
+# -- the pieces --------------------------------------------------------------------------------
+
+
+def test_sizes_are_the_papers(make):
+    blocks = make(STACKING).scene.task.blocks
+    assert [block.shape.size_m for block in blocks] == [(0.05, 0.05, 0.05)] * 2
+    task = make(HOUSE).scene.task
+    low, high = np.array(task.triangle.shape.bounds_m)
+    np.testing.assert_allclose(high - low, 0.05)
+    vertices = task.triangle.shape.mesh().vertices
+    ridge = vertices[vertices[:, 2] > 0.02]
+    np.testing.assert_allclose(ridge, [[0, 0.025, 0.025], [0, -0.025, 0.025]])
+
+
+@pytest.mark.parametrize("task", [STACKING, HOUSE])
+def test_the_number_of_pieces_is_configurable(make, task):
+    for count in (2, 3, 4):
+        env = make(task, num_objects=count)
+        for _ in range(3):
+            env.reset()
+            points = [body.position[:2] for body in env.scene.task.objects]
+            assert len(points) == count
+            apart = [math.dist(a, b) for i, a in enumerate(points) for b in points[:i]]
+            assert min(apart) > 0.099
+    for count in (1, 5):
+        with pytest.raises(ConfigError, match="2 to 4"):
+            ba_torchrl.make(task, num_objects=count)
+
+
+def test_fixed_orientations_turn_the_ends_of_the_triangle_to_the_fingers(make):
+    env = make(HOUSE, **FIXED)
+    for _ in range(3):
+        env.reset()
+        task = env.scene.task
+        assert task.blocks[0].yaw_rad == pytest.approx(0.0, abs=1e-3)
+        assert task.triangle.yaw_rad == pytest.approx(math.pi / 2, abs=1e-3)
+
+
+def test_a_triangle_is_held_level_by_its_ends(make):
+    scene = make(HOUSE).scene
+    task = scene.task
+    task.stand(task.blocks[0], (0.35, 0.1), 0.0)
+    task.stand(task.triangle, (0.45, 0.0), math.pi / 2)
+    scene.motion.reset(((0.45, 0.0, 0.1), 0.0))
+    scene.world.settle()
+    scene.motion.move_to((0.45, 0.0, 0.025), 0.0)
+    scene.motion.grip(0.0)
+    for z in (0.075, 0.125):
+        scene.motion.move_to((0.45, 0.0, z), 0.0)
+    assert scene.robot.held_body() is task.triangle
+    assert vertical_extent(task.triangle)[0] > 0.09
+    assert task.triangle.tilt_rad < 0.05
+
+
+# -- the goals ---------------------------------------------------------------------------------
+
+
+def test_stacking_succeeds_when_let_go_of_and_not_before(make):
+    env = make(STACKING)
+    scene = env.scene
+    lower, upper = scene.task.blocks
+    lower.place((0.45, 0.0, 0.025))
+    upper.place((0.4, 0.1, 0.025))
+    scene.motion.reset(((0.4, 0.1, 0.1), 0.0))
+    scene.world.settle()
+    scene.motion.move_to((0.4, 0.1, 0.025), 0.0)
+    scene.motion.grip(0.0)
+    for target in ((0.4, 0.1, 0.1), (0.45, 0.0, 0.1), (0.45, 0.0, 0.0755)):
+        scene.motion.move_to(target, 0.0)
+    assert scene.robot.held_body() is upper
+    assert not scene.task.is_goal()
+    scene.motion.grip(1.0)
+    scene.world.settle()
+    assert scene.task.is_goal()
+
+
+@pytest.mark.parametrize(
+    ("position", "expected"),
+    [
+        ((0.45, 0.0, 0.075), True),
+        ((0.45, 0.02, 0.075), True),
+        ((0.45, 0.0, 0.079), True),  # dropped, it lands where it should
+        ((0.45, 0.028, 0.075), False),  # it topples
+        ((0.45, 0.05, 0.025), False),
+    ],
+)
+def test_stacking_is_judged_at_rest(make, position, expected):
+    env = make(STACKING)
+    lower, upper = env.scene.task.blocks
+    env.scene.motion.reset(((0.35, -0.1, 0.2), 0.0))
+    lower.place((0.45, 0.0, 0.025))
+    upper.place(position)
+    env.scene.world.settle()
+    outcome = wait(env)
+    assert outcome["success"] == expected
+    assert outcome["terminated"] == expected
+    assert outcome["reward"] == float(expected)
+
+
+def test_a_house_has_its_triangle_on_top(make):
+    env = make(HOUSE, num_objects=3)
+    task = env.scene.task
+    env.scene.motion.reset(((0.35, -0.1, 0.25), 0.0))
+    first, second = task.blocks
+    for first_z, second_z, triangle_xy, triangle_z, expected in (
+        (0.025, 0.075, (0.5, 0.1), 0.025, False),
+        (0.025, 0.075, (0.45, 0.0), 0.125, True),
+        (0.075, 0.025, (0.45, 0.0), 0.125, True),
+    ):
+        for i, body in enumerate(task.objects):  # out of each other's way
+            body.place((0.35, 0.1 * (i - 1), 0.03))
+        env.scene.world.settle()
+        first.place((0.45, 0.0, first_z))
+        second.place((0.45, 0.0, second_z))
+        task.triangle.place((*triangle_xy, triangle_z), 0.5)
+        env.scene.world.settle()
+        assert task.is_goal() is expected
+    second.place((0.5, 0.1, 0.025))
+    first.place((0.45, 0.0, 0.025))
+    task.triangle.place((0.45, 0.0, 0.075))
+    env.scene.world.settle()
+    assert not task.is_goal()
+
+
+def test_a_tipped_triangle_ends_the_episode_without_reward(make):
+    env = make(HOUSE)
+    triangle = env.scene.task.triangle
+    slope = math.pi - math.atan2(0.05, 0.025)
+    triangle.move_to((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
+    env.scene.world.settle()
+    assert triangle.tilt_rad > 1.0
+    outcome = wait(env)
+    assert outcome["terminated"]
+    assert not outcome["success"]
+    assert outcome["reward"] == 0
+
+
+def test_a_tumbled_cube_is_as_good_as_any(make):
+    env = make(HOUSE, expert=True)
+    task = env.scene.task
+    task.blocks[0].move_to(
+        (*task.blocks[0].position[:2], 0.025), (math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4))
+    )
+    assert follow(env)["success"]
+
+
+# -- the expert --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", [STACKING, HOUSE])
+@pytest.mark.parametrize("variant", [{}, FIXED], ids=["random orientations", "fixed"])
+@pytest.mark.parametrize(("count", "most"), [(2, 12.0), (3, 24.0), (4, 40.0)])
+def test_expert_builds_higher(make, task, variant, count, most):
+    env = make(task, num_objects=count, **variant)
+    lengths = []
+    for _ in range(5):
+        env.reset()
+        assert follow(env)["success"]
+        lengths.append(env._step_count)
+    assert np.mean(lengths) <= most
+
+
+def test_expert_takes_blocks_that_touch(make):
+    env = make(STACKING)
+    for yaw in (-0.6, 0.0, 0.4, 0.8):
+        env.reset()
+        first, second = env.scene.task.blocks
+        first.place((0.42, 0.0, 0.025), yaw)
+        second.place((0.42 + 0.051 * math.cos(yaw), 0.051 * math.sin(yaw), 0.025), yaw)
+        assert follow(env)["success"]
+
+
+def test_expert_takes_a_triangle_down_that_was_put_on_too_early(make):
+    env = make(HOUSE, num_objects=3)
+    task = env.scene.task
+    task.blocks[0].place((0.4, -0.05, 0.025), 0.3)
+    task.blocks[1].place((0.52, 0.05, 0.025), 0.0)
+    task.triangle.place((0.4, -0.05, 0.075), 0.3)
+    env.scene.world.settle()
+    assert follow(env)["success"]
+
+
+def test_expert_lets_go_of_what_is_needed_later(make):
+    env = make(HOUSE)
+    scene = env.scene
+    task = scene.task
+    block = task.blocks[0]
+    block.place((0.45, 0.0, 0.025))
+    task.triangle.place((0.35, 0.1, 0.025))
+    scene.motion.reset(((0.45, 0.0, 0.1), 0.0))
+    scene.motion.move_to((0.45, 0.0, 0.025), 0.0)
+    scene.motion.grip(0.0)
+    scene.motion.move_to((0.45, 0.0, 0.1), 0.0)
+    assert scene.robot.held_body() is block
+    state = None
+    while state is None or not state["done"]:
+        action = torch.from_numpy(env._expert_action(scene))
+        state = env._step(env.full_action_spec.zero().set("action", action))
+    assert state["success"]
+
+
+# -- cylinders ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cylinders(make):
+    """Return a task whose cylinders stand in a stack."""
+    task = make(OPEN_STACKING, object_type="cylinder").scene.task
+    for level, body in enumerate(task.objects):
+        body.place((0.45, 0.0, (level + 0.5) * 0.03), 0.7 * level)
+    task.world.settle()
+    return task
+
+
+def on_its_side(body, position):
+    body.move_to(position, (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))
+
+
+def test_cylinders_are_as_high_and_wide_as_blocks(cylinders):
+    for body in cylinders.objects:
+        vertices = body.shape.vertices
+        np.testing.assert_allclose(np.hypot(vertices[:, 0], vertices[:, 1]), 0.015)
+        np.testing.assert_allclose(np.abs(vertices[:, 2]), 0.015)
+
+
+def test_fingers_close_on_sides_of_a_cylinder_at_every_grasp_yaw(cylinders):
+    body = cylinders.objects[0]
+    body.place((0.3, 0.1, 0.015), 0.4)
+    yaws = CYLINDER.grasp_yaws(body)
+    assert len({round(yaw % math.pi, 6) for yaw in yaws}) == 8
+    for yaw in yaws:
+        along = (world_vertices(body)[:, :2] - (0.3, 0.1)) @ (math.cos(yaw), math.sin(yaw))
+        assert along.max() == pytest.approx(0.015 * math.cos(math.pi / 16))
+        assert (along > along.max() - 1e-9).sum() == 4  # the corners of a side
+
+
+def test_a_stack_of_cylinders_is_the_goal_whichever_end_is_up(cylinders):
+    assert cylinders.is_goal()
+    top = cylinders.objects[-1]
+    top.move_to(top.position, (1.0, 0.0, 0.0, 0.0))
+    cylinders.world.settle()
+    assert cylinders.is_goal()
+    assert cylinders.is_valid()
+
+
+@pytest.mark.parametrize("place", [(0.45, 0.031, 0.015), (0.48, 0.1, 0.015)])
+def test_a_cylinder_beside_the_stack_does_not_count(cylinders, place):
+    cylinders.objects[-1].place(place)
+    cylinders.world.settle()
+    assert not cylinders.is_goal()
+    assert cylinders.is_valid()
+
+
+def test_a_cylinder_over_the_edge_falls_and_ends_the_episode(cylinders):
+    cylinders.objects[-1].place((0.45, 0.018, 0.1055))
+    cylinders.world.settle()
+    assert not cylinders.is_goal()
+    assert not cylinders.is_valid()
+
+
+def test_a_cylinder_on_its_side_ends_the_episode_on_top_or_on_the_floor(cylinders):
+    for position in ((0.45, 0.0, 0.1051), (0.35, 0.1, 0.0151)):
+        on_its_side(cylinders.objects[-1], position)
+        cylinders.world.step(2)
+        assert cylinders.objects[-1].position[2] == pytest.approx(position[2], abs=1e-3)
+        assert not cylinders.is_goal()
+        assert not cylinders.is_valid()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"random_orientation": False, "action_sequence": "pxy"}, {"num_objects": 6}],
+    ids=["random orientations", "fixed", "six"],
+)
+def test_expert_stacks_cylinders_in_the_fewest_steps(settings):
+    env = ba_torchrl.make(
+        OPEN_STACKING, object_type="cylinder", obs_size=64, seed=0, expert=True, **settings
+    )
+    for _ in range(10):
+        td = env.reset()
+        while not td["done"]:
+            td = env.step(td.set("action", td["expert_action"]))["next"]
+        assert td["success"]
+        assert env._step_count == 2 * (len(env.scene.task.objects) - 1)
+    env.close()
+
+
+def test_a_stack_of_cylinders_taken_apart_can_be_built_again():
+    scores = replay_scores(OPEN_STACKING, 10, object_type="cylinder")
+    assert scores.reversible * scores.success_rate >= 0.9
+
+
+@pytest.mark.parametrize("task", [STACKING, "open_loop/house_building_1"])
+def test_cylinders_have_no_meaning_elsewhere(task):
+    with pytest.raises(ConfigError, match="no meaning"):
+        ba_torchrl.make(task, object_type="cylinder")
+
+
+def let_expert_go_on(env):
+    """The last outcome and the steps until the episode ends, from the scene as it was arranged."""
+    env.scene.world.settle()
+    env.scene.world.step(2)
+    done, steps = False, 0
+    while not done:
+        action = torch.from_numpy(env._expert_action(env.scene))
+        outcome = env._step(env.full_action_spec.zero().set("action", action))
+        done, steps = bool(outcome["done"]), steps + 1
+    return outcome, steps
+
+
+def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
+    env = make(OPEN_STACKING, expert=True, max_steps=20)
+    cubes = env.scene.task.objects
+    for level, cube in enumerate(cubes[:3]):
+        cube.place((0.394, 0.046, (level + 0.5) * 0.03), 1.2)
+    cubes[3].place((0.362, 0.055, 0.015), 1.228)
+    outcome, steps = let_expert_go_on(env)
+    assert outcome["success"]
+    assert steps <= 12
+
+
+@pytest.mark.parametrize(
+    ("robot", "gap_m"),
+    [("kuka", 0.01), ("kuka", 0.025), ("panda", 0.001), ("panda", 0.01), ("panda", 0.025)],
+)
+def test_expert_that_cannot_turn_takes_cubes_that_stand_side_by_side(make, robot, gap_m):
+    """In a row along the fingers' line each is in the others' way, grasped by its middle."""
+    fixed = {"action_sequence": "pxy", "random_orientation": False}
+    env = make(OPEN_STACKING, expert=True, max_steps=30, robot=robot, num_objects=3, **fixed)
+    for i, cube in enumerate(env.scene.task.objects):
+        cube.place((0.42 + i * (0.03 + gap_m), 0.02, 0.015))
+    outcome, steps = let_expert_go_on(env)
+    assert outcome["success"]
+    assert steps <= 20

@@ -1,0 +1,280 @@
+"""Open-loop structures: what counts as built, what does not, and who builds them."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ba_torchrl
+from ba_torchrl.tasks.structures.improvise import (
+    CUBOID_M,
+    NUMBERS,
+    SIZES,
+    random_cuboids,
+    random_shapes,
+    shape_piece,
+)
+
+B = 0.03
+X, Y = 0.45, 0.0
+APART = 1.75 * B / 2
+CUBES = {"block_stacking": 4, "house_building_1": 3, "house_building_2": 2, "house_building_3": 2}
+CUBES["house_building_4"] = 4
+HOUSES = sorted(CUBES)
+IMPROVISED = ["improvise_house_building_2", "improvise_house_building_3"]
+
+
+class House:
+    """A task's scene with the finished structure, to be spoilt."""
+
+    def __init__(self, name):
+        self.env = ba_torchrl.make(f"open_loop/{name}", seed=0)
+        self.env.reset()
+        self.task, self.world = self.env.scene.task, self.env.scene.world
+        self.named = {body.name: body for body in self.task.objects}
+        self.cubes = [body for name, body in self.named.items() if name.startswith("cube")]
+        self.build(name)
+
+    def build(self, name):
+        if name in ("block_stacking", "house_building_1"):
+            for level, cube in enumerate(self.cubes):
+                self.put(cube, 0.0, level)
+            if "triangle 1" in self.named:
+                self.put(self.named["triangle 1"], 0.0, len(self.cubes))
+        else:
+            for side, cube in zip((-APART, APART), self.cubes[:2], strict=True):
+                self.put(cube, side, 0)
+            level = 1
+            if "cuboid 1" in self.named:
+                self.put(self.named["cuboid 1"], 0.0, level)
+                level += 1
+            if len(self.cubes) == 4:
+                for side, cube in zip((-APART, APART), self.cubes[2:], strict=True):
+                    self.put(cube, side, level)
+                level += 1
+            self.put(self.named["roof 1"], 0.0, level)
+        self.world.settle()
+
+    def put(self, body, along, level, across=0.0, turn=None):
+        position = (X + across, Y + along, (level + 0.5) * B)
+        if turn is None:
+            body.place(position)
+        else:
+            body.move_to(position, turn)
+
+    @property
+    def top(self):
+        return max(self.task.objects, key=lambda body: body.position[2])
+
+    def is_goal(self):
+        self.world.step(2)
+        self.world.settle()
+        return self.task.is_goal()
+
+
+@pytest.fixture
+def house():
+    made = []
+
+    def make(name):
+        made.append(House(name))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.env.close()
+
+
+@pytest.mark.parametrize("name", HOUSES)
+def test_the_finished_structure_is_the_goal(house, name):
+    h = house(name)
+    assert h.is_goal()
+    assert h.task.is_valid()
+
+
+@pytest.mark.parametrize("name", HOUSES)
+def test_a_top_piece_beside_the_rest_does_not_count(house, name):
+    h = house(name)
+    low = h.top.shape.bounds_m[0][2]
+    h.top.place((X + 0.12, Y, -low))
+    assert not h.is_goal()
+    assert h.task.is_valid()
+
+
+@pytest.mark.parametrize("name", ["block_stacking", "house_building_1"])
+def test_a_block_that_only_leans_against_the_stack_does_not_count(house, name):
+    h = house(name)
+    lowest, second, *others = h.cubes
+    h.put(second, 0.0, 0, across=B)  # beside the lowest, touching it
+    for level, cube in enumerate(others, start=1):
+        h.put(cube, 0.0, level)
+    if name == "house_building_1":
+        h.put(h.named["triangle 1"], 0.0, len(others) + 1)
+    h.world.settle()
+    assert not h.is_goal()
+    assert lowest.position[2] == pytest.approx(B / 2, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("house_building_1", "triangle 1"), *((f"house_building_{i}", "roof 1") for i in (2, 3, 4))],
+)
+def test_a_tipped_roof_ends_the_episode_and_does_not_count(house, name, kind):
+    h = house(name)
+    turn = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
+    h.named[kind].move_to((X + 0.13, Y, 0.02), turn)
+    assert not h.is_goal()
+    assert not h.task.is_valid()
+
+
+@pytest.mark.parametrize("name", ["house_building_2", "house_building_3", "house_building_4"])
+def test_a_roof_that_misses_a_support_does_not_count(house, name):
+    """It lies on one of the two pieces that should carry it, or to one side of the middle."""
+    h = house(name)
+    roof = h.named["roof 1"]
+    x, y, z = roof.position
+    if name == "house_building_3":
+        roof.place((x, y + 1.2 * B, z))  # still on the cuboid, but off the middle
+    else:
+        other = h.cubes[-1]
+        side = math.copysign(1.0, other.position[1] - Y)
+        other.place((X, Y + side * 0.14, B / 2))
+        roof.place((x, y - side * APART, z))
+    assert not h.is_goal()
+    assert roof.tilt_rad < 0.1
+    assert roof.position[2] == pytest.approx(z, abs=2e-3)
+
+
+@pytest.mark.parametrize("name", ["house_building_3", "house_building_4"])
+def test_a_storey_may_not_be_missing(house, name):
+    h = house(name)
+    roof, cuboid = h.named["roof 1"], h.named["cuboid 1"]
+    for cube in h.cubes[2:]:
+        cube.place((X + 0.1 * (1 if cube is h.cubes[2] else -1), Y, B / 2))
+    cuboid.place((X + 0.15, Y, B / 2))
+    h.put(roof, 0.0, 1)
+    assert not h.is_goal()
+
+
+@pytest.mark.parametrize("name", [*HOUSES, *IMPROVISED])
+def test_what_is_still_in_the_gripper_does_not_count(name):
+    """The expert's last place is needed; before it, nothing counts."""
+    env = ba_torchrl.make(f"open_loop/{name}", seed=1, expert=True)
+    td, holding = env.reset(), False
+    while not td["done"]:
+        holding = bool(td["holding"])
+        assert not td["success"]
+        td = env.step(td.set("action", td["expert_action"]))["next"]
+    assert td["success"]
+    assert holding
+    assert not td["holding"]
+    env.close()
+
+
+# -- improvised --------------------------------------------------------------------------------
+
+
+def test_shapes_have_the_sizes_of_the_specification():
+    shapes = random_shapes()
+    assert len(shapes) == len(NUMBERS) * SIZES
+    assert {number for number, _ in shapes} == set(NUMBERS)
+    for _, shape in shapes:
+        low, high = np.array(shape.bounds_m)
+        assert 0.025 < high[2] - low[2] < 0.031
+        assert low[2] == pytest.approx(-high[2])
+        assert min(high[:2] - low[:2]) > 0.036
+        assert max(high[:2] - low[:2]) < 0.092
+        (yaw,) = shape_piece(shape).grasp_yaws_rad
+        across = shape.vertices[:, :2] @ (math.cos(yaw), math.sin(yaw))
+        assert np.ptp(across) < 0.085  # the open fingers take it
+    for cuboid in random_cuboids():
+        for edge, (least, most) in zip(cuboid.size_m, CUBOID_M, strict=True):
+            assert least <= edge <= most
+
+
+@pytest.mark.parametrize("name", IMPROVISED)
+def test_every_episode_draws_its_shapes(name):
+    env = ba_torchrl.make(f"open_loop/{name}", seed=0)
+    drawn = set()
+    for _ in range(12):
+        env.reset()
+        task = env.scene.task
+        visible = {body for body in env.scene.world.bodies if not body.is_hidden}
+        assert visible == set(task.objects)
+        assert len(task.objects) == task.num_objects
+        drawn.add(tuple(body.name for body in task.objects[1:3]))
+    assert len(drawn) > 8
+    env.close()
+
+
+def test_a_restored_state_brings_its_shapes_back():
+    env = ba_torchrl.make("open_loop/improvise_house_building_3", seed=0, expert=True)
+    env.reset()
+    scene = env.scene
+    first, state = list(scene.task.objects), scene.get_state()
+    poses = [body.pose for body in first]
+    scene.task.randomise(np.random.default_rng(5))
+    assert list(scene.task.objects) != first
+    scene.set_state(state)
+    assert list(scene.task.objects) == first
+    assert [body.pose for body in first] == poses
+    assert all(not body.is_hidden for body in first)
+    assert set(scene.task.planner.pieces) == set(first)
+    env.close()
+
+
+def test_an_improvised_roof_on_one_shape_does_not_count():
+    env = ba_torchrl.make("open_loop/improvise_house_building_2", seed=0)
+    env.reset()
+    task, world = env.scene.task, env.scene.world
+    roof, first, second = task.objects
+    first.place((X, Y - 0.1, first.shape.height_m / 2))
+    second.place((X, Y + 0.1, second.shape.height_m / 2))
+    roof.place((X, Y - 0.1, first.shape.height_m + B / 2))
+    world.step(2)
+    world.settle()
+    assert roof.touches(first)
+    assert not task.is_goal()
+    env.close()
+
+
+# -- experts -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*HOUSES, *IMPROVISED])
+def test_a_gripper_that_does_not_turn_builds_it_too(name):
+    env = ba_torchrl.make(
+        f"open_loop/{name}",
+        seed=4,
+        expert=True,
+        action_sequence="pxy",
+        random_orientation=False,
+    )
+    built = 0
+    for _ in range(3):
+        td = env.reset()
+        while not td["done"]:
+            td = env.step(td.set("action", td["expert_action"]))["next"]
+        built += bool(td["success"])
+    assert built == 3
+    env.close()
+
+
+def test_the_site_is_away_from_what_is_still_to_be_fetched():
+    """A roof lies right beside one pair of blocks; the house is begun at another."""
+    env = ba_torchrl.make("open_loop/house_building_4", seed=0, expert=True)
+    env.reset()
+    task, world = env.scene.task, env.scene.world
+    named = {body.name: body for body in task.objects}
+    spots = [(0.40, -0.12), (0.40, -0.04), (0.36, 0.15), (0.55, 0.15)]
+    for number, (x, y) in enumerate(spots, start=1):
+        named[f"cube {number}"].place((x, y, B / 2))
+    named["roof 1"].place((0.47, -0.08, B / 2))
+    named["cuboid 1"].place((0.56, -0.08, B / 2))
+    world.step(2)
+    pick = task.expert_command()
+    area = task._placement_area()
+    move = task.planner.next_move(area, None, task._effort, task._crowding)
+    assert math.dist(move.position[:2], (0.47, -0.08)) > 0.1
+    assert (pick.x_m, pick.y_m) == pytest.approx(move.body.position[:2])
+    env.close()
