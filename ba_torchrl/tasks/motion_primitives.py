@@ -201,7 +201,7 @@ def carry_to(
         body: what is held.
         position: where the body's origin is to be.
         limits: of an action.
-        yaw_rad: final yaw of the gripper, from `nearest_equivalent_yaw`; None keeps the present one.
+        yaw_rad: final yaw of the gripper; None keeps the present one.
         obstacles: bodies to pass over, with what the body is to rest on.
         ceiling_m: the tool never goes higher.
         hover_m: gap that the body keeps to what it passes over, and to its place before it comes
