@@ -12,7 +12,8 @@ from torchrl.data import Binary, Bounded, Unbounded
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import CONTROLS, SETTLE_STEPS, ManipulationEnv
+from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.episodes import SETTLE_STEPS
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits, tool_rotation
