@@ -13,8 +13,7 @@ from ba_torchrl.data.episodes import collect_episodes
 from ba_torchrl.data.time_reversal import is_reversible, replay_scores, reverse_episode
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.control.pick_place import tool_rotation
-from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.tasks.structures.deconstruction import Watch, tool_angles
 
 TASK = "open_loop/house_building_2"

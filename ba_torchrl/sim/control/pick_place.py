@@ -17,7 +17,14 @@ import pybullet
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.control.close_loop import ramp_fingers, smooth_step
-from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector
+from ba_torchrl.sim.geometry import (
+    Matrix,
+    Pose,
+    Vector,
+    bullet_compose,
+    bullet_inverse,
+    quaternion_matrix,
+)
 from ba_torchrl.sim.robots.base import Robot
 
 
@@ -69,20 +76,7 @@ class HeldState(NamedTuple):
 
     held: int | None
     """Its place among the world's bodies."""
-    grasp: tuple[Vector, Quaternion] | None
-
-
-def tool_rotation(rz_rad: float, ry_rad: float = 0.0, rx_rad: float = 0.0) -> Matrix:
-    """Return Rz Ry Rx of a tool that points down at zero angles."""
-    cz, sz = math.cos(rz_rad), math.sin(rz_rad)
-    cy, sy = math.cos(ry_rad), math.sin(ry_rad)
-    cx, sx = math.cos(rx_rad), math.sin(rx_rad)
-    # the columns of Rz Ry Rx, the last two negated: the tool's y and z axes at zero angles
-    return (
-        (cz * cy, -(cz * sy * sx - sz * cx), -(cz * sy * cx + sz * sx)),
-        (sz * cy, -(sz * sy * sx + cz * cx), -(sz * sy * cx - cz * sx)),
-        (-sy, -cy * sx, -cy * cx),
-    )
+    grasp: Pose | None
 
 
 class PickPlace:
@@ -114,7 +108,7 @@ class PickPlace:
         self.limits = limits or PickPlaceLimits()
         self.held: Body | None = None
         """What is in the gripper; it is hidden from cameras, as is the arm."""
-        self.grasp: tuple[Vector, Quaternion] | None = None
+        self.grasp: Pose | None = None
         """Its pose in the frame of the tool."""
 
     def reset(self) -> None:
@@ -195,17 +189,15 @@ class PickPlace:
 
     def _remember_grasp(self) -> None:
         """Measure where in the gripper the body is now."""
-        to_tool = pybullet.invertTransform(*self.robot.tool_transform())
-        self.grasp = pybullet.multiplyTransforms(*to_tool, *self.held.pose)
+        to_tool = bullet_inverse(self.robot.tool_transform())
+        self.grasp = bullet_compose(to_tool, self.held.pose)
 
     def _carry(self, joints: Sequence[float]) -> None:
         """Teleport the arm, and rigidly with it what is held."""
         self.robot.teleport(joints)
         if self.held is not None:
             self.world.detect_collisions()  # contacts end: Bullet would not turn their normals
-            self.held.move_to(
-                *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self.grasp)
-            )
+            self.held.move_to(*bullet_compose(self.robot.tool_transform(), self.grasp))
 
     def check_grasp(self) -> None:
         """Take note if what was held slipped out.
@@ -235,8 +227,7 @@ class PickPlace:
         return x, y, max(z, self.robot.gripper.lowest_tool_m(rotation, self.opening))
 
     def _tool_rotation(self) -> Matrix:
-        turn = pybullet.getMatrixFromQuaternion(self.robot.tool_transform()[1])
-        return tuple(zip(*[iter(turn)] * 3, strict=True))
+        return quaternion_matrix(self.robot.tool_transform().orientation)
 
     def _joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
@@ -11,7 +10,18 @@ import pybullet
 
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.bodies import CONTACT_M, Body
-from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector, YawPose, quaternion_yaw
+from ba_torchrl.sim.geometry import (
+    IDENTITY,
+    Matrix,
+    Pose,
+    Quaternion,
+    Vector,
+    YawPose,
+    bullet_compose,
+    dot,
+    perpendicular,
+    quaternion_matrix,
+)
 from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
 from ba_torchrl.sim.world import World
 
@@ -56,7 +66,7 @@ class Robot(ABC):
     """The link that the tool point is fixed to."""
     tool_offset_m: ClassVar[Vector]
     """Tool point between the fingertips, in the frame of the hand link."""
-    tool_orientation: ClassVar[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+    tool_orientation: ClassVar[Quaternion] = IDENTITY
     """Orientation of the tool in the frame of the hand link (x, y, z, w): the fingers open along
     its x axis, its z axis is the direction of approach."""
     home_joints: ClassVar[tuple[float, ...]]
@@ -168,20 +178,19 @@ class Robot(ABC):
         states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
         return [state[0] for state in states]
 
-    def tool_transform(self) -> tuple[Vector, Quaternion]:
-        """Return position (metres) and orientation (x, y, z, w) of the tool point."""
+    def tool_transform(self) -> Pose:
+        """Return the pose of the tool."""
         state = pybullet.getLinkState(
             self.id, self.hand_link, computeForwardKinematics=1, physicsClientId=self.client
         )
-        return pybullet.multiplyTransforms(
-            state[4], state[5], self.tool_offset_m, self.tool_orientation
-        )
+        hand = Pose(state[4], state[5])
+        return bullet_compose(hand, Pose(self.tool_offset_m, self.tool_orientation))
 
     def tool_pose(self) -> YawPose:
         """Return the tool point and the gripper's yaw in [-pi, pi)."""
-        position, orientation = self.tool_transform()
+        tool = self.tool_transform()
         # the fingers open along the tool's x axis
-        return position, quaternion_yaw(orientation)
+        return tool.position, tool.yaw_rad
 
     # -- gripper -----------------------------------------------------------------------------
 
@@ -281,9 +290,7 @@ class Robot(ABC):
 
     def _is_squeezed(self, body: Body, touching: tuple[set[tuple[int, int]], ...]) -> bool:
         """Whether a link of each finger pushes the body towards the other finger."""
-        _, (x, y, z, w) = self.tool_transform()
-        axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-        approach = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+        axis, _, approach = zip(*quaternion_matrix(self.tool_transform().orientation), strict=True)
         left, right = (
             [
                 point[7]
@@ -293,12 +300,12 @@ class Robot(ABC):
                 for point in pybullet.getClosestPoints(
                     self.id, body.id, QUERY_M, linkIndexA=link, physicsClientId=self.client
                 )
-                if sign * _dot(point[7], axis) > CLOSING_COSINE
+                if sign * dot(point[7], axis) > CLOSING_COSINE
             ]
             for sign, links in zip(self.closing_sign, touching, strict=True)
         )
         return any(
-            _dot(_across(a, approach), _across(b, approach)) < -OPPOSED_COSINE
+            dot(perpendicular(a, approach), perpendicular(b, approach)) < -OPPOSED_COSINE
             for a in left
             for b in right
         )
@@ -308,15 +315,3 @@ class Robot(ABC):
         self.world.detect_collisions()
         points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
         return any(point[8] < margin_m for point in points)
-
-
-def _across(vector: Vector, axis: Vector) -> Vector:
-    """Return the direction of ``vector`` as seen along the unit vector ``axis``."""
-    along = _dot(vector, axis)
-    rest = tuple(v - along * a for v, a in zip(vector, axis, strict=True))
-    norm = math.sqrt(_dot(rest, rest))
-    return tuple(r / norm for r in rest)
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

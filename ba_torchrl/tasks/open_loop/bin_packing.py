@@ -205,7 +205,7 @@ class BinPacking(PackingTask):
         ends = [(side * x, 0.0, thin, y) for side in (-1, 1)]
         sides = [(0.0, side * y, x, thin) for side in (-1, 1)]
         return [
-            Rectangle(*inside.at(along, across), inside.yaw_rad, *half)
+            Rectangle(*inside.frame.to_world(along, across), inside.yaw_rad, *half)
             for along, across, *half in ends + sides
         ]
 
@@ -228,7 +228,7 @@ class BinPacking(PackingTask):
         if best is None:  # too large for the bin as it is held
             best = (0.0, (0.0, 0.0), 0.0, 0.0)
         _, spot, top, turn = best
-        x, y = self._inside().at(*spot)
+        x, y = self._inside().frame.to_world(*spot)
         depth = self.depth_m(held)
         z = max(self._release_m() + self.floor_m, top + depth + RELEASE_GAP_M)
         # the middle of the outline goes there, which need not be the body's origin

@@ -11,7 +11,7 @@ import numpy as np
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, vertical_extent
-from ba_torchrl.sim.geometry import YawPose
+from ba_torchrl.sim.geometry import PlanarFrame, YawPose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
@@ -148,8 +148,11 @@ class CovidTest(OpenLoopTask):
         center = self.random_point(rng, 2 * half)
         for area, place, body in self._slabs:
             x, y = area.center
-            middle = _turned((mirror * x, y), center, yaw)
-            body.place((*_turned(place, middle, yaw), -SUNK_M - body.shape.bounds_m[0][2]), yaw)
+            middle = PlanarFrame(*center, yaw).to_world(mirror * x, y)
+            body.place(
+                (*PlanarFrame(*middle, yaw).to_world(*place), -SUNK_M - body.shape.bounds_m[0][2]),
+                yaw,
+            )
         rows = self._rows()
         for bodies, row in ((self.tubes, rows[0]), (self.swabs, rows[1])):
             for column, body in zip(self._columns(), bodies, strict=True):
@@ -261,8 +264,8 @@ class CovidTest(OpenLoopTask):
         """Whether a body, let go of, has its centre above a rectangle about an area's centre."""
         if body is self.robot.held_body():
             return False
-        (ax, ay, _), (bx, by, _), yaw = area.position, body.position, area.yaw_rad
-        local = _turned((bx - ax, by - ay), (0.0, 0.0), -yaw)
+        frame = PlanarFrame(*area.position[:2], area.yaw_rad)
+        local = frame.to_local(*body.position[:2])
         return all(abs(place) < extent / 2 for place, extent in zip(local, size_m, strict=False))
 
     # -- the expert --------------------------------------------------------------------------
@@ -332,7 +335,7 @@ class CovidTest(OpenLoopTask):
         if self.action_limits.turn_rad:
             turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
         ox, oy = (b - t for b, t in zip(held.position[:2], tool[:2], strict=True))
-        dx, dy = _turned((ox, oy), (0.0, 0.0), turn)
+        dx, dy = PlanarFrame(0.0, 0.0, turn).to_world(ox, oy)
         z = SHEET_M + RELEASE_GAP_M + tool[2] - vertical_extent(held)[0]
         z = max(z, rim_m + GRASP_M + RELEASE_GAP_M)
         return PickPlaceCommand(PLACE, x - dx, y - dy, z, tool_yaw + turn)
@@ -363,20 +366,11 @@ class CovidTest(OpenLoopTask):
         return [(i - (self.rounds - 1) / 2) * COLUMN_M for i in range(self.rounds)]
 
     def _to_world(self, area: Body, spot: tuple[float, float]) -> tuple[float, float]:
-        return _turned(spot, area.position[:2], area.yaw_rad)
+        return PlanarFrame(*area.position[:2], area.yaw_rad).to_world(*spot)
 
     def _lay(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put a tube or swab on the floor of an area."""
         body.place((*xy, SHEET_M - body.shape.bounds_m[0][2]), yaw_rad)
-
-
-def _turned(
-    point: tuple[float, float], center: tuple[float, float], yaw_rad: float
-) -> tuple[float, float]:
-    """Return where a point of a frame lies whose origin and heading are given."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    x, y = point
-    return center[0] + cos * x - sin * y, center[1] + sin * x + cos * y
 
 
 def _slab(area: Area, size_m: tuple[float, float], top_m: float) -> Box:

@@ -169,7 +169,7 @@ class PackingTask(OpenLoopTask):
             for offset in self.grasp_offsets_m:
                 if abs(offset * self.unit) > max(side.half_y - 0.012, 0.0):
                     continue
-                xy = side.at(0.0, offset * self.unit)
+                xy = side.frame.to_world(0.0, offset * self.unit)
                 room = finger_gap_m(xy, side.yaw_rad, half_open, others)
                 hand = Rectangle(*xy, side.yaw_rad, *half_hand)
                 room = min([room, *(gap_m(hand, other) for other in tall)])
@@ -204,7 +204,7 @@ class PackingTask(OpenLoopTask):
         """Return how far from the tool point the fingers' inner sides are as they let go."""
         tool, yaw = self.robot.tool_pose()
         around = outline(held, yaw)
-        return abs(around.local(*tool[:2])[0]) + around.half_x + RELEASE_M
+        return abs(around.frame.to_local(*tool[:2])[0]) + around.half_x + RELEASE_M
 
     @property
     def floor_m(self) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, Shape, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import PlanarFrame, Vector
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.motion_primitives import finger_room
@@ -226,9 +226,8 @@ class StructureTask(OpenLoopTask):
         for other in others:
             corners = world_vertices(other)
             if corners[:, 2].max() > z + HAND_OVER_TOOL_M:
-                cos, sin = math.cos(yaw), math.sin(yaw)
-                along_across = (corners[:, :2] - (x, y)) @ ((cos, -sin), (sin, cos))
-                low, high = along_across.min(axis=0), along_across.max(axis=0)
+                local = np.stack(PlanarFrame(x, y, yaw).to_local(corners[:, 0], corners[:, 1]), 1)
+                low, high = local.min(axis=0), local.max(axis=0)
                 gaps = np.maximum(low, -high) - self.robot.hand_half_m
                 room = min(room, float(gaps.max()))
         return room
@@ -279,8 +278,7 @@ class StructureTask(OpenLoopTask):
         effort_m = BLOCKED_M - CROWDED * lack_m
         if candidate.shift_m and lack_m == 0:
             x, y, _ = body.position
-            cos, sin = math.cos(candidate.yaw_rad), math.sin(candidate.yaw_rad)
-            end = (x + DRIVEN_M * cos, y + DRIVEN_M * sin)
+            end = PlanarFrame(x, y, candidate.yaw_rad).to_world(DRIVEN_M, 0.0)
             spans = self.settings.workspace.x, self.settings.workspace.y
             effort_m += max(
                 max(low - e, e - high, 0.0) for e, (low, high) in zip(end, spans, strict=True)
@@ -315,7 +313,4 @@ class StructureTask(OpenLoopTask):
 
 def _tool_point(at: Vector, candidate: GraspCandidate) -> tuple[float, float]:
     """Return where the tool is to grasp what is at a place."""
-    return (
-        at[0] + candidate.shift_m * math.cos(candidate.yaw_rad),
-        at[1] + candidate.shift_m * math.sin(candidate.yaw_rad),
-    )
+    return PlanarFrame(*at[:2], candidate.yaw_rad).to_world(candidate.shift_m, 0.0)
