@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import pybullet
 
-from ba_torchrl.sim.bodies import CONTACT_M, Body, Shape, Solid
+from ba_torchrl.sim.bodies import Body, Shape, Solid
+from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import IDENTITY, ORIGIN, Pose, Quaternion, Vector, yaw_quaternion
 
 
@@ -107,8 +108,8 @@ class Part(Body):
 
     def touches(self, other: Body) -> bool:
         """Whether the part, and not its sibling, is in contact with a body as of the last step."""
-        points = pybullet.getContactPoints(self.id, other.id, physicsClientId=self.client)
-        return any(point[3] in self.links and point[8] < CONTACT_M for point in points)
+        points = contacts(self.client, self.id, other.id)
+        return is_any_within(point for point in points if point.link in self.links)
 
     def forget_pairs(self) -> None:
         """Let the engine look afresh at what is near the part."""

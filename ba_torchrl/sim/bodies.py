@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 import pybullet
 
+from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import (
     Pose,
     Quaternion,
@@ -24,9 +25,6 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, write_obj
 
 Color = tuple[float, float, float, float]
-
-CONTACT_M = 5e-4
-"""Bodies closer than this touch; PyBullet already lists pairs that are millimetres apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,8 +265,7 @@ class Body:
 
     def touches(self, other: Body) -> bool:
         """Whether the two bodies are in contact, as of the last step."""
-        points = pybullet.getContactPoints(self.id, other.id, physicsClientId=self.client)
-        return any(point[8] < CONTACT_M for point in points)
+        return is_any_within(contacts(self.client, self.id, other.id))
 
     def bounding_box(self) -> tuple[Vector, Vector]:
         """Return the lower and upper corner of the axis-aligned bounding box."""
@@ -290,26 +287,3 @@ def radius_m(body: Body) -> float:
     """Return the distance of the farthest point of an upright body from its axis."""
     low, high = body.shape.bounds_m
     return math.hypot(*(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True)))
-
-
-def gap_m(other_id: int, body: Body, up_to_m: float = 0.1) -> float:
-    """Return the distance between a body and anything else of its client, as of now.
-
-    Args:
-        other_id: PyBullet's id of a body or robot.
-        body: the body.
-        up_to_m: farther is reported as infinite; negative distances are depths of penetration.
-    """
-    points = pybullet.getClosestPoints(other_id, body.id, up_to_m, physicsClientId=body.client)
-    return min((point[8] for point in points), default=math.inf)
-
-
-def press_n(other_id: int, body: Body) -> float:
-    """Return the force with which something bears on a body from above or below.
-
-    Args:
-        other_id: PyBullet's id of a body or robot.
-        body: the body; the force is that of the last step, in newtons.
-    """
-    points = pybullet.getContactPoints(other_id, body.id, physicsClientId=body.client)
-    return sum(point[9] for point in points if abs(point[7][2]) > 0.6)

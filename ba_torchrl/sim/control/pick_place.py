@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import pybullet
-
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import Contact, bearing_force_n, is_any_within, outer_contacts
 from ba_torchrl.sim.control.close_loop import ramp_fingers, smooth_step
 from ba_torchrl.sim.geometry import (
     Matrix,
@@ -318,7 +317,7 @@ class PickPlace:
             before = self.robot.joints
             self.robot.command(joints)
             self.world.step()
-            if goes_down and self._press_n() > limits.max_press_n:
+            if goes_down and bearing_force_n(self._outer_contacts()) > limits.max_press_n:
                 self.robot.command(before)
                 self.world.step()
                 return
@@ -342,22 +341,14 @@ class PickPlace:
 
     # -- contacts ----------------------------------------------------------------------------
 
-    def _outer_contacts(self) -> list[tuple]:
-        """Return PyBullet's contact points of the hand, and what it holds, with all else."""
-        client, robot = self.world.client, self.robot.id
-        points = pybullet.getContactPoints(robot, physicsClientId=client)
-        if self.held is None:
-            return points
-        points += pybullet.getContactPoints(self.held.id, physicsClientId=client)
-        inner = {robot, self.held.id}
-        return [point for point in points if {point[1], point[2]} != inner]
+    def _outer_contacts(self) -> list[Contact]:
+        """Return the contacts of the hand and the held body with everything else."""
+        held = () if self.held is None else (self.held.id,)
+        return outer_contacts(self.world.client, self.robot.id, *held)
 
     def _touches_anything(self) -> bool:
         self.world.detect_collisions()
-        return any(point[8] < self.limits.margin_m for point in self._outer_contacts())
-
-    def _press_n(self) -> float:
-        return sum(point[9] for point in self._outer_contacts() if abs(point[7][2]) > 0.6)
+        return is_any_within(self._outer_contacts(), self.limits.margin_m)
 
     # -- fingers -----------------------------------------------------------------------------
 

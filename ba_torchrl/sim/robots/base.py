@@ -9,7 +9,8 @@ from typing import ClassVar
 import pybullet
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import CONTACT_M, Body
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import CONTACT_M, contacts, is_any_within, nearest_points
 from ba_torchrl.sim.geometry import (
     IDENTITY,
     Matrix,
@@ -239,8 +240,9 @@ class Robot(ABC):
         turned by half a turn, those of a flat face point the wrong way, and instead of pushing
         the opening fingers off they would pull the body along.
         """
-        points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
-        touched = {point[2] for point in points if point[3] in self._side}
+        touched = {
+            point.other_id for point in contacts(self.client, self.id) if point.link in self._side
+        }
         bodies = [body.id for body in self.world.bodies if body.id in touched and body.is_free]
         kept = []
         for i, body in enumerate(bodies):
@@ -278,10 +280,10 @@ class Robot(ABC):
         against both fingers is not held.
         """
         touching: tuple[set[tuple[int, int]], ...] = (set(), set())
-        for point in pybullet.getContactPoints(self.id, physicsClientId=self.client):
-            side = self._side.get(point[3])
-            if side is not None and point[8] < CONTACT_M:
-                touching[side].add((point[2], point[3]))
+        for point in contacts(self.client, self.id):
+            side = self._side.get(point.link)
+            if side is not None and point.distance_m < CONTACT_M:
+                touching[side].add((point.other_id, point.link))
         both = {body for body, _ in touching[0]} & {body for body, _ in touching[1]}
         for body in self.world.bodies:
             if body.id in both and body.is_free and self._is_squeezed(body, touching):
@@ -293,14 +295,12 @@ class Robot(ABC):
         axis, _, approach = zip(*quaternion_matrix(self.tool_transform().orientation), strict=True)
         left, right = (
             [
-                point[7]
+                point.normal
                 for body_id, link in links
                 if body_id == body.id
                 # a fresh query: normals of lasting contacts do not turn with the bodies
-                for point in pybullet.getClosestPoints(
-                    self.id, body.id, QUERY_M, linkIndexA=link, physicsClientId=self.client
-                )
-                if sign * dot(point[7], axis) > CLOSING_COSINE
+                for point in nearest_points(self.client, self.id, body.id, QUERY_M, link)
+                if sign * dot(point.normal, axis) > CLOSING_COSINE
             ]
             for sign, links in zip(self.closing_sign, touching, strict=True)
         )
@@ -313,5 +313,4 @@ class Robot(ABC):
     def is_near_anything(self, margin_m: float = 1e-3) -> bool:
         """Whether the hand is closer than ``margin_m`` to a body or the floor, as of now."""
         self.world.detect_collisions()
-        points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
-        return any(point[8] < margin_m for point in points)
+        return is_any_within(contacts(self.client, self.id), margin_m)

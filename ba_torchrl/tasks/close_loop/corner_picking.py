@@ -9,7 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Box, Color, Solid, gap_m, press_n, vertical_extent
+from ba_torchrl.sim.bodies import Body, Box, Color, Solid, vertical_extent
+from ba_torchrl.sim.contacts import bearing_force_n, contacts, gap_m
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, moved
 from ba_torchrl.sim.world import World
@@ -128,7 +129,8 @@ class CornerPicking(CloseLoopTask):
         if robot.held_body() is block and robot.opening() < 0.9:
             return lift(limits.step_m)
         yaw = robot.tool_pose()[1]
-        is_pressing = robot.opening() < 0.5 and press_n(robot.id, block) > FIRM_N
+        touching = contacts(self.world.client, robot.id, block.id)
+        is_pressing = robot.opening() < 0.5 and bearing_force_n(touching) > FIRM_N
         yaws = [
             nearest_equivalent_yaw(yaw, block.yaw_rad + k * math.pi / 2, limits, math.pi)
             for k in (0, 1)
@@ -182,7 +184,7 @@ class CornerPicking(CloseLoopTask):
         is_clear = min(tool_x - px, tool_y - py) > -WALL_GAP_M and abs(turn) < PRESS_TURN_RAD
         target = self.corner.to_world(px, py)
         if robot.opening() < 0.1 and aside < PRESS_ASIDE_M and is_clear:
-            gap = gap_m(robot.id, self.block)
+            gap = gap_m(self.world.client, robot.id, self.block.id)
             if gap <= 2 * NEAR_M:
                 return lift(-PRESS_M)
             if gap <= limits.step_m:

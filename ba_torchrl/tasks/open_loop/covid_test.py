@@ -10,7 +10,8 @@ import numpy as np
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, vertical_extent
+from ba_torchrl.sim.bodies import Body, Box, Color, vertical_extent
+from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.geometry import PlanarFrame, YawPose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
@@ -250,7 +251,7 @@ class CovidTest(OpenLoopTask):
             spot = tuple(float(rng.uniform(-half, half)) for half in self.spot_m)
             yaw = math.pi / 2 + self.random_yaw(rng, 2 * math.pi)
             self._lay(tube, self._to_world(self.test_area, spot), yaw)
-            if all(gap_m(other.id, tube) > APART_M for other in others):
+            if all(gap_m(self.world.client, other.id, tube.id) > APART_M for other in others):
                 break
         self.world.settle(max_steps=REST_STEPS)
 
