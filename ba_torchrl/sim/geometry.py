@@ -158,6 +158,11 @@ class Pose(NamedTuple):
         return quaternion_yaw(self.orientation)
 
 
+def downward_pose(position: Vector, yaw_rad: float) -> Pose:
+    """Return the pose of a tool that points straight down."""
+    return Pose(position, downward_quaternion(yaw_rad))
+
+
 def bullet_compose(outer: Pose, inner: Pose) -> Pose:
     """Return `outer.compose(inner)` as PyBullet computes it: in single precision."""
     return Pose(*pybullet.multiplyTransforms(*outer, *inner))

@@ -166,4 +166,4 @@ TRANSFORMS = r"getMatrixFrom|multiplyTransforms|invertTransform|getQuaternionFro
 def test_no_other_file_of_the_package_does_this_algebra():
     files = sorted(Path(ba_torchrl.__file__).parent.rglob("*.py"))
     found = {path.name for path in files if re.search(TRANSFORMS, path.read_text("utf-8"))}
-    assert found - {"deconstruction.py"} == {"geometry.py"}
+    assert found == {"geometry.py"}

@@ -22,6 +22,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)
@@ -174,7 +175,7 @@ class BottleArrangement(PackingTask):
             return self.place(held, (x, y, floor + RELEASE_GAP_M), turn)
         outside = [body for body in self.objects if not self.stands_in_tray(body)]
         if not outside:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in outside}
         place = self._free_place(None)
         if self._clearance(place, None) < CLEARANCE_M:

@@ -23,6 +23,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import CUBOID, UPRIGHT_RAD
 
 PALLET_M = (0.232, 0.192, 0.03)
@@ -158,7 +159,7 @@ class BoxPalletizing(PackingTask):
             return self._place_in_slot(held, filled)
         astray = [body for body in self.pool.present if body not in filled.values()]
         if not astray:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in astray}
 
         def urgency(body: Body) -> tuple[float, bool, float]:

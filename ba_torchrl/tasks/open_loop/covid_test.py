@@ -8,16 +8,17 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, Color, vertical_extent
 from ba_torchrl.sim.contacts import gap_m
-from ba_torchrl.sim.geometry import PlanarFrame, YawPose
+from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
 from ba_torchrl.tasks.motion_primitives import RELEASE_GAP_M, finger_room
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 
 PURPLE: Color = (0.6, 0.45, 0.78, 1.0)
 GRAY: Color = (0.6, 0.6, 0.6, 1.0)
@@ -277,13 +278,12 @@ class CovidTest(OpenLoopTask):
         if held is not None:
             return self._place(held)
         wanted = self._wanted()
-        if not wanted:  # all is done: a pick from the bare corner changes nothing
-            workspace = self.settings.workspace
-            return PickPlaceCommand(PICK, workspace.x[0], workspace.y[0], 0.1)
+        if not wanted:
+            return no_op(self.settings.workspace, is_holding=False)
         body = max(wanted, key=self._room)
         x, y, _ = body.position
         z = vertical_extent(body)[0] + GRASP_M
-        return PickPlaceCommand(PICK, x, y, z, self._grasp_yaw(body))
+        return pick_command(downward_pose((x, y, z), self._grasp_yaw(body)))
 
     def _wanted(self) -> list[Body]:
         """Return the bodies any of which is to be picked next."""
@@ -326,20 +326,18 @@ class CovidTest(OpenLoopTask):
             along_rad: how it is to lie in that frame; a gripper that cannot turn leaves it.
             rim_m: height that the fingertips stay above.
         """
-        tool, tool_yaw = self.robot.tool_pose()
+        tool = self.robot.tool_transform()
         others = [other.position for other in self.objects if other is not held]
         x, y = max(
             (self._to_world(area, spot) for spot in spots),
             key=lambda spot: min(math.dist(spot, other[:2]) for other in others),
         )
-        turn = -tool_yaw
+        turn = -tool.yaw_rad
         if self.action_limits.turn_rad:
             turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
-        ox, oy = (b - t for b, t in zip(held.position[:2], tool[:2], strict=True))
-        dx, dy = PlanarFrame(0.0, 0.0, turn).to_world(ox, oy)
-        z = SHEET_M + RELEASE_GAP_M + tool[2] - vertical_extent(held)[0]
-        z = max(z, rim_m + GRASP_M + RELEASE_GAP_M)
-        return PickPlaceCommand(PLACE, x - dx, y - dy, z, tool_yaw + turn)
+        z = SHEET_M + RELEASE_GAP_M + held.position[2] - vertical_extent(held)[0]
+        command = place_command(tool, held.pose, held.pose.moved_to((x, y, z), turn))
+        return command._replace(z_m=max(command.z_m, rim_m + GRASP_M + RELEASE_GAP_M))
 
     def _grasp_yaw(self, body: Body) -> float:
         return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0

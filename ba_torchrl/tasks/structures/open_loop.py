@@ -9,13 +9,14 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, Shape, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import PlanarFrame, Vector
+from ba_torchrl.sim.geometry import PlanarFrame, Vector, downward_pose
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.motion_primitives import finger_room
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps, finger_way_room
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
 from ba_torchrl.tasks.structures.free_space import PlacementArea
@@ -115,16 +116,15 @@ class StructureTask(OpenLoopTask):
         move = self.planner.next_move(
             self._placement_area(), held, self._effort, self._crowding, blocks_grasp
         )
-        if move is None:  # it stands: a pick from the bare corner changes nothing
-            x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
-            return PickPlaceCommand(PLACE if held is not None else PICK, x, y, 0.1)
+        if move is None:
+            return no_op(self.settings.workspace, held is not None)
         if move.body is held:
             return self._place(move)
         candidate = self._best_grasp(move.body)
         yaw, z = candidate.yaw_rad, move.body.position[2]
         x, y = _tool_point(move.body.position, candidate)
         lowest = self.settings.workspace.z[0] + self.lowest_pick_m
-        return PickPlaceCommand(PICK, x, y, max(z, lowest), yaw)
+        return pick_command(downward_pose((x, y, max(z, lowest)), yaw))
 
     def pick_height_m(self, top_m: float) -> float:
         """Return the height of the tool for a pick.
@@ -287,23 +287,18 @@ class StructureTask(OpenLoopTask):
 
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
-        tool, tool_yaw = self.robot.tool_pose()
-        yaw = tool_yaw
+        tool, held = self.robot.tool_transform(), move.body.pose
+        yaw = tool.yaw_rad
         if not self.action_limits.turn_rad:
             yaw = 0.0
         elif move.yaw_rad is None:
             turns = [math.pi * i / FREE_YAWS for i in range(FREE_YAWS)]
             yaw = self._roomiest(move, turns)
         else:
-            ahead = tool_yaw + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
+            ahead = tool.yaw_rad + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
             count = max(1, round(math.pi / move.yaw_period_rad))  # a half turn swaps the fingers
             yaw = self._roomiest(move, [ahead + move.yaw_period_rad * i for i in range(count)])
-        cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
-        ox, oy, oz = (b - t for b, t in zip(move.body.position, tool, strict=True))
-        x, y, z = move.position
-        return PickPlaceCommand(
-            PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
-        )
+        return place_command(tool, held, held.moved_to(move.position, yaw - tool.yaw_rad))
 
     def _roomiest(self, move: Move, yaws_rad: Sequence[float]) -> float:
         """Return the first of the yaws at which the fingers can part most freely."""
