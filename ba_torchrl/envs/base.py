@@ -18,19 +18,20 @@ from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.observations import ExtraObservations
 from ba_torchrl.envs.scene import (
-    Motion,
+    Controller,
     Scene,
     SceneState,
     build_scene,
     check_action_limits,
-    check_task_parameters,
 )
+from ba_torchrl.envs.settings import check_action_components, check_task_parameters
 from ba_torchrl.errors import ConfigError, InvalidActionError, PlacementError, SimulationError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.vision.rgb import LIGHT_FLOOR, render_rgb
 from ba_torchrl.sim.world import Physics
-from ba_torchrl.tasks.base import SCALE_STEP, TASKS, ActionLimits, Task, Workspace
+from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 logger = logging.getLogger(__name__)
 
@@ -83,15 +84,16 @@ class ManipulationEnv(EnvBase):
         num_objects = config.num_objects or self.task_class.num_objects
         self.max_steps = config.max_steps or self.task_class.step_limit(num_objects)
         self.action_sequence = (
-            self.default_action_sequence
-            if config.action_sequence is None
-            else config.action_sequence
+            config.action_sequence
+            or self.task_class.default_action_sequence
+            or self.default_action_sequence
         )
         """One letter per action component."""
         self.half_rotation = (
             self.default_half_rotation if config.half_rotation is None else config.half_rotation
         )
         self._configure()
+        check_action_components(task_id, self.actions.components)
         low, high = config.object_scale_range or self.task_class.scale_range
         self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._identity = object()
@@ -129,8 +131,8 @@ class ManipulationEnv(EnvBase):
         """Check the parameters that concern the control, and set up what it needs."""
 
     @abstractmethod
-    def _make_motion(self, robot: Robot, task: Task) -> Motion:
-        """Return what carries out actions."""
+    def _make_controller(self, robot: Robot, task: Task) -> Controller:
+        """Return the controller that executes actions."""
 
     @property
     @abstractmethod
@@ -358,7 +360,7 @@ class ManipulationEnv(EnvBase):
                 limits=self.action_limits,
                 scale=scale,
                 physics=self.physics,
-                make_motion=self._make_motion,
+                make_controller=self._make_controller,
             )
         return self._scenes[key]
 
@@ -375,7 +377,7 @@ class ManipulationEnv(EnvBase):
             scene.task.resume()
             self._place_robot(scene)
             scene.world.settle(max_steps=SETTLE_STEPS)
-            if scene.task.is_start():
+            if scene.task.is_valid_start():
                 return scene
         scene = self._scene_for(float(rng.choice(self._scales)))
         self._start(scene, rng)
@@ -391,9 +393,9 @@ class ManipulationEnv(EnvBase):
         for _ in range(RESET_ATTEMPTS):
             scene.world.restore_pristine()
             self._place_robot(scene)
-            scene.task.randomise(rng)
+            scene.task.initialize_episode(rng)
             scene.world.settle(max_steps=SETTLE_STEPS)
-            if scene.task.is_start():
+            if scene.task.is_valid_start():
                 return
             invalid += not scene.task.is_valid()
         raise PlacementError(
@@ -406,10 +408,10 @@ class ManipulationEnv(EnvBase):
         """Return whether the goal holds, once everything is at rest, and the scene is valid."""
         if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
             raise SimulationError("a body's position is not finite")
-        success = scene.task.is_goal()
+        success = scene.task.is_success()
         if success:
             scene.world.settle(max_steps=SETTLE_STEPS)
-            success = scene.task.is_goal()
+            success = scene.task.is_success()
         valid = scene.task.is_valid()
         return valid and success, valid
 

@@ -15,7 +15,8 @@ from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.views import VIEWS, ViewInput, ViewSetup
-from ba_torchrl.tasks.base import ActionLimits, Task
+from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.workspace import ActionLimits
 
 START_HEIGHT_M = 0.2
 HALF_TURN = (-math.pi / 2, math.pi / 2)
@@ -54,7 +55,7 @@ class CloseLoopEnv(ManipulationEnv):
         turn = self.config.drot if self.actions.has_yaw else 0.0
         return ActionLimits(self.config.dpos, turn, HALF_TURN if self.half_rotation else None)
 
-    def _make_motion(self, robot: Robot, task: Task) -> CloseLoopController:
+    def _make_controller(self, robot: Robot, task: Task) -> CloseLoopController:
         return CloseLoopController(robot, teleport=self.config.fast_mode)
 
     @property
@@ -73,7 +74,7 @@ class CloseLoopEnv(ManipulationEnv):
     def _place_robot(self, scene: Scene) -> None:
         x, y = self.workspace.center
         z = min(max(START_HEIGHT_M, self.workspace.z[0]), self.workspace.z[1])
-        scene.motion.reset(((x, y, z), 0.0))
+        scene.controller.reset(((x, y, z), 0.0))
 
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         command = self.actions.decode(action)
@@ -82,8 +83,8 @@ class CloseLoopEnv(ManipulationEnv):
         yaw += command.dyaw_rad
         if self.half_rotation:
             yaw = min(max(yaw, HALF_TURN[0]), HALF_TURN[1])
-        scene.motion.move_to(target, yaw)
-        scene.motion.grip(command.opening)
+        scene.controller.move_to(target, yaw)
+        scene.controller.grip(command.opening)
 
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         robot = scene.robot

@@ -16,7 +16,7 @@ from ba_torchrl.sim.vision.depth import point_cloud
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_rgbd
 from ba_torchrl.sim.vision.views import finger_posts
-from ba_torchrl.tasks.base import Workspace
+from ba_torchrl.tasks.workspace import Workspace
 
 
 class ExtraObservations:

@@ -20,8 +20,9 @@ from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics
-from ba_torchrl.tasks.base import ActionLimits, Task
+from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.structures.deconstruction import Watch, watch
+from ba_torchrl.tasks.workspace import ActionLimits
 
 
 @CONTROLS.register("open_loop")
@@ -70,12 +71,13 @@ class OpenLoopEnv(ManipulationEnv):
 
     # -- for the base class ------------------------------------------------------------------
 
-    def _make_motion(self, robot: Robot, task: Task) -> PickPlace:
+    def _make_controller(self, robot: Robot, task: Task) -> PickPlace:
         return PickPlace(
             robot,
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
+            surface_height_m=task.terrain.height_m,
         )
 
     @property
@@ -112,34 +114,34 @@ class OpenLoopEnv(ManipulationEnv):
         }
 
     def _place_robot(self, scene: Scene) -> None:
-        held = scene.motion.held
-        scene.motion.reset()
+        held = scene.controller.held
+        scene.controller.reset()
         if held is not None and held not in scene.task.objects:
             held.is_hidden = True  # the task has put it aside
         self._memory = {}
 
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         command = self.actions.decode(action)
-        motion = scene.motion
+        controller = scene.controller
         watched = self._watch(scene)
-        holding = motion.held is not None
+        holding = controller.held is not None
         primitive = command.primitive
         if primitive is None:
             primitive = PLACE if holding else PICK
         if primitive == PICK and not holding:
             before = self._heightmap(scene)
             position = self._position(scene, command, before, primitive)
-            body = motion.pick(position, tool_rotation(*command.angles_rad))
+            body = controller.pick(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
             if body is not None:
                 after = self._heightmap(scene)
                 self._memory = {"in_hand": self._draw_in_hand(before, after, position, command)}
         elif primitive == PLACE and holding:
             position = self._position(scene, command, self._heightmap(scene), primitive)
-            motion.place(position, tool_rotation(*command.angles_rad))
+            controller.place(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
-        motion.check_grasp()
-        if motion.held is None:
+        controller.check_grasp()
+        if controller.held is None:
             self._memory = {}
         if watched is not None:
             self._memory = self._remember_undo(scene, *watched)
@@ -165,7 +167,7 @@ class OpenLoopEnv(ManipulationEnv):
         return observation
 
     def _is_holding(self, scene: Scene) -> bool:
-        return scene.motion.held is not None
+        return scene.controller.held is not None
 
     def _expert_action(self, scene: Scene) -> np.ndarray:
         return self.actions.encode(scene.task.expert_command())
@@ -176,9 +178,9 @@ class OpenLoopEnv(ManipulationEnv):
         """Return how things lie before an action, if it will be asked what undoes it."""
         if not self.config.deconstruct:
             return None
-        return watch(scene.task.objects, scene.motion.held, scene.motion.grasp), self._heightmap(
-            scene
-        )
+        return watch(
+            scene.task.objects, scene.controller.held, scene.controller.grasp
+        ), self._heightmap(scene)
 
     def _remember_undo(self, scene: Scene, before: Watch, heights: np.ndarray) -> dict[str, Any]:
         """Return the memory with what undoes an action that has just settled.
@@ -189,8 +191,9 @@ class OpenLoopEnv(ManipulationEnv):
             heights: the heightmap before it.
         """
         memory = {name: value for name, value in self._memory.items() if name != "undo"}
-        lowest = scene.robot.gripper.lowest_tool_m()
-        command = before.undo(scene.motion.held, scene.motion.grasp, lowest)
+        command = before.undo(
+            scene.controller.held, scene.controller.grasp, scene.task.lowest_tool_m
+        )
         if command is None:
             return memory
         action = self.actions.encode(command)
@@ -216,19 +219,19 @@ class OpenLoopEnv(ManipulationEnv):
     def _position(
         self, scene: Scene, command: PickPlaceCommand, heights: np.ndarray, primitive: int
     ) -> tuple[float, float, float]:
-        """Return where the tool goes, the height taken from the image if it is left open."""
+        """Return where the tool goes; without a z component, the height follows from the image."""
         if command.z_m is not None:
             return command.x_m, command.y_m, command.z_m
-        task, floor = scene.task, self.workspace.z[0]
-        half = task.window_m(scene.motion.held) / self.pixel_m
+        task, xy = scene.task, (command.x_m, command.y_m)
+        half = task.window_m(scene.controller.held) / self.pixel_m
         rows, columns = (
             slice(max(math.ceil(c - half - 0.5), 0), max(math.floor(c + half + 0.5), 1))
             for c in self._pixel_of(command.x_m, command.y_m)
         )
         window = heights[rows, columns]
-        top = float(window.max()) - floor if window.size else 0.0
-        height = task.pick_height_m(top) if primitive == PICK else task.place_height_m(top)
-        return command.x_m, command.y_m, min(height + floor, self.workspace.z[1])
+        top = float(window.max()) if window.size else task.terrain.height_m(xy)
+        height = task.pick_height_m(top, xy) if primitive == PICK else task.place_height_m(top, xy)
+        return *xy, min(height, self.workspace.z[1])
 
     def _draw_in_hand(
         self,

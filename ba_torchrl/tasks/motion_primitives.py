@@ -14,9 +14,9 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.base import ActionLimits, Workspace
 from ba_torchrl.tasks.pick_place_commands import carrying_pose
 from ba_torchrl.tasks.structures.free_space import finger_path_clearance_m
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
 ALIGNED_M = 4e-3

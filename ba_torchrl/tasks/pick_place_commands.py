@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.geometry import Pose, tool_angles
-from ba_torchrl.tasks.base import Workspace
+from ba_torchrl.tasks.workspace import Workspace
 
 LEVEL_RAD = 0.02
 """A tool that leans less than this points straight down: the home pose leans by up to 1e-3."""

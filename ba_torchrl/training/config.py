@@ -14,7 +14,7 @@ from pydantic import Field
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.config import EnvConfig, StrictModel, parse
 from ba_torchrl.data.demos import Source, check_demonstrations, source_config
-from ba_torchrl.envs.scene import check_task_parameters
+from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import is_available
 from ba_torchrl.tasks.base import TASKS
@@ -102,7 +102,7 @@ class ExperimentConfig(StrictModel):
     @cached_property
     def env_config(self) -> EnvConfig:
         """The environments' parameters."""
-        return parse(EnvConfig, self.env, "env")
+        return parse_env_config(self.task, self.env, "env")
 
     @cached_property
     def network_config(self) -> NetworkConfig:
@@ -191,7 +191,9 @@ class ExperimentConfig(StrictModel):
     def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)
         if self.demonstrations:
-            check_task_parameters(self.task, parse(EnvConfig, {**self.env, **source}, "env"))
+            check_task_parameters(
+                self.task, parse_env_config(self.task, {**self.env, **source}, "env")
+            )
         if self.demonstrations_path is not None:
             check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
 

@@ -98,7 +98,7 @@ def test_demonstrations_of_other_environments_are_refused(expert_env, tmp_path):
 def test_faults_are_played_again(expert_env, monkeypatch):
     calls = 0
     scene = expert_env._envs[1].scene
-    original = scene.motion.move_to
+    original = scene.controller.move_to
 
     def fail_once(*args):
         nonlocal calls
@@ -107,7 +107,7 @@ def test_faults_are_played_again(expert_env, monkeypatch):
             raise RuntimeError("exploded")
         original(*args)
 
-    monkeypatch.setattr(scene.motion, "move_to", fail_once)
+    monkeypatch.setattr(scene.controller, "move_to", fail_once)
     episodes = collect_demonstrations(expert_env, 6)
     assert calls == 2
     assert len(episodes) == 6

@@ -223,7 +223,7 @@ def test_episodes_come_out_as_the_experts_do(mode):
         for body, start in zip(plain.scene.task.objects, env.scene.task.objects, strict=True):
             body.move_to(*start.pose)
         plain.scene.world.settle(max_steps=100)
-        plain.scene.motion.reset()
+        plain.scene.controller.reset()
         plain._memory = {}
         for step in built:
             played = plain.step(TensorDict({"action": step["action"]}))["next"]
@@ -247,8 +247,8 @@ def test_the_start_is_the_goal_and_the_end_is_apart():
     try:
         state = env.reset()
         task = env.scene.task
-        assert task.task.is_goal()
-        assert not task.is_goal()
+        assert task.task.is_success()
+        assert not task.is_success()
         assert not state["can_undo"]
         first = state["expert_action"]
         assert torch.equal(env.reset(seed=0)["expert_action"], first)
@@ -256,8 +256,8 @@ def test_the_start_is_the_goal_and_the_end_is_apart():
             state = env.step(state.set("action", state["expert_action"].clone()))["next"]
             assert state["can_undo"]
         assert state["terminated"]
-        assert task.is_goal()
-        assert not task.task.is_goal()
+        assert task.is_success()
+        assert not task.task.is_success()
         bodies = list(task.objects)
         for i, body in enumerate(bodies):
             for other in bodies[:i]:

@@ -126,7 +126,7 @@ def check_resets(task, robot, episodes):
     env = make(task, robot=robot)
     for _ in range(episodes):
         state = env.reset()
-        assert not env.scene.task.is_goal()
+        assert not env.scene.task.is_success()
         assert env.scene.task.is_valid()
         assert not state["done"]
         assert not state["success"]

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from ba_torchrl.actions import PICK, PLACE
 from ba_torchrl.sim.geometry import Pose, downward_pose
-from ba_torchrl.tasks.base import Workspace
 from ba_torchrl.tasks.pick_place_commands import (
     LEVEL_RAD,
     carrying_pose,
@@ -16,6 +15,7 @@ from ba_torchrl.tasks.pick_place_commands import (
     pick_command,
     place_command,
 )
+from ba_torchrl.tasks.workspace import Workspace
 
 FLIP = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 """Of a tool that points down."""

@@ -9,7 +9,7 @@ it does not. With ``teleport`` off every centimetre is simulated.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -87,6 +87,7 @@ class PickPlace:
         opening: how far the fingers open, 0 to 1.
         top_down: come from straight above even where the tool is tilted, instead of along its
             axis.
+        surface_height_m: from x and y to the height of the support surface there, metres.
         limits: distances and step counts.
     """
 
@@ -97,6 +98,7 @@ class PickPlace:
         teleport: bool = True,
         opening: float = 1.0,
         top_down: bool = False,
+        surface_height_m: Callable[[tuple[float, float]], float] = lambda xy: 0.0,
         limits: PickPlaceLimits | None = None,
     ) -> None:
         self.robot = robot
@@ -104,6 +106,7 @@ class PickPlace:
         self.teleport = teleport
         self.opening = opening
         self.top_down = top_down
+        self.surface_height_m = surface_height_m
         self.limits = limits or PickPlaceLimits()
         self.held: Body | None = None
         """What is in the gripper; it is hidden from cameras, as is the arm."""
@@ -119,7 +122,7 @@ class PickPlace:
     def pick(self, position: Vector, rotation: Matrix) -> Body | None:
         """Grasp what is at a pose, lift it and go home.
 
-        The tool stays so high that its fingers can close above the floor.
+        The tool stays so high that its fingers can close above the support surface.
 
         Args:
             position: of the tool point, metres.
@@ -130,7 +133,7 @@ class PickPlace:
         """
         robot, limits = self.robot, self.limits
         robot.set_opening(self.opening)
-        if self._approach(self._over_floor(position, rotation), rotation, 0.0):
+        if self._approach(self._above_surface(position, rotation), rotation, 0.0):
             self._close()
             reached = robot.tool_transform()[0]
             above = self._above(reached, rotation, limits.lift_m)
@@ -220,10 +223,11 @@ class PickPlace:
         up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
         return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
 
-    def _over_floor(self, position: Vector, rotation: Matrix) -> Vector:
-        """Return the point, or the first one above it, from which the fingers can close."""
+    def _above_surface(self, position: Vector, rotation: Matrix) -> Vector:
+        """Return the point, raised if necessary so that the fingers close above the surface."""
         x, y, z = position
-        return x, y, max(z, self.robot.gripper.lowest_tool_m(rotation, self.opening))
+        lowest = self.robot.gripper.lowest_tool_m(rotation, self.opening)
+        return x, y, max(z, self.surface_height_m((x, y)) + lowest)
 
     def _tool_rotation(self) -> Matrix:
         return quaternion_matrix(self.robot.tool_transform().orientation)

@@ -13,7 +13,6 @@ from ba_torchrl.sim.bodies import Body, Box, Color, Solid, vertical_extent
 from ba_torchrl.sim.contacts import bearing_force_n, contacts, gap_m
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, moved
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import BLOCK_M, TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
@@ -83,11 +82,11 @@ class CornerPicking(CloseLoopTask):
     wall_height_m: ClassVar[float] = 0.08
     lift_height_m: ClassVar[float] = 0.15
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the block, the base and the walls."""
-        self.block = world.add(self.cube(), "block")
+        self.block = self.world.add(self.cube(), "block")
         size = (self.base_m, self.base_m, self.base_height_m)
-        self.base = world.add(
+        self.base = self.world.add(
             Box(size_m=size, mass_kg=0, friction=self.base_friction, color=BASE), "base"
         )
         # centred on the edges of the base; the second wall ends at the first
@@ -97,14 +96,14 @@ class CornerPicking(CloseLoopTask):
             moved(box_mesh((wall, 2 * edge + wall / 2, height)), (-edge, -wall / 4, 0.0)),
             moved(box_mesh((2 * edge - wall / 2, wall, height)), (wall / 4, -edge, 0.0)),
         )
-        self.walls = world.add(Solid(parts=parts, mass_kg=0, color=WALL), "walls")
+        self.walls = self.world.add(Solid(parts=parts, mass_kg=0, color=WALL), "walls")
 
     @property
     def corner(self) -> PlanarFrame:
         """Frame of the corner; its walls are at negative x and y."""
         return PlanarFrame(*self.base.position[:2], self.base.yaw_rad)
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the corner anywhere, 10 cm from the border, with the block in it."""
         xy = self.random_point(rng, self.base_m)
         self.put_corner(xy, self.random_yaw(rng, 2 * math.pi))
@@ -114,14 +113,16 @@ class CornerPicking(CloseLoopTask):
         self.stand(self.base, xy, yaw_rad)
         self.stand(self.walls, xy, yaw_rad)
         flush = (self.wall_m - self.base_m) / 2 + self.block_m / 2 + SEAM_M
-        z = self.settings.surface_z_m + self.base_height_m + self.block_m / 2
-        self.block.place((*self.corner.to_world(flush, flush), z), yaw_rad)
+        xy = self.corner.to_world(flush, flush)
+        z = self.terrain.height_m(xy) + self.base_height_m + self.block_m / 2
+        self.block.place((*xy, z), yaw_rad)
 
-    def is_goal(self) -> bool:
-        """Whether the block is held and the tool higher than 15 cm."""
-        if self.robot.held_body() is not self.block:
-            return False
-        return self.robot.tool_pose()[0][2] > self.lift_height_m
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the block is held and the tool higher than 15 cm."""
+        return {
+            "is_grasped": self.robot.held_body() is self.block,
+            "is_lifted": self.robot.tool_pose()[0][2] > self.lift_height_m,
+        }
 
     def expert_command(self) -> GripperCommand:
         """Nudge the block out of the corner until fingers fit beside it, then grasp and lift it."""

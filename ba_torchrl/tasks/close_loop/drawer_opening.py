@@ -14,8 +14,7 @@ from ba_torchrl.sim.articulated import Rail
 from ba_torchrl.sim.bodies import Body, Color, Solid
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
-from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import LAYOUT_ATTEMPTS, TASKS
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
@@ -27,6 +26,7 @@ from ba_torchrl.tasks.motion_primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
+from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS
 
 CABINET_M: Vector = (0.22, 0.23, 0.11)
 """Depth along x, width, height; the open front looks towards +x."""
@@ -68,11 +68,11 @@ class DrawerOpening(CloseLoopTask):
     friction_n: ClassVar[float] = 3.0
     """Stops the drawer, 0.5 kg, faster than the fingers that pull it slow down."""
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the cabinet with its drawer."""
         scale = self.settings.scale
         low, high = self.travel_range_m
-        self.cabinet = world.add_articulated(
+        self.cabinet = self.world.add_articulated(
             Solid(parts=_scaled(cabinet_parts(), scale), mass_kg=0.0, color=WOOD),
             Solid(
                 parts=_scaled(drawer_parts(), scale),
@@ -83,7 +83,7 @@ class DrawerOpening(CloseLoopTask):
             "cabinet",
         )
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the cabinet beside the workspace, opening towards its centre.
 
         Layouts whose handle leaves the workspace on the way to the goal, where no gripper can
@@ -100,8 +100,8 @@ class DrawerOpening(CloseLoopTask):
             else:
                 yaw = float(rng.choice((math.pi / 2, 3 * math.pi / 2)))
             back, aside = scale * float(rng.uniform(0.15, 0.2)), float(rng.uniform(-0.1, 0.1))
-            place = PlanarFrame(x, y, yaw).to_world(-back, aside)
-            self.cabinet.place((*place, 0.0), yaw)
+            xy = PlanarFrame(x, y, yaw).to_world(-back, aside)
+            self.cabinet.place((*xy, self.terrain.height_m(xy)), yaw)
             if self._can_be_opened():
                 return
         raise PlacementError(
@@ -109,9 +109,9 @@ class DrawerOpening(CloseLoopTask):
             "`workspace` or lower `object_scale_range`"
         )
 
-    def is_goal(self) -> bool:
-        """Whether the drawer is open by more than 15 cm."""
-        return self.cabinet.travel_m > self._goal_m
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the drawer is open by more than 15 cm."""
+        return {"is_open": self.cabinet.travel_m > self._goal_m}
 
     def expert_command(self) -> GripperCommand:
         """Come down behind the handle with closed fingers and pull it along.

@@ -15,8 +15,8 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Vector, YawPose
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.tasks.base import ActionLimits, Workspace
 from ba_torchrl.tasks.motion_primitives import nearest_equivalent_yaw
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 SPARE_M = 0.007
 """Room between an open finger and what it closes on; less is a risk."""

@@ -10,7 +10,6 @@ from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
 from ba_torchrl.sim.meshes import lathe_parts
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.packing.base import OPEN_M, RELEASE_GAP_M, Grasp, PackingTask, open_box
@@ -85,7 +84,7 @@ class BottleArrangement(PackingTask):
     num_objects_range = (6, 6)
     finger_opening = 0.8
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the tray, and as many bottles of each kind as may be drawn."""
         tray = open_box(
             tuple(size * self.unit for size in TRAY_M),
@@ -93,7 +92,7 @@ class BottleArrangement(PackingTask):
             FLOOR_M * self.unit,
             (0.72, 0.56, 0.38, 1.0),
         )
-        self.container = world.add(tray, "tray")
+        self.container = self.world.add(tray, "tray")
         self._kinds = [
             Solid(
                 parts=tuple(
@@ -107,12 +106,12 @@ class BottleArrangement(PackingTask):
         ]
         copies = self.settings.num_objects
         self.pool = BodyPool(
-            world,
+            self.world,
             [shape for shape in self._kinds for _ in range(copies)],
             [f"{name} {i + 1}" for name in BOTTLES_CM for i in range(copies)],
         )
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the tray anywhere, and random bottles around it."""
         count = self.settings.num_objects
         length, width, _ = (size * self.unit for size in TRAY_M)
@@ -136,10 +135,12 @@ class BottleArrangement(PackingTask):
             self.pool.activate(bottle)
             self.stand(bottle, xy, yaw)
 
-    def is_goal(self) -> bool:
-        """Whether every bottle stands in the tray, let go of."""
-        held = self.robot.held_body()
-        return all(body is not held and self.stands_in_tray(body) for body in self.objects)
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether every bottle stands in the tray, released."""
+        return {
+            "is_released": self.robot.held_body() not in self.objects,
+            "is_arranged": all(map(self.stands_in_tray, self.objects)),
+        }
 
     def is_valid(self) -> bool:
         """Whether all is inside the workspace, and no bottle fell over."""
@@ -188,7 +189,7 @@ class BottleArrangement(PackingTask):
 
     def grasp(self, body: Body) -> Grasp:
         """Return where to grasp a bottle: by its neck, from the side with most room."""
-        height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
+        height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         others = self.obstacles(body, height - TIP_M)
         x, y, _ = body.position
         half = self.finger_opening * OPEN_M / 2

@@ -10,7 +10,6 @@ import numpy as np
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, vertical_extent
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.packing.base import ENOUGH_M, RELEASE_GAP_M, PackingTask
@@ -79,18 +78,18 @@ class BoxPalletizing(PackingTask):
     num_objects_range = (6, 18)
     num_objects_step = PER_LAYER
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the pallet and all boxes."""
         pallet, box = (tuple(s * self.unit for s in size) for size in (PALLET_M, BOX_M))
         color = (0.55, 0.42, 0.28, 1.0)
-        self.container = world.add(Box(size_m=pallet, mass_kg=0.0, color=color), "pallet")
+        self.container = self.world.add(Box(size_m=pallet, mass_kg=0.0, color=color), "pallet")
         shape = Box(size_m=box, color=(0.85, 0.66, 0.4, 1.0))
         count = self.settings.num_objects
-        self.pool = BodyPool(world, [shape] * count, [f"box {i + 1}" for i in range(count)])
+        self.pool = BodyPool(self.world, [shape] * count, [f"box {i + 1}" for i in range(count)])
         self._arrivals: list[tuple[tuple[float, float], float]] = []
         """Where each box comes in."""
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the pallet anywhere, and the first box beside it."""
         half_x, half_y, _ = (size * self.unit / 2 for size in PALLET_M)
         width, length, _ = (size * self.unit / 2 for size in BOX_M)
@@ -121,9 +120,9 @@ class BoxPalletizing(PackingTask):
             self._bring()
             self.world.settle(SETTLE_STEPS)
 
-    def is_goal(self) -> bool:
-        """Whether every slot has its box."""
-        return len(self.filled()) == self.settings.num_objects
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether every slot has its box, released."""
+        return {"is_stacked": len(self.filled()) == self.settings.num_objects}
 
     def filled(self) -> dict[tuple[int, int], Body]:
         """Return the boxes that count, by layer and number of their slots."""
@@ -138,9 +137,9 @@ class BoxPalletizing(PackingTask):
             full += 1
         return {slot: body for slot, body in found.items() if slot[0] <= full}
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which a box is held."""
-        return max(top_m - GRIP_M * self.unit, self.lowest_pick_m)
+        return max(top_m - GRIP_M * self.unit, self.lowest_tool_m(xy))
 
     def get_state(self) -> Any:
         """Return which boxes are there, and where the others will come in."""
@@ -246,7 +245,8 @@ class BoxPalletizing(PackingTask):
             if all(gap_m(spot, other) > 0 for other in astray):
                 return self.place(held, (spot.x, spot.y, z), spot.yaw_rad - heading)
         (x, y), yaw = max(self._arrivals, key=lambda arrival: self._room_at(arrival, held))
-        return self.place(held, (x, y, self.floor_m + height + RELEASE_GAP_M), yaw - heading)
+        z = self.terrain.height_m((x, y)) + height + RELEASE_GAP_M
+        return self.place(held, (x, y, z), yaw - heading)
 
     def _tip_over(self, held: Body) -> PickPlaceCommand:
         """Return the place at the pallet's edge from which a box that stands on its end falls."""

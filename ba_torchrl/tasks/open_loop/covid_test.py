@@ -13,7 +13,6 @@ from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, Color, vertical_extent
 from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
 from ba_torchrl.tasks.motion_primitives import RELEASE_GAP_M, finger_room
@@ -109,15 +108,15 @@ class CovidTest(OpenLoopTask):
     spot_m: ClassVar[tuple[float, float]] = (0.0125, 0.1)
     """A used tube turns up within this of the middle of the test area."""
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the three areas, the tubes and the swabs."""
-        floors = [world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS]
+        floors = [self.world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS]
         self.new_box, self.used_box, self.test_area = floors
         self._slabs = [(area, (0.0, 0.0), floor) for area, floor in zip(AREAS, floors, strict=True)]
         self._walls: list[Body] = []
         for area in (NEW_BOX, USED_BOX):
             for place, size in _walls(area):
-                wall = world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}")
+                wall = self.world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}")
                 self._slabs.append((area, place, wall))
                 self._walls.append(wall)
         factor = self.settings.scale / self.scale_range[0]
@@ -127,15 +126,15 @@ class CovidTest(OpenLoopTask):
         (tube_m, tube_width_m), (swab_m, swab_width_m) = self._tube_m, self._swab_m
         tube = Box(size_m=(tube_m, tube_width_m, tube_width_m), mass_kg=0.05, color=GLASS)
         swab = Box(size_m=(swab_m, swab_width_m, swab_width_m), mass_kg=0.03, color=WHITE)
-        self.tubes = [world.add(tube, f"tube {i + 1}") for i in range(self.rounds)]
-        self.swabs = [world.add(swab, f"swab {i + 1}") for i in range(self.rounds)]
+        self.tubes = [self.world.add(tube, f"tube {i + 1}") for i in range(self.rounds)]
+        self.swabs = [self.world.add(swab, f"swab {i + 1}") for i in range(self.rounds)]
         self._used: list[Body] = []
         self._spent: list[Body] = []
         self._seed = 0
         self.has_failed = False
         """Whether the order of the test was broken."""
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the layout anywhere, mirrored or not, with all tubes and swabs in their box.
 
         With fixed orientations the layout is turned by 0 or 180 degrees, and all lies along y.
@@ -151,10 +150,9 @@ class CovidTest(OpenLoopTask):
         for area, place, body in self._slabs:
             x, y = area.center
             middle = PlanarFrame(*center, yaw).to_world(mirror * x, y)
-            body.place(
-                (*PlanarFrame(*middle, yaw).to_world(*place), -SUNK_M - body.shape.bounds_m[0][2]),
-                yaw,
-            )
+            xy = PlanarFrame(*middle, yaw).to_world(*place)
+            z = self.terrain.height_m(xy) - SUNK_M - body.shape.bounds_m[0][2]
+            body.place((*xy, z), yaw)
         rows = self._rows()
         for bodies, row in ((self.tubes, rows[0]), (self.swabs, rows[1])):
             for column, body in zip(self._columns(), bodies, strict=True):
@@ -177,9 +175,12 @@ class CovidTest(OpenLoopTask):
         elif max(len(tubes), len(swabs)) > 1:
             self.has_failed = True
 
-    def is_goal(self) -> bool:
-        """Whether all tubes are in the box for used ones, and no swab is left."""
-        return len(self._spent) == self.rounds and all(map(self.is_collected, self.tubes))
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether all tests are made and all tubes are in the box for used ones."""
+        return {
+            "is_tested": len(self._spent) == self.rounds,
+            "is_collected": all(map(self.is_collected, self.tubes)),
+        }
 
     def is_valid(self) -> bool:
         """Whether the order of the test was kept and all is inside the workspace."""
@@ -189,7 +190,8 @@ class CovidTest(OpenLoopTask):
         """Whether a tube lies in the box for used ones, below its rim."""
         length, width, rim = USED_BOX.size
         inner = (length - 2 * WALL_M, width - 2 * WALL_M)
-        return tube.position[2] < rim and self._is_on(self.used_box, inner, tube)
+        is_below_rim = tube.position[2] - self.terrain.height_m(tube.position[:2]) < rim
+        return is_below_rim and self._is_on(self.used_box, inner, tube)
 
     @property
     def objects(self) -> Sequence[Body]:
@@ -223,11 +225,11 @@ class CovidTest(OpenLoopTask):
 
     # -- heights that an action leaves open --------------------------------------------------
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool at which the fingers close on what lies highest there."""
-        return max(top_m - self._tube_m[1] / 2, SHEET_M + GRASP_M)
+        return max(top_m - self._tube_m[1] / 2, self._sheet_z_m(xy) + GRASP_M)
 
-    def place_height_m(self, top_m: float) -> float:
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool at which what was picked like this is let go."""
         return top_m + GRASP_M + RELEASE_GAP_M
 
@@ -301,7 +303,8 @@ class CovidTest(OpenLoopTask):
         if held in self._used:
             turns = bool(self.action_limits.turn_rad)
             spots = USED_ROWS if turns else USED_COLUMNS
-            return self._place_on(held, self.used_box, spots, 0.0, rim_m=USED_BOX.size[2])
+            rim_m = self.terrain.height_m(self.used_box.position[:2]) + USED_BOX.size[2]
+            return self._place_on(held, self.used_box, spots, 0.0, rim_m=rim_m)
         kin = self.tubes if held in self.tubes else self.swabs
         if self._uncollected() or any(map(self._is_presented, kin)):
             row = self._rows()[0 if kin is self.tubes else 1]
@@ -335,7 +338,7 @@ class CovidTest(OpenLoopTask):
         turn = -tool.yaw_rad
         if self.action_limits.turn_rad:
             turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
-        z = SHEET_M + RELEASE_GAP_M + held.position[2] - vertical_extent(held)[0]
+        z = self._sheet_z_m((x, y)) + RELEASE_GAP_M + held.position[2] - vertical_extent(held)[0]
         command = place_command(tool, held.pose, held.pose.moved_to((x, y, z), turn))
         return command._replace(z_m=max(command.z_m, rim_m + GRASP_M + RELEASE_GAP_M))
 
@@ -369,7 +372,11 @@ class CovidTest(OpenLoopTask):
 
     def _lay(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put a tube or swab on the floor of an area."""
-        body.place((*xy, SHEET_M - body.shape.bounds_m[0][2]), yaw_rad)
+        body.place((*xy, self._sheet_z_m(xy) - body.shape.bounds_m[0][2]), yaw_rad)
+
+    def _sheet_z_m(self, xy: tuple[float, float]) -> float:
+        """Return the height of the floors of the areas."""
+        return self.terrain.height_m(xy) + SHEET_M
 
 
 def _slab(area: Area, size_m: tuple[float, float], top_m: float) -> Box:

@@ -13,8 +13,9 @@ from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
 from ba_torchrl.sim.geometry import Vector, YawPose, downward_pose
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, joined, moved
+from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.packing.footprints import (
     RELEASE_M,
     TIP_M,
@@ -86,7 +87,7 @@ class Grasp(NamedTuple):
     """Gap between the open fingers and what stands beside them."""
 
 
-class PackingTask(OpenLoopTask):
+class PackingTask(OpenLoopControl, Task):
     """Objects from a pool on the floor, and a container that does not move."""
 
     scale_range = (SCALE, SCALE)
@@ -125,11 +126,11 @@ class PackingTask(OpenLoopTask):
         """Take up what `get_state` returned."""
         self.pool.set_state(state)
 
-    def place_height_m(self, top_m: float) -> float:
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which what is held comes to rest on what is highest there."""
         held = self.robot.held_body()
         if held is None:
-            return super().place_height_m(top_m)
+            return super().place_height_m(top_m, xy)
         return top_m + self.depth_m(held) + RELEASE_GAP_M
 
     def depth_m(self, held: Body) -> float:
@@ -154,7 +155,7 @@ class PackingTask(OpenLoopTask):
 
     def grasp(self, body: Body) -> Grasp:
         """Return where to grasp an object: in its middle, or where the fingers have more room."""
-        height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
+        height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         others = self.obstacles(body, height - TIP_M)
         tall = self.obstacles(body, height + HAND_ABOVE_M)
         half_hand = self.robot.hand_half_m
@@ -173,7 +174,7 @@ class PackingTask(OpenLoopTask):
 
     def pick(self, body: Body, grasp: Grasp) -> PickPlaceCommand:
         """Return the pick of an object."""
-        height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
+        height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         return pick_command(downward_pose((grasp.x, grasp.y, height), grasp.yaw_rad))
 
     def place(self, held: Body, position: Vector, turn_rad: float) -> PickPlaceCommand:
@@ -195,8 +196,3 @@ class PackingTask(OpenLoopTask):
         tool, yaw = self.robot.tool_pose()
         around = outline(held, yaw)
         return abs(around.frame.to_local(*tool[:2])[0]) + around.half_x + RELEASE_M
-
-    @property
-    def floor_m(self) -> float:
-        """Height of the workspace's floor, from which heights in images count."""
-        return self.settings.workspace.z[0]

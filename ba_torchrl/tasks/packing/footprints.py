@@ -11,7 +11,8 @@ import numpy as np
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, world_vertices
 from ba_torchrl.sim.geometry import PlanarFrame
-from ba_torchrl.tasks.base import Task, Workspace
+from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.workspace import Workspace
 
 LAYOUTS = 10
 TRIES = 100

@@ -25,7 +25,6 @@ class PieceState(NamedTuple):
     position: Vector
     tilt_rad: float
     on_ground: bool
-    on_floor: bool
     below: frozenset[Body]
     """The pieces that it rests on."""
 
@@ -65,7 +64,6 @@ def read_piece_states(
             body.position,
             piece.tilt_rad(body),
             not ground.isdisjoint(touched),
-            world.floor in touched,
             frozenset(below),
         )
     return states
@@ -184,7 +182,7 @@ class SlotAssigner:
             return False
         partner = self.blueprint.partner(number)
         if supports:
-            if view.on_floor or not view.below.issuperset(supports):
+            if view.on_ground or not view.below.issuperset(supports):
                 return False
         elif not view.on_ground or view.below:
             return False

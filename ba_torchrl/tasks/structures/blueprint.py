@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.bodies import Body, Shape
 from ba_torchrl.sim.geometry import Vector, quaternion_matrix
+from ba_torchrl.tasks.workspace import Spot
 
 UPRIGHT_RAD = math.pi / 9
 """A piece that leans less than this is upright."""
@@ -25,7 +26,7 @@ def _both(*axes: Vector) -> tuple[Vector, ...]:
 
 @dataclass(frozen=True)
 class Piece:
-    """A kind of piece; sizes are those of the bodies.
+    """A kind of piece, and the body that is loaded for it.
 
     Args:
         kind: the name that bodies are matched by.
@@ -34,6 +35,9 @@ class Piece:
             stands for its reverse too.
         up: directions of its frame that may point up.
         stays_upright: whether it ends the episode if it tips over.
+        shape: of the body; None where the bodies are given otherwise.
+        spot: space that it needs at the start of an episode; None stands for its own circle.
+        variants: pieces of this kind, of which every episode draws as many as there are slots.
     """
 
     kind: str
@@ -41,6 +45,9 @@ class Piece:
     grasp_yaws_rad: tuple[float, ...] = (0.0,)
     up: tuple[Vector, ...] = (_Z,)
     stays_upright: bool = False
+    shape: Shape | None = None
+    spot: Spot | None = None
+    variants: tuple[Piece, ...] = ()
 
     def tilt_rad(self, body: Body) -> float:
         """Return the angle by which a body is off the nearest way in which it may lie."""

@@ -7,20 +7,30 @@ Every action leaves something that undoes it; in reverse order these actions bui
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import ORIGIN, PlanarFrame, Pose, YawPose, downward_pose
+from ba_torchrl.sim.geometry import (
+    ORIGIN,
+    PlanarFrame,
+    Pose,
+    Vector,
+    YawPose,
+    downward_pose,
+)
+from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import Spot
+from ba_torchrl.tasks.base import TaskSettings
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.blueprint import Slot
-from ba_torchrl.tasks.structures.open_loop import StructureTask
+from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.workspace import Spot
 
 APART_BLOCKS = 2.4
 """Pieces that lie apart keep this distance of their centres, as at the start of an episode."""
@@ -43,6 +53,23 @@ _DIRECTIONS = np.array(
 ).T
 
 
+class Deconstructible(Protocol):
+    """What deconstruction needs of the task that builds a structure, besides `OpenLoopTask`."""
+
+    settings: TaskSettings
+    world: World
+    robot: Robot
+    terrain: Terrain
+    finger_opening: float
+    planner: StructurePlanner
+
+    def room(self, body: Body, yaw_rad: float, at: Vector | None = None) -> float:
+        """Return the gap between the hand, open around a body, and what stands beside it."""
+
+    def grasp_yaws(self, body: Body) -> list[float]:
+        """Return the yaws at which the gripper grasps a body."""
+
+
 class Deconstruction(OpenLoopTask):
     """A structure's task backwards: the goal stands at the start, and must be taken apart.
 
@@ -50,19 +77,17 @@ class Deconstruction(OpenLoopTask):
         task: what builds the structure; its bodies, limits and heights hold here too.
     """
 
-    def __init__(self, task: StructureTask) -> None:
-        super().__init__(task.settings)
+    def __init__(self, task: Deconstructible) -> None:
         self.task = task
+        super().__init__(task.settings, task.world, task.robot, task.terrain)
         self.finger_opening = task.finger_opening
 
-    def build(self, world: World) -> None:
-        """Load the pieces."""
-        self.task.world, self.task.robot = self.world, self.robot
-        self.task.build(world)
+    def load_scene(self) -> None:
+        """The pieces are those of the task."""
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Stand the structure somewhere, its pieces drawn as for building it."""
-        self.task.randomise(rng)
+        self.task.initialize_episode(rng)
         planner = self.task.planner
         slots = planner.blueprint.slots
         pool = list(planner.pieces)
@@ -84,13 +109,16 @@ class Deconstruction(OpenLoopTask):
         for number, slot in enumerate(slots):
             self._stand_in(number, slot, bodies, centers.get(number), rng)
 
-    def is_start(self) -> bool:
+    def is_valid_start(self) -> bool:
         """Whether the structure stands."""
-        return self.task.is_valid() and self.task.is_goal() and not self.is_goal()
+        return self.task.is_valid() and self.task.is_success() and not self.is_success()
 
-    def is_goal(self) -> bool:
-        """Whether all lies on the ground, apart, and nothing is held."""
-        return self.robot.held_body() is None and not self._to_move()
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the pieces lie on the ground, apart from each other, none of them held."""
+        return {
+            "is_released": self.robot.held_body() is None,
+            "is_apart": not self._to_move(),
+        }
 
     def is_valid(self) -> bool:
         """Whether the scene is one of the task's."""
@@ -114,7 +142,7 @@ class Deconstruction(OpenLoopTask):
         """Take up what `get_state` returned."""
         self.task.set_state(state)
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a pick, where an action leaves it open.
 
         The next piece is held as it will be when it is picked from the ground. Its base is that of
@@ -124,12 +152,12 @@ class Deconstruction(OpenLoopTask):
         if to_move := self._to_move():
             top = max(to_move, key=lambda body: body.position[2])
             middle = top.position[2] + top.shape.bounds_m[0][2]
-            base_m = max(vertical_extent(top)[0], middle) - self.settings.workspace.z[0]
-        return self.task.pick_height_m(top_m - base_m) + base_m
+            base_m = max(vertical_extent(top)[0], middle) - self.terrain.height_m(xy)
+        return self.task.pick_height_m(top_m - base_m, xy) + base_m
 
-    def place_height_m(self, top_m: float) -> float:
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a place, where an action leaves it open."""
-        return self.task.place_height_m(top_m)
+        return self.task.place_height_m(top_m, xy)
 
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square searched for the highest point."""
@@ -145,7 +173,8 @@ class Deconstruction(OpenLoopTask):
             return no_op(self.settings.workspace, is_holding=False)
 
         def level(body: Body) -> int:
-            return round(2 * (body.position[2] - self.settings.surface_z_m) / self.block_m)
+            x, y, z = body.position
+            return round(2 * (z - self.terrain.height_m((x, y))) / self.block_m)
 
         top = max(map(level, to_move))
         options = [
@@ -156,8 +185,7 @@ class Deconstruction(OpenLoopTask):
         ]
         _, _, body, yaw = max(options, key=lambda option: option[:2])
         x, y, _ = body.position
-        floor = self.settings.workspace.z[0]
-        z = self.pick_height_m(vertical_extent(body)[1] - floor) + floor
+        z = self.pick_height_m(vertical_extent(body)[1], (x, y))
         return pick_command(downward_pose((x, y, z), yaw))
 
     # -- the structure -----------------------------------------------------------------------
@@ -198,7 +226,7 @@ class Deconstruction(OpenLoopTask):
         if supports:
             lift = max(vertical_extent(support)[1] for support in supports)
             x, y, z = body.position
-            body.place((x, y, z + lift - self.settings.surface_z_m), yaw)
+            body.place((x, y, z + lift - self.terrain.height_m((x, y))), yaw)
         if partner is not None and partner < number:
             self._part(number, bodies, rng)
 
@@ -235,7 +263,6 @@ class Deconstruction(OpenLoopTask):
         """Return the pieces that are not on the ground, or too near another."""
         bodies = list(self.objects)
         shadows = {body: _shadow(world_vertices(body)[:, :2]) for body in bodies}
-        ground = self.settings.surface_z_m + self.block_m / 4
 
         def is_near(body: Body, other: Body) -> bool:
             return (
@@ -246,7 +273,7 @@ class Deconstruction(OpenLoopTask):
         return [
             body
             for body in bodies
-            if vertical_extent(body)[0] > ground
+            if self.terrain.gap_below_m(body) > self.block_m / 4
             or any(is_near(body, other) for other in bodies if other is not body)
         ]
 
@@ -257,15 +284,13 @@ class Deconstruction(OpenLoopTask):
         shadows = [_shadow(world_vertices(other)[:, :2]) for other in others]
         outline = world_vertices(held)[:, :2] - held.position[:2]
         border = radius_m(held) + self.block_m / 4
-        ranges = [
-            (low + border, high - border)
-            for low, high in (self.settings.workspace.x, self.settings.workspace.y)
-        ]
-        z = self.settings.surface_z_m + held.position[2] - vertical_extent(held)[0]
+        ranges = self.terrain.build_area.shrunk(border)
+        rise_m = held.position[2] - vertical_extent(held)[0]
         rng = self._generator()
         best, place = -math.inf, None
         for _ in range(SITES):
             x, y = (float(rng.uniform(low, high)) for low, high in ranges)
+            z = self.terrain.height_m((x, y)) + rise_m
             yaw = self._tool_yaw(held, tool.yaw_rad, rng)
             slack = min(
                 math.dist((x, y), other.position[:2]) - APART_BLOCKS * self.block_m - GAP_M
@@ -330,7 +355,7 @@ class Watch(NamedTuple):
         self,
         held: Body | None,
         grasp: Pose | None,
-        lowest_m: float = -math.inf,
+        lowest_m: Callable[[tuple[float, float]], float] = lambda xy: -math.inf,
     ) -> PickPlaceCommand | None:
         """Return what undoes the action that has just settled.
 
@@ -341,7 +366,7 @@ class Watch(NamedTuple):
         Args:
             held: what is held now.
             grasp: and how.
-            lowest_m: height of the tool below which fingers cannot close.
+            lowest_m: from x and y to the least height of the tool at which the fingers close.
 
         Returns:
             None if nothing undoes it: it grasped or put down nothing, or another body moved.
@@ -355,7 +380,7 @@ class Watch(NamedTuple):
         if self.held is None:
             return place_command(Pose(ORIGIN), grasp, self.poses[body])
         command = pick_command(body.pose.compose(self.grasp.inverse()))
-        return command._replace(z_m=max(command.z_m, lowest_m))
+        return command._replace(z_m=max(command.z_m, lowest_m((command.x_m, command.y_m))))
 
 
 def watch(bodies: Sequence[Body], held: Body | None, grasp: Pose | None) -> Watch:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,8 @@ class PlacementArea(NamedTuple):
     y: tuple[float, float]
     gap_m: float
     """Room wanted around a piece."""
-    z_m: float = 0.0
+    height_m: Callable[[tuple[float, float]], float]
+    """Height of the ground at a point, metres."""
     line_yaw_rad: float | None = None
     """Direction in which two pieces for a bridge must stand; None if any will do."""
 
@@ -42,7 +43,8 @@ def nearest_spot(body: Body, others: Sequence[Body], area: PlacementArea) -> Vec
     spots = np.array([(a, b) for a in _steps(*area.x) for b in _steps(*area.y)])
     aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
     best = np.lexsort((aways, placement_deficit_m(spots, body, others, area)))[0]
-    return (*spots[best].tolist(), area.z_m + z - vertical_extent(body)[0])
+    spot = tuple(spots[best].tolist())
+    return (*spot, area.height_m(spot) + z - vertical_extent(body)[0])
 
 
 def placement_deficit_m(

@@ -51,8 +51,8 @@ def test_the_corner_is_fixed_and_the_base_smooth(env):
     assert all(body.is_static for body in (task.base, task.walls))
     assert task.base.shape.friction == 0.001
     task.put_corner((0.45, 0.0), 0.0)
-    scene.motion.reset(((0.42, 0.0, 0.05), 0.0), 0.0)
-    scene.motion.move_to((0.3, 0.0, 0.05), 0.0)  # into the wall
+    scene.controller.reset(((0.42, 0.0, 0.05), 0.0), 0.0)
+    scene.controller.move_to((0.3, 0.0, 0.05), 0.0)  # into the wall
     assert scene.robot.tool_pose()[0][0] > 0.36
     assert before != [body.pose for body in (task.base, task.walls)]
     task.put_corner((0.45, 0.0), 0.0)
@@ -90,12 +90,12 @@ def test_the_block_cannot_be_grasped_in_the_corner(env, turn):
     task.put_corner((0.45, 0.0), 0.0)
     assert task.room_m(turn) < 0
     x, y, z = task.block.position
-    scene.motion.reset(((x, y, 0.2), turn))
+    scene.controller.reset(((x, y, 0.2), turn))
     for height in (0.15, 0.1, z, z):
-        scene.motion.move_to((x, y, height), turn)
-    scene.motion.grip(0.0)
-    scene.motion.move_to((x, y, 0.18), turn)
-    assert not task.is_goal()
+        scene.controller.move_to((x, y, height), turn)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((x, y, 0.18), turn)
+    assert not task.is_success()
 
 
 def test_the_goal_needs_the_grasp_and_fifteen_centimetres(env):
@@ -103,14 +103,14 @@ def test_the_goal_needs_the_grasp_and_fifteen_centimetres(env):
     task.put_corner((0.45, 0.0), 0.0)
     task.block.place((0.45, 0.0, 0.027))
     assert task.room_m(0.0) > 0
-    scene.motion.reset(((0.45, 0.0, 0.16), 0.0))
-    assert not task.is_goal()  # high, but empty
-    scene.motion.move_to((0.45, 0.0, 0.027), 0.0)
-    scene.motion.grip(0.0)
-    scene.motion.move_to((0.45, 0.0, 0.145), 0.0)
-    assert not task.is_goal()  # held, but low
-    scene.motion.move_to((0.45, 0.0, 0.155), 0.0)
-    assert task.is_goal()
+    scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
+    assert not task.is_success()  # high, but empty
+    scene.controller.move_to((0.45, 0.0, 0.027), 0.0)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.145), 0.0)
+    assert not task.is_success()  # held, but low
+    scene.controller.move_to((0.45, 0.0, 0.155), 0.0)
+    assert task.is_success()
 
 
 def test_room_beside_the_fingers_against_arithmetic(env):
