@@ -1,6 +1,5 @@
 import math
 
-import numpy as np
 import pybullet
 import pytest
 import torch
@@ -13,9 +12,8 @@ from ba_torchrl.data.episodes import collect_episodes
 from ba_torchrl.data.time_reversal import is_reversible, replay_scores, reverse_episode
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.control.pick_place import tool_rotation
-from ba_torchrl.sim.geometry import downward
-from ba_torchrl.tasks.structures.deconstruction import Watch, tool_angles
+from ba_torchrl.sim.geometry import Pose
+from ba_torchrl.tasks.structures.deconstruction import Watch
 
 TASK = "open_loop/house_building_2"
 STRUCTURES = [
@@ -125,26 +123,11 @@ def test_what_did_not_go_by_turns_is_refused(taken_apart, key, values):
         reverse_episode(taken_apart)
 
 
-def test_angles_of_a_tool():
-    for angles in [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (1.0, -0.2, 0.5)]:
-        rotation = np.array(tool_rotation(*angles))
-        quaternion = (math.sin(math.pi / 2), 0.0, 0.0, math.cos(math.pi / 2))
-        for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
-            angle = angles[axis[::-1].index(1)]
-            turn = pybullet.getQuaternionFromAxisAngle(axis, angle)
-            _, quaternion = pybullet.multiplyTransforms((0, 0, 0), turn, (0, 0, 0), quaternion)
-        np.testing.assert_allclose(
-            np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3)), rotation, atol=1e-6
-        )
-        np.testing.assert_allclose(tool_angles(quaternion), angles, atol=1e-6)
-    assert tool_rotation(0.3)[0] == pytest.approx(downward(0.3)[0])
-
-
 class Piece:
     """A body that lies somewhere."""
 
     def __init__(self, x, y, z, turn=(0.0, 0.0, 0.0, 1.0)):
-        self.pose = ((x, y, z), turn)
+        self.pose = Pose((x, y, z), turn)
 
     @property
     def position(self):
@@ -155,9 +138,9 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
     down = pybullet.getQuaternionFromEuler((math.pi, 0.0, 0.0))
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
     # held 4 mm beside its middle, along the tool's x axis
-    grasp = ((0.004, 0.0, 0.0), pybullet.invertTransform((0, 0, 0), down)[1])
+    grasp = Pose((0.004, 0.0, 0.0), pybullet.invertTransform((0, 0, 0), down)[1])
     before = Watch({body: body.pose, other: other.pose}, None, None)
-    body.pose = ((0.6, 0.0, 0.4), body.pose[1])
+    body.pose = Pose((0.6, 0.0, 0.4), body.pose[1])
     undo = before.undo(body, grasp)
     assert undo.primitive == PLACE
     assert undo[1:4] == pytest.approx((0.396, 0.1, 0.05))
@@ -165,7 +148,7 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
 
     held = Watch({body: body.pose, other: other.pose}, body, grasp)
     quarter = pybullet.getQuaternionFromEuler((0.0, 0.0, math.pi / 2))
-    body.pose = ((0.3, -0.1, 0.015), quarter)
+    body.pose = Pose((0.3, -0.1, 0.015), quarter)
     undo = held.undo(None, None)
     assert undo.primitive == PICK
     assert undo[1:4] == pytest.approx((0.3, -0.104, 0.015))
@@ -177,12 +160,12 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
 
 def test_nothing_undoes_an_action_that_moved_nothing_or_two_things():
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
-    grasp = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    grasp = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     before = Watch({body: body.pose, other: other.pose}, None, None)
     assert before.undo(None, None) is None
-    other.pose = ((0.5, 0.004, 0.015), other.pose[1])
+    other.pose = Pose((0.5, 0.004, 0.015), other.pose[1])
     assert before.undo(body, grasp) is not None
-    other.pose = ((0.5, 0.006, 0.015), other.pose[1])
+    other.pose = Pose((0.5, 0.006, 0.015), other.pose[1])
     assert before.undo(body, grasp) is None
 
 

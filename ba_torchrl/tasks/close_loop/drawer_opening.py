@@ -12,7 +12,7 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.articulated import Rail
 from ba_torchrl.sim.bodies import Body, Color, Solid
-from ba_torchrl.sim.geometry import Vector, YawPose
+from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
@@ -100,8 +100,7 @@ class DrawerOpening(CloseLoopTask):
             else:
                 yaw = float(rng.choice((math.pi / 2, 3 * math.pi / 2)))
             back, aside = scale * float(rng.uniform(0.15, 0.2)), float(rng.uniform(-0.1, 0.1))
-            cos, sin = math.cos(yaw), math.sin(yaw)
-            xy = (x - back * cos - aside * sin, y - back * sin + aside * cos)
+            xy = PlanarFrame(x, y, yaw).to_world(-back, aside)
             self.cabinet.place((*xy, self.terrain.height_m(xy)), yaw)
             if self._can_be_opened():
                 return
@@ -123,9 +122,9 @@ class DrawerOpening(CloseLoopTask):
         robot, limits, scale = self.robot, self.action_limits, self.settings.scale
         (x, y, z), yaw = robot.tool_pose()
         (rx, ry, rz), heading = self.handle_pose
-        ux, uy = math.cos(heading), math.sin(heading)
-        ahead = (x - rx) * ux + (y - ry) * uy
-        aside = abs((y - ry) * ux - (x - rx) * uy)
+        handle = PlanarFrame(rx, ry, heading)
+        ahead, aside = handle.to_local(x, y)
+        aside = abs(aside)
         target_yaw = nearest_equivalent_yaw(yaw, heading + math.pi / 2, limits, math.pi)
         turn = abs(wrap_angle(target_yaw - yaw))
         radius = ROD_DIAMETER_M / 2 * scale
@@ -143,12 +142,12 @@ class DrawerOpening(CloseLoopTask):
         ):
             slack = -ahead - radius - finger
             farther = self._goal_m + MARGIN_M - self.cabinet.travel_m + slack
-            advance = ahead + min(farther, limits.step_m / max(abs(ux), abs(uy)))
-            target = (rx + advance * ux, ry + advance * uy, hook_z)
-            return move_toward(robot, target, target_yaw, CLOSED)
+            longest = limits.step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
+            target = handle.to_world(ahead + min(farther, longest), 0.0)
+            return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
 
         behind = -radius - finger - PLAY_BEHIND_M
-        hx, hy = rx + behind * ux, ry + behind * uy
+        hx, hy = handle.to_world(behind, 0.0)
         is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
         if is_beside and turn <= ALIGNED_RAD and is_closed:
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
@@ -165,7 +164,7 @@ class DrawerOpening(CloseLoopTask):
         slider, scale = self.cabinet.slider, self.settings.scale
         (x, y, z), heading = slider.position, slider.yaw_rad
         out = (CABINET_M[0] / 2 + ROD_OFFSET_M) * scale
-        middle = (x + out * math.cos(heading), y + out * math.sin(heading))
+        middle = PlanarFrame(x, y, heading).to_world(out, 0.0)
         return (*middle, z + ROD_HEIGHT_M * scale), heading
 
     @property

@@ -11,6 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, Color, Shape, Solid, vertical_extent, world_vertices
+from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_mesh
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
@@ -24,6 +25,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 
 BIN_M = (0.176, 0.144, 0.08)
 WALL_M = 0.004
@@ -174,7 +176,7 @@ class BinPacking(PackingTask):
             return self._drop(held)
         outside = [body for body in self.objects if not self.is_packed(body)]
         if not outside:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in outside}
 
         def order(body: Body) -> tuple[bool, float, float]:
@@ -207,7 +209,7 @@ class BinPacking(PackingTask):
         ends = [(side * x, 0.0, thin, y) for side in (-1, 1)]
         sides = [(0.0, side * y, x, thin) for side in (-1, 1)]
         return [
-            Rectangle(*inside.at(along, across), inside.yaw_rad, *half)
+            Rectangle(*inside.frame.to_world(along, across), inside.yaw_rad, *half)
             for along, across, *half in ends + sides
         ]
 
@@ -230,13 +232,12 @@ class BinPacking(PackingTask):
         if best is None:  # too large for the bin as it is held
             best = (0.0, (0.0, 0.0), 0.0, 0.0)
         _, spot, top, turn = best
-        x, y = self._inside().at(*spot)
+        x, y = self._inside().frame.to_world(*spot)
         depth = self.depth_m(held)
         z = max(self._release_m(), top + depth + RELEASE_GAP_M)
         # the middle of the outline goes there, which need not be the body's origin
         ox, oy = held.position[0] - own.x, held.position[1] - own.y
-        cos, sin = math.cos(turn), math.sin(turn)
-        at = (x + cos * ox - sin * oy, y + sin * ox + cos * oy)
+        at = PlanarFrame(x, y, turn).to_world(ox, oy)
         command = self.place(held, (*at, held.position[2]), turn)
         return command._replace(z_m=z)
 

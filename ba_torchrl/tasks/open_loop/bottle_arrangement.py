@@ -21,6 +21,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)
@@ -175,7 +176,7 @@ class BottleArrangement(PackingTask):
             return self.place(held, (x, y, floor + RELEASE_GAP_M), turn)
         outside = [body for body in self.objects if not self.stands_in_tray(body)]
         if not outside:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in outside}
         place = self._free_place(None)
         if self._clearance(place, None) < CLEARANCE_M:
@@ -224,7 +225,8 @@ class BottleArrangement(PackingTask):
         """Return how far a bottle is from the nearest slot."""
         tray = self._tray()
         return min(
-            math.dist(body.position[:2], tray.at(x * self.unit, y * self.unit)) for x, y in slots()
+            math.dist(body.position[:2], tray.frame.to_world(x * self.unit, y * self.unit))
+            for x, y in slots()
         )
 
     def _clearance(self, place: tuple[float, float], held: Body | None) -> float:
@@ -241,14 +243,14 @@ class BottleArrangement(PackingTask):
     def _free_place(self, held: Body | None) -> tuple[float, float]:
         """Return the first free slot, or the place in the tray with most room."""
         tray = self._tray()
-        places = [tray.at(x * self.unit, y * self.unit) for x, y in slots()]
+        places = [tray.frame.to_world(x * self.unit, y * self.unit) for x, y in slots()]
         for place in places:
             if self._clearance(place, held) >= CLEARANCE_M:
                 return place
         inside, half = self._inside(), BOTTLE_M * self.unit / 2 + CLEARANCE_M
         along, across = inside.half_x - half, inside.half_y - half
         places += [
-            tray.at(x, y)
+            tray.frame.to_world(x, y)
             for x in np.arange(-along, along + 1e-9, SEARCH_M).tolist()
             for y in np.arange(-across, across + 1e-9, SEARCH_M).tolist()
         ]

@@ -22,6 +22,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import CUBOID, UPRIGHT_RAD
 
 PALLET_M = (0.232, 0.192, 0.03)
@@ -157,7 +158,7 @@ class BoxPalletizing(PackingTask):
             return self._place_in_slot(held, filled)
         astray = [body for body in self.pool.present if body not in filled.values()]
         if not astray:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in astray}
 
         def urgency(body: Body) -> tuple[float, bool, float]:
@@ -197,7 +198,7 @@ class BoxPalletizing(PackingTask):
         )
         if not is_level:
             return None
-        along, across = pallet.local(x, y)
+        along, across = pallet.frame.to_local(x, y)
         heading = CUBOID.yaw_rad(body) - pallet.yaw_rad
         for number, (slot_x, slot_y, yaw) in enumerate(slots(layer)):
             off = max(abs(along - slot_x * self.unit), abs(across - slot_y * self.unit))
@@ -224,10 +225,13 @@ class BoxPalletizing(PackingTask):
             if (layer, number) in filled:
                 continue
             middle = Rectangle(
-                *pallet.at(x * self.unit, y * self.unit), pallet.yaw_rad + yaw, width, length
+                *pallet.frame.to_world(x * self.unit, y * self.unit),
+                pallet.yaw_rad + yaw,
+                width,
+                length,
             )
             spots = [
-                Rectangle(*middle.at(shift * SLOT_M * self.unit, 0.0), *middle[2:])
+                Rectangle(*middle.frame.to_world(shift * SLOT_M * self.unit, 0.0), *middle[2:])
                 for shift in SHIFTS
             ]
             # a neighbour may lie at the edge of its slot, where a finger should go
@@ -256,14 +260,14 @@ class BoxPalletizing(PackingTask):
                 across = along / (TIP_PLACES + 1) * (pallet.half_y - width)
                 edge = side * pallet.half_x
                 falls = Rectangle(
-                    *pallet.at(edge + side * (length + 2 * TIP_OVER_M), across),
+                    *pallet.frame.to_world(edge + side * (length + 2 * TIP_OVER_M), across),
                     pallet.yaw_rad,
                     length + 2 * TIP_OVER_M,
                     width,
                 )
                 room = min((gap_m(falls, other) for other in others), default=ENOUGH_M)
                 inside = 1.0 if falls.is_inside(workspace) else 0.0
-                spot = pallet.at(edge + side * TIP_OVER_M, across)
+                spot = pallet.frame.to_world(edge + side * TIP_OVER_M, across)
                 if best is None or inside + min(room, ENOUGH_M) > best[0]:
                     best = (inside + min(room, ENOUGH_M), spot)
         z = self._level_z_m(0) - BOX_M[2] * self.unit / 2 + RELEASE_GAP_M

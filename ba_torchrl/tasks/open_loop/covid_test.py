@@ -8,14 +8,16 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, vertical_extent
-from ba_torchrl.sim.geometry import YawPose
+from ba_torchrl.sim.bodies import Body, Box, Color, vertical_extent
+from ba_torchrl.sim.contacts import gap_m
+from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
 from ba_torchrl.tasks.motion_primitives import RELEASE_GAP_M, finger_room
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 
 PURPLE: Color = (0.6, 0.45, 0.78, 1.0)
 GRAY: Color = (0.6, 0.6, 0.6, 1.0)
@@ -147,8 +149,8 @@ class CovidTest(OpenLoopTask):
         center = self.random_point(rng, 2 * half)
         for area, place, body in self._slabs:
             x, y = area.center
-            middle = _turned((mirror * x, y), center, yaw)
-            xy = _turned(place, middle, yaw)
+            middle = PlanarFrame(*center, yaw).to_world(mirror * x, y)
+            xy = PlanarFrame(*middle, yaw).to_world(*place)
             z = self.terrain.height_m(xy) - SUNK_M - body.shape.bounds_m[0][2]
             body.place((*xy, z), yaw)
         rows = self._rows()
@@ -252,7 +254,7 @@ class CovidTest(OpenLoopTask):
             spot = tuple(float(rng.uniform(-half, half)) for half in self.spot_m)
             yaw = math.pi / 2 + self.random_yaw(rng, 2 * math.pi)
             self._lay(tube, self._to_world(self.test_area, spot), yaw)
-            if all(gap_m(other.id, tube) > APART_M for other in others):
+            if all(gap_m(self.world.client, other.id, tube.id) > APART_M for other in others):
                 break
         self.world.settle(max_steps=REST_STEPS)
 
@@ -266,8 +268,8 @@ class CovidTest(OpenLoopTask):
         """Whether a body, let go of, has its centre above a rectangle about an area's centre."""
         if body is self.robot.held_body():
             return False
-        (ax, ay, _), (bx, by, _), yaw = area.position, body.position, area.yaw_rad
-        local = _turned((bx - ax, by - ay), (0.0, 0.0), -yaw)
+        frame = PlanarFrame(*area.position[:2], area.yaw_rad)
+        local = frame.to_local(*body.position[:2])
         return all(abs(place) < extent / 2 for place, extent in zip(local, size_m, strict=False))
 
     # -- the expert --------------------------------------------------------------------------
@@ -278,13 +280,12 @@ class CovidTest(OpenLoopTask):
         if held is not None:
             return self._place(held)
         wanted = self._wanted()
-        if not wanted:  # all is done: a pick from the bare corner changes nothing
-            workspace = self.settings.workspace
-            return PickPlaceCommand(PICK, workspace.x[0], workspace.y[0], 0.1)
+        if not wanted:
+            return no_op(self.settings.workspace, is_holding=False)
         body = max(wanted, key=self._room)
         x, y, _ = body.position
         z = vertical_extent(body)[0] + GRASP_M
-        return PickPlaceCommand(PICK, x, y, z, self._grasp_yaw(body))
+        return pick_command(downward_pose((x, y, z), self._grasp_yaw(body)))
 
     def _wanted(self) -> list[Body]:
         """Return the bodies any of which is to be picked next."""
@@ -328,20 +329,18 @@ class CovidTest(OpenLoopTask):
             along_rad: how it is to lie in that frame; a gripper that cannot turn leaves it.
             rim_m: height that the fingertips stay above.
         """
-        tool, tool_yaw = self.robot.tool_pose()
+        tool = self.robot.tool_transform()
         others = [other.position for other in self.objects if other is not held]
         x, y = max(
             (self._to_world(area, spot) for spot in spots),
             key=lambda spot: min(math.dist(spot, other[:2]) for other in others),
         )
-        turn = -tool_yaw
+        turn = -tool.yaw_rad
         if self.action_limits.turn_rad:
             turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
-        ox, oy = (b - t for b, t in zip(held.position[:2], tool[:2], strict=True))
-        dx, dy = _turned((ox, oy), (0.0, 0.0), turn)
-        z = self._sheet_z_m((x, y)) + RELEASE_GAP_M + tool[2] - vertical_extent(held)[0]
-        z = max(z, rim_m + GRASP_M + RELEASE_GAP_M)
-        return PickPlaceCommand(PLACE, x - dx, y - dy, z, tool_yaw + turn)
+        z = self._sheet_z_m((x, y)) + RELEASE_GAP_M + held.position[2] - vertical_extent(held)[0]
+        command = place_command(tool, held.pose, held.pose.moved_to((x, y, z), turn))
+        return command._replace(z_m=max(command.z_m, rim_m + GRASP_M + RELEASE_GAP_M))
 
     def _grasp_yaw(self, body: Body) -> float:
         return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0
@@ -369,7 +368,7 @@ class CovidTest(OpenLoopTask):
         return [(i - (self.rounds - 1) / 2) * COLUMN_M for i in range(self.rounds)]
 
     def _to_world(self, area: Body, spot: tuple[float, float]) -> tuple[float, float]:
-        return _turned(spot, area.position[:2], area.yaw_rad)
+        return PlanarFrame(*area.position[:2], area.yaw_rad).to_world(*spot)
 
     def _lay(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put a tube or swab on the floor of an area."""
@@ -378,15 +377,6 @@ class CovidTest(OpenLoopTask):
     def _sheet_z_m(self, xy: tuple[float, float]) -> float:
         """Return the height of the floors of the areas."""
         return self.terrain.height_m(xy) + SHEET_M
-
-
-def _turned(
-    point: tuple[float, float], center: tuple[float, float], yaw_rad: float
-) -> tuple[float, float]:
-    """Return where a point of a frame lies whose origin and heading are given."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    x, y = point
-    return center[0] + cos * x - sin * y, center[1] + sin * x + cos * y
 
 
 def _slab(area: Area, size_m: tuple[float, float], top_m: float) -> Box:

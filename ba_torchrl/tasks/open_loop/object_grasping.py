@@ -7,12 +7,14 @@ from functools import partial
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
+from ba_torchrl.actions import PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import downward_pose
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import DEEPEST_M, PIXEL_M, YAWS
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
+from ba_torchrl.tasks.pick_place_commands import pick_command
 
 USUAL_WIDTH_M = 0.045
 """Of an object between the fingers, where an action leaves the height open."""
@@ -83,7 +85,7 @@ class ObjectGrasping(OpenLoopControl, ClutterTask):
             return self._squeeze()
         near = [grasp for grasp in found if grasp.cost < found[0].cost + NEAR_COST]
         grasp = near[self.clutter.failures % len(near)]
-        return PickPlaceCommand(PICK, *grasp.position, grasp.yaw_rad)
+        return pick_command(downward_pose(grasp.position, grasp.yaw_rad))
 
     def _penalty(self, highest: np.ndarray, grasps: np.ndarray) -> np.ndarray:
         """Return what speaks against grasps [N, 6] as the planner lists them, [N].
@@ -116,7 +118,7 @@ class ObjectGrasping(OpenLoopControl, ClutterTask):
         x, y = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
         z = self.pick_height_m(points[:, 2].max(), (float(x), float(y)))
         yaw = yaws[np.ptp(across, axis=0).argmin()]
-        return PickPlaceCommand(PICK, float(x), float(y), float(z), float(yaw))
+        return pick_command(downward_pose((float(x), float(y), float(z)), float(yaw)))
 
     def grasped_object(self) -> Body | None:
         """Return what the last pick took: cameras do not see it; contacts wait for a step."""

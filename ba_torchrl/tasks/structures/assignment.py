@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 
-from ba_torchrl.sim.bodies import CONTACT_M, Body
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import CONTACT_M, contacts
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
@@ -49,14 +49,14 @@ def read_piece_states(
     states = {}
     for body, piece in pieces.items():
         touched, below = set(), set()
-        for point in pybullet.getContactPoints(body.id, physicsClientId=world.client):
-            if point[8] >= CONTACT_M:
+        for point in contacts(world.client, body.id):
+            if point.distance_m >= CONTACT_M:
                 continue
-            touched.add(point[2])
-            other = by_id.get(point[2])
+            touched.add(point.other_id)
+            other = by_id.get(point.other_id)
             if (
                 other is not None
-                and point[7][2] > LYING_COSINE
+                and point.normal[2] > LYING_COSINE
                 and heights[body] - heights[other] >= block_m / 2
             ):
                 below.add(other)

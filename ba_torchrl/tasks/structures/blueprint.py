@@ -11,10 +11,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import pybullet
-
 from ba_torchrl.sim.bodies import Body, Shape
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import Vector, quaternion_matrix
 from ba_torchrl.tasks.workspace import Spot
 
 UPRIGHT_RAD = math.pi / 9
@@ -53,16 +51,16 @@ class Piece:
 
     def tilt_rad(self, body: Body) -> float:
         """Return the angle by which a body is off the nearest way in which it may lie."""
-        down = pybullet.getMatrixFromQuaternion(body.pose[1])[6:]
+        down = quaternion_matrix(body.pose.orientation)[2]
         cosine = max(sum(d * u for d, u in zip(down, up, strict=True)) for up in self.up)
         return math.acos(min(max(cosine, -1.0), 1.0))
 
     def yaw_rad(self, body: Body) -> float:
         """Return a body's heading, whichever of its sides is up."""
-        turn = pybullet.getMatrixFromQuaternion(body.pose[1])
-        if abs(turn[7]) <= abs(turn[6]):  # its y axis lies flatter than its x axis
-            return math.atan2(turn[4], turn[1]) - math.pi / 2
-        return math.atan2(turn[3], turn[0])
+        x_axis, y_axis, _ = zip(*quaternion_matrix(body.pose.orientation), strict=True)
+        if abs(y_axis[2]) <= abs(x_axis[2]):  # the y axis is closer to horizontal than the x axis
+            return math.atan2(y_axis[1], y_axis[0]) - math.pi / 2
+        return math.atan2(x_axis[1], x_axis[0])
 
     def grasp_yaws(self, body: Body) -> list[float]:
         """Return the gripper's yaws at which the fingers close on a body."""

@@ -11,15 +11,22 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import pybullet
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Quaternion, Vector, YawPose
+from ba_torchrl.sim.geometry import (
+    ORIGIN,
+    PlanarFrame,
+    Pose,
+    Vector,
+    YawPose,
+    downward_pose,
+)
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TaskSettings
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.blueprint import Slot
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.terrain import Terrain
@@ -40,8 +47,6 @@ BEARINGS = 16
 """Directions along which the gap between two outlines is measured."""
 MOVED_M = 5e-3
 """What moves less than this stays where it is."""
-LEVEL_RAD = 0.02
-"""A tool that leans less than this points straight down."""
 
 _DIRECTIONS = np.array(
     [[math.cos(a), math.sin(a)] for a in np.arange(BEARINGS) * math.pi / BEARINGS]
@@ -164,9 +169,8 @@ class Deconstruction(OpenLoopTask):
         if held is not None:
             return self._put_away(held)
         to_move = self._to_move()
-        if not to_move:  # a pick from the bare corner changes nothing
-            x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
-            return PickPlaceCommand(PICK, x, y, 0.1)
+        if not to_move:
+            return no_op(self.settings.workspace, is_holding=False)
 
         def level(body: Body) -> int:
             x, y, z = body.position
@@ -182,7 +186,7 @@ class Deconstruction(OpenLoopTask):
         _, _, body, yaw = max(options, key=lambda option: option[:2])
         x, y, _ = body.position
         z = self.pick_height_m(vertical_extent(body)[1], (x, y))
-        return PickPlaceCommand(PICK, x, y, z, yaw)
+        return pick_command(downward_pose((x, y, z), yaw))
 
     # -- the structure -----------------------------------------------------------------------
 
@@ -275,7 +279,7 @@ class Deconstruction(OpenLoopTask):
 
     def _put_away(self, held: Body) -> PickPlaceCommand:
         """Return the place on the first of many random sites that has room enough."""
-        tool, tool_yaw = self.robot.tool_pose()
+        tool, pose = self.robot.tool_transform(), held.pose
         others = [other for other in self.objects if other is not held]
         shadows = [_shadow(world_vertices(other)[:, :2]) for other in others]
         outline = world_vertices(held)[:, :2] - held.position[:2]
@@ -287,24 +291,22 @@ class Deconstruction(OpenLoopTask):
         for _ in range(SITES):
             x, y = (float(rng.uniform(low, high)) for low, high in ranges)
             z = self.terrain.height_m((x, y)) + rise_m
-            yaw = self._tool_yaw(held, tool_yaw, rng)
-            cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
+            yaw = self._tool_yaw(held, tool.yaw_rad, rng)
             slack = min(
                 math.dist((x, y), other.position[:2]) - APART_BLOCKS * self.block_m - GAP_M
                 for other in others
             )
             if slack <= best:
                 continue
-            turned = outline @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+            frame = PlanarFrame(x, y, yaw - tool.yaw_rad)
+            turned = np.stack(frame.to_world(*outline.T), axis=1)
             gap = min(_gap_m(_shadow(turned), shadow) for shadow in shadows)
             room = self.task.room(held, yaw, (x, y, z))
             slack = min(slack, gap - GAP_M - AMPLE_GAP_M, room - AMPLE_ROOM_M)
             if slack > best:
                 best = slack
-                ox, oy, oz = (b - t for b, t in zip(held.position, tool, strict=True))
-                place = PickPlaceCommand(
-                    PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
-                )
+                target = pose.moved_to((x, y, z), yaw - tool.yaw_rad)
+                place = place_command(tool, pose, target)
             if slack >= 0:
                 break
         assert place is not None  # the first site is better than nothing
@@ -344,15 +346,15 @@ def _gap_m(one: np.ndarray, other: np.ndarray) -> float:
 class Watch(NamedTuple):
     """How things lay before an action, to tell afterwards what undoes it."""
 
-    poses: Mapping[Body, tuple[Vector, Quaternion]]
+    poses: Mapping[Body, Pose]
     held: Body | None
-    grasp: tuple[Vector, Quaternion] | None
-    """YawPose of what was held in the frame of the tool."""
+    grasp: Pose | None
+    """Pose of what was held in the frame of the tool."""
 
     def undo(
         self,
         held: Body | None,
-        grasp: tuple[Vector, Quaternion] | None,
+        grasp: Pose | None,
         lowest_m: Callable[[tuple[float, float]], float] = lambda xy: -math.inf,
     ) -> PickPlaceCommand | None:
         """Return what undoes the action that has just settled.
@@ -375,31 +377,12 @@ class Watch(NamedTuple):
         for other, (before, _) in self.poses.items():
             if other is not body and math.dist(before, other.position) > MOVED_M:
                 return None
-        pose, in_tool, primitive = (
-            (self.poses[body], grasp, PLACE) if self.held is None else (body.pose, self.grasp, PICK)
-        )
-        (x, y, z), turn = pybullet.multiplyTransforms(*pose, *pybullet.invertTransform(*in_tool))
-        if primitive == PICK:
-            z = max(z, lowest_m((x, y)))
-        return PickPlaceCommand(primitive, x, y, z, *tool_angles(turn))
+        if self.held is None:
+            return place_command(Pose(ORIGIN), grasp, self.poses[body])
+        command = pick_command(body.pose.compose(self.grasp.inverse()))
+        return command._replace(z_m=max(command.z_m, lowest_m((command.x_m, command.y_m))))
 
 
-def watch(
-    bodies: Sequence[Body], held: Body | None, grasp: tuple[Vector, Quaternion] | None
-) -> Watch:
+def watch(bodies: Sequence[Body], held: Body | None, grasp: Pose | None) -> Watch:
     """Return how bodies lie now, and what is held how."""
     return Watch({body: body.pose for body in bodies}, held, grasp)
-
-
-def tool_angles(orientation: Quaternion) -> tuple[float, float, float]:
-    """Return rz, ry and rx of a tool: the inverse of `tool_rotation`.
-
-    Args:
-        orientation: of the tool (x, y, z, w).
-    """
-    turn = pybullet.getMatrixFromQuaternion(orientation)
-    rz = math.atan2(turn[3], turn[0])
-    ry = math.asin(min(max(-turn[6], -1.0), 1.0))
-    rx = math.atan2(-turn[7], -turn[8])
-    ry, rx = (0.0 if abs(angle) < LEVEL_RAD else angle for angle in (ry, rx))
-    return rz, ry, rx

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import PlanarFrame, Vector
 from ba_torchrl.sim.robots.gripper import Gripper
 
 SPOT_STEP_M = 0.02
@@ -101,16 +101,15 @@ def finger_path_clearance_m(
         others: bodies that may be in the way.
         at: where the body is, if not where it is now.
     """
-    ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
     below_m = -min(z for _, z in gripper.arc)
     bx, by, bz = body.position if at is None else at
+    frame = PlanarFrame(bx, by, yaw_rad)
     gap = math.inf
     for other in others:
         corners = world_vertices(other)
         if corners[:, 2].max() < bz - below_m:
             continue
-        px, py = corners[:, 0] - bx, corners[:, 1] - by
-        along, across = px * ux + py * uy, py * ux - px * uy
+        along, across = frame.to_local(corners[:, 0], corners[:, 1])
         aside = max(across.min(), -across.max()) - gripper.half_width_m
         for low, high in ways_m:
             gap = min(gap, max(along.min() - high, low - along.max(), aside))

@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, radius_m, world_vertices
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import PlanarFrame, Vector, downward_pose
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.motion_primitives import finger_room
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps, finger_way_room
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction
@@ -111,15 +112,15 @@ class StructureTask(OpenLoopControl, Task):
         move = self.planner.next_move(
             self._placement_area(), held, self._effort, self._crowding, blocks_grasp
         )
-        if move is None:  # it stands: a pick from the bare corner changes nothing
-            x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
-            return PickPlaceCommand(PLACE if held is not None else PICK, x, y, 0.1)
+        if move is None:
+            return no_op(self.settings.workspace, held is not None)
         if move.body is held:
             return self._place(move)
         candidate = self._best_grasp(move.body)
         yaw, z = candidate.yaw_rad, move.body.position[2]
         x, y = _tool_point(move.body.position, candidate)
-        return PickPlaceCommand(PICK, x, y, max(z, self.lowest_tool_m((x, y))), yaw)
+        z = max(z, self.lowest_tool_m((x, y)))
+        return pick_command(downward_pose((x, y, z), yaw))
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a pick, at least `least_pick_blocks`."""
@@ -222,9 +223,8 @@ class StructureTask(OpenLoopControl, Task):
         for other in others:
             corners = world_vertices(other)
             if corners[:, 2].max() > z + HAND_OVER_TOOL_M:
-                cos, sin = math.cos(yaw), math.sin(yaw)
-                along_across = (corners[:, :2] - (x, y)) @ ((cos, -sin), (sin, cos))
-                low, high = along_across.min(axis=0), along_across.max(axis=0)
+                local = np.stack(PlanarFrame(x, y, yaw).to_local(corners[:, 0], corners[:, 1]), 1)
+                low, high = local.min(axis=0), local.max(axis=0)
                 gaps = np.maximum(low, -high) - self.robot.hand_half_m
                 room = min(room, float(gaps.max()))
         return room
@@ -275,8 +275,7 @@ class StructureTask(OpenLoopControl, Task):
         effort_m = BLOCKED_M - CROWDED * lack_m
         if candidate.shift_m and lack_m == 0:
             x, y, _ = body.position
-            cos, sin = math.cos(candidate.yaw_rad), math.sin(candidate.yaw_rad)
-            end = (x + DRIVEN_M * cos, y + DRIVEN_M * sin)
+            end = PlanarFrame(x, y, candidate.yaw_rad).to_world(DRIVEN_M, 0.0)
             spans = self.settings.workspace.x, self.settings.workspace.y
             effort_m += max(
                 max(low - e, e - high, 0.0) for e, (low, high) in zip(end, spans, strict=True)
@@ -285,23 +284,18 @@ class StructureTask(OpenLoopControl, Task):
 
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
-        tool, tool_yaw = self.robot.tool_pose()
-        yaw = tool_yaw
+        tool, held = self.robot.tool_transform(), move.body.pose
+        yaw = tool.yaw_rad
         if not self.action_limits.turn_rad:
             yaw = 0.0
         elif move.yaw_rad is None:
             turns = [math.pi * i / FREE_YAWS for i in range(FREE_YAWS)]
             yaw = self._roomiest(move, turns)
         else:
-            ahead = tool_yaw + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
+            ahead = tool.yaw_rad + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
             count = max(1, round(math.pi / move.yaw_period_rad))  # a half turn swaps the fingers
             yaw = self._roomiest(move, [ahead + move.yaw_period_rad * i for i in range(count)])
-        cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
-        ox, oy, oz = (b - t for b, t in zip(move.body.position, tool, strict=True))
-        x, y, z = move.position
-        return PickPlaceCommand(
-            PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
-        )
+        return place_command(tool, held, held.moved_to(move.position, yaw - tool.yaw_rad))
 
     def _roomiest(self, move: Move, yaws_rad: Sequence[float]) -> float:
         """Return the first of the yaws at which the fingers can part most freely."""
@@ -311,7 +305,4 @@ class StructureTask(OpenLoopControl, Task):
 
 def _tool_point(at: Vector, candidate: GraspCandidate) -> tuple[float, float]:
     """Return where the tool is to grasp what is at a place."""
-    return (
-        at[0] + candidate.shift_m * math.cos(candidate.yaw_rad),
-        at[1] + candidate.shift_m * math.sin(candidate.yaw_rad),
-    )
+    return PlanarFrame(*at[:2], candidate.yaw_rad).to_world(candidate.shift_m, 0.0)

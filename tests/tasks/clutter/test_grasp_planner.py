@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
 from ba_torchrl.tasks.clutter import grasp_planner
@@ -54,7 +55,7 @@ class Lying:
     @property
     def pose(self):
         half = self.yaw_rad / 2
-        return self.position, (0.0, 0.0, math.sin(half), math.cos(half))
+        return Pose(self.position, (0.0, 0.0, math.sin(half), math.cos(half)))
 
 
 def block(size_m, xy=(0.45, 0.0), yaw_rad=0.0):
