@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -10,6 +11,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import StrictModel
@@ -47,6 +49,38 @@ class Algorithm(ABC):
     ``set_exploration_type`` says."""
     updates: int = 0
     """Gradient updates so far."""
+    stores_expert_action: ClassVar[bool] = False
+    """Whether the environments are made with ``expert=True``, and transitions keep
+    ``expert_action``."""
+
+    def nearest_action(self, action: Tensor) -> Tensor:
+        """Return the action that the policy can choose and that is nearest to another one.
+
+        Demonstrations are executed with it, so that what is learnt is what was executed. By
+        default every action can be chosen.
+
+        Args:
+            action: [..., A].
+        """
+        return action
+
+    @abstractmethod
+    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDictBase:
+        """Return the transitions [N] that the replay stores of collected data.
+
+        Args:
+            data: steps of any batch shape, those of an episode in order.
+            is_expert: whether they are demonstrations.
+        """
+
+    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
+        """Receive the demonstrations, before the first update; by default the replay stores them.
+
+        Args:
+            episodes: TensorDicts [T].
+        """
+        for episode in episodes:
+            self.extend(self.to_transitions(episode, is_expert=True))
 
     @abstractmethod
     def extend(self, transitions: TensorDictBase) -> None:

@@ -17,6 +17,7 @@ from ba_torchrl.algorithms.base import Algorithm, AlgorithmConfig, Problem
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 
 
@@ -92,6 +93,15 @@ class Learner(Algorithm):
             start_factor=1.0,
             end_factor=config.learning_rate_end_factor,
             total_iters=problem.total_updates,
+        )
+
+    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+        """Return the transitions [N] that the replay stores of collected data."""
+        images = (
+            [keys.PIXELS] if self.problem.in_hand_shape is None else [keys.PIXELS, keys.IN_HAND]
+        )
+        return as_transitions(
+            data, images, is_expert=is_expert, expert_action=self.stores_expert_action
         )
 
     def extend(self, transitions: TensorDictBase) -> None:

@@ -13,7 +13,8 @@ from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.config import EnvConfig, StrictModel, parse
-from ba_torchrl.data.demos import Source, check_demonstrations, source_config
+from ba_torchrl.data.demo_files import check_demonstrations
+from ba_torchrl.data.demos import Source, source_config
 from ba_torchrl.envs.scene import check_task_parameters
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import is_available

@@ -8,7 +8,8 @@ from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.algorithms.base import NETWORKS, Problem
 from ba_torchrl.algorithms.sac import SACConfig
 from ba_torchrl.config import parse
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.transitions import as_transitions
 
 TASK = "close_loop/block_reaching"
 DEPTH_M = 0.39
@@ -35,7 +36,7 @@ def demonstrations():
     env = ba_torchrl.make_vector_env(TASK, 2, parallel=False, expert=True, obs_size=64, seed=0)
     episodes = collect_demonstrations(env, 6, seed=0)
     env.close()
-    return torch.cat([as_transitions(episode, is_expert=True) for episode in episodes])
+    return torch.cat([as_transitions(episode, ["pixels"], is_expert=True) for episode in episodes])
 
 
 @pytest.mark.parametrize("network", ["cnn", "equi"])

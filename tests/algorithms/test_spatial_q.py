@@ -10,9 +10,11 @@ from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
 from ba_torchrl.algorithms.spatial_q import SpatialQConfig
 from ba_torchrl.config import parse
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.errors import ConfigError
 
+IMAGES = ["pixels", "in_hand"]
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
@@ -40,7 +42,7 @@ def transitions():
     env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
     episodes = collect_demonstrations(env, 4, seed=0, only_successful=True)
     env.close()
-    return torch.cat([as_transitions(episode, is_expert=True) for episode in episodes])
+    return torch.cat([as_transitions(episode, IMAGES, is_expert=True) for episode in episodes])
 
 
 def online(transitions):

@@ -12,10 +12,11 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
 import ba_torchrl
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.buffer import make_replay_buffer
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.frames import FrameTable
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError
 
@@ -205,7 +206,7 @@ def test_memory_of_expert_episodes(task):
     env.close()
     rb = make_replay_buffer(200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
     for data in episodes:
-        rb.extend(as_transitions(data, is_expert=True))
+        rb.extend(as_transitions(data, ["pixels"], is_expert=True))
     assert rb.storage.nbytes / len(rb) <= 5_000
     original = torch.cat(episodes)
     for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
