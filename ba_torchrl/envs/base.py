@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import ExtraObservations
 from ba_torchrl.envs.scene import (
     Motion,
@@ -147,8 +148,8 @@ class ManipulationEnv(EnvBase):
         """Return the specification of an action."""
 
     @abstractmethod
-    def _image_specs(self) -> dict[str, Bounded]:
-        """Return the specifications of the images that a policy sees, by key."""
+    def _declare_images(self) -> dict[str, ImageSpec]:
+        """Return what `_images` gives, by key."""
 
     @abstractmethod
     def _place_robot(self, scene: Scene) -> None:
@@ -318,7 +319,10 @@ class ManipulationEnv(EnvBase):
             return Binary(n=1, shape=(1,), dtype=torch.bool)
 
         action = self._make_action_spec()
-        seen = self._image_specs() if self.config.obs_type == "pixel" else {}
+        images = self._declare_images() if self.config.obs_type == "pixel" else {}
+        self.images = {**images, **self._extras.images()}
+        """Declaration of each image that is observed, by key."""
+        seen = {key: image.to_tensor_spec() for key, image in self.images.items()}
         seen |= self._extras.specs(self._scene_for(float(self._scales[-1])))
         observation = {
             **seen,

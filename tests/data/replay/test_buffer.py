@@ -85,7 +85,7 @@ def test_a_plain_episode_shares_its_frames():
 
 @pytest.mark.parametrize("capacity", [7, 16, 50])
 def test_random_interleavings_and_wrap_around(capacity):
-    """Four environments step side by side, end at their own times, beside demos and single adds."""
+    """Four environments step side by side, end at their own times, between whole episodes."""
     rb, rng = buffer(capacity), np.random.default_rng(1)
     expected = [None] * capacity
     cursor = 0
@@ -102,7 +102,7 @@ def test_random_interleavings_and_wrap_around(capacity):
     for _ in range(40):
         kind = rng.random()
         if kind < 0.15:
-            put(episode(int(rng.integers(1, 6)), rng, expert=True))
+            put(episode(int(rng.integers(1, 6)), rng))
         else:
             steps = []
             for stream in streams:
