@@ -27,7 +27,7 @@ EXTRA = {
 SHARED = {"_malloc"}
 APART = {
     "__init__": BASE | {"tasks", "envs"},
-    "modules": BASE | {"modules", "envs.keys"},
+    "modules": BASE | {"modules", "envs.keys", "envs.images"},
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
     "_malloc": set(),

@@ -18,6 +18,7 @@ from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.episodes import SETTLE_STEPS, Episodes
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import ExtraObservations
 from ba_torchrl.envs.scene import (
     Controller,
@@ -153,8 +154,8 @@ class ManipulationEnv(EnvBase):
         """Return the specification of an action."""
 
     @abstractmethod
-    def _image_specs(self) -> dict[str, Bounded]:
-        """Return the specifications of the images that a policy sees, by key."""
+    def _declare_images(self) -> dict[str, ImageSpec]:
+        """Return what `_images` gives, by key."""
 
     @abstractmethod
     def _place_robot(self, scene: Scene) -> None:
@@ -333,8 +334,11 @@ class ManipulationEnv(EnvBase):
             return Binary(n=1, shape=(1,), dtype=torch.bool)
 
         action = self._make_action_spec()
-        seen = self._image_specs() if self.config.obs_type == "pixel" else {}
-        seen |= self._extras.specs(self._episodes.scene_for(float(self._episodes.scales[-1])))
+        images = self._declare_images() if self.config.obs_type == "pixel" else {}
+        self.images = {**images, **self._extras.images()}
+        """Declaration of each image that is observed, by key."""
+        seen = {key: image.to_tensor_spec() for key, image in self.images.items()}
+        seen |= self._extras.specs(self._episodes.largest_scene)
         observation = {
             **seen,
             keys.HOLDING: flag(),
@@ -353,17 +357,12 @@ class ManipulationEnv(EnvBase):
 
     def _check_feasible(self) -> None:
         """Raise, before any worker starts, if the objects or the robot do not fit the workspace."""
-        check_action_limits(
-            self._episodes.scene_for(float(self._episodes.scales[-1])).robot,
-            self.workspace,
-            self._heights_to_reach,
-        )
-        scales = self._episodes.scales
-        for scale in {float(scales[0]), float(scales[-1])}:
-            try:
-                self._episodes.initialize(self._episodes.scene_for(scale), np.random.default_rng(0))
-            except PlacementError as error:
-                raise ConfigError(f"{self.task_id}: {error}") from None
+        largest = self._episodes.largest_scene
+        check_action_limits(largest.robot, self.workspace, self._heights_to_reach)
+        try:
+            self._episodes.check_starts()
+        except PlacementError as error:
+            raise ConfigError(f"{self.task_id}: {error}") from None
 
     def _build_scene(self, scale: float) -> Scene:
         return build_scene(

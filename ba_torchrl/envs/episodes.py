@@ -42,6 +42,20 @@ class Episodes:
             self._scenes[key] = self._build(scale)
         return self._scenes[key]
 
+    @property
+    def largest_scene(self) -> Scene:
+        """The scene with the largest objects."""
+        return self.scene_for(float(self.scales[-1]))
+
+    def check_starts(self) -> None:
+        """Start an episode with the smallest and one with the largest objects.
+
+        Raises:
+            PlacementError: the objects do not fit the workspace.
+        """
+        for scale in {float(self.scales[0]), float(self.scales[-1])}:
+            self.initialize(self.scene_for(scale), np.random.default_rng(0))
+
     def scale(self) -> float:
         """Return the scale of the objects in the present episode."""
         return next(key for key, scene in self._scenes.items() if scene is self.scene)

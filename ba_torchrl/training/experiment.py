@@ -14,12 +14,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.data.demos import (
-    as_transitions,
-    collect_demonstrations,
-    load_demonstrations,
-    source_config,
-)
+from ba_torchrl.data.demo_files import load_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -154,6 +150,7 @@ class Experiment:
                     seed=seed,
                     source=config.demonstrations_source,
                     only_successful=config.only_successful_demonstrations,
+                    nearest_action=self.algorithm.nearest_action,
                 )
             finally:
                 env.close()
@@ -162,8 +159,7 @@ class Experiment:
                 f"no episode of the source {config.demonstrations_source!r} is of use; see "
                 "demonstrations_source and only_successful_demonstrations"
             )
-        for episode in episodes:
-            self.algorithm.extend(as_transitions(episode, is_expert=True))
+        self.algorithm.on_demonstrations(episodes)
         self.log.write(
             0,
             {
@@ -181,7 +177,9 @@ class Experiment:
             return
         # Other episodes than before an interruption, or the first ones would come twice.
         part = self._progress.resumed_at[-1] if self._progress.resumed_at else 0
-        self._train_env = self._make_env(config.derived_seed(SeedUse.COLLECTION, part))
+        self._train_env = self._make_env(
+            config.derived_seed(SeedUse.COLLECTION, part), expert=algorithm.stores_expert_action
+        )
         collector = Collector(
             self._train_env,
             algorithm.policy,
@@ -295,7 +293,7 @@ class Experiment:
         progress.faults += int(following[keys.FAULT].sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
-        self.algorithm.extend(as_transitions(data, is_expert=False))
+        self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
 
     def _update(self) -> None:
         """Take one update, and whatever is due after it."""
