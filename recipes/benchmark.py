@@ -14,18 +14,18 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl.config import parse
-from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 
-hydra_schema.register()
+hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="benchmark", version_base="1.3")
 def main(settings: DictConfig) -> None:
     """Run what is missing of the grid, or list it."""
-    quiet_libraries()
+    limit_library_logs()
     values = OmegaConf.to_container(settings, resolve=True)
     dry_run = values.pop("dry_run")
     grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields if name in values}

@@ -11,12 +11,14 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
+from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
 
 
 @hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
 def main(settings: DictConfig) -> None:
     """Play one episode per task and write the pictures."""
+    load_plugins(settings.plugins)
     strips = {}
     for task in tqdm(settings.tasks or list_tasks(), unit="task"):
         strips[task] = expert_strip(task, settings.seed, settings.pictures)

@@ -12,14 +12,16 @@ tune_malloc()  # before torch allocates anything: halves the time of an update o
 import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
+from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.profiling.table import as_markdown, machine, measure  # noqa: E402
-from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
+from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="speed", version_base="1.3")
 def main(settings: DictConfig) -> None:
     """Measure, and compare with the budgets."""
-    quiet_libraries()
+    limit_library_logs()
+    load_plugins(settings.plugins)
     where = machine()  # the load before this starts adding to it
     profiles: dict[str, str] | None = {} if settings.profile else None
     rows = measure(settings.which, settings.repeats, profiles=profiles)

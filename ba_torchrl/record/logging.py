@@ -65,14 +65,14 @@ def is_available(backend: Backend) -> bool:
     return backend == "csv" or importlib.util.find_spec(backend) is not None
 
 
-def quiet_libraries() -> None:
-    """Keep the libraries' notes out of a recipe's output; warnings and errors stay."""
+def limit_library_logs() -> None:
+    """Let the libraries log warnings and errors only."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 def progress_bar(**settings: Any) -> tqdm:
-    """Return a progress bar; into a file it writes now and then only.
+    """Return a progress bar; one that is written to a file is updated less often.
 
     Args:
         settings: of ``tqdm``.

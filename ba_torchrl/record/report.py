@@ -17,7 +17,7 @@ from typing import Any
 from jinja2 import Environment
 
 from ba_torchrl.record.plots import plot_panels
-from ba_torchrl.record.results import failure_reason, now
+from ba_torchrl.record.results import now, read_failure
 from ba_torchrl.record.summary import (
     COLUMNS,
     CONFIDENCE,
@@ -68,7 +68,7 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
         writer.writeheader()
         writer.writerows(row for table in tables for row in table)
     left_out = [
-        {"path": _relative(path, folder), "reason": failure_reason(path) or "interrupted"}
+        {"path": _relative(path, folder), "reason": read_failure(path) or "interrupted"}
         for path in unfinished
     ]
     texts = [_markdown(section, table) for section, table in zip(sections, tables, strict=True)]

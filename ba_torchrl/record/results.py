@@ -1,4 +1,4 @@
-"""Results: what a finished run leaves as data, one ``result.json`` per run folder.
+"""Results: the data of a finished run, one ``result.json`` per run folder.
 
 `RunResult` is the schema. Reports are made from these files alone.
 """
@@ -23,11 +23,12 @@ from ba_torchrl.config import StrictModel
 RESULT_FILE = "result.json"
 CONFIG_FILE = "config.json"
 FAILURE_FILE = "failure.json"
-"""What a benchmark leaves in the folder of a run that failed: ``reason``, ``when`` and ``log``."""
+"""Written by a benchmark into the folder of a run that failed: ``reason``, ``when``, ``log``."""
 PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
 
 NON_LEARNING_FIELDS = frozenset(
     {
+        "plugins",
         "run_dir",
         "resume",
         "label",
@@ -41,8 +42,8 @@ NON_LEARNING_FIELDS = frozenset(
         "video_episodes",
     }
 )
-"""Fields of a run's configuration that say where and how it is computed and shown, not what is
-learnt: a run can be resumed under others, and runs that differ in them are averaged."""
+"""Fields of a run's configuration that do not change what is learnt: a resumed run may have other
+values, and reports average over runs that differ in them."""
 
 
 class CurvePoint(StrictModel):
@@ -140,8 +141,8 @@ def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
     return sorted(finished), sorted(set().union(*others) - finished)
 
 
-def failure_reason(folder: str | Path) -> str | None:
-    """Return why the run in a folder failed when a benchmark last tried it, None if it did not."""
+def read_failure(folder: str | Path) -> str | None:
+    """Return why a benchmark's last attempt at the run in a folder failed, None if it did not."""
     path = Path(folder) / FAILURE_FILE
     return json.loads(path.read_text(encoding="utf-8"))["reason"] if path.exists() else None
 

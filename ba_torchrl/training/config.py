@@ -17,7 +17,9 @@ from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import Source, source_config
 from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
+from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
@@ -25,20 +27,26 @@ SET_BY_THE_EXPERIMENT = ("seed", "expert")
 
 
 class SeedUse(IntEnum):
-    """What a seed is derived for; no two uses share episodes, nor do two runs."""
+    """What a seed is derived for. Different uses and different runs have different episodes."""
 
     DEMONSTRATIONS = 0
     COLLECTION = 1
     EVALUATION = 2
     REPORT = 3
+    """The last evaluation of a run, which is reported."""
+    TEST = 4
+    """Evaluations of a checkpoint after the run."""
 
 
 class ExperimentConfig(StrictModel):
     """One training run. Fields that the paper fixes have its values (appendix G.2).
 
-    Parsing it checks all of it, nested parts included, before anything starts.
+    `parse` checks all fields, nested ones included, before anything starts.
     """
 
+    plugins: list[str] = Field(default_factory=list)
+    """Modules outside the package to import first. `parse` adds those that register the run's task,
+    robot, network and algorithm."""
     task: str
     """Id of the task."""
     env: dict[str, Any] = Field(default_factory=dict)
@@ -159,6 +167,7 @@ class ExperimentConfig(StrictModel):
             ConfigError: a name is unknown, a type wrong, or parts do not go together.
         """
         config = parse(cls, values, what)
+        load_plugins(config.plugins)
         control = TASKS[config.task].control  # raises with the known names
         for reserved in SET_BY_THE_EXPERIMENT:
             if reserved in config.env:
@@ -182,7 +191,19 @@ class ExperimentConfig(StrictModel):
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
-        return config
+        return config.model_copy(update={"plugins": config._all_plugins()})
+
+    def _all_plugins(self) -> list[str]:
+        """Return `plugins` and the modules that register what the run uses, each once."""
+        used = (
+            (TASKS, self.task),
+            (ROBOTS, self.env_config.robot),
+            (NETWORKS, self.network["name"]),
+            (ALGORITHMS, self.algorithm["name"]),
+        )
+        modules = (registry.plugin_module(name) for registry, name in used)
+        found = [name for name in modules if name is not None and name not in MAIN]
+        return list(dict.fromkeys([*self.plugins, *found]))
 
     def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)

@@ -283,6 +283,7 @@ class Experiment:
             config.num_envs,
             parallel=config.parallel,
             start_method=config.start_method,
+            register_modules=config.plugins,
             **{**config.env, "seed": seed, **changes},
         )
 

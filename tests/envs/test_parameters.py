@@ -13,6 +13,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
+from ba_torchrl.tasks.base import TASKS
 
 PICKING = "close_loop/block_picking"
 
@@ -151,7 +152,7 @@ def test_half_rotation_keeps_the_yaw_within_a_half_turn(make):
 
 @pytest.mark.parametrize("task", ba_torchrl.list_tasks())
 def test_experts_stay_within_the_half_turn(make, task):
-    if not task.startswith("close_loop"):
+    if TASKS[task].control != "close_loop":
         pytest.skip("open-loop yaws are within a half turn by default")
     env = make(task, half_rotation=True, expert=True)
     successes = 0

@@ -1,4 +1,4 @@
-"""Benchmark: a grid of tasks, algorithms, networks and seeds, which `training.jobs` runs."""
+"""Benchmark: a grid of tasks, algorithms, networks and seeds, which `training.grid.jobs` runs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from pydantic import Field
 from ba_torchrl.algorithms.base import Problem
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.results import (
     CONFIG_FILE,
     RESULT_FILE,
     differences,
-    failure_reason,
+    read_failure,
     read_result,
 )
 from ba_torchrl.tasks.base import TASKS
@@ -103,8 +104,8 @@ def plan(
 
     Args:
         config: the grid.
-        common: fields of `ExperimentConfig` that all runs share. Those of ``algorithm`` and
-            ``network`` go over the presets, without a name.
+        common: fields of `ExperimentConfig` that all runs share. ``algorithm`` and ``network`` hold
+            fields without a ``name``, which override those of every preset.
         preset: loads the presets.
 
     Returns:
@@ -113,6 +114,7 @@ def plan(
     Raises:
         ConfigError: a name is unknown, a value cannot be used, or parts do not go together.
     """
+    load_plugins(common.get("plugins", ()))
     _check_axes(config, preset)
     presets = {
         (group, name): preset(group, name)
@@ -139,7 +141,8 @@ def plan(
         taken = [name for name in SET_BY_THE_GRID if name in values]
         if taken:
             raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
-        where = Path(config.folder, task.replace("/", "_"), f"{algorithm}_{network}", f"seed{seed}")
+        names = (name.replace("/", "_") for name in (task, f"{algorithm}_{network}"))
+        where = Path(config.folder, *names, f"seed{seed}")
         values |= {
             "task": task,
             "seed": seed,
@@ -177,7 +180,7 @@ def status(run: ExperimentConfig) -> Status:
         return Status("done", f"success {result.final.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
         check_same_run(run)
-    reason = failure_reason(folder)
+    reason = read_failure(folder)
     if reason is not None:
         return Status("failed", reason)
     if (folder / CONFIG_FILE).exists():
