@@ -55,7 +55,7 @@ def test_a_run_leaves_everything_behind(tmp_path):
     assert scalars["demonstrations/success_rate"].values[0] == 1.0
     # two pretraining updates, then one per step of both environments
     assert scalars["train/env_steps"].values[-1] == 8
-    assert find_checkpoint(folder).name.endswith("6")
+    assert find_checkpoint(folder, "latest").name.endswith("6")
 
 
 @pytest.mark.parametrize("parallel", [False, True])
@@ -109,7 +109,7 @@ def test_a_crash_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeyp
         patch.setattr(algorithm, "state_dict", lambda: {"loss": 1 / 0})
         with pytest.raises(ZeroDivisionError):
             checkpoints.save(2, 0.2)
-    assert find_checkpoint(config.folder).name.endswith("1")
+    assert find_checkpoint(config.folder, "latest").name.endswith("1")
 
 
 def test_the_best_checkpoint_outlives_the_rotation(tmp_path):
@@ -121,6 +121,10 @@ def test_the_best_checkpoint_outlives_the_rotation(tmp_path):
         checkpoints.save(updates, rate)
     kept = sorted(path.name[-1] for path in (config.folder / "checkpoints").iterdir())
     assert kept == ["1", "3"]
+    assert find_checkpoint(config.folder).name.endswith("1")
+    assert find_checkpoint(config.folder, "latest").name.endswith("3")
+    with pytest.raises(ConfigError, match="'newest' is none of best, latest"):
+        find_checkpoint(config.folder, "newest")
 
 
 def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
@@ -208,7 +212,7 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
     assert result.evaluation.episodes == 4
     scalars = read_scalars(tmp_path / "run")
     assert scalars["demonstrations/success_rate"].values == [1.0]
-    _, algorithm = load(tmp_path / "run")
+    _, algorithm = load(tmp_path / "run", "latest")
     assert algorithm.updates == 6
 
 
