@@ -81,6 +81,11 @@ class CloseLoopActions:
         return len(self.sequence)
 
     @property
+    def components(self) -> list[str]:
+        """Name of each component: p, x, y, z or rz."""
+        return ["rz" if letter == "r" else letter for letter in self.sequence]
+
+    @property
     def has_yaw(self) -> bool:
         """Whether the gripper can be turned."""
         return "r" in self.sequence

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable
+from functools import cache
 from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
@@ -63,15 +64,18 @@ CUSTOM_PHYSICS = ("time_step_s", "solver_iterations", "solver_residual")
 
 _CLOSE_LOOP = {"control": "close_loop"}
 _OPEN_LOOP = {"control": "open_loop"}
-_SOME_TASKS = {"task_parameter": True}
+
+
+class TaskParameters(StrictModel):
+    """The parameters that one task adds to `EnvConfig`; a task without any uses this class."""
 
 
 class EnvConfig(StrictModel):
     """The parameters of an environment (appendix B, table 4), under the paper's names.
 
     A value of ``None`` stands for the task's own default. Lengths are metres, angles radians.
-    Fields marked "close loop" or "open loop" are refused by tasks of the other kind, those marked
-    "some tasks" by tasks that have no use for them.
+    Fields marked "close loop" or "open loop" are refused by tasks of the other control. A task adds
+    the fields of its own `TaskParameters`; see `env_config_model`.
     """
 
     robot: str = "kuka"
@@ -124,15 +128,9 @@ class EnvConfig(StrictModel):
     """Add a colour picture of the scene, arm included, and its depth to every observation."""
     point_cloud: int = Field(default=0, ge=0, le=1_000_000)
     """Add this many points of the scene's surfaces to every observation."""
-    object_set: str = Field(default="random", json_schema_extra=_SOME_TASKS)
-    """Some tasks: which shapes the objects have; see `ba_torchrl.sim.assets`."""
-    object_type: Literal["cube", "cylinder"] = Field(default="cube", json_schema_extra=_SOME_TASKS)
-    """Some tasks: what the objects are, all of them."""
-    asset_root: str | None = Field(default=None, json_schema_extra=_SOME_TASKS)
-    """Some tasks: folder of a set of objects that does not ship with the package."""
-    deconstruct: bool = Field(default=False, json_schema_extra=_SOME_TASKS)
-    """Some tasks: start with the structure standing and take it apart; every observation says how
-    to undo the last action. See `ba_torchrl.data.time_reversal`."""
+    deconstruct: bool = False
+    """Structures: start with the structure standing and take it apart; every observation contains
+    the action that reverses the last one. See `ba_torchrl.data.time_reversal`."""
     floor_color: Rgb | None = None
     """Colour of the floor in pictures, each component from 0 to 1; light by default, and in
     PyBullet's window and `rgb` a chequered blue."""
@@ -216,23 +214,26 @@ class EnvConfig(StrictModel):
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
         return self
 
-    def check_for(self, task_id: str, control: str, task_parameters: Iterable[str]) -> None:
-        """Check that the parameters that differ from their defaults have a meaning for a task.
+    def check_control(self, task_id: str, control: str) -> None:
+        """Check that the parameters that differ from their defaults apply to a control.
 
         Args:
             task_id: for the message.
             control: "open_loop" or "close_loop".
-            task_parameters: fields marked "some tasks" that this one takes.
 
         Raises:
-            ConfigError: one has none.
+            ConfigError: one applies to the other control only.
         """
-        for name, field in type(self).model_fields.items():
-            if getattr(self, name) == field.default:
-                continue
-            marks = field.json_schema_extra or {}
-            if marks.get("control", control) != control:
-                kind = marks["control"].replace("_", "-")
+        for name, field in EnvConfig.model_fields.items():
+            needed = (field.json_schema_extra or {}).get("control", control)
+            if needed != control and getattr(self, name) != field.default:
+                kind = needed.replace("_", "-")
                 raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")
-            if marks.get("task_parameter") and name not in task_parameters:
-                raise ConfigError(f"{name!r} has no meaning for {task_id}: leave it out")
+
+
+@cache
+def env_config_model(parameters: type[TaskParameters]) -> type[EnvConfig]:
+    """Return `EnvConfig` with the fields of a task's own parameters added."""
+    if not parameters.model_fields:
+        return EnvConfig
+    return type(EnvConfig.__name__, (parameters, EnvConfig), {"__module__": __name__})

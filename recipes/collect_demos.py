@@ -12,7 +12,8 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.data.demos import collect_demonstrations, save_demonstrations, source_config
+from ba_torchrl.data.demo_files import save_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.data.time_reversal import replay_scores
 from ba_torchrl.errors import ConfigError

@@ -11,11 +11,13 @@ from torchrl.data import Bounded
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.views import VIEWS, ViewInput, ViewSetup
-from ba_torchrl.tasks.base import ActionLimits, Task
+from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.workspace import ActionLimits
 
 START_HEIGHT_M = 0.2
 HALF_TURN = (-math.pi / 2, math.pi / 2)
@@ -54,7 +56,7 @@ class CloseLoopEnv(ManipulationEnv):
         turn = self.config.drot if self.actions.has_yaw else 0.0
         return ActionLimits(self.config.dpos, turn, HALF_TURN if self.half_rotation else None)
 
-    def _make_motion(self, robot: Robot, task: Task) -> CloseLoopController:
+    def _make_controller(self, robot: Robot, task: Task) -> CloseLoopController:
         return CloseLoopController(robot, teleport=self.config.fast_mode)
 
     @property
@@ -64,16 +66,15 @@ class CloseLoopEnv(ManipulationEnv):
     def _make_action_spec(self) -> Bounded:
         return Bounded(-1.0, 1.0, shape=(self.actions.size,), dtype=torch.float32)
 
-    def _image_specs(self) -> dict[str, Bounded]:
-        size = self.config.obs_size
+    def _declare_images(self) -> dict[str, ImageSpec]:
         low, high = self._view.range_m(self._view_setup)
-        shape = (self._view.channels, size, size)
-        return {keys.PIXELS: Bounded(low, high, shape=shape, dtype=torch.float32)}
+        channels, size = self._view.channels, self.config.obs_size
+        return {keys.PIXELS: ImageSpec(channels, size, high, low, storage="uint8")}
 
     def _place_robot(self, scene: Scene) -> None:
         x, y = self.workspace.center
         z = min(max(START_HEIGHT_M, self.workspace.z[0]), self.workspace.z[1])
-        scene.motion.reset(((x, y, z), 0.0))
+        scene.controller.reset(((x, y, z), 0.0))
 
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         command = self.actions.decode(action)
@@ -82,8 +83,8 @@ class CloseLoopEnv(ManipulationEnv):
         yaw += command.dyaw_rad
         if self.half_rotation:
             yaw = min(max(yaw, HALF_TURN[0]), HALF_TURN[1])
-        scene.motion.move_to(target, yaw)
-        scene.motion.grip(command.opening)
+        scene.controller.move_to(target, yaw)
+        scene.controller.grip(command.opening)
 
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         robot = scene.robot

@@ -9,8 +9,9 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from ba_torchrl.config import EnvConfig, parse
+from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.settings import parse_env_config
 from ba_torchrl.envs.vector.make import make_vector_env
 from ba_torchrl.plugins import (
     MAIN,
@@ -25,7 +26,7 @@ from ba_torchrl.tasks.base import TASKS
 def make_env(task: str, **config: Any) -> ManipulationEnv:
     """Make one environment; see `ba_torchrl.make`."""
     control = TASKS[task].control
-    settings = parse(EnvConfig, config, f"configuration of {task}")
+    settings = parse_env_config(task, config)
     return CONTROLS[control](task, settings)
 
 
@@ -40,7 +41,7 @@ def resolve(task: str, **config: Any) -> EnvConfig:
     """
     task_class = TASKS[task]
     control, box = CONTROLS[task_class.control], task_class.workspace
-    settings = parse(EnvConfig, config, f"configuration of {task}")
+    settings = parse_env_config(task, config)
     defaults = {
         "action_sequence": control.default_action_sequence,
         "half_rotation": control.default_half_rotation,
@@ -65,7 +66,7 @@ def make_vector(
     """Make environments that step together; see `ba_torchrl.make_vector_env`."""
     modules = module_names(register_modules)
     import_modules(modules)
-    settings = parse(EnvConfig, config, f"configuration of {task}")
+    settings = parse_env_config(task, config)
     if parallel and start_method == "spawn":
         modules += _plugins_of(task, settings)
     return make_vector_env(

@@ -122,6 +122,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
             key: state[key].item() for key in (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT)
         }
         info["is_success"] = info[keys.SUCCESS]
+        info |= self.torchrl_env.conditions
         if keys.EXPERT_ACTION in state:
             info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
         return observation, info

@@ -7,16 +7,17 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
-from torchrl.data import Bounded, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.vision.depth import point_cloud
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_rgbd
 from ba_torchrl.sim.vision.views import finger_posts
-from ba_torchrl.tasks.base import Workspace
+from ba_torchrl.tasks.workspace import Workspace
 
 
 class ExtraObservations:
@@ -31,17 +32,22 @@ class ExtraObservations:
         self.config = config
         self.workspace = workspace
 
+    def images(self) -> dict[str, ImageSpec]:
+        """Return the declarations of the images that are added, by key."""
+        if not self.config.rgb:
+            return {}
+        size, (near, far) = self.config.obs_size, RGBD_RANGE_M
+        return {
+            keys.RGB: ImageSpec(3, size, 255, storage="exact", frame="camera", dtype=torch.uint8),
+            keys.RGB_DEPTH: ImageSpec(1, size, far, near, frame="camera"),
+        }
+
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specifications of what is added, by key."""
+        """Return the specifications of what is added besides images, by key."""
         config, specs = self.config, {}
         if config.obs_type == "vec":
             length = 1 + 4 * (1 + len(scene.task.landmarks))
             specs[keys.OBSERVATION] = Unbounded(shape=(length,), dtype=torch.float32)
-        if config.rgb:
-            size = config.obs_size
-            specs[keys.RGB] = Bounded(0, 255, shape=(3, size, size), dtype=torch.uint8)
-            near, far = RGBD_RANGE_M
-            specs[keys.RGB_DEPTH] = Bounded(near, far, shape=(1, size, size), dtype=torch.float32)
         if config.point_cloud:
             specs[keys.POINT_CLOUD] = Unbounded(shape=(config.point_cloud, 3), dtype=torch.float32)
         return specs

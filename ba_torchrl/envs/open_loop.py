@@ -12,15 +12,19 @@ from torchrl.data import Binary, Bounded, Unbounded
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import CONTROLS, SETTLE_STEPS, ManipulationEnv
+from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.episodes import SETTLE_STEPS
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits, tool_rotation
+from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits
+from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics
-from ba_torchrl.tasks.base import ActionLimits, Task
+from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.structures.deconstruction import Watch, watch
+from ba_torchrl.tasks.workspace import ActionLimits
 
 
 @CONTROLS.register("open_loop")
@@ -69,12 +73,13 @@ class OpenLoopEnv(ManipulationEnv):
 
     # -- for the base class ------------------------------------------------------------------
 
-    def _make_motion(self, robot: Robot, task: Task) -> PickPlace:
+    def _make_controller(self, robot: Robot, task: Task) -> PickPlace:
         return PickPlace(
             robot,
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
+            surface_height_m=task.terrain.height_m,
         )
 
     @property
@@ -99,46 +104,46 @@ class OpenLoopEnv(ManipulationEnv):
                 undo[keys.UNDO_IN_HAND] = self.observation_spec[keys.IN_HAND].clone()
             self.observation_spec.update(undo)
 
-    def _image_specs(self) -> dict[str, Bounded]:
-        size, patch = self.config.obs_size, self.config.in_hand_size
-        channels = self._in_hand_kind.channels
-        most = patch if channels == 3 else self.workspace.z[1]
+    def _declare_images(self) -> dict[str, ImageSpec]:
+        highest_m, patch = self.workspace.z[1], self.config.in_hand_size
+        if self._in_hand_kind.channels == 1:
+            in_hand = ImageSpec(1, patch, highest_m, frame="gripper")
+        else:  # projections: numbers of voxels
+            in_hand = ImageSpec(3, patch, patch, frame="gripper", channel_axes=("yz", "xz", "xy"))
         return {
-            keys.PIXELS: Bounded(
-                0.0, self.workspace.z[1], shape=(1, size, size), dtype=torch.float32
-            ),
-            keys.IN_HAND: Bounded(0.0, most, shape=(channels, patch, patch), dtype=torch.float32),
+            keys.PIXELS: ImageSpec(1, self.config.obs_size, highest_m),
+            keys.IN_HAND: in_hand,
         }
 
     def _place_robot(self, scene: Scene) -> None:
-        held = scene.motion.held
-        scene.motion.reset()
+        held = scene.controller.held
+        scene.controller.reset()
         if held is not None and held not in scene.task.objects:
             held.is_hidden = True  # the task has put it aside
         self._memory = {}
 
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         command = self.actions.decode(action)
-        motion = scene.motion
+        controller = scene.controller
         watched = self._watch(scene)
-        holding = motion.held is not None
+        holding = controller.held is not None
         primitive = command.primitive
         if primitive is None:
             primitive = PLACE if holding else PICK
         if primitive == PICK and not holding:
             before = self._heightmap(scene)
             position = self._position(scene, command, before, primitive)
-            body = motion.pick(position, tool_rotation(*command.angles_rad))
+            body = controller.pick(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
             if body is not None:
                 after = self._heightmap(scene)
                 self._memory = {"in_hand": self._draw_in_hand(before, after, position, command)}
         elif primitive == PLACE and holding:
             position = self._position(scene, command, self._heightmap(scene), primitive)
-            motion.place(position, tool_rotation(*command.angles_rad))
+            controller.place(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
-        motion.check_grasp()
-        if motion.held is None:
+        controller.check_grasp()
+        if controller.held is None:
             self._memory = {}
         if watched is not None:
             self._memory = self._remember_undo(scene, *watched)
@@ -164,7 +169,7 @@ class OpenLoopEnv(ManipulationEnv):
         return observation
 
     def _is_holding(self, scene: Scene) -> bool:
-        return scene.motion.held is not None
+        return scene.controller.held is not None
 
     def _expert_action(self, scene: Scene) -> np.ndarray:
         return self.actions.encode(scene.task.expert_command())
@@ -175,9 +180,9 @@ class OpenLoopEnv(ManipulationEnv):
         """Return how things lie before an action, if it will be asked what undoes it."""
         if not self.config.deconstruct:
             return None
-        return watch(scene.task.objects, scene.motion.held, scene.motion.grasp), self._heightmap(
-            scene
-        )
+        return watch(
+            scene.task.objects, scene.controller.held, scene.controller.grasp
+        ), self._heightmap(scene)
 
     def _remember_undo(self, scene: Scene, before: Watch, heights: np.ndarray) -> dict[str, Any]:
         """Return the memory with what undoes an action that has just settled.
@@ -188,8 +193,9 @@ class OpenLoopEnv(ManipulationEnv):
             heights: the heightmap before it.
         """
         memory = {name: value for name, value in self._memory.items() if name != "undo"}
-        lowest = scene.robot.gripper.lowest_tool_m()
-        command = before.undo(scene.motion.held, scene.motion.grasp, lowest)
+        command = before.undo(
+            scene.controller.held, scene.controller.grasp, scene.task.lowest_tool_m
+        )
         if command is None:
             return memory
         action = self.actions.encode(command)
@@ -215,19 +221,19 @@ class OpenLoopEnv(ManipulationEnv):
     def _position(
         self, scene: Scene, command: PickPlaceCommand, heights: np.ndarray, primitive: int
     ) -> tuple[float, float, float]:
-        """Return where the tool goes, the height taken from the image if it is left open."""
+        """Return where the tool goes; without a z component, the height follows from the image."""
         if command.z_m is not None:
             return command.x_m, command.y_m, command.z_m
-        task, floor = scene.task, self.workspace.z[0]
-        half = task.window_m(scene.motion.held) / self.pixel_m
+        task, xy = scene.task, (command.x_m, command.y_m)
+        half = task.window_m(scene.controller.held) / self.pixel_m
         rows, columns = (
             slice(max(math.ceil(c - half - 0.5), 0), max(math.floor(c + half + 0.5), 1))
             for c in self._pixel_of(command.x_m, command.y_m)
         )
         window = heights[rows, columns]
-        top = float(window.max()) - floor if window.size else 0.0
-        height = task.pick_height_m(top) if primitive == PICK else task.place_height_m(top)
-        return command.x_m, command.y_m, min(height + floor, self.workspace.z[1])
+        top = float(window.max()) if window.size else task.terrain.height_m(xy)
+        height = task.pick_height_m(top, xy) if primitive == PICK else task.place_height_m(top, xy)
+        return *xy, min(height, self.workspace.z[1])
 
     def _draw_in_hand(
         self,

@@ -1,4 +1,4 @@
-"""Scene: a sealed world with robot, task and what watches them, built from a configuration."""
+"""Scene: a sealed world with its robot, task, controller and camera, built from a configuration."""
 
 from __future__ import annotations
 
@@ -8,71 +8,72 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from ba_torchrl.config import CUSTOM_PHYSICS, EnvConfig
+from ba_torchrl.envs.settings import task_parameters
 from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SavedState, Snapshot, World
-from ba_torchrl.tasks.base import TASKS, ActionLimits, Task, TaskSettings, Workspace, check_scales
-from ba_torchrl.tasks.clutter.tray import add_tray
-from ba_torchrl.tasks.structures.deconstruction import Deconstruction
+from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
+from ba_torchrl.tasks.clutter.tray import Tray
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 MARK_M = 1e-3
 """Thickness of the coloured sheet that marks the workspace."""
 
 
-class Motion(Protocol):
-    """What carries out actions; its methods beyond these are the control's own."""
+class Controller(Protocol):
+    """Executes actions; the methods that do so are those of each control."""
 
     def get_state(self) -> Any:
-        """Return what it remembers from one action to the next."""
+        """Return the state that lasts from one action to the next."""
 
     def set_state(self, state: Any) -> None:
-        """Take up what `get_state` returned."""
+        """Restore a state of `get_state`."""
 
 
 @dataclass(frozen=True)
 class SceneState:
-    """Everything in a scene, at one moment."""
+    """The state of everything in a scene."""
 
     world: Snapshot | SavedState
     robot: Any
-    motion: Any
+    controller: Any
     task: Any
     hidden: tuple[bool, ...]
-    """Of each body, whether it is put aside."""
+    """Whether each body is inactive."""
 
 
 @dataclass
 class Scene:
-    """A sealed world with everything in it."""
+    """A sealed world with its robot, task, controller and camera."""
 
     world: World
     robot: Robot
     task: Task
-    motion: Motion
+    controller: Controller
     camera: HeightCamera
 
     def get_state(self, *, outlives_world: bool = False) -> SceneState:
-        """Return the state to come back to.
+        """Return the state.
 
         Args:
-            outlives_world: another scene that was built alike can take it up, too.
+            outlives_world: make a state that any scene of the same configuration can restore.
         """
         return SceneState(
             self.world.save() if outlives_world else self.world.snapshot(),
             self.robot.get_state(),
-            self.motion.get_state(),
+            self.controller.get_state(),
             self.task.get_state(),
             tuple(body.is_hidden for body in self.world.bodies),
         )
 
     def set_state(self, state: SceneState) -> None:
-        """Return to a state of this scene, or to one that outlives its world.
+        """Restore a state of this scene, or one that outlives its world.
 
         Raises:
-            SimulationError: it is another scene's.
+            SimulationError: the state is of another scene.
         """
         if isinstance(state.world, SavedState):
             self.world.load(state.world)
@@ -80,7 +81,7 @@ class Scene:
             self.world.restore(state.world)
         self.task.set_state(state.task)
         self.robot.set_state(state.robot)
-        self.motion.set_state(state.motion)
+        self.controller.set_state(state.controller)
         for body, is_hidden in zip(self.world.bodies, state.hidden, strict=True):
             body.is_hidden = is_hidden
 
@@ -93,27 +94,26 @@ def build_scene(
     limits: ActionLimits,
     scale: float,
     physics: Physics,
-    make_motion: Callable[[Robot, Task], Motion],
+    make_controller: Callable[[Robot, Task], Controller],
 ) -> Scene:
     """Build the world of a task for objects of one scale.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
         config: the environment's parameters.
-        workspace: where the task takes place.
-        limits: what one action covers.
+        workspace: bounds of the task.
+        limits: of one action.
         scale: of the objects.
-        physics: settings of the engine, unless the parameters say otherwise.
-        make_motion: from a robot and a task to what carries out actions.
+        physics: settings of the engine, unless the configuration overrides them.
+        make_controller: builds the controller of a robot and a task.
 
     Raises:
         ConfigError: there is no display for ``render=True``.
     """
     task_class = TASKS[task_id]
     world = _empty_world(config, workspace, physics)
-    surface_z_m = 0.0
-    if config.close_loop_tray:
-        surface_z_m = add_tray(world, workspace.center, workspace.width)
+    terrain = Tray(world, workspace) if config.close_loop_tray else None
+    robot = ROBOTS[config.robot](world)
     task = task_class(
         TaskSettings(
             workspace=workspace,
@@ -124,43 +124,16 @@ def build_scene(
             num_objects=(
                 task_class.num_objects if config.num_objects is None else config.num_objects
             ),
-            surface_z_m=surface_z_m,
-            parameters={name: getattr(config, name) for name in task_class.parameters},
-        )
+            parameters=task_parameters(task_class, config),
+        ),
+        world,
+        robot,
+        terrain,
     )
     if config.deconstruct:
-        task = Deconstruction(task)
-    task.world, task.robot = world, ROBOTS[config.robot](world)
-    task.build(world)
+        task = task.deconstruction()
     world.seal()
-    motion = make_motion(task.robot, task)
-    return Scene(world, task.robot, task, motion, HeightCamera(world.bodies))
-
-
-def check_task_parameters(task_id: str, config: EnvConfig) -> None:
-    """Check that a task can be had with these parameters.
-
-    Raises:
-        ConfigError: one has no meaning for it, or a value it does not take.
-    """
-    task_class = TASKS[task_id]
-    config.check_for(task_id, task_class.control, task_class.parameters)
-    if config.object_scale_range is not None:
-        check_scales(task_id, config.object_scale_range)
-    least, most = task_class.num_objects_range
-    numbers = range(least, most + 1, task_class.num_objects_step)
-    if config.num_objects is not None and config.num_objects not in numbers:
-        allowed = str(least) if least == most else f"{least} to {most}"
-        if numbers.step > 1:
-            allowed = f"{', '.join(map(str, numbers[:-1]))} or {numbers[-1]}"
-        raise ConfigError(
-            f"num_objects: {task_id} takes {allowed} objects, not {config.num_objects}"
-        )
-    if config.close_loop_tray and not task_class.fits_tray:
-        fitting = ", ".join(name for name in TASKS if TASKS[name].fits_tray)
-        raise ConfigError(
-            f"close_loop_tray: the tray has no room for {task_id}; it is for {fitting}"
-        )
+    return Scene(world, robot, task, make_controller(robot, task), HeightCamera(world.bodies))
 
 
 def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[float]) -> None:

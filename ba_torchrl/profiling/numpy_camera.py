@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Quaternion
 
 
 class NumpyHeightCamera:
@@ -40,7 +39,7 @@ class NumpyHeightCamera:
         """
         vertices = np.concatenate(
             [
-                mesh.vertices @ _rotation(body.pose[1]).T + body.position
+                body.pose.apply(mesh.vertices)
                 for body, mesh in zip(self._bodies, self._meshes, strict=True)
             ]
         )
@@ -69,15 +68,3 @@ class NumpyHeightCamera:
         image = np.zeros((pixels, pixels))
         np.maximum.at(image, (row[inside], col[inside]), height[inside])
         return image
-
-
-def _rotation(quaternion: Quaternion) -> np.ndarray:
-    """Return the matrix [3, 3] of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 
 import pybullet
 
-from ba_torchrl.sim.bodies import CONTACT_M, Body, Shape, Solid
-from ba_torchrl.sim.geometry import Quaternion, Vector, yaw_quaternion
-
-_NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
-_ORIGIN: Vector = (0.0, 0.0, 0.0)
+from ba_torchrl.sim.bodies import Body, Shape, Solid
+from ba_torchrl.sim.contacts import contacts, is_any_within
+from ba_torchrl.sim.geometry import IDENTITY, ORIGIN, Pose, Quaternion, Vector, yaw_quaternion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,14 +76,16 @@ class Part(Body):
         return False
 
     @property
-    def pose(self) -> tuple[Vector, Quaternion]:
-        """Position of the geometry's frame (metres) and orientation (x, y, z, w)."""
+    def pose(self) -> Pose:
+        """Pose of the geometry's frame."""
         if self.is_static:
-            return pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+            return Pose(
+                *pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
+            )
         state = pybullet.getLinkState(
             self.id, self.links[0], computeForwardKinematics=1, physicsClientId=self.client
         )
-        return state[4], state[5]
+        return Pose(state[4], state[5])
 
     def move_to(self, position: Vector, orientation: Quaternion) -> None:
         """Put the whole articulated body at a pose; only its fixed part can be asked to.
@@ -108,8 +108,8 @@ class Part(Body):
 
     def touches(self, other: Body) -> bool:
         """Whether the part, and not its sibling, is in contact with a body as of the last step."""
-        points = pybullet.getContactPoints(self.id, other.id, physicsClientId=self.client)
-        return any(point[3] in self.links and point[8] < CONTACT_M for point in points)
+        points = contacts(self.client, self.id, other.id)
+        return is_any_within(point for point in points if point.link in self.links)
 
     def forget_pairs(self) -> None:
         """Let the engine look afresh at what is near the part."""
@@ -170,10 +170,10 @@ class Articulated:
             linkMasses=[share, *[0.0] * len(fixed), *[share] * (len(moving) - 1)],
             linkCollisionShapeIndices=[piece.create_collision(client) for piece in pieces],
             linkVisualShapeIndices=[slider.create_visual(client), *[-1] * (len(pieces) - 1)],
-            linkPositions=[_ORIGIN] * len(pieces),
-            linkOrientations=[_NO_TURN] * len(pieces),
-            linkInertialFramePositions=[_ORIGIN] * len(pieces),
-            linkInertialFrameOrientations=[_NO_TURN] * len(pieces),
+            linkPositions=[ORIGIN] * len(pieces),
+            linkOrientations=[IDENTITY] * len(pieces),
+            linkInertialFramePositions=[ORIGIN] * len(pieces),
+            linkInertialFrameOrientations=[IDENTITY] * len(pieces),
             linkParentIndices=parents,
             linkJointTypes=[
                 pybullet.JOINT_PRISMATIC,

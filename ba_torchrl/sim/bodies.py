@@ -13,13 +13,18 @@ from typing import ClassVar
 import numpy as np
 import pybullet
 
-from ba_torchrl.sim.geometry import IDENTITY, Quaternion, Vector, quaternion_yaw, yaw_quaternion
+from ba_torchrl.sim.contacts import contacts, is_any_within
+from ba_torchrl.sim.geometry import (
+    Pose,
+    Quaternion,
+    Vector,
+    bullet_compose,
+    quaternion_tilt,
+    yaw_quaternion,
+)
 from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, write_obj
 
 Color = tuple[float, float, float, float]
-
-CONTACT_M = 5e-4
-"""Bodies closer than this touch; PyBullet already lists pairs that are millimetres apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,9 +184,8 @@ class Body:
         self.is_hidden = False
         """Put aside for now: cameras and settling leave it out."""
         # PyBullet's poses are of the centre of mass
-        self._from_center = (
-            tuple(-x for x in shape.center_of_mass_m) if any(shape.center_of_mass_m) else None
-        )
+        self._center = Pose(shape.center_of_mass_m) if any(shape.center_of_mass_m) else None
+        self._from_center = None if self._center is None else self._center.inverse()
         self.id = pybullet.createMultiBody(
             baseMass=shape.mass_kg,
             baseCollisionShapeIndex=shape.create_collision(client),
@@ -216,14 +220,10 @@ class Body:
         return not self.is_static
 
     @property
-    def pose(self) -> tuple[Vector, Quaternion]:
-        """Position of the geometry's frame (metres) and orientation (x, y, z, w)."""
-        pose = pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
-        return (
-            pose
-            if self._from_center is None
-            else pybullet.multiplyTransforms(*pose, self._from_center, IDENTITY)
-        )
+    def pose(self) -> Pose:
+        """Pose of the geometry's frame."""
+        pose = Pose(*pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client))
+        return pose if self._from_center is None else bullet_compose(pose, self._from_center)
 
     @property
     def position(self) -> Vector:
@@ -233,13 +233,12 @@ class Body:
     @property
     def yaw_rad(self) -> float:
         """Heading of the body's x axis in the plane."""
-        return quaternion_yaw(self.pose[1])
+        return self.pose.yaw_rad
 
     @property
     def tilt_rad(self) -> float:
         """Angle between the body's z axis and the vertical."""
-        x, y, _, _ = self.pose[1]
-        return math.acos(min(max(1 - 2 * (x * x + y * y), -1.0), 1.0))
+        return quaternion_tilt(self.pose.orientation)
 
     def place(self, position: Vector, yaw_rad: float = 0.0) -> None:
         """Put the body at rest, upright, at a pose."""
@@ -247,10 +246,8 @@ class Body:
 
     def move_to(self, position: Vector, orientation: Quaternion) -> None:
         """Put the body at rest at any pose."""
-        if self._from_center is not None:
-            position, orientation = pybullet.multiplyTransforms(
-                position, orientation, self.shape.center_of_mass_m, IDENTITY
-            )
+        if self._center is not None:
+            position, orientation = bullet_compose(Pose(position, orientation), self._center)
         pybullet.resetBasePositionAndOrientation(
             self.id, position, orientation, physicsClientId=self.client
         )
@@ -268,8 +265,7 @@ class Body:
 
     def touches(self, other: Body) -> bool:
         """Whether the two bodies are in contact, as of the last step."""
-        points = pybullet.getContactPoints(self.id, other.id, physicsClientId=self.client)
-        return any(point[8] < CONTACT_M for point in points)
+        return is_any_within(contacts(self.client, self.id, other.id))
 
     def bounding_box(self) -> tuple[Vector, Vector]:
         """Return the lower and upper corner of the axis-aligned bounding box."""
@@ -278,9 +274,7 @@ class Body:
 
 def world_vertices(body: Body) -> np.ndarray:
     """Return the vertices of a body's surface as it lies, [V, 3] in metres."""
-    position, orientation = body.pose
-    turn = np.reshape(pybullet.getMatrixFromQuaternion(orientation), (3, 3))
-    return body.shape.vertices @ turn.T + position
+    return body.pose.apply(body.shape.vertices)
 
 
 def vertical_extent(body: Body) -> tuple[float, float]:
@@ -293,26 +287,3 @@ def radius_m(body: Body) -> float:
     """Return the distance of the farthest point of an upright body from its axis."""
     low, high = body.shape.bounds_m
     return math.hypot(*(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True)))
-
-
-def gap_m(other_id: int, body: Body, up_to_m: float = 0.1) -> float:
-    """Return the distance between a body and anything else of its client, as of now.
-
-    Args:
-        other_id: PyBullet's id of a body or robot.
-        body: the body.
-        up_to_m: farther is reported as infinite; negative distances are depths of penetration.
-    """
-    points = pybullet.getClosestPoints(other_id, body.id, up_to_m, physicsClientId=body.client)
-    return min((point[8] for point in points), default=math.inf)
-
-
-def press_n(other_id: int, body: Body) -> float:
-    """Return the force with which something bears on a body from above or below.
-
-    Args:
-        other_id: PyBullet's id of a body or robot.
-        body: the body; the force is that of the last step, in newtons.
-    """
-    points = pybullet.getContactPoints(other_id, body.id, physicsClientId=body.client)
-    return sum(point[9] for point in points if abs(point[7][2]) > 0.6)

@@ -1,4 +1,4 @@
-"""Positions, orientations and poses in three dimensions.
+"""Positions, orientations and poses: SE(3), and its counterpart in the horizontal plane.
 
 Frames are right-handed with z up, lengths are metres, angles radians, quaternions (x, y, z, w).
 """
@@ -6,6 +6,11 @@ Frames are right-handed with z up, lengths are metres, angles radians, quaternio
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import pybullet
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -14,7 +19,13 @@ Matrix = tuple[Vector, Vector, Vector]
 YawPose = tuple[Vector, float]
 """Position and yaw of an upright body, or of a tool that points down."""
 
+Coordinate = TypeVar("Coordinate", float, np.ndarray)
+
+ORIGIN: Vector = (0.0, 0.0, 0.0)
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+# -- rotations ---------------------------------------------------------------------------------
 
 
 def yaw_quaternion(yaw_rad: float) -> Quaternion:
@@ -28,7 +39,175 @@ def quaternion_yaw(orientation: Quaternion) -> float:
     return math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
 
 
+def quaternion_tilt(orientation: Quaternion) -> float:
+    """Return the angle between the rotated z axis and the vertical, in [0, pi]."""
+    x, y, _, _ = orientation
+    return math.acos(min(max(1 - 2 * (x * x + y * y), -1.0), 1.0))
+
+
+def quaternion_matrix(orientation: Quaternion) -> Matrix:
+    """Return the rotation matrix of a unit quaternion, as rows."""
+    m = pybullet.getMatrixFromQuaternion(orientation)
+    return m[:3], m[3:6], m[6:]
+
+
+def rotation_array(orientation: Quaternion) -> np.ndarray:
+    """Return the rotation matrix of a unit quaternion, [3, 3] float64."""
+    return np.reshape(pybullet.getMatrixFromQuaternion(orientation), (3, 3))
+
+
+def euler_matrix(rz_rad: float, ry_rad: float, rx_rad: float) -> Matrix:
+    """Return the rotation matrix Rz(rz) Ry(ry) Rx(rx), as rows."""
+    cz, sz = math.cos(rz_rad), math.sin(rz_rad)
+    cy, sy = math.cos(ry_rad), math.sin(ry_rad)
+    cx, sx = math.cos(rx_rad), math.sin(rx_rad)
+    return (
+        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+        (-sy, cy * sx, cy * cx),
+    )
+
+
+def quaternion_product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return the rotation by ``b`` followed by the rotation by ``a``."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by + ay * bw + az * bx - ax * bz,
+        aw * bz + az * bw + ax * by - ay * bx,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+# -- tools: z is the direction of approach, the fingers open along x ----------------------------
+
+
 def downward(yaw_rad: float) -> Matrix:
-    """Return the rotation of a tool that points down, its fingers along x at yaw 0."""
+    """Return the rotation of a tool that points straight down, its fingers along x at yaw 0."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return ((cos, sin, 0.0), (sin, -cos, 0.0), (0.0, 0.0, -1.0))
+
+
+def downward_quaternion(yaw_rad: float) -> Quaternion:
+    """Return the rotation of a tool that points straight down, as a quaternion."""
+    return (math.cos(yaw_rad / 2), math.sin(yaw_rad / 2), 0.0, 0.0)
+
+
+def tool_rotation(rz_rad: float, ry_rad: float = 0.0, rx_rad: float = 0.0) -> Matrix:
+    """Return Rz(rz) Ry(ry) Rx(rx) of a tool that points straight down at zero angles."""
+    return tuple((x, -y, -z) for x, y, z in euler_matrix(rz_rad, ry_rad, rx_rad))
+
+
+def tool_angles(orientation: Quaternion) -> Vector:
+    """Return rz, ry and rx of a tool: the inverse of `tool_rotation`.
+
+    Args:
+        orientation: of the tool.
+
+    Returns:
+        rz and rx in [-pi, pi], ry in [-pi/2, pi/2].
+    """
+    (m00, _, _), (m10, _, _), (m20, m21, m22) = quaternion_matrix(orientation)
+    return math.atan2(m10, m00), math.asin(min(max(-m20, -1.0), 1.0)), math.atan2(-m21, -m22)
+
+
+# -- poses -------------------------------------------------------------------------------------
+
+
+class Pose(NamedTuple):
+    """A pose of one frame in another: an element of SE(3)."""
+
+    position: Vector
+    orientation: Quaternion = IDENTITY
+
+    def compose(self, inner: Pose) -> Pose:
+        """Return the pose, in the outer frame, of what has a pose in this one."""
+        rows = quaternion_matrix(self.orientation)
+        position = tuple(
+            p + dot(row, inner.position) for p, row in zip(self.position, rows, strict=True)
+        )
+        return Pose(position, quaternion_product(self.orientation, inner.orientation))
+
+    def inverse(self) -> Pose:
+        """Return the pose of the outer frame in this one."""
+        columns = zip(*quaternion_matrix(self.orientation), strict=True)
+        x, y, z, w = self.orientation
+        return Pose(tuple(-dot(column, self.position) for column in columns), (-x, -y, -z, w))
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Return points of this frame, [..., 3], in the outer frame."""
+        return points @ rotation_array(self.orientation).T + self.position
+
+    def rotate(self, vectors: np.ndarray) -> np.ndarray:
+        """Return directions of this frame, [..., 3], in the outer frame."""
+        return vectors @ rotation_array(self.orientation).T
+
+    def moved_to(self, position: Vector, turn_rad: float = 0.0) -> Pose:
+        """Return the pose at another position, turned about the vertical.
+
+        Args:
+            position: in the outer frame.
+            turn_rad: about the outer frame's z axis.
+        """
+        return Pose(position, quaternion_product(yaw_quaternion(turn_rad), self.orientation))
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading of the x axis in the horizontal plane, in [-pi, pi]."""
+        return quaternion_yaw(self.orientation)
+
+
+def downward_pose(position: Vector, yaw_rad: float) -> Pose:
+    """Return the pose of a tool that points straight down."""
+    return Pose(position, downward_quaternion(yaw_rad))
+
+
+def bullet_compose(outer: Pose, inner: Pose) -> Pose:
+    """Return `outer.compose(inner)` as PyBullet computes it: in single precision."""
+    return Pose(*pybullet.multiplyTransforms(*outer, *inner))
+
+
+def bullet_inverse(pose: Pose) -> Pose:
+    """Return `pose.inverse()` as PyBullet computes it: in single precision."""
+    return Pose(*pybullet.invertTransform(*pose))
+
+
+class PlanarFrame(NamedTuple):
+    """A frame in the horizontal plane: an element of SE(2)."""
+
+    x: float
+    y: float
+    yaw_rad: float
+
+    def to_world(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+        """Return the world's coordinates of a point of this frame; arrays stand for many."""
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return self.x + cos * x - sin * y, self.y + sin * x + cos * y
+
+    def to_local(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
+        """Return this frame's coordinates of a point of the world; arrays stand for many."""
+        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        dx, dy = x - self.x, y - self.y
+        return cos * dx + sin * dy, cos * dy - sin * dx
+
+
+def dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return the scalar product of two vectors of three components."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
+    """Return the vector product."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def perpendicular(vector: Vector, axis: Vector) -> Vector:
+    """Return the direction of the part of a vector that is perpendicular to a unit axis.
+
+    It is zero for a vector along the axis.
+    """
+    along = dot(vector, axis)
+    rest = tuple(v - along * a for v, a in zip(vector, axis, strict=True))
+    norm = math.sqrt(dot(rest, rest)) or 1.0
+    return tuple(r / norm for r in rest)

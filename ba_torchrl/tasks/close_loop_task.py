@@ -1,4 +1,4 @@
-"""What the close-loop tasks share."""
+"""The base of the close-loop tasks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Box, Color
-from ba_torchrl.tasks.base import BLOCK_M, Task, Workspace
+from ba_torchrl.tasks.base import BLOCK_M, Task
+from ba_torchrl.tasks.workspace import Workspace
 
 RED: Color = (0.82, 0.22, 0.2, 1.0)
 BLUE: Color = (0.2, 0.4, 0.8, 1.0)
@@ -19,14 +20,18 @@ PAIR_ATTEMPTS = 2000
 """Layouts tried before giving up; the rarest, two pulling blocks in line, come up in 1 of 30."""
 
 
-class CloseLoopTask(Task):
-    """A task controlled by small displacements of the gripper (appendix A.2, G.2)."""
+class CloseLoopControl:
+    """Defaults of close-loop control (appendix A.2, G.2); a mixin of `Task`."""
 
     control: ClassVar[Literal["open_loop", "close_loop"]] = "close_loop"
     max_steps = 50
     workspace = Workspace(x=(0.3, 0.6), y=(-0.15, 0.15), z=(0.01, 0.25))
     scale_range = (1.0, 1.0)
     scale_limits = (0.6, 1.2)
+
+
+class CloseLoopTask(CloseLoopControl, Task):
+    """A task controlled by small displacements of the gripper (appendix A.2, G.2)."""
 
     def cube(self, color: Color = RED) -> Box:
         """Return the shape of a cubic block."""

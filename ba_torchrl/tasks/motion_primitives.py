@@ -14,8 +14,9 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.base import ActionLimits, Workspace
+from ba_torchrl.tasks.pick_place_commands import carrying_pose
 from ba_torchrl.tasks.structures.free_space import finger_path_clearance_m
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
 ALIGNED_M = 4e-3
@@ -207,16 +208,12 @@ def carry_to(
         hover_m: gap that the body keeps to what it passes over, and to its place before it comes
             down; more is needed where its place has a rim.
     """
-    tool, yaw = robot.tool_pose()
+    tool_pose, pose = robot.tool_transform(), body.pose
+    tool, yaw = tool_pose.position, tool_pose.yaw_rad
     turn = 0.0 if yaw_rad is None else wrap_angle(yaw_rad - yaw)
-    x, y, z = body.position
-    cos, sin = math.cos(turn), math.sin(turn)
-    ox, oy = x - tool[0], y - tool[1]
-    target = (
-        position[0] - (cos * ox - sin * oy),
-        position[1] - (sin * ox + cos * oy),
-        tool[2] + position[2] + RELEASE_GAP_M - z,
-    )
+    x, y, _ = pose.position
+    released = (*position[:2], position[2] + RELEASE_GAP_M)
+    target = carrying_pose(tool_pose, pose, pose.moved_to(released, turn)).position
     is_beside = max(abs(position[0] - x), abs(position[1] - y)) <= ALIGNED_M
     if is_beside and abs(turn) <= ALIGNED_RAD:
         arrives = tool[2] - target[2] <= limits.step_m

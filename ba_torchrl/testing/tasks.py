@@ -108,7 +108,7 @@ def check_resets(task: str, *, episodes: int = 10, **config: Any) -> None:
         for episode in range(episodes):
             state = env.reset()
             where = f"{task}, episode {episode}"
-            assert not env.scene.task.is_goal(), f"{where}: the goal holds at the start"
+            assert not env.scene.task.is_success(), f"{where}: the goal holds at the start"
             assert env.scene.task.is_valid(), f"{where}: the scene is invalid at the start"
             assert not state[keys.DONE], f"{where}: done at the start"
             assert not state[keys.SUCCESS], f"{where}: success at the start"

@@ -12,10 +12,10 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Algorithm, Problem
-from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.config import ExperimentConfig
 
 Which = Literal["best", "latest"]
@@ -181,30 +181,18 @@ def problem_of(config: ExperimentConfig) -> Problem:
     """Return what the algorithm of an experiment must know of its environment.
 
     Raises:
-        ConfigError: the environment cannot be made, or its images are not for networks.
+        ConfigError: the environment cannot be made.
     """
     env = make_env(config.task, **config.env)
-    try:
-        pixels = env.observation_spec[keys.PIXELS]
-        if pixels.shape[0] != 1 or float(pixels.space.low.min()) < 0:
-            raise ConfigError(
-                f"env.view_type {config.env_config.view_type!r}: the networks take depth or height "
-                "in one channel, nothing below zero"
-            )
-        in_hand = None
-        if keys.IN_HAND in env.observation_spec:
-            in_hand = tuple(env.observation_spec[keys.IN_HAND].shape[:2])
-        return Problem(
-            image_size=pixels.shape[-1],
-            actions=env.actions,
-            max_depth_m=float(pixels.space.high.max()),
-            in_hand_shape=in_hand,
-            total_updates=config.total_updates,
-            seed=config.seed,
-            device=config.torch_device,
-        )
-    finally:
-        env.close()
+    env.close()
+    return Problem(
+        control=TASKS[config.task].control,
+        images=env.images,
+        actions=env.actions,
+        total_updates=config.total_updates,
+        seed=config.seed,
+        device=config.torch_device,
+    )
 
 
 def _rotation(folder: Path, keep_last: int = 1) -> CheckpointRotation:

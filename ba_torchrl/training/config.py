@@ -13,8 +13,9 @@ from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.config import EnvConfig, StrictModel, parse
-from ba_torchrl.data.demos import Source, check_demonstrations, source_config
-from ba_torchrl.envs.scene import check_task_parameters
+from ba_torchrl.data.demo_files import check_demonstrations
+from ba_torchrl.data.demos import Source, source_config
+from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
@@ -110,7 +111,7 @@ class ExperimentConfig(StrictModel):
     @cached_property
     def env_config(self) -> EnvConfig:
         """The environments' parameters."""
-        return parse(EnvConfig, self.env, "env")
+        return parse_env_config(self.task, self.env, "env")
 
     @cached_property
     def network_config(self) -> NetworkConfig:
@@ -174,12 +175,7 @@ class ExperimentConfig(StrictModel):
         _ = config.env_config
         if config.env_config.obs_type != "pixel":
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
-        config.algorithm_config.check(config.network_config)
-        if config.algorithm_config.control != control:
-            raise ConfigError(
-                f"algorithm {config.algorithm['name']!r} learns "
-                f"{config.algorithm_config.control} tasks, not {config.task}"
-            )
+        config.algorithm_config.check(config.network_config, control)
         if config.pretrain_updates > config.total_updates:
             raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
         if config.pretrain_updates and not config.demonstrations:
@@ -212,7 +208,9 @@ class ExperimentConfig(StrictModel):
     def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)
         if self.demonstrations:
-            check_task_parameters(self.task, parse(EnvConfig, {**self.env, **source}, "env"))
+            check_task_parameters(
+                self.task, parse_env_config(self.task, {**self.env, **source}, "env")
+            )
         if self.demonstrations_path is not None:
             check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
 

@@ -14,12 +14,8 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import Algorithm
-from ba_torchrl.data.demos import (
-    as_transitions,
-    collect_demonstrations,
-    load_demonstrations,
-    source_config,
-)
+from ba_torchrl.data.demo_files import load_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -72,8 +68,12 @@ def make_collector(env: EnvBase, algorithm: Algorithm, config: ExperimentConfig)
     )
 
 
-def gather_demonstrations(config: ExperimentConfig) -> list[TensorDict]:
+def gather_demonstrations(config: ExperimentConfig, algorithm: Algorithm) -> list[TensorDict]:
     """Return the episodes [T] of a run's demonstrations, read from a folder or played now.
+
+    Args:
+        config: of the run.
+        algorithm: whose policy must be able to choose the demonstrated actions.
 
     Raises:
         ConfigError: the folder holds fewer than the run asks for.
@@ -96,6 +96,7 @@ def gather_demonstrations(config: ExperimentConfig) -> list[TensorDict]:
             seed=seed,
             source=config.demonstrations_source,
             only_successful=config.only_successful_demonstrations,
+            nearest_action=algorithm.nearest_action,
         )
     finally:
         env.close()
@@ -182,9 +183,8 @@ class Experiment:
         """Fill the replay with demonstrations."""
         if not self.config.demonstrations:
             return
-        episodes = gather_demonstrations(self.config)
-        for episode in episodes:
-            self.algorithm.extend(as_transitions(episode, is_expert=True))
+        episodes = gather_demonstrations(self.config, self.algorithm)
+        self.algorithm.on_demonstrations(episodes)
         self.log.write(
             0,
             {
@@ -202,7 +202,8 @@ class Experiment:
             return
         # A resumed run plays other episodes than before its interruption.
         part = self._progress.resumed_at[-1] if self._progress.resumed_at else 0
-        self._train_env = make_env(config, config.derived_seed(SeedUse.COLLECTION, part))
+        seed = config.derived_seed(SeedUse.COLLECTION, part)
+        self._train_env = make_env(config, seed, expert=algorithm.stores_expert_action)
         collector = make_collector(self._train_env, algorithm, config)
         try:
             for data in collector:
@@ -244,7 +245,7 @@ class Experiment:
         progress.faults += int(following[keys.FAULT].sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
-        self.algorithm.extend(as_transitions(data, is_expert=False))
+        self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
 
     def _update(self) -> None:
         """Take one update; log and evaluate if they are due."""

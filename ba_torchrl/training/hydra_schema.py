@@ -57,14 +57,18 @@ def register(arguments: Sequence[str] = ()) -> None:
         for name, value in defaults_of(EnvConfig).items()
         if name not in SET_BY_THE_EXPERIMENT
     }
-    store.store(name="environment", node={"env": env})
-    experiment = {**defaults_of(ExperimentConfig), "env": env}
+    # open: a task adds parameters of its own, which are checked against the task
+    environment = OmegaConf.create({"env": env})
+    OmegaConf.set_struct(environment.env, False)
+    store.store(name="environment", node=environment)
+    experiment = OmegaConf.create({**defaults_of(ExperimentConfig), "env": env})
+    OmegaConf.set_struct(experiment.env, False)
     store.store(name="experiment", node=experiment)
     shared = {name: value for name, value in experiment.items() if name not in SET_BY_THE_GRID}
     grid = OmegaConf.create(
         {**defaults_of(BenchmarkConfig), **shared, "algorithm": {}, "network": {}}
     )
-    for name in ("algorithm", "network", "per_task", "per_algorithm", "per_network"):
+    for name in ("env", "algorithm", "network", "per_task", "per_algorithm", "per_network"):
         OmegaConf.set_struct(grid[name], False)
     store.store(name="grid", node=grid)
     for group, registry in GROUPS.items():

@@ -10,9 +10,12 @@ from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
 from ba_torchrl.algorithms.spatial_q import SpatialQConfig
 from ba_torchrl.config import parse
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.errors import ConfigError
+from tests.specs import open_loop_images
 
+IMAGES = ["pixels", "in_hand"]
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
@@ -22,10 +25,9 @@ TINY = {"num_rotations": 4, "width": 0.125, "precision": "float32", "height_scal
 def build(network="asr", sequence="pxyr", *, sizes=None, seed=0, **config):
     torch.manual_seed(seed)
     problem = Problem(
-        image_size=32,
+        control="open_loop",
+        images=open_loop_images(),
         actions=OpenLoopActions(sequence, BOUNDS),
-        max_depth_m=0.24,
-        in_hand_shape=(1, 24),
         total_updates=10,
         seed=seed,
         device=torch.device("cpu"),
@@ -40,7 +42,7 @@ def transitions():
     env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
     episodes = collect_demonstrations(env, 4, seed=0, only_successful=True)
     env.close()
-    return torch.cat([as_transitions(episode, is_expert=True) for episode in episodes])
+    return torch.cat([as_transitions(episode, IMAGES, is_expert=True) for episode in episodes])
 
 
 def online(transitions):
@@ -69,7 +71,7 @@ def test_every_network_learns_the_demonstrations(network, transitions):
 
 
 @pytest.mark.parametrize("demonstrations", ["none", "dqfd", "sdqfd", "adet"])
-@pytest.mark.parametrize("replay", ["split", "prioritized", "uniform"])
+@pytest.mark.parametrize("replay", ["symmetric", "prioritized", "uniform"])
 def test_every_loss_takes_steps_on_every_replay(demonstrations, replay, transitions):
     algorithm = build("fcn", demonstrations=demonstrations, replay=replay)
     algorithm.extend(transitions)
@@ -141,7 +143,7 @@ def test_the_policy_is_greedy_until_epsilon_says_otherwise(transitions):
     explorer.extend(transitions)
     found = []
     for _ in range(6):
-        found.append(float(explorer.acting.epsilon))
+        found.append(float(explorer.explorer.epsilon))
         explorer.update()
     assert found == pytest.approx([1.0, 0.875, 0.75, 0.625, 0.5, 0.5])
 
@@ -173,10 +175,13 @@ def test_an_action_without_yaw_takes_the_networks_that_suit_it(transitions):
         build("fcn", "pxy", augmentation="se2")
 
 
-def test_networks_of_the_other_kind_are_refused():
+def test_networks_and_tasks_of_the_other_kind_are_refused():
     spatial, close = parse(SpatialQConfig, {}, "q"), parse(ALGORITHMS["sac"], {}, "sac")
-    with pytest.raises(ConfigError, match=r"for close_loop tasks; .* asr, equi_asr"):
-        spatial.check(parse(NETWORKS["cnn"], {}, "cnn"))
-    with pytest.raises(ConfigError, match=r"for open_loop tasks; .* cnn, equi"):
-        close.check(parse(NETWORKS["fcn"], {}, "fcn"))
-    spatial.check(parse(NETWORKS["fcn"], {}, "fcn"))
+    cnn, fcn = parse(NETWORKS["cnn"], {}, "cnn"), parse(NETWORKS["fcn"], {}, "fcn")
+    with pytest.raises(ConfigError, match=r"for close_loop tasks; open_loop tasks take .* asr"):
+        spatial.check(cnn, "open_loop")
+    with pytest.raises(ConfigError, match=r"for open_loop tasks; close_loop tasks take .* cnn"):
+        close.check(fcn, "close_loop")
+    with pytest.raises(ConfigError, match="for open_loop tasks, not for close_loop ones"):
+        spatial.check(cnn, "close_loop")
+    spatial.check(fcn, "open_loop")

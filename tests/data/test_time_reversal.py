@@ -1,6 +1,5 @@
 import math
 
-import numpy as np
 import pybullet
 import pytest
 import torch
@@ -8,14 +7,14 @@ from tensordict import TensorDict
 
 import ba_torchrl
 from ba_torchrl.actions import PICK, PLACE
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.episodes import collect_episodes
 from ba_torchrl.data.time_reversal import is_reversible, replay_scores, reverse_episode
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.control.pick_place import tool_rotation
-from ba_torchrl.sim.geometry import downward
-from ba_torchrl.tasks.structures.deconstruction import Watch, tool_angles
+from ba_torchrl.sim.geometry import Pose
+from ba_torchrl.tasks.structures.deconstruction import Watch
 
 TASK = "open_loop/house_building_2"
 STRUCTURES = [
@@ -125,26 +124,11 @@ def test_what_did_not_go_by_turns_is_refused(taken_apart, key, values):
         reverse_episode(taken_apart)
 
 
-def test_angles_of_a_tool():
-    for angles in [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (1.0, -0.2, 0.5)]:
-        rotation = np.array(tool_rotation(*angles))
-        quaternion = (math.sin(math.pi / 2), 0.0, 0.0, math.cos(math.pi / 2))
-        for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
-            angle = angles[axis[::-1].index(1)]
-            turn = pybullet.getQuaternionFromAxisAngle(axis, angle)
-            _, quaternion = pybullet.multiplyTransforms((0, 0, 0), turn, (0, 0, 0), quaternion)
-        np.testing.assert_allclose(
-            np.reshape(pybullet.getMatrixFromQuaternion(quaternion), (3, 3)), rotation, atol=1e-6
-        )
-        np.testing.assert_allclose(tool_angles(quaternion), angles, atol=1e-6)
-    assert tool_rotation(0.3)[0] == pytest.approx(downward(0.3)[0])
-
-
 class Piece:
     """A body that lies somewhere."""
 
     def __init__(self, x, y, z, turn=(0.0, 0.0, 0.0, 1.0)):
-        self.pose = ((x, y, z), turn)
+        self.pose = Pose((x, y, z), turn)
 
     @property
     def position(self):
@@ -155,9 +139,9 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
     down = pybullet.getQuaternionFromEuler((math.pi, 0.0, 0.0))
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
     # held 4 mm beside its middle, along the tool's x axis
-    grasp = ((0.004, 0.0, 0.0), pybullet.invertTransform((0, 0, 0), down)[1])
+    grasp = Pose((0.004, 0.0, 0.0), pybullet.invertTransform((0, 0, 0), down)[1])
     before = Watch({body: body.pose, other: other.pose}, None, None)
-    body.pose = ((0.6, 0.0, 0.4), body.pose[1])
+    body.pose = Pose((0.6, 0.0, 0.4), body.pose[1])
     undo = before.undo(body, grasp)
     assert undo.primitive == PLACE
     assert undo[1:4] == pytest.approx((0.396, 0.1, 0.05))
@@ -165,7 +149,7 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
 
     held = Watch({body: body.pose, other: other.pose}, body, grasp)
     quarter = pybullet.getQuaternionFromEuler((0.0, 0.0, math.pi / 2))
-    body.pose = ((0.3, -0.1, 0.015), quarter)
+    body.pose = Pose((0.3, -0.1, 0.015), quarter)
     undo = held.undo(None, None)
     assert undo.primitive == PICK
     assert undo[1:4] == pytest.approx((0.3, -0.104, 0.015))
@@ -177,12 +161,12 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
 
 def test_nothing_undoes_an_action_that_moved_nothing_or_two_things():
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
-    grasp = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    grasp = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     before = Watch({body: body.pose, other: other.pose}, None, None)
     assert before.undo(None, None) is None
-    other.pose = ((0.5, 0.004, 0.015), other.pose[1])
+    other.pose = Pose((0.5, 0.004, 0.015), other.pose[1])
     assert before.undo(body, grasp) is not None
-    other.pose = ((0.5, 0.006, 0.015), other.pose[1])
+    other.pose = Pose((0.5, 0.006, 0.015), other.pose[1])
     assert before.undo(body, grasp) is None
 
 
@@ -240,7 +224,7 @@ def test_episodes_come_out_as_the_experts_do(mode):
         for body, start in zip(plain.scene.task.objects, env.scene.task.objects, strict=True):
             body.move_to(*start.pose)
         plain.scene.world.settle(max_steps=100)
-        plain.scene.motion.reset()
+        plain.scene.controller.reset()
         plain._memory = {}
         for step in built:
             played = plain.step(TensorDict({"action": step["action"]}))["next"]
@@ -264,8 +248,8 @@ def test_the_start_is_the_goal_and_the_end_is_apart():
     try:
         state = env.reset()
         task = env.scene.task
-        assert task.task.is_goal()
-        assert not task.is_goal()
+        assert task.task.is_success()
+        assert not task.is_success()
         assert not state["can_undo"]
         first = state["expert_action"]
         assert torch.equal(env.reset(seed=0)["expert_action"], first)
@@ -273,8 +257,8 @@ def test_the_start_is_the_goal_and_the_end_is_apart():
             state = env.step(state.set("action", state["expert_action"].clone()))["next"]
             assert state["can_undo"]
         assert state["terminated"]
-        assert task.is_goal()
-        assert not task.task.is_goal()
+        assert task.is_success()
+        assert not task.task.is_success()
         bodies = list(task.objects)
         for i, body in enumerate(bodies):
             for other in bodies[:i]:
@@ -299,7 +283,7 @@ def test_collected_side_by_side():
     assert [len(episode) for episode in episodes] == [4, 4, 4]
     for episode, original in zip(episodes, played, strict=True):
         assert torch.equal(episode["pixels"][0], original["next", "pixels"][-1])
-    transitions = as_transitions(episodes[0], is_expert=True)
+    transitions = as_transitions(episodes[0], ["pixels", "in_hand"], is_expert=True)
     assert keys.IN_HAND in transitions
     assert (keys.NEXT, keys.IN_HAND) in transitions.keys(include_nested=True)
 

@@ -275,7 +275,7 @@ def test_a_simulator_fault_truncates_and_is_told(make, monkeypatch, caplog):
     env = make()
     env.reset()
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(env.unwrapped.torchrl_env.scene.motion, "move_to", fail)
+        patch.setattr(env.unwrapped.torchrl_env.scene.controller, "move_to", fail)
         _, reward, terminated, truncated, info = env.step(NOTHING)
     assert (reward, terminated, truncated, info["fault"]) == (0.0, False, True, True)
     env.reset()

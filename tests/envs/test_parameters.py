@@ -185,7 +185,7 @@ def test_top_down_approach_is_the_pick_and_places(make):
     for top_down in (False, True):
         env = make("open_loop/block_stacking", top_down_approach=top_down)
         env.reset()
-        assert env.scene.motion.top_down is top_down
+        assert env.scene.controller.top_down is top_down
 
 
 def test_in_hand_images_have_the_size_that_is_asked_for(make):

@@ -376,10 +376,11 @@ def test_refusals():
 
 def test_with_tanh_normal_actor_and_image_networks():
     """The real thing: TorchRL's actor on the plain network, one joint backward pass."""
-    from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
+    from ba_torchrl.modules.base import NETWORKS
+    from tests.specs import actor_critic_spec
 
     torch.manual_seed(0)
-    networks = NETWORKS["cnn"](width=0.1).build(ActorCriticSpec(64, "pxyz"))
+    networks = NETWORKS["cnn"](width=0.1).build(actor_critic_spec(64, "pxyz"))
     observation = [keys.PIXELS, keys.HOLDING]
     actor = ProbabilisticActor(
         TensorDictModule(networks.actor, observation, ["loc", "scale"]),

@@ -28,25 +28,25 @@ def test_reaching_needs_three_centimetres(make):
     scene = env.scene
     scene.task.block.place((0.45, 0.0, 0.025))
     for z, expected in ((0.025 + 0.031, False), (0.025 + 0.029, True)):
-        scene.motion.reset(((0.45, 0.0, z), 0.0))
-        assert scene.task.is_goal() is expected
+        scene.controller.reset(((0.45, 0.0, z), 0.0))
+        assert scene.task.is_success() is expected
 
 
 def test_picking_needs_the_grasp_and_the_height(make):
     env = make("block_picking")
     scene = env.scene
     scene.task.block.place((0.45, 0.0, 0.025))
-    scene.motion.reset(((0.45, 0.0, 0.16), 0.0))
-    assert not scene.task.is_goal()  # high, but empty
-    scene.motion.move_to((0.45, 0.0, 0.025), 0.0)
-    scene.motion.grip(0.0)
-    scene.motion.move_to((0.45, 0.0, 0.14), 0.0)
-    assert not scene.task.is_goal()  # held, but low
-    scene.motion.move_to((0.45, 0.0, 0.16), 0.0)
-    assert scene.task.is_goal()
-    scene.motion.grip(1.0)
+    scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
+    assert not scene.task.is_success()  # high, but empty
+    scene.controller.move_to((0.45, 0.0, 0.025), 0.0)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.14), 0.0)
+    assert not scene.task.is_success()  # held, but low
+    scene.controller.move_to((0.45, 0.0, 0.16), 0.0)
+    assert scene.task.is_success()
+    scene.controller.grip(1.0)
     scene.world.settle()
-    assert not scene.task.is_goal()
+    assert not scene.task.is_success()
 
 
 def test_pushing_needs_five_centimetres(make):
@@ -55,7 +55,7 @@ def test_pushing_needs_five_centimetres(make):
     task.goal.place((0.45, 0.0, 0.0))
     for distance, expected in ((0.051, False), (0.049, True)):
         task.block.place((0.45 + distance * math.cos(1.0), distance * math.sin(1.0), 0.025))
-        assert task.is_goal() is expected
+        assert task.is_success() is expected
 
 
 def test_pulling_needs_contact(make):
@@ -66,7 +66,7 @@ def test_pulling_needs_contact(make):
     for gap, expected in ((0.003, False), (-1e-4, True)):
         second.place((0.4 + 0.08 + gap, 0.0, 0.025))
         scene.world.step(2)
-        assert scene.task.is_goal() is expected
+        assert scene.task.is_success() is expected
 
 
 def test_an_object_that_leaves_the_workspace_terminates_without_reward(make):

@@ -31,7 +31,7 @@ TINY = {
     "log_every": 1,
     "video_episodes": 0,
 }
-UNIFORM = {**TINY["algorithm"], "prioritized": False}
+UNIFORM = {**TINY["algorithm"], "replay": "uniform"}
 
 
 class Interrupted(BaseException):
@@ -134,7 +134,7 @@ def test_learner_replay_priorities_and_generators_come_back_bit_by_bit(tmp_path,
     for key in ("exp_avg", "exp_avg_sq", "step"):
         for index, moments in old.optimizer.state_dict()["state"].items():
             assert torch.equal(new.optimizer.state_dict()["state"][index][key], moments[key])
-    if config.algorithm_config.prioritized:
+    if config.algorithm_config.replay == "prioritized":
         a, b = (algorithm.replay.sampler.state_dict() for algorithm in (old, new))
         assert torch.equal(a["leaves"], b["leaves"])
         assert len(set(a["leaves"][: old.replay_size].tolist())) > 3  # not all of them alike

@@ -15,10 +15,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import pybullet
-
 from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import Contact, bearing_force_n, lateral_force_n, outer_contacts
 from ba_torchrl.sim.geometry import Vector, YawPose, downward
 from ba_torchrl.sim.robots.base import Robot
 
@@ -164,7 +163,7 @@ class CloseLoopController:
     def _rests_on_something(self, held: Body | None) -> bool:
         """Whether the hand, or what it holds, stands on anything else or all but touches it."""
         return any(
-            abs(point[7][2]) > 0.6 and point[8] < 2 * self.limits.creep_m
+            point.is_vertical and point.distance_m < 2 * self.limits.creep_m
             for point in self._outer_contacts(held)
         )
 
@@ -219,23 +218,16 @@ class CloseLoopController:
 
     def _overloaded(self, held: Body | None) -> bool:
         """Whether the hand, or what it holds, presses too hard on anything else."""
-        pressing = pushing = 0.0
-        for point in self._outer_contacts(held):
-            if abs(point[7][2]) > 0.6:
-                pressing += point[9]
-            else:
-                pushing += point[9]
-        return pressing > self.limits.max_press_n or pushing > self.limits.max_push_n
+        points = self._outer_contacts(held)
+        return (
+            bearing_force_n(points) > self.limits.max_press_n
+            or lateral_force_n(points) > self.limits.max_push_n
+        )
 
-    def _outer_contacts(self, held: Body | None) -> list[tuple]:
-        """Return PyBullet's contact points of hand and held body with everything else."""
-        robot, client = self.robot.id, self.world.client
-        points = pybullet.getContactPoints(robot, physicsClientId=client)
-        if held is None:
-            return points
-        points += pybullet.getContactPoints(held.id, physicsClientId=client)
-        inner = {robot, held.id}
-        return [point for point in points if {point[1], point[2]} != inner]
+    def _outer_contacts(self, held: Body | None) -> list[Contact]:
+        """Return the contacts of the hand and the held body with everything else."""
+        inner = () if held is None else (held.id,)
+        return outer_contacts(self.world.client, self.robot.id, *inner)
 
 
 class _Path:

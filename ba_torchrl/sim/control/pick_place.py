@@ -9,15 +9,21 @@ it does not. With ``teleport`` off every centimetre is simulated.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import pybullet
-
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import Contact, bearing_force_n, is_any_within, outer_contacts
 from ba_torchrl.sim.control.close_loop import ramp_fingers, smooth_step
-from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector
+from ba_torchrl.sim.geometry import (
+    Matrix,
+    Pose,
+    Vector,
+    bullet_compose,
+    bullet_inverse,
+    quaternion_matrix,
+)
 from ba_torchrl.sim.robots.base import Robot
 
 
@@ -69,20 +75,7 @@ class HeldState(NamedTuple):
 
     held: int | None
     """Its place among the world's bodies."""
-    grasp: tuple[Vector, Quaternion] | None
-
-
-def tool_rotation(rz_rad: float, ry_rad: float = 0.0, rx_rad: float = 0.0) -> Matrix:
-    """Return Rz Ry Rx of a tool that points down at zero angles."""
-    cz, sz = math.cos(rz_rad), math.sin(rz_rad)
-    cy, sy = math.cos(ry_rad), math.sin(ry_rad)
-    cx, sx = math.cos(rx_rad), math.sin(rx_rad)
-    # the columns of Rz Ry Rx, the last two negated: the tool's y and z axes at zero angles
-    return (
-        (cz * cy, -(cz * sy * sx - sz * cx), -(cz * sy * cx + sz * sx)),
-        (sz * cy, -(sz * sy * sx + cz * cx), -(sz * sy * cx - cz * sx)),
-        (-sy, -cy * sx, -cy * cx),
-    )
+    grasp: Pose | None
 
 
 class PickPlace:
@@ -94,6 +87,7 @@ class PickPlace:
         opening: how far the fingers open, 0 to 1.
         top_down: come from straight above even where the tool is tilted, instead of along its
             axis.
+        surface_height_m: from x and y to the height of the support surface there, metres.
         limits: distances and step counts.
     """
 
@@ -104,6 +98,7 @@ class PickPlace:
         teleport: bool = True,
         opening: float = 1.0,
         top_down: bool = False,
+        surface_height_m: Callable[[tuple[float, float]], float] = lambda xy: 0.0,
         limits: PickPlaceLimits | None = None,
     ) -> None:
         self.robot = robot
@@ -111,10 +106,11 @@ class PickPlace:
         self.teleport = teleport
         self.opening = opening
         self.top_down = top_down
+        self.surface_height_m = surface_height_m
         self.limits = limits or PickPlaceLimits()
         self.held: Body | None = None
         """What is in the gripper; it is hidden from cameras, as is the arm."""
-        self.grasp: tuple[Vector, Quaternion] | None = None
+        self.grasp: Pose | None = None
         """Its pose in the frame of the tool."""
 
     def reset(self) -> None:
@@ -126,7 +122,7 @@ class PickPlace:
     def pick(self, position: Vector, rotation: Matrix) -> Body | None:
         """Grasp what is at a pose, lift it and go home.
 
-        The tool stays so high that its fingers can close above the floor.
+        The tool stays so high that its fingers can close above the support surface.
 
         Args:
             position: of the tool point, metres.
@@ -137,7 +133,7 @@ class PickPlace:
         """
         robot, limits = self.robot, self.limits
         robot.set_opening(self.opening)
-        if self._approach(self._over_floor(position, rotation), rotation, 0.0):
+        if self._approach(self._above_surface(position, rotation), rotation, 0.0):
             self._close()
             reached = robot.tool_transform()[0]
             above = self._above(reached, rotation, limits.lift_m)
@@ -195,17 +191,15 @@ class PickPlace:
 
     def _remember_grasp(self) -> None:
         """Measure where in the gripper the body is now."""
-        to_tool = pybullet.invertTransform(*self.robot.tool_transform())
-        self.grasp = pybullet.multiplyTransforms(*to_tool, *self.held.pose)
+        to_tool = bullet_inverse(self.robot.tool_transform())
+        self.grasp = bullet_compose(to_tool, self.held.pose)
 
     def _carry(self, joints: Sequence[float]) -> None:
         """Teleport the arm, and rigidly with it what is held."""
         self.robot.teleport(joints)
         if self.held is not None:
             self.world.detect_collisions()  # contacts end: Bullet would not turn their normals
-            self.held.move_to(
-                *pybullet.multiplyTransforms(*self.robot.tool_transform(), *self.grasp)
-            )
+            self.held.move_to(*bullet_compose(self.robot.tool_transform(), self.grasp))
 
     def check_grasp(self) -> None:
         """Take note if what was held slipped out.
@@ -229,14 +223,14 @@ class PickPlace:
         up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
         return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
 
-    def _over_floor(self, position: Vector, rotation: Matrix) -> Vector:
-        """Return the point, or the first one above it, from which the fingers can close."""
+    def _above_surface(self, position: Vector, rotation: Matrix) -> Vector:
+        """Return the point, raised if necessary so that the fingers close above the surface."""
         x, y, z = position
-        return x, y, max(z, self.robot.gripper.lowest_tool_m(rotation, self.opening))
+        lowest = self.robot.gripper.lowest_tool_m(rotation, self.opening)
+        return x, y, max(z, self.surface_height_m((x, y)) + lowest)
 
     def _tool_rotation(self) -> Matrix:
-        turn = pybullet.getMatrixFromQuaternion(self.robot.tool_transform()[1])
-        return tuple(zip(*[iter(turn)] * 3, strict=True))
+        return quaternion_matrix(self.robot.tool_transform().orientation)
 
     def _joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
@@ -327,7 +321,7 @@ class PickPlace:
             before = self.robot.joints
             self.robot.command(joints)
             self.world.step()
-            if goes_down and self._press_n() > limits.max_press_n:
+            if goes_down and bearing_force_n(self._outer_contacts()) > limits.max_press_n:
                 self.robot.command(before)
                 self.world.step()
                 return
@@ -351,22 +345,14 @@ class PickPlace:
 
     # -- contacts ----------------------------------------------------------------------------
 
-    def _outer_contacts(self) -> list[tuple]:
-        """Return PyBullet's contact points of the hand, and what it holds, with all else."""
-        client, robot = self.world.client, self.robot.id
-        points = pybullet.getContactPoints(robot, physicsClientId=client)
-        if self.held is None:
-            return points
-        points += pybullet.getContactPoints(self.held.id, physicsClientId=client)
-        inner = {robot, self.held.id}
-        return [point for point in points if {point[1], point[2]} != inner]
+    def _outer_contacts(self) -> list[Contact]:
+        """Return the contacts of the hand and the held body with everything else."""
+        held = () if self.held is None else (self.held.id,)
+        return outer_contacts(self.world.client, self.robot.id, *held)
 
     def _touches_anything(self) -> bool:
         self.world.detect_collisions()
-        return any(point[8] < self.limits.margin_m for point in self._outer_contacts())
-
-    def _press_n(self) -> float:
-        return sum(point[9] for point in self._outer_contacts() if abs(point[7][2]) > 0.6)
+        return is_any_within(self._outer_contacts(), self.limits.margin_m)
 
     # -- fingers -----------------------------------------------------------------------------
 

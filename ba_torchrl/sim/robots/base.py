@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
@@ -10,8 +9,20 @@ from typing import ClassVar
 import pybullet
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import CONTACT_M, Body
-from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector, YawPose, quaternion_yaw
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import CONTACT_M, contacts, is_any_within, nearest_points
+from ba_torchrl.sim.geometry import (
+    IDENTITY,
+    Matrix,
+    Pose,
+    Quaternion,
+    Vector,
+    YawPose,
+    bullet_compose,
+    dot,
+    perpendicular,
+    quaternion_matrix,
+)
 from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
 from ba_torchrl.sim.world import World
 
@@ -56,7 +67,7 @@ class Robot(ABC):
     """The link that the tool point is fixed to."""
     tool_offset_m: ClassVar[Vector]
     """Tool point between the fingertips, in the frame of the hand link."""
-    tool_orientation: ClassVar[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+    tool_orientation: ClassVar[Quaternion] = IDENTITY
     """Orientation of the tool in the frame of the hand link (x, y, z, w): the fingers open along
     its x axis, its z axis is the direction of approach."""
     home_joints: ClassVar[tuple[float, ...]]
@@ -168,20 +179,19 @@ class Robot(ABC):
         states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
         return [state[0] for state in states]
 
-    def tool_transform(self) -> tuple[Vector, Quaternion]:
-        """Return position (metres) and orientation (x, y, z, w) of the tool point."""
+    def tool_transform(self) -> Pose:
+        """Return the pose of the tool."""
         state = pybullet.getLinkState(
             self.id, self.hand_link, computeForwardKinematics=1, physicsClientId=self.client
         )
-        return pybullet.multiplyTransforms(
-            state[4], state[5], self.tool_offset_m, self.tool_orientation
-        )
+        hand = Pose(state[4], state[5])
+        return bullet_compose(hand, Pose(self.tool_offset_m, self.tool_orientation))
 
     def tool_pose(self) -> YawPose:
         """Return the tool point and the gripper's yaw in [-pi, pi)."""
-        position, orientation = self.tool_transform()
+        tool = self.tool_transform()
         # the fingers open along the tool's x axis
-        return position, quaternion_yaw(orientation)
+        return tool.position, tool.yaw_rad
 
     # -- gripper -----------------------------------------------------------------------------
 
@@ -230,8 +240,9 @@ class Robot(ABC):
         turned by half a turn, those of a flat face point the wrong way, and instead of pushing
         the opening fingers off they would pull the body along.
         """
-        points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
-        touched = {point[2] for point in points if point[3] in self._side}
+        touched = {
+            point.other_id for point in contacts(self.client, self.id) if point.link in self._side
+        }
         bodies = [body.id for body in self.world.bodies if body.id in touched and body.is_free]
         kept = []
         for i, body in enumerate(bodies):
@@ -269,10 +280,10 @@ class Robot(ABC):
         against both fingers is not held.
         """
         touching: tuple[set[tuple[int, int]], ...] = (set(), set())
-        for point in pybullet.getContactPoints(self.id, physicsClientId=self.client):
-            side = self._side.get(point[3])
-            if side is not None and point[8] < CONTACT_M:
-                touching[side].add((point[2], point[3]))
+        for point in contacts(self.client, self.id):
+            side = self._side.get(point.link)
+            if side is not None and point.distance_m < CONTACT_M:
+                touching[side].add((point.other_id, point.link))
         both = {body for body, _ in touching[0]} & {body for body, _ in touching[1]}
         for body in self.world.bodies:
             if body.id in both and body.is_free and self._is_squeezed(body, touching):
@@ -281,24 +292,20 @@ class Robot(ABC):
 
     def _is_squeezed(self, body: Body, touching: tuple[set[tuple[int, int]], ...]) -> bool:
         """Whether a link of each finger pushes the body towards the other finger."""
-        _, (x, y, z, w) = self.tool_transform()
-        axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-        approach = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
+        axis, _, approach = zip(*quaternion_matrix(self.tool_transform().orientation), strict=True)
         left, right = (
             [
-                point[7]
+                point.normal
                 for body_id, link in links
                 if body_id == body.id
                 # a fresh query: normals of lasting contacts do not turn with the bodies
-                for point in pybullet.getClosestPoints(
-                    self.id, body.id, QUERY_M, linkIndexA=link, physicsClientId=self.client
-                )
-                if sign * _dot(point[7], axis) > CLOSING_COSINE
+                for point in nearest_points(self.client, self.id, body.id, QUERY_M, link)
+                if sign * dot(point.normal, axis) > CLOSING_COSINE
             ]
             for sign, links in zip(self.closing_sign, touching, strict=True)
         )
         return any(
-            _dot(_across(a, approach), _across(b, approach)) < -OPPOSED_COSINE
+            dot(perpendicular(a, approach), perpendicular(b, approach)) < -OPPOSED_COSINE
             for a in left
             for b in right
         )
@@ -306,17 +313,4 @@ class Robot(ABC):
     def is_near_anything(self, margin_m: float = 1e-3) -> bool:
         """Whether the hand is closer than ``margin_m`` to a body or the floor, as of now."""
         self.world.detect_collisions()
-        points = pybullet.getContactPoints(self.id, physicsClientId=self.client)
-        return any(point[8] < margin_m for point in points)
-
-
-def _across(vector: Vector, axis: Vector) -> Vector:
-    """Return the direction of ``vector`` as seen along the unit vector ``axis``."""
-    along = _dot(vector, axis)
-    rest = tuple(v - along * a for v, a in zip(vector, axis, strict=True))
-    norm = math.sqrt(_dot(rest, rest))
-    return tuple(r / norm for r in rest)
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+        return is_any_within(contacts(self.client, self.id), margin_m)

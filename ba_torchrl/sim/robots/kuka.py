@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import pybullet
 import pybullet_data
 
-from ba_torchrl.sim.geometry import Matrix, Vector
+from ba_torchrl.sim.geometry import Matrix, Vector, dot
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _SHOULDER_HEIGHT_M = 0.36
@@ -107,22 +107,18 @@ class Kuka(Robot):
         forearm_y = (-s1, c1, 0.0)
         forearm_z = (c1 * st, s1 * st, ct)
         hand_x = tuple(row[0] for row in rotation)
-        m02, m12, m22 = (_dot(axis, approach) for axis in (forearm_x, forearm_y, forearm_z))
+        m02, m12, m22 = (dot(axis, approach) for axis in (forearm_x, forearm_y, forearm_z))
         bend = math.hypot(m02, m12)
         if bend > 1e-9:
             q5, q6, sign = math.atan2(m12, m02), math.atan2(bend, m22), 1.0
             if abs(q5) > math.pi / 2:  # the other solution, with the wrist folded forward
                 q5, q6, sign = q5 - math.copysign(math.pi, q5), -q6, -1.0
-            q7 = math.atan2(sign * _dot(forearm_z, side), -sign * _dot(forearm_z, hand_x))
+            q7 = math.atan2(sign * dot(forearm_z, side), -sign * dot(forearm_z, hand_x))
         else:  # wrist stretched or folded: the last two turns are about the same line
             q5, q6 = 0.0, math.atan2(0.0, m22)
             q7 = math.atan2(
-                _dot(forearm_y, hand_x), math.copysign(1.0, m22) * _dot(forearm_x, hand_x)
+                dot(forearm_y, hand_x), math.copysign(1.0, m22) * dot(forearm_x, hand_x)
             )
         if near is not None:
             q7 += 2 * math.pi * round((near[6] - q7) / (2 * math.pi))
         return [turn, shoulder, 0.0, -elbow, q5, q6, q7]
-
-
-def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pybullet
 import pybullet_data
 
-from ba_torchrl.sim.geometry import Matrix, Vector
+from ba_torchrl.sim.geometry import Matrix, Vector, cross, dot, perpendicular
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _SHOULDER_HEIGHT_M = 0.333
@@ -88,8 +88,8 @@ class Panda(Robot):
         radius = math.hypot(x, y) or 1.0
         outwards = (x / radius, y / radius, 0.0)
         beside = (-outwards[1], outwards[0], 0.0)
-        start = _perpendicular(outwards, approach)
-        across = _cross(approach, start)
+        start = perpendicular(outwards, approach)
+        across = cross(approach, start)
 
         def solve(turn: float) -> _Arm | None:
             swivel = _SWIVEL_LIMIT * math.tanh(turn / _SWIVEL_LIMIT)
@@ -103,13 +103,13 @@ class Panda(Robot):
             return None
         # damped Gauss-Newton, a fixed number of rounds: smooth in the pose, converged or not
         for _ in range(_SWIVEL_ROUNDS):
-            lean = _dot(arm.upper_arm, beside)
+            lean = dot(arm.upper_arm, beside)
             if abs(lean) < _PRECISION:
                 break
             ahead = solve(turn + _SWIVEL_STRIDE)
             if ahead is None:
                 break
-            slope = (_dot(ahead.upper_arm, beside) - lean) / _SWIVEL_STRIDE
+            slope = (dot(ahead.upper_arm, beside) - lean) / _SWIVEL_STRIDE
             turn -= lean * slope / (slope * slope + _SWIVEL_DAMPING)
             moved = solve(turn)
             if moved is None:
@@ -133,21 +133,19 @@ class Panda(Robot):
         ahead = outwards
         if near is not None:
             ahead = (ahead[0] + math.cos(near[0]), ahead[1] + math.sin(near[0]), 0.0)
-        sign = 1.0 if _dot(arm.upper_arm, ahead) >= 0 else -1.0
+        sign = 1.0 if dot(arm.upper_arm, ahead) >= 0 else -1.0
         if level > 1e-7:
             c1, s1 = sign * ux / level, sign * uy / level
         else:
             c1, s1 = outwards[0], outwards[1]
         q2 = math.atan2(sign * level, uz)
         c2, s2 = math.cos(q2), math.sin(q2)
-        elbow_axis = _cross(arm.lower_front, arm.forearm)  # of joint 4
-        upper_front = _cross(arm.upper_arm, elbow_axis)
-        q3 = math.atan2(
-            _dot(upper_front, (-s1, c1, 0.0)), _dot(upper_front, (c1 * c2, s1 * c2, -s2))
-        )
-        across = _cross(approach, arm.offset)  # axis of joint 6
-        q5 = math.atan2(_dot(across, arm.lower_front), _dot(across, elbow_axis))
-        q7 = math.atan2(_dot(finger, across), _dot(finger, arm.offset)) - _HAND_ANGLE
+        elbow_axis = cross(arm.lower_front, arm.forearm)  # of joint 4
+        upper_front = cross(arm.upper_arm, elbow_axis)
+        q3 = math.atan2(dot(upper_front, (-s1, c1, 0.0)), dot(upper_front, (c1 * c2, s1 * c2, -s2)))
+        across = cross(approach, arm.offset)  # axis of joint 6
+        q5 = math.atan2(dot(across, arm.lower_front), dot(across, elbow_axis))
+        q7 = math.atan2(dot(finger, across), dot(finger, arm.offset)) - _HAND_ANGLE
         joints = [math.atan2(s1, c1), q2, q3, arm.bend, q5, arm.wrist, q7]
         if near is not None:
             full = 2 * math.pi
@@ -177,7 +175,7 @@ def _solve(center: Vector, approach: Vector, offset: Vector) -> _Arm | None:
         offset: direction of the wrist's offset.
     """
     wrist = tuple(c - _WRIST_OFFSET_M * o for c, o in zip(center, offset, strict=True))
-    distance = math.sqrt(_dot(wrist, wrist))
+    distance = math.sqrt(dot(wrist, wrist))
     cos_elbow = (_SHOULDER_TO_ELBOW_M**2 + _ELBOW_TO_WRIST_M**2 - distance**2) / (
         2 * _SHOULDER_TO_ELBOW_M * _ELBOW_TO_WRIST_M
     )
@@ -193,37 +191,21 @@ def _solve(center: Vector, approach: Vector, offset: Vector) -> _Arm | None:
         )
     )
     back = tuple(-w / distance for w in wrist)
-    along, down = _dot(back, offset), _dot(back, approach)
+    along, down = dot(back, offset), dot(back, approach)
     cos_rest = math.cos(slant) / max(math.hypot(along, down), 1e-9)
     if abs(cos_rest) > 1:
         return None
     angle = math.acos(cos_rest) + math.pi - math.atan2(-along, -down)
     c6, s6 = math.cos(angle), math.sin(angle)
     forearm = tuple(s6 * o - c6 * a for o, a in zip(offset, approach, strict=True))
-    front = _perpendicular(back, forearm)
+    front = perpendicular(back, forearm)
     elbow = tuple(
         w - _FOREARM_M * f + _ELBOW_OFFSET_M * n
         for w, f, n in zip(wrist, forearm, front, strict=True)
     )
-    turned = _cross(_cross(front, forearm), elbow)
+    turned = cross(cross(front, forearm), elbow)
     upper_arm = tuple(
         (_UPPER_ARM_M * e + _ELBOW_OFFSET_M * t) / _SHOULDER_TO_ELBOW_M**2
         for e, t in zip(elbow, turned, strict=True)
     )
     return _Arm(upper_arm, forearm, front, offset, bend, angle)
-
-
-def _perpendicular(vector: Vector, axis: Vector) -> Vector:
-    """Return the direction of ``vector`` seen along the unit vector ``axis``."""
-    along = _dot(vector, axis)
-    rest = tuple(v - along * a for v, a in zip(vector, axis, strict=True))
-    norm = math.sqrt(_dot(rest, rest)) or 1.0
-    return tuple(r / norm for r in rest)
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

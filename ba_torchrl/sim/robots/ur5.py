@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import pybullet
 
-from ba_torchrl.sim.geometry import Matrix, Vector
+from ba_torchrl.sim.geometry import Matrix, Vector, cross, dot
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _MODELS = Path(__file__).parent / "models"
@@ -65,16 +65,16 @@ class UR5(Robot):
         turn = math.atan2(y, x) - math.asin(_WRIST_1_M / radius)
         c1, s1 = math.cos(turn), math.sin(turn)
         front, side = (c1, s1, 0.0), (-s1, c1, 0.0)
-        cos5 = min(max(_dot(approach, side), -1.0), 1.0)
+        cos5 = min(max(dot(approach, side), -1.0), 1.0)
         q5 = -math.acos(cos5)
         sin5 = math.sqrt(1 - cos5 * cos5)
         if sin5 < 1e-6:
             return None  # the last axis parallel to those of the arm: the wrist is free to spin
         across = tuple((a - cos5 * s) / sin5 for a, s in zip(approach, side, strict=True))
-        wrist_2 = _cross(across, side)  # axis of joint 5
-        total = math.atan2(across[2], -_dot(across, front))  # sum of joints 2, 3 and 4
+        wrist_2 = cross(across, side)  # axis of joint 5
+        total = math.atan2(across[2], -dot(across, front))  # sum of joints 2, 3 and 4
         # what is left is two links in the plane
-        u = math.sqrt(radius**2 - _WRIST_1_M**2) - _WRIST_2_M * _dot(wrist_2, front)
+        u = math.sqrt(radius**2 - _WRIST_1_M**2) - _WRIST_2_M * dot(wrist_2, front)
         v = z - _WRIST_2_M * wrist_2[2] - _SHOULDER_HEIGHT_M
         cos3 = (u**2 + v**2 - _UPPER_ARM_M**2 - _FOREARM_M**2) / (2 * _UPPER_ARM_M * _FOREARM_M)
         if abs(cos3) > 1:
@@ -84,7 +84,7 @@ class UR5(Robot):
             _FOREARM_M * math.sin(q3), _UPPER_ARM_M + _FOREARM_M * cos3
         )
         axis_x = tuple(cos5 * a - sin5 * s for a, s in zip(across, side, strict=True))
-        q6 = math.atan2(-_dot(finger, wrist_2), _dot(finger, axis_x))
+        q6 = math.atan2(-dot(finger, wrist_2), dot(finger, axis_x))
         if near is not None:
             q6 += 2 * math.pi * round((near[5] - q6) / (2 * math.pi))
         return [turn, q2, q3, total - q2 - q3, q5, q6]
@@ -187,11 +187,3 @@ def _load_joined(models: Sequence[Path], base_m: Vector, client: int) -> int:
         )
     finally:
         os.unlink(name)
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

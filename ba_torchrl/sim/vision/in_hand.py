@@ -13,6 +13,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.registry import Registry
+from ba_torchrl.sim.geometry import euler_matrix
 
 IN_HAND_MODES: Registry[type[InHandImage]] = Registry("in_hand_mode", "ba_torchrl.sim")
 
@@ -79,7 +80,7 @@ class ProjectedImage(InHandImage):
         middle = (size - 1) / 2
         levels = view.z_m + (np.arange(size) - middle) * view.pixel_m
         occupied = np.argwhere(heights[:, :, None] > levels) - middle
-        turn = _rotation(view.rz_rad, view.ry_rad, view.rx_rad)
+        turn = np.array(euler_matrix(view.rz_rad, view.ry_rad, view.rx_rad))
         cells = np.rint(occupied @ turn + middle).astype(np.int64)  # into the gripper's frame
         cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
         voxels = np.zeros((size, size, size), dtype=bool)
@@ -117,18 +118,6 @@ def crop(
         + u * (1 - v) * padded[i + 1, j]
         + (1 - u) * v * padded[i, j + 1]
         + u * v * padded[i + 1, j + 1]
-    )
-
-
-def _rotation(rz_rad: float, ry_rad: float, rx_rad: float) -> np.ndarray:
-    """Return Rz Ry Rx."""
-    (cz, cy, cx), (sz, sy, sx) = (
-        [f(angle) for angle in (rz_rad, ry_rad, rx_rad)] for f in (math.cos, math.sin)
-    )
-    return (
-        np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-        @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     )
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Solid, vertical_extent
 from ba_torchrl.sim.meshes import bowl_parts, centroid
-from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TASKS, Spot
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import BLUE, CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import CLOSED, OPEN, move_toward, pick_up, travel
+from ba_torchrl.tasks.workspace import Spot
 
 RELEASE_GAP_M = 4e-3
 """The block is let go of this far above the bowl's floor; it lands before the action ends."""
@@ -41,7 +41,7 @@ class BlockInBowl(CloseLoopTask):
     within_rim_m: ClassVar[float] = 0.03
     """This close to the bowl's axis, a block at any yaw has room between the walls."""
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the block and the bowl."""
         scale = self.settings.scale
         parts = tuple(
@@ -53,12 +53,12 @@ class BlockInBowl(CloseLoopTask):
                 wall_m=0.006 * scale,
             )
         )
-        self.block = world.add(self.cube(), "block")
-        self.bowl = world.add(
+        self.block = self.world.add(self.cube(), "block")
+        self.bowl = self.world.add(
             Solid(parts=parts, color=BLUE, center_of_mass_m=centroid(parts)), "bowl"
         )
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put block and bowl anywhere, 17 cm apart or more."""
         block = 2.4 * self.block_m
         bowl = 0.17 * self.settings.scale
@@ -66,17 +66,18 @@ class BlockInBowl(CloseLoopTask):
         for body, xy in zip((self.block, self.bowl), points, strict=True):
             self.stand(body, xy, self.random_yaw(rng, math.pi))
 
-    def is_goal(self) -> bool:
-        """Whether the block was let go of and touches the upright bowl, close to its middle."""
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the block lies near the middle of the upright bowl, released."""
         (x, y, z), (bowl_x, bowl_y, bowl_z) = self.block.position, self.bowl.position
         floor_z = bowl_z - self.bowl.shape.height_m / 2 + self.floor_m * self.settings.scale
-        return (
-            math.dist((x, y), (bowl_x, bowl_y)) < self.inside_m * self.settings.scale
-            and z > floor_z  # not below a bowl that stands on it
-            and self.bowl.tilt_rad < self.upright_rad
-            and self.bowl.touches(self.block)
-            and self.robot.held_body() is not self.block
-        )
+        return {
+            "is_over_bowl": math.dist((x, y), (bowl_x, bowl_y))
+            < self.inside_m * self.settings.scale,
+            "is_above_bowl_floor": z > floor_z,  # an overturned bowl may cover the block
+            "is_bowl_upright": self.bowl.tilt_rad < self.upright_rad,
+            "is_touching_bowl": self.bowl.touches(self.block),
+            "is_released": self.robot.held_body() is not self.block,
+        }
 
     def is_valid(self) -> bool:
         """Whether both are inside the workspace and the bowl has not tipped over."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import grasp, lift
@@ -24,20 +23,21 @@ class BlockPicking(CloseLoopTask):
     fits_tray = True
     lift_height_m: ClassVar[float] = 0.15
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the block."""
-        self.block = world.add(self.cube(), "block")
+        self.block = self.world.add(self.cube(), "block")
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the block anywhere, 1.2 blocks from the border."""
         xy = self.random_point(rng, 2.4 * self.block_m)
         self.stand(self.block, xy, self.random_yaw(rng, math.pi / 2))
 
-    def is_goal(self) -> bool:
-        """Whether the block is held and the tool higher than 15 cm."""
-        if self.robot.held_body() is not self.block:
-            return False
-        return self.robot.tool_pose()[0][2] > self.lift_height_m
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the block is held and the tool higher than 15 cm."""
+        return {
+            "is_grasped": self.robot.held_body() is self.block,
+            "is_lifted": self.robot.tool_pose()[0][2] > self.lift_height_m,
+        }
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, then go up."""

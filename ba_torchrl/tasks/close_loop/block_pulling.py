@@ -9,7 +9,6 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Box
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import BLUE, RED, CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import behind_point, push
@@ -21,24 +20,24 @@ class BlockPulling(CloseLoopTask):
 
     scale_limits = (0.6, 1.1)
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the blocks."""
         size = tuple(edge * self.settings.scale for edge in (0.08, 0.08, 0.05))
         self.blocks = [
-            world.add(Box(size_m=size, mass_kg=0.5, color=color), name)
+            self.world.add(Box(size_m=size, mass_kg=0.5, color=color), name)
             for color, name in ((RED, "first block"), (BLUE, "second block"))
         ]
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the blocks 13.6 cm apart or more; with fixed orientations, along y."""
         spacing = 3.4 * 0.04 * self.settings.scale
         points = self.random_pair(rng, (spacing, spacing), spacing)
         for block, xy in zip(self.blocks, points, strict=True):
             self.stand(block, xy, self.random_yaw(rng, math.pi))
 
-    def is_goal(self) -> bool:
-        """Whether the blocks touch."""
-        return self.blocks[0].touches(self.blocks[1])
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the blocks touch."""
+        return {"is_touching": self.blocks[0].touches(self.blocks[1])}
 
     def expert_command(self) -> GripperCommand:
         """Go beyond the block that is handier and pull it to the other."""

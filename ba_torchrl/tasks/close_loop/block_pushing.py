@@ -11,7 +11,6 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Decal
 from ba_torchrl.sim.geometry import YawPose
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import BLOCK_M, TASKS
 from ba_torchrl.tasks.close_loop_task import GREEN, CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import push
@@ -29,21 +28,22 @@ class BlockPushing(CloseLoopTask):
     goal_radius_m: ClassVar[float] = 0.05
     least_distance_m: ClassVar[float] = 0.09
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the block and the goal area."""
-        self.block = world.add(self.cube(), "block")
+        self.block = self.world.add(self.cube(), "block")
         size = (self.goal_size_m, self.goal_size_m, 1e-3)
-        self.goal = world.add(Decal(size_m=size, color=GREEN, depth_m=0.02), "goal")
+        self.goal = self.world.add(Decal(size_m=size, color=GREEN, depth_m=0.02), "goal")
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put block and goal at least 9 cm apart; with fixed orientations, along y."""
         block, goal = self.random_pair(rng, (2.4 * self.block_m, 0.13), self.least_distance_m)
         self.stand(self.block, block, self.random_yaw(rng, math.pi))
         self.stand(self.goal, goal, self.random_yaw(rng, math.pi / 2))
 
-    def is_goal(self) -> bool:
-        """Whether the block's centre is within 5 cm of the goal's."""
-        return math.dist(self.block.position[:2], self.goal.position[:2]) < self.goal_radius_m
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the block's centre is within 5 cm of the goal's."""
+        distance_m = math.dist(self.block.position[:2], self.goal.position[:2])
+        return {"is_at_goal": distance_m < self.goal_radius_m}
 
     def expert_command(self) -> GripperCommand:
         """Go behind the block and push it with half-open fingers.

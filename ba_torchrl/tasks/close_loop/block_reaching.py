@@ -10,7 +10,6 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import OPEN, grasp
@@ -24,18 +23,19 @@ class BlockReaching(CloseLoopTask):
     fits_tray = True
     goal_distance_m: ClassVar[float] = 0.03
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the block."""
-        self.block = world.add(self.cube(), "block")
+        self.block = self.world.add(self.cube(), "block")
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the block anywhere, 1.2 blocks from the border."""
         xy = self.random_point(rng, 2.4 * self.block_m)
         self.stand(self.block, xy, self.random_yaw(rng, math.pi))
 
-    def is_goal(self) -> bool:
-        """Whether the tool point is within 3 cm of the block's centre."""
-        return math.dist(self.robot.tool_pose()[0], self.block.position) < self.goal_distance_m
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the tool point is within 3 cm of the block's centre."""
+        distance_m = math.dist(self.robot.tool_pose()[0], self.block.position)
+        return {"is_reached": distance_m < self.goal_distance_m}
 
     def expert_command(self) -> GripperCommand:
         """Go down around the block, without closing the fingers."""

@@ -9,9 +9,10 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Box, Color, Solid, gap_m, press_n, vertical_extent
+from ba_torchrl.sim.bodies import Body, Box, Color, Solid, vertical_extent
+from ba_torchrl.sim.contacts import bearing_force_n, contacts, gap_m
+from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, moved
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import BLOCK_M, TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
@@ -81,11 +82,11 @@ class CornerPicking(CloseLoopTask):
     wall_height_m: ClassVar[float] = 0.08
     lift_height_m: ClassVar[float] = 0.15
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the block, the base and the walls."""
-        self.block = world.add(self.cube(), "block")
+        self.block = self.world.add(self.cube(), "block")
         size = (self.base_m, self.base_m, self.base_height_m)
-        self.base = world.add(
+        self.base = self.world.add(
             Box(size_m=size, mass_kg=0, friction=self.base_friction, color=BASE), "base"
         )
         # centred on the edges of the base; the second wall ends at the first
@@ -95,26 +96,14 @@ class CornerPicking(CloseLoopTask):
             moved(box_mesh((wall, 2 * edge + wall / 2, height)), (-edge, -wall / 4, 0.0)),
             moved(box_mesh((2 * edge - wall / 2, wall, height)), (wall / 4, -edge, 0.0)),
         )
-        self.walls = world.add(Solid(parts=parts, mass_kg=0, color=WALL), "walls")
+        self.walls = self.world.add(Solid(parts=parts, mass_kg=0, color=WALL), "walls")
 
     @property
-    def corner(self) -> tuple[float, float, float]:
-        """x, y and yaw of the corner; its walls are at negative x and y of its frame."""
-        return (*self.base.position[:2], self.base.yaw_rad)
+    def corner(self) -> PlanarFrame:
+        """Frame of the corner; its walls are at negative x and y."""
+        return PlanarFrame(*self.base.position[:2], self.base.yaw_rad)
 
-    def to_world(self, x: float, y: float) -> tuple[float, float]:
-        """Return the place of a point given in the corner's frame."""
-        cx, cy, yaw = self.corner
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        return cx + cos * x - sin * y, cy + sin * x + cos * y
-
-    def to_corner(self, x: float, y: float) -> tuple[float, float]:
-        """Return the place of a point in the corner's frame."""
-        cx, cy, yaw = self.corner
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        return cos * (x - cx) + sin * (y - cy), cos * (y - cy) - sin * (x - cx)
-
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the corner anywhere, 10 cm from the border, with the block in it."""
         xy = self.random_point(rng, self.base_m)
         self.put_corner(xy, self.random_yaw(rng, 2 * math.pi))
@@ -124,14 +113,16 @@ class CornerPicking(CloseLoopTask):
         self.stand(self.base, xy, yaw_rad)
         self.stand(self.walls, xy, yaw_rad)
         flush = (self.wall_m - self.base_m) / 2 + self.block_m / 2 + SEAM_M
-        z = self.settings.surface_z_m + self.base_height_m + self.block_m / 2
-        self.block.place((*self.to_world(flush, flush), z), yaw_rad)
+        xy = self.corner.to_world(flush, flush)
+        z = self.terrain.height_m(xy) + self.base_height_m + self.block_m / 2
+        self.block.place((*xy, z), yaw_rad)
 
-    def is_goal(self) -> bool:
-        """Whether the block is held and the tool higher than 15 cm."""
-        if self.robot.held_body() is not self.block:
-            return False
-        return self.robot.tool_pose()[0][2] > self.lift_height_m
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the block is held and the tool higher than 15 cm."""
+        return {
+            "is_grasped": self.robot.held_body() is self.block,
+            "is_lifted": self.robot.tool_pose()[0][2] > self.lift_height_m,
+        }
 
     def expert_command(self) -> GripperCommand:
         """Nudge the block out of the corner until fingers fit beside it, then grasp and lift it."""
@@ -139,7 +130,8 @@ class CornerPicking(CloseLoopTask):
         if robot.held_body() is block and robot.opening() < 0.9:
             return lift(limits.step_m)
         yaw = robot.tool_pose()[1]
-        is_pressing = robot.opening() < 0.5 and press_n(robot.id, block) > FIRM_N
+        touching = contacts(self.world.client, robot.id, block.id)
+        is_pressing = robot.opening() < 0.5 and bearing_force_n(touching) > FIRM_N
         yaws = [
             nearest_equivalent_yaw(yaw, block.yaw_rad + k * math.pi / 2, limits, math.pi)
             for k in (0, 1)
@@ -160,12 +152,12 @@ class CornerPicking(CloseLoopTask):
         Args:
             yaw_rad: the gripper's; the gap is in metres, negative where there is none.
         """
-        turn = yaw_rad - self.corner[2]
+        turn = yaw_rad - self.corner.yaw_rad
         along = self.robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
         across = self.robot.gripper.half_width_m
         cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
         extents = (along * cos + across * sin, along * sin + across * cos)
-        place = self.to_corner(*self.block.position[:2])
+        place = self.corner.to_local(*self.block.position[:2])
         inner = (self.wall_m - self.base_m) / 2
         outer = inner - self.wall_m
         return min(
@@ -177,23 +169,23 @@ class CornerPicking(CloseLoopTask):
         """Go over the block with closed fingers, come down to it, and press."""
         robot, limits = self.robot, self.action_limits
         (x, y, z), yaw = robot.tool_pose()
-        target_yaw = nearest_equivalent_yaw(yaw, self.corner[2], limits, math.pi / 2)
+        target_yaw = nearest_equivalent_yaw(yaw, self.corner.yaw_rad, limits, math.pi / 2)
         turn = wrap_angle(target_yaw - yaw)
         # the hand is wider than the block along the fingers, and has the wall beside it
-        px, py = self.to_corner(*self.block.position[:2])
+        px, py = self.corner.to_local(*self.block.position[:2])
         away = min(HAND_HALF_M - BLOCK_M / 2, BLOCK_M / 2 - TIP_HALF_M) * self.settings.scale
-        if abs(math.cos(target_yaw - self.corner[2])) > 0.7:
+        if abs(math.cos(target_yaw - self.corner.yaw_rad)) > 0.7:
             px += away
         else:
             py += away
-        tool_x, tool_y = self.to_corner(x, y)
+        tool_x, tool_y = self.corner.to_local(x, y)
         top = vertical_extent(self.block)[1]
         low_z = top + TIP_BELOW_TOOL_M + TOUCH_M
         aside = max(abs(tool_x - px), abs(tool_y - py))
         is_clear = min(tool_x - px, tool_y - py) > -WALL_GAP_M and abs(turn) < PRESS_TURN_RAD
-        target = self.to_world(px, py)
+        target = self.corner.to_world(px, py)
         if robot.opening() < 0.1 and aside < PRESS_ASIDE_M and is_clear:
-            gap = gap_m(robot.id, self.block)
+            gap = gap_m(self.world.client, robot.id, self.block.id)
             if gap <= 2 * NEAR_M:
                 return lift(-PRESS_M)
             if gap <= limits.step_m:
@@ -208,7 +200,9 @@ class CornerPicking(CloseLoopTask):
 
     def _pull(self) -> GripperCommand:
         """Drag the block away from both walls, straight towards its place."""
-        goal = self.to_world(*(max(b, OUT_M) for b in self.to_corner(*self.block.position[:2])))
+        goal = self.corner.to_world(
+            *(max(b, OUT_M) for b in self.corner.to_local(*self.block.position[:2]))
+        )
         dx, dy = (g - b for g, b in zip(goal, self.block.position, strict=False))
         share = min(1.0, self.action_limits.step_m / max(abs(dx), abs(dy), 1e-6))
         return GripperCommand(CLOSED, share * dx, share * dy, 0.0, 0.0)

@@ -12,10 +12,9 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.articulated import Rail
 from ba_torchrl.sim.bodies import Body, Color, Solid
-from ba_torchrl.sim.geometry import Vector, YawPose
+from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
-from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import LAYOUT_ATTEMPTS, TASKS
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
@@ -27,6 +26,7 @@ from ba_torchrl.tasks.motion_primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
+from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS
 
 CABINET_M: Vector = (0.22, 0.23, 0.11)
 """Depth along x, width, height; the open front looks towards +x."""
@@ -68,11 +68,11 @@ class DrawerOpening(CloseLoopTask):
     friction_n: ClassVar[float] = 3.0
     """Stops the drawer, 0.5 kg, faster than the fingers that pull it slow down."""
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the cabinet with its drawer."""
         scale = self.settings.scale
         low, high = self.travel_range_m
-        self.cabinet = world.add_articulated(
+        self.cabinet = self.world.add_articulated(
             Solid(parts=_scaled(cabinet_parts(), scale), mass_kg=0.0, color=WOOD),
             Solid(
                 parts=_scaled(drawer_parts(), scale),
@@ -83,7 +83,7 @@ class DrawerOpening(CloseLoopTask):
             "cabinet",
         )
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the cabinet beside the workspace, opening towards its centre.
 
         Layouts whose handle leaves the workspace on the way to the goal, where no gripper can
@@ -100,10 +100,8 @@ class DrawerOpening(CloseLoopTask):
             else:
                 yaw = float(rng.choice((math.pi / 2, 3 * math.pi / 2)))
             back, aside = scale * float(rng.uniform(0.15, 0.2)), float(rng.uniform(-0.1, 0.1))
-            cos, sin = math.cos(yaw), math.sin(yaw)
-            self.cabinet.place(
-                (x - back * cos - aside * sin, y - back * sin + aside * cos, 0.0), yaw
-            )
+            xy = PlanarFrame(x, y, yaw).to_world(-back, aside)
+            self.cabinet.place((*xy, self.terrain.height_m(xy)), yaw)
             if self._can_be_opened():
                 return
         raise PlacementError(
@@ -111,9 +109,9 @@ class DrawerOpening(CloseLoopTask):
             "`workspace` or lower `object_scale_range`"
         )
 
-    def is_goal(self) -> bool:
-        """Whether the drawer is open by more than 15 cm."""
-        return self.cabinet.travel_m > self._goal_m
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the drawer is open by more than 15 cm."""
+        return {"is_open": self.cabinet.travel_m > self._goal_m}
 
     def expert_command(self) -> GripperCommand:
         """Come down behind the handle with closed fingers and pull it along.
@@ -124,9 +122,9 @@ class DrawerOpening(CloseLoopTask):
         robot, limits, scale = self.robot, self.action_limits, self.settings.scale
         (x, y, z), yaw = robot.tool_pose()
         (rx, ry, rz), heading = self.handle_pose
-        ux, uy = math.cos(heading), math.sin(heading)
-        ahead = (x - rx) * ux + (y - ry) * uy
-        aside = abs((y - ry) * ux - (x - rx) * uy)
+        handle = PlanarFrame(rx, ry, heading)
+        ahead, aside = handle.to_local(x, y)
+        aside = abs(aside)
         target_yaw = nearest_equivalent_yaw(yaw, heading + math.pi / 2, limits, math.pi)
         turn = abs(wrap_angle(target_yaw - yaw))
         radius = ROD_DIAMETER_M / 2 * scale
@@ -144,12 +142,12 @@ class DrawerOpening(CloseLoopTask):
         ):
             slack = -ahead - radius - finger
             farther = self._goal_m + MARGIN_M - self.cabinet.travel_m + slack
-            advance = ahead + min(farther, limits.step_m / max(abs(ux), abs(uy)))
-            target = (rx + advance * ux, ry + advance * uy, hook_z)
-            return move_toward(robot, target, target_yaw, CLOSED)
+            longest = limits.step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
+            target = handle.to_world(ahead + min(farther, longest), 0.0)
+            return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
 
         behind = -radius - finger - PLAY_BEHIND_M
-        hx, hy = rx + behind * ux, ry + behind * uy
+        hx, hy = handle.to_world(behind, 0.0)
         is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
         if is_beside and turn <= ALIGNED_RAD and is_closed:
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
@@ -166,7 +164,7 @@ class DrawerOpening(CloseLoopTask):
         slider, scale = self.cabinet.slider, self.settings.scale
         (x, y, z), heading = slider.position, slider.yaw_rad
         out = (CABINET_M[0] / 2 + ROD_OFFSET_M) * scale
-        middle = (x + out * math.cos(heading), y + out * math.sin(heading))
+        middle = PlanarFrame(x, y, heading).to_world(out, 0.0)
         return (*middle, z + ROD_HEIGHT_M * scale), heading
 
     @property

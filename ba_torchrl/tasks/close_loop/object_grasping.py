@@ -10,7 +10,7 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
+from ba_torchrl.tasks.close_loop_task import CloseLoopControl
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import Grasp
 from ba_torchrl.tasks.clutter.push_planner import NEAR_M, Push, PushPlanner
@@ -28,7 +28,7 @@ WALL_PIXELS = 25
 
 
 @TASKS.register("close_loop/object_grasping")
-class ObjectGrasping(ClutterTask, CloseLoopTask):
+class ObjectGrasping(CloseLoopControl, ClutterTask):
     """Random objects in a tray; success when one is held with the tool 15 cm above ground."""
 
     num_objects = 5
@@ -39,9 +39,9 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
     risk_allowed: ClassVar[float] = 1.0
     """Where a grasp is riskier, the expert pushes the object first."""
 
-    def is_goal(self) -> bool:
-        """Whether any object is held and the tool higher than 15 cm."""
-        return self.grasped_object() is not None
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether any object is held and the tool higher than 15 cm."""
+        return {"is_grasped": self.robot.held_body() is not None, "is_lifted": self._is_lifted()}
 
     def expert_command(self) -> GripperCommand:
         """Close the fingers around the object that takes fewest actions, then go up.
@@ -58,7 +58,9 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
         grasp = planner.plan(self.clutter.pool.present, tool, limits, heights, self._slip_cost)
         if grasp is None or grasp.risk > self.risk_allowed:
-            push = PushPlanner(planner).plan(self.clutter.pool.present, tool, limits, heights)
+            push = PushPlanner(planner, self.terrain).plan(
+                self.clutter.pool.present, tool, limits, heights
+            )
             if push is not None:
                 return self._push(push, over_z)
         if grasp is None or robot.opening() < 0.9:
@@ -99,10 +101,11 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         return move_toward(robot, (sx, sy, over_z), yaw, CLOSED)
 
     def grasped_object(self) -> Body | None:
-        """Return what is held, if the tool is high enough."""
-        if self.robot.tool_pose()[0][2] <= self.lift_height_m:
-            return None
-        return self.robot.held_body()
+        """Return the held object if the tool is higher than 15 cm."""
+        return self.robot.held_body() if self._is_lifted() else None
+
+    def _is_lifted(self) -> bool:
+        return self.robot.tool_pose()[0][2] > self.lift_height_m
 
     def _is_inside(self, body: Body) -> bool:
         # thin objects lie lower than the workspace begins: the floor bounds them

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ba_torchrl.config import TaskParameters
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Quaternion, YawPose, downward
@@ -17,7 +18,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Task, TaskSettings
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clutter.grasp_planner import GraspPlanner
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, MARGIN_M, add_tray
+from ba_torchrl.tasks.clutter.tray import Tray
 
 FAILURES_ALLOWED = 3
 """Episodes in a row that take nothing, until new objects fall."""
@@ -47,19 +48,19 @@ class Clutter:
     Args:
         world: not sealed yet.
         robot: keeps away while objects fall.
+        tray: where they fall.
         settings: of the task; their `parameters` name the object set.
     """
 
-    def __init__(self, world: World, robot: Robot, settings: TaskSettings) -> None:
+    def __init__(self, world: World, robot: Robot, tray: Tray, settings: TaskSettings) -> None:
         self.world = world
         self.robot = robot
         self.settings = settings
         self.failures = 0
         """Episodes in a row that took nothing."""
-        if not settings.surface_z_m:
-            add_tray(world, settings.workspace.center, settings.workspace.width)
+        self.tray = tray
         parameters = settings.parameters
-        shapes = load_object_set(parameters["object_set"], parameters["asset_root"])
+        shapes = load_object_set(parameters.object_set, parameters.asset_root)
         copies = -(-settings.num_objects // len(shapes))
         numbers = [f" {copy + 1}" if copies > 1 else "" for copy in range(copies)]
         self.pool = BodyPool(
@@ -99,7 +100,7 @@ class Clutter:
         self.failures = 0
         settings, world, pool = self.settings, self.world, self.pool
         center = np.array(settings.workspace.center)
-        half_m = (settings.workspace.width - MARGIN_M) / 2
+        half_m = self.tray.half_m
         count = settings.num_objects
         joints = self.robot.joints
         self._retreat()
@@ -110,9 +111,10 @@ class Clutter:
             bodies = [pool.bodies[i] for i in chosen]
             apart = {} if settings.random_orientation else _apart(rng, bodies, half_m)
             for i, (x, y) in apart.items():
-                z = FLOOR_Z_M + LOW_DROP_M - bodies[i].shape.bounds_m[0][2]
+                place = (x + center[0], y + center[1])
+                z = self.tray.height_m(place) + LOW_DROP_M - bodies[i].shape.bounds_m[0][2]
                 pool.activate(bodies[i])
-                bodies[i].place((x + center[0], y + center[1], z))
+                bodies[i].place((*place, z))
             for i in sorted(set(range(count)) - set(apart)):
                 x, y = center + rng.uniform(WALL_M - half_m, half_m - WALL_M, 2)
                 turn = _random_turn(rng) if settings.random_orientation else (0.0, 0.0, 0.0, 1.0)
@@ -140,17 +142,28 @@ class ClutterTask(Task):
 
     needs_fresh_world = True
     scale_limits = (1.0, 1.0)
-    parameters = frozenset({"object_set", "asset_root"})
+
+    class Parameters(TaskParameters):
+        """The objects of the heap."""
+
+        object_set: str = "random"
+        """The set that the objects are drawn from; see `ba_torchrl.sim.assets`."""
+        asset_root: str | None = None
+        """Folder of a set of objects that does not ship with the package."""
 
     @abstractmethod
     def grasped_object(self) -> Body | None:
         """Return what this episode took out, if anything."""
 
-    def build(self, world: World) -> None:
-        """Load the tray and every shape of the object set."""
-        self.clutter = Clutter(world, self.robot, self.settings)
+    def load_scene(self) -> None:
+        """Load every shape of the object set."""
+        self.clutter = Clutter(self.world, self.robot, self.terrain, self.settings)
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def make_terrain(self) -> Tray:
+        """Load the tray."""
+        return Tray(self.world, self.settings.workspace)
+
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Let new objects fall into the tray."""
         self.clutter.drop(rng)
 

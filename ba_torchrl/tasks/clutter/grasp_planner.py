@@ -15,8 +15,8 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Vector, YawPose
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.tasks.base import ActionLimits, Workspace
 from ba_torchrl.tasks.motion_primitives import nearest_equivalent_yaw
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 SPARE_M = 0.007
 """Room between an open finger and what it closes on; less is a risk."""
@@ -185,23 +185,8 @@ class GraspPlanner:
         if key not in self._samples:
             self._samples[key] = np.hstack(surface_samples(body.shape.mesh(), SAMPLES))
         local = self._samples[key]
-        position, quaternion = body.pose
-        rotation = _rotation(quaternion)
-        placed = np.empty_like(local)
-        placed[:, :3] = local[:, :3] @ rotation.T + position
-        placed[:, 3:] = local[:, 3:] @ rotation.T
-        return placed
-
-
-def _rotation(quaternion: tuple[float, float, float, float]) -> np.ndarray:
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+        pose = body.pose
+        return np.hstack([pose.apply(local[:, :3]), pose.rotate(local[:, 3:])])
 
 
 class _Jaws(NamedTuple):

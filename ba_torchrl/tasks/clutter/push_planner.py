@@ -10,9 +10,9 @@ import numpy as np
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Vector, YawPose
-from ba_torchrl.tasks.base import ActionLimits
 from ba_torchrl.tasks.clutter.grasp_planner import PIXEL_M, GraspPlanner
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, MARGIN_M
+from ba_torchrl.tasks.clutter.tray import Tray
+from ba_torchrl.tasks.workspace import ActionLimits
 
 BEHIND_M = 5.5e-3
 """Room between a surface and the closed fingers that are about to push it."""
@@ -53,10 +53,12 @@ class PushPlanner:
 
     Args:
         grasps: knows the objects, and how well they can be grasped.
+        tray: holds them.
     """
 
-    def __init__(self, grasps: GraspPlanner) -> None:
+    def __init__(self, grasps: GraspPlanner, tray: Tray) -> None:
         self._grasps = grasps
+        self._tray = tray
         gripper = grasps.gripper
         self._tip_m = gripper.tip_m(0.0)
         """Height at which the closed fingers end, above the tool point."""
@@ -64,7 +66,8 @@ class PushPlanner:
         """A push starts this far from the surface."""
         self._hand = np.array([p for p in gripper.closed_outline if p[0] > self._standoff_m])
         """Distances from the tool and heights above it of what is wider than the fingers."""
-        self._low_m = max(grasps.workspace.z[0], FLOOR_Z_M + OVER_FLOOR_M - self._tip_m)
+        floor_m = tray.height_m(grasps.workspace.center)
+        self._low_m = max(grasps.workspace.z[0], floor_m + OVER_FLOOR_M - self._tip_m)
 
     def plan(
         self, bodies: Sequence[Body], tool: YawPose, limits: ActionLimits, heights: np.ndarray
@@ -171,7 +174,7 @@ class PushPlanner:
 
     def _is_on_floor(self, point: np.ndarray, margin_m: float) -> bool:
         """Whether a point is off the tray's walls by a margin."""
-        half = (self._grasps.workspace.width - MARGIN_M) / 2 - margin_m
+        half = self._tray.half_m - margin_m
         return float(np.abs(point - self._grasps.workspace.center).max()) < half
 
 

@@ -1,4 +1,4 @@
-"""The tray that clutter lies in, and other close-loop tasks on request (appendix, table 4)."""
+"""The tray of the object-grasping tasks, and of others on request (appendix, table 4)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Color, Solid
+from ba_torchrl.sim.bodies import Body, Color, Solid
+from ba_torchrl.sim.geometry import Quaternion, Vector, yaw_quaternion
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.workspace import Workspace
 
 FLOOR_Z_M = 2e-3
 MARGIN_M = 0.05
@@ -42,28 +45,51 @@ def profile(width_m: float) -> list[tuple[float, float]]:
     return [(inner, FLOOR_Z_M), lip, rim]
 
 
-def add_tray(world: World, center_xy: tuple[float, float], width_m: float) -> float:
-    """Put a tray on the floor: a flat base, a gentle lip and steep walls without friction.
+class Tray(Terrain):
+    """A tray on the floor: a flat base, a gentle lip and steep walls without friction.
 
     Args:
-        world: not sealed yet.
-        center_xy: middle of the workspace, metres.
-        width_m: of the workspace.
-
-    Returns:
-        The height of the tray's floor, metres.
+        world: not sealed yet; the tray becomes two static bodies.
+        workspace: the tray is as wide, about its centre.
     """
-    corners = profile(width_m)
-    inner = corners[0][0]
-    base = _slab(np.array([[s * inner, t * inner] for s, t in _SIGNS]), [FLOOR_Z_M] * 4)
-    walls = [_wall(start, end, side) for side in range(4) for start, end in pairwise(corners)]
-    for name, parts, friction, color in (
-        ("tray floor", (base,), FLOOR_FRICTION, FLOOR_COLOR),
-        ("tray walls", tuple(walls), WALL_FRICTION, COLOR),
-    ):
+
+    def __init__(self, world: World, workspace: Workspace) -> None:
+        super().__init__(world, workspace)
+        corners = profile(workspace.width)
+        self.half_m = corners[0][0]
+        """Half the width of the flat base."""
+        base = _slab(
+            np.array([[s * self.half_m, t * self.half_m] for s, t in _SIGNS]), [FLOOR_Z_M] * 4
+        )
+        walls = [_wall(start, end, side) for side in range(4) for start, end in pairwise(corners)]
+        self._base, _ = (
+            self._add(name, parts, friction, color)
+            for name, parts, friction, color in (
+                ("tray floor", (base,), FLOOR_FRICTION, FLOOR_COLOR),
+                ("tray walls", tuple(walls), WALL_FRICTION, COLOR),
+            )
+        )
+
+    def _add(self, name: str, parts: tuple[Mesh, ...], friction: float, color: Color) -> Body:
         shape = Solid(parts=parts, mass_kg=0.0, friction=friction, color=color)
-        world.add(shape, name).place((*center_xy, 0.0))
-    return FLOOR_Z_M
+        body = self.world.add(shape, name)
+        body.place((*self.workspace.center, 0.0))
+        return body
+
+    @property
+    def support_ids(self) -> frozenset[int]:
+        """The flat base."""
+        return frozenset((self._base.id,))
+
+    def height_m(self, xy: tuple[float, float]) -> float:
+        """Return the height of the flat base, metres."""
+        return FLOOR_Z_M
+
+    def surface_pose(
+        self, xy: tuple[float, float], yaw_rad: float = 0.0
+    ) -> tuple[Vector, Quaternion]:
+        """Return the upright frame at a point of the base."""
+        return (*xy, FLOOR_Z_M), yaw_quaternion(yaw_rad)
 
 
 _SIGNS = ((-1, -1), (1, -1), (1, 1), (-1, 1))

@@ -11,9 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, Color, Shape, Solid, vertical_extent, world_vertices
+from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_mesh
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
@@ -25,6 +25,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 
 BIN_M = (0.176, 0.144, 0.08)
 WALL_M = 0.004
@@ -97,21 +98,21 @@ class BinPacking(PackingTask):
     num_objects_range = (1, 10)
     needs_fresh_world = True
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the bin, and as many objects of each shape as may be drawn."""
         size = tuple(extent * self.unit for extent in BIN_M)
         wall, floor = WALL_M * self.unit, FLOOR_M * self.unit
-        self.container = world.add(open_box(size, wall, floor, (0.6, 0.62, 0.66, 1.0)), "bin")
+        self.container = self.world.add(open_box(size, wall, floor, (0.6, 0.62, 0.66, 1.0)), "bin")
         kinds = pieces(self.unit)
         copies = self.settings.num_objects
         self.pool = BodyPool(
-            world,
+            self.world,
             [shape for shape in kinds.values() for _ in range(copies)],
             [f"{name} {i + 1}" for name in kinds for i in range(copies)],
         )
-        self._camera = HeightCamera(world.bodies)
+        self._camera = HeightCamera(self.world.bodies)
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the bin anywhere, and random objects around it."""
         count = self.settings.num_objects
         half_x, half_y, _ = (size * self.unit / 2 for size in BIN_M)
@@ -134,10 +135,12 @@ class BinPacking(PackingTask):
             self.pool.activate(body)
             self.stand(body, xy, yaw)
 
-    def is_goal(self) -> bool:
-        """Whether every object lies in the bin, let go of."""
-        held = self.robot.held_body()
-        return held not in self.objects and all(map(self.is_packed, self.objects))
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether every object lies in the bin, released."""
+        return {
+            "is_released": self.robot.held_body() not in self.objects,
+            "is_packed": all(map(self.is_packed, self.objects)),
+        }
 
     def is_packed(self, body: Body) -> bool:
         """Whether an object is within the bin's walls, its middle lower than the rim."""
@@ -145,15 +148,16 @@ class BinPacking(PackingTask):
             world_vertices(body)
         )
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which an object is held: just below its top."""
-        return max(top_m - PICK_BELOW_M * self.unit, LOWEST_PICK_M * self.unit)
+        lowest_m = self.terrain.height_m(xy) + LOWEST_PICK_M * self.unit
+        return max(top_m - PICK_BELOW_M * self.unit, lowest_m)
 
-    def place_height_m(self, top_m: float) -> float:
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which to let go: over the bin's rim, or gently on the ground."""
-        if top_m < FLOOR_M * self.unit / 2:
-            return super().place_height_m(top_m)
-        return max(super().place_height_m(top_m), self._release_m())
+        if top_m - self.terrain.height_m(xy) < FLOOR_M * self.unit / 2:
+            return super().place_height_m(top_m, xy)
+        return max(super().place_height_m(top_m, xy), self._release_m())
 
     def obstacles(self, body: Body | None, above_m: float) -> list[Rectangle]:
         """Return the outlines of what fingers may meet at a height, the bin's walls one by one."""
@@ -172,7 +176,7 @@ class BinPacking(PackingTask):
             return self._drop(held)
         outside = [body for body in self.objects if not self.is_packed(body)]
         if not outside:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in outside}
 
         def order(body: Body) -> tuple[bool, float, float]:
@@ -189,8 +193,8 @@ class BinPacking(PackingTask):
         return self.container.position[2] + BIN_M[2] * self.unit / 2
 
     def _release_m(self) -> float:
-        """Return the height of the tool, above the workspace's floor, as it lets go."""
-        return self._rim_m() - self.floor_m + OVER_RIM_M
+        """Return the height of the tool as it releases an object."""
+        return self._rim_m() + OVER_RIM_M
 
     def _inside(self, margin_m: float = 0.0) -> Rectangle:
         """Return the bin's inside, less a margin."""
@@ -205,7 +209,7 @@ class BinPacking(PackingTask):
         ends = [(side * x, 0.0, thin, y) for side in (-1, 1)]
         sides = [(0.0, side * y, x, thin) for side in (-1, 1)]
         return [
-            Rectangle(*inside.at(along, across), inside.yaw_rad, *half)
+            Rectangle(*inside.frame.to_world(along, across), inside.yaw_rad, *half)
             for along, across, *half in ends + sides
         ]
 
@@ -228,13 +232,12 @@ class BinPacking(PackingTask):
         if best is None:  # too large for the bin as it is held
             best = (0.0, (0.0, 0.0), 0.0, 0.0)
         _, spot, top, turn = best
-        x, y = self._inside().at(*spot)
+        x, y = self._inside().frame.to_world(*spot)
         depth = self.depth_m(held)
-        z = max(self._release_m() + self.floor_m, top + depth + RELEASE_GAP_M)
+        z = max(self._release_m(), top + depth + RELEASE_GAP_M)
         # the middle of the outline goes there, which need not be the body's origin
         ox, oy = held.position[0] - own.x, held.position[1] - own.y
-        cos, sin = math.cos(turn), math.sin(turn)
-        at = (x + cos * ox - sin * oy, y + sin * ox + cos * oy)
+        at = PlanarFrame(x, y, turn).to_world(ox, oy)
         command = self.place(held, (*at, held.position[2]), turn)
         return command._replace(z_m=z)
 

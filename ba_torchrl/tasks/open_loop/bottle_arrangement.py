@@ -10,7 +10,6 @@ from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
 from ba_torchrl.sim.meshes import lathe_parts
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.packing.base import OPEN_M, RELEASE_GAP_M, Grasp, PackingTask, open_box
@@ -22,6 +21,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)
@@ -84,7 +84,7 @@ class BottleArrangement(PackingTask):
     num_objects_range = (6, 6)
     finger_opening = 0.8
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the tray, and as many bottles of each kind as may be drawn."""
         tray = open_box(
             tuple(size * self.unit for size in TRAY_M),
@@ -92,7 +92,7 @@ class BottleArrangement(PackingTask):
             FLOOR_M * self.unit,
             (0.72, 0.56, 0.38, 1.0),
         )
-        self.container = world.add(tray, "tray")
+        self.container = self.world.add(tray, "tray")
         self._kinds = [
             Solid(
                 parts=tuple(
@@ -106,12 +106,12 @@ class BottleArrangement(PackingTask):
         ]
         copies = self.settings.num_objects
         self.pool = BodyPool(
-            world,
+            self.world,
             [shape for shape in self._kinds for _ in range(copies)],
             [f"{name} {i + 1}" for name in BOTTLES_CM for i in range(copies)],
         )
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the tray anywhere, and random bottles around it."""
         count = self.settings.num_objects
         length, width, _ = (size * self.unit for size in TRAY_M)
@@ -135,10 +135,12 @@ class BottleArrangement(PackingTask):
             self.pool.activate(bottle)
             self.stand(bottle, xy, yaw)
 
-    def is_goal(self) -> bool:
-        """Whether every bottle stands in the tray, let go of."""
-        held = self.robot.held_body()
-        return all(body is not held and self.stands_in_tray(body) for body in self.objects)
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether every bottle stands in the tray, released."""
+        return {
+            "is_released": self.robot.held_body() not in self.objects,
+            "is_arranged": all(map(self.stands_in_tray, self.objects)),
+        }
 
     def is_valid(self) -> bool:
         """Whether all is inside the workspace, and no bottle fell over."""
@@ -174,7 +176,7 @@ class BottleArrangement(PackingTask):
             return self.place(held, (x, y, floor + RELEASE_GAP_M), turn)
         outside = [body for body in self.objects if not self.stands_in_tray(body)]
         if not outside:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in outside}
         place = self._free_place(None)
         if self._clearance(place, None) < CLEARANCE_M:
@@ -187,7 +189,7 @@ class BottleArrangement(PackingTask):
 
     def grasp(self, body: Body) -> Grasp:
         """Return where to grasp a bottle: by its neck, from the side with most room."""
-        height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
+        height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         others = self.obstacles(body, height - TIP_M)
         x, y, _ = body.position
         half = self.finger_opening * OPEN_M / 2
@@ -223,7 +225,8 @@ class BottleArrangement(PackingTask):
         """Return how far a bottle is from the nearest slot."""
         tray = self._tray()
         return min(
-            math.dist(body.position[:2], tray.at(x * self.unit, y * self.unit)) for x, y in slots()
+            math.dist(body.position[:2], tray.frame.to_world(x * self.unit, y * self.unit))
+            for x, y in slots()
         )
 
     def _clearance(self, place: tuple[float, float], held: Body | None) -> float:
@@ -240,14 +243,14 @@ class BottleArrangement(PackingTask):
     def _free_place(self, held: Body | None) -> tuple[float, float]:
         """Return the first free slot, or the place in the tray with most room."""
         tray = self._tray()
-        places = [tray.at(x * self.unit, y * self.unit) for x, y in slots()]
+        places = [tray.frame.to_world(x * self.unit, y * self.unit) for x, y in slots()]
         for place in places:
             if self._clearance(place, held) >= CLEARANCE_M:
                 return place
         inside, half = self._inside(), BOTTLE_M * self.unit / 2 + CLEARANCE_M
         along, across = inside.half_x - half, inside.half_y - half
         places += [
-            tray.at(x, y)
+            tray.frame.to_world(x, y)
             for x in np.arange(-along, along + 1e-9, SEARCH_M).tolist()
             for y in np.arange(-across, across + 1e-9, SEARCH_M).tolist()
         ]

@@ -10,7 +10,6 @@ import numpy as np
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, vertical_extent
-from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.packing.base import ENOUGH_M, RELEASE_GAP_M, PackingTask
@@ -23,6 +22,7 @@ from ba_torchrl.tasks.packing.footprints import (
     random_rectangle,
     scatter,
 )
+from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import CUBOID, UPRIGHT_RAD
 
 PALLET_M = (0.232, 0.192, 0.03)
@@ -78,18 +78,18 @@ class BoxPalletizing(PackingTask):
     num_objects_range = (6, 18)
     num_objects_step = PER_LAYER
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the pallet and all boxes."""
         pallet, box = (tuple(s * self.unit for s in size) for size in (PALLET_M, BOX_M))
         color = (0.55, 0.42, 0.28, 1.0)
-        self.container = world.add(Box(size_m=pallet, mass_kg=0.0, color=color), "pallet")
+        self.container = self.world.add(Box(size_m=pallet, mass_kg=0.0, color=color), "pallet")
         shape = Box(size_m=box, color=(0.85, 0.66, 0.4, 1.0))
         count = self.settings.num_objects
-        self.pool = BodyPool(world, [shape] * count, [f"box {i + 1}" for i in range(count)])
+        self.pool = BodyPool(self.world, [shape] * count, [f"box {i + 1}" for i in range(count)])
         self._arrivals: list[tuple[tuple[float, float], float]] = []
         """Where each box comes in."""
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the pallet anywhere, and the first box beside it."""
         half_x, half_y, _ = (size * self.unit / 2 for size in PALLET_M)
         width, length, _ = (size * self.unit / 2 for size in BOX_M)
@@ -120,9 +120,9 @@ class BoxPalletizing(PackingTask):
             self._bring()
             self.world.settle(SETTLE_STEPS)
 
-    def is_goal(self) -> bool:
-        """Whether every slot has its box."""
-        return len(self.filled()) == self.settings.num_objects
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether every slot has its box, released."""
+        return {"is_stacked": len(self.filled()) == self.settings.num_objects}
 
     def filled(self) -> dict[tuple[int, int], Body]:
         """Return the boxes that count, by layer and number of their slots."""
@@ -137,9 +137,9 @@ class BoxPalletizing(PackingTask):
             full += 1
         return {slot: body for slot, body in found.items() if slot[0] <= full}
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which a box is held."""
-        return max(top_m - GRIP_M * self.unit, self.lowest_pick_m)
+        return max(top_m - GRIP_M * self.unit, self.lowest_tool_m(xy))
 
     def get_state(self) -> Any:
         """Return which boxes are there, and where the others will come in."""
@@ -158,7 +158,7 @@ class BoxPalletizing(PackingTask):
             return self._place_in_slot(held, filled)
         astray = [body for body in self.pool.present if body not in filled.values()]
         if not astray:
-            return self.stay()
+            return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in astray}
 
         def urgency(body: Body) -> tuple[float, bool, float]:
@@ -198,7 +198,7 @@ class BoxPalletizing(PackingTask):
         )
         if not is_level:
             return None
-        along, across = pallet.local(x, y)
+        along, across = pallet.frame.to_local(x, y)
         heading = CUBOID.yaw_rad(body) - pallet.yaw_rad
         for number, (slot_x, slot_y, yaw) in enumerate(slots(layer)):
             off = max(abs(along - slot_x * self.unit), abs(across - slot_y * self.unit))
@@ -225,10 +225,13 @@ class BoxPalletizing(PackingTask):
             if (layer, number) in filled:
                 continue
             middle = Rectangle(
-                *pallet.at(x * self.unit, y * self.unit), pallet.yaw_rad + yaw, width, length
+                *pallet.frame.to_world(x * self.unit, y * self.unit),
+                pallet.yaw_rad + yaw,
+                width,
+                length,
             )
             spots = [
-                Rectangle(*middle.at(shift * SLOT_M * self.unit, 0.0), *middle[2:])
+                Rectangle(*middle.frame.to_world(shift * SLOT_M * self.unit, 0.0), *middle[2:])
                 for shift in SHIFTS
             ]
             # a neighbour may lie at the edge of its slot, where a finger should go
@@ -242,7 +245,8 @@ class BoxPalletizing(PackingTask):
             if all(gap_m(spot, other) > 0 for other in astray):
                 return self.place(held, (spot.x, spot.y, z), spot.yaw_rad - heading)
         (x, y), yaw = max(self._arrivals, key=lambda arrival: self._room_at(arrival, held))
-        return self.place(held, (x, y, self.floor_m + height + RELEASE_GAP_M), yaw - heading)
+        z = self.terrain.height_m((x, y)) + height + RELEASE_GAP_M
+        return self.place(held, (x, y, z), yaw - heading)
 
     def _tip_over(self, held: Body) -> PickPlaceCommand:
         """Return the place at the pallet's edge from which a box that stands on its end falls."""
@@ -256,14 +260,14 @@ class BoxPalletizing(PackingTask):
                 across = along / (TIP_PLACES + 1) * (pallet.half_y - width)
                 edge = side * pallet.half_x
                 falls = Rectangle(
-                    *pallet.at(edge + side * (length + 2 * TIP_OVER_M), across),
+                    *pallet.frame.to_world(edge + side * (length + 2 * TIP_OVER_M), across),
                     pallet.yaw_rad,
                     length + 2 * TIP_OVER_M,
                     width,
                 )
                 room = min((gap_m(falls, other) for other in others), default=ENOUGH_M)
                 inside = 1.0 if falls.is_inside(workspace) else 0.0
-                spot = pallet.at(edge + side * TIP_OVER_M, across)
+                spot = pallet.frame.to_world(edge + side * TIP_OVER_M, across)
                 if best is None or inside + min(room, ENOUGH_M) > best[0]:
                     best = (inside + min(room, ENOUGH_M), spot)
         z = self._level_z_m(0) - BOX_M[2] * self.unit / 2 + RELEASE_GAP_M

@@ -8,15 +8,16 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Body, Box, Color, gap_m, vertical_extent
-from ba_torchrl.sim.geometry import YawPose
-from ba_torchrl.sim.world import World
+from ba_torchrl.sim.bodies import Body, Box, Color, vertical_extent
+from ba_torchrl.sim.contacts import gap_m
+from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
 from ba_torchrl.tasks.motion_primitives import RELEASE_GAP_M, finger_room
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 
 PURPLE: Color = (0.6, 0.45, 0.78, 1.0)
 GRAY: Color = (0.6, 0.6, 0.6, 1.0)
@@ -107,15 +108,15 @@ class CovidTest(OpenLoopTask):
     spot_m: ClassVar[tuple[float, float]] = (0.0125, 0.1)
     """A used tube turns up within this of the middle of the test area."""
 
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the three areas, the tubes and the swabs."""
-        floors = [world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS]
+        floors = [self.world.add(_slab(area, area.size[:2], SHEET_M), area.name) for area in AREAS]
         self.new_box, self.used_box, self.test_area = floors
         self._slabs = [(area, (0.0, 0.0), floor) for area, floor in zip(AREAS, floors, strict=True)]
         self._walls: list[Body] = []
         for area in (NEW_BOX, USED_BOX):
             for place, size in _walls(area):
-                wall = world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}")
+                wall = self.world.add(_slab(area, size, area.size[2]), f"wall of the {area.name}")
                 self._slabs.append((area, place, wall))
                 self._walls.append(wall)
         factor = self.settings.scale / self.scale_range[0]
@@ -125,15 +126,15 @@ class CovidTest(OpenLoopTask):
         (tube_m, tube_width_m), (swab_m, swab_width_m) = self._tube_m, self._swab_m
         tube = Box(size_m=(tube_m, tube_width_m, tube_width_m), mass_kg=0.05, color=GLASS)
         swab = Box(size_m=(swab_m, swab_width_m, swab_width_m), mass_kg=0.03, color=WHITE)
-        self.tubes = [world.add(tube, f"tube {i + 1}") for i in range(self.rounds)]
-        self.swabs = [world.add(swab, f"swab {i + 1}") for i in range(self.rounds)]
+        self.tubes = [self.world.add(tube, f"tube {i + 1}") for i in range(self.rounds)]
+        self.swabs = [self.world.add(swab, f"swab {i + 1}") for i in range(self.rounds)]
         self._used: list[Body] = []
         self._spent: list[Body] = []
         self._seed = 0
         self.has_failed = False
         """Whether the order of the test was broken."""
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put the layout anywhere, mirrored or not, with all tubes and swabs in their box.
 
         With fixed orientations the layout is turned by 0 or 180 degrees, and all lies along y.
@@ -148,8 +149,10 @@ class CovidTest(OpenLoopTask):
         center = self.random_point(rng, 2 * half)
         for area, place, body in self._slabs:
             x, y = area.center
-            middle = _turned((mirror * x, y), center, yaw)
-            body.place((*_turned(place, middle, yaw), -SUNK_M - body.shape.bounds_m[0][2]), yaw)
+            middle = PlanarFrame(*center, yaw).to_world(mirror * x, y)
+            xy = PlanarFrame(*middle, yaw).to_world(*place)
+            z = self.terrain.height_m(xy) - SUNK_M - body.shape.bounds_m[0][2]
+            body.place((*xy, z), yaw)
         rows = self._rows()
         for bodies, row in ((self.tubes, rows[0]), (self.swabs, rows[1])):
             for column, body in zip(self._columns(), bodies, strict=True):
@@ -172,9 +175,12 @@ class CovidTest(OpenLoopTask):
         elif max(len(tubes), len(swabs)) > 1:
             self.has_failed = True
 
-    def is_goal(self) -> bool:
-        """Whether all tubes are in the box for used ones, and no swab is left."""
-        return len(self._spent) == self.rounds and all(map(self.is_collected, self.tubes))
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether all tests are made and all tubes are in the box for used ones."""
+        return {
+            "is_tested": len(self._spent) == self.rounds,
+            "is_collected": all(map(self.is_collected, self.tubes)),
+        }
 
     def is_valid(self) -> bool:
         """Whether the order of the test was kept and all is inside the workspace."""
@@ -184,7 +190,8 @@ class CovidTest(OpenLoopTask):
         """Whether a tube lies in the box for used ones, below its rim."""
         length, width, rim = USED_BOX.size
         inner = (length - 2 * WALL_M, width - 2 * WALL_M)
-        return tube.position[2] < rim and self._is_on(self.used_box, inner, tube)
+        is_below_rim = tube.position[2] - self.terrain.height_m(tube.position[:2]) < rim
+        return is_below_rim and self._is_on(self.used_box, inner, tube)
 
     @property
     def objects(self) -> Sequence[Body]:
@@ -218,11 +225,11 @@ class CovidTest(OpenLoopTask):
 
     # -- heights that an action leaves open --------------------------------------------------
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool at which the fingers close on what lies highest there."""
-        return max(top_m - self._tube_m[1] / 2, SHEET_M + GRASP_M)
+        return max(top_m - self._tube_m[1] / 2, self._sheet_z_m(xy) + GRASP_M)
 
-    def place_height_m(self, top_m: float) -> float:
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool at which what was picked like this is let go."""
         return top_m + GRASP_M + RELEASE_GAP_M
 
@@ -247,7 +254,7 @@ class CovidTest(OpenLoopTask):
             spot = tuple(float(rng.uniform(-half, half)) for half in self.spot_m)
             yaw = math.pi / 2 + self.random_yaw(rng, 2 * math.pi)
             self._lay(tube, self._to_world(self.test_area, spot), yaw)
-            if all(gap_m(other.id, tube) > APART_M for other in others):
+            if all(gap_m(self.world.client, other.id, tube.id) > APART_M for other in others):
                 break
         self.world.settle(max_steps=REST_STEPS)
 
@@ -261,8 +268,8 @@ class CovidTest(OpenLoopTask):
         """Whether a body, let go of, has its centre above a rectangle about an area's centre."""
         if body is self.robot.held_body():
             return False
-        (ax, ay, _), (bx, by, _), yaw = area.position, body.position, area.yaw_rad
-        local = _turned((bx - ax, by - ay), (0.0, 0.0), -yaw)
+        frame = PlanarFrame(*area.position[:2], area.yaw_rad)
+        local = frame.to_local(*body.position[:2])
         return all(abs(place) < extent / 2 for place, extent in zip(local, size_m, strict=False))
 
     # -- the expert --------------------------------------------------------------------------
@@ -273,13 +280,12 @@ class CovidTest(OpenLoopTask):
         if held is not None:
             return self._place(held)
         wanted = self._wanted()
-        if not wanted:  # all is done: a pick from the bare corner changes nothing
-            workspace = self.settings.workspace
-            return PickPlaceCommand(PICK, workspace.x[0], workspace.y[0], 0.1)
+        if not wanted:
+            return no_op(self.settings.workspace, is_holding=False)
         body = max(wanted, key=self._room)
         x, y, _ = body.position
         z = vertical_extent(body)[0] + GRASP_M
-        return PickPlaceCommand(PICK, x, y, z, self._grasp_yaw(body))
+        return pick_command(downward_pose((x, y, z), self._grasp_yaw(body)))
 
     def _wanted(self) -> list[Body]:
         """Return the bodies any of which is to be picked next."""
@@ -297,7 +303,8 @@ class CovidTest(OpenLoopTask):
         if held in self._used:
             turns = bool(self.action_limits.turn_rad)
             spots = USED_ROWS if turns else USED_COLUMNS
-            return self._place_on(held, self.used_box, spots, 0.0, rim_m=USED_BOX.size[2])
+            rim_m = self.terrain.height_m(self.used_box.position[:2]) + USED_BOX.size[2]
+            return self._place_on(held, self.used_box, spots, 0.0, rim_m=rim_m)
         kin = self.tubes if held in self.tubes else self.swabs
         if self._uncollected() or any(map(self._is_presented, kin)):
             row = self._rows()[0 if kin is self.tubes else 1]
@@ -322,20 +329,18 @@ class CovidTest(OpenLoopTask):
             along_rad: how it is to lie in that frame; a gripper that cannot turn leaves it.
             rim_m: height that the fingertips stay above.
         """
-        tool, tool_yaw = self.robot.tool_pose()
+        tool = self.robot.tool_transform()
         others = [other.position for other in self.objects if other is not held]
         x, y = max(
             (self._to_world(area, spot) for spot in spots),
             key=lambda spot: min(math.dist(spot, other[:2]) for other in others),
         )
-        turn = -tool_yaw
+        turn = -tool.yaw_rad
         if self.action_limits.turn_rad:
             turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
-        ox, oy = (b - t for b, t in zip(held.position[:2], tool[:2], strict=True))
-        dx, dy = _turned((ox, oy), (0.0, 0.0), turn)
-        z = SHEET_M + RELEASE_GAP_M + tool[2] - vertical_extent(held)[0]
-        z = max(z, rim_m + GRASP_M + RELEASE_GAP_M)
-        return PickPlaceCommand(PLACE, x - dx, y - dy, z, tool_yaw + turn)
+        z = self._sheet_z_m((x, y)) + RELEASE_GAP_M + held.position[2] - vertical_extent(held)[0]
+        command = place_command(tool, held.pose, held.pose.moved_to((x, y, z), turn))
+        return command._replace(z_m=max(command.z_m, rim_m + GRASP_M + RELEASE_GAP_M))
 
     def _grasp_yaw(self, body: Body) -> float:
         return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0
@@ -363,20 +368,15 @@ class CovidTest(OpenLoopTask):
         return [(i - (self.rounds - 1) / 2) * COLUMN_M for i in range(self.rounds)]
 
     def _to_world(self, area: Body, spot: tuple[float, float]) -> tuple[float, float]:
-        return _turned(spot, area.position[:2], area.yaw_rad)
+        return PlanarFrame(*area.position[:2], area.yaw_rad).to_world(*spot)
 
     def _lay(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put a tube or swab on the floor of an area."""
-        body.place((*xy, SHEET_M - body.shape.bounds_m[0][2]), yaw_rad)
+        body.place((*xy, self._sheet_z_m(xy) - body.shape.bounds_m[0][2]), yaw_rad)
 
-
-def _turned(
-    point: tuple[float, float], center: tuple[float, float], yaw_rad: float
-) -> tuple[float, float]:
-    """Return where a point of a frame lies whose origin and heading are given."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    x, y = point
-    return center[0] + cos * x - sin * y, center[1] + sin * x + cos * y
+    def _sheet_z_m(self, xy: tuple[float, float]) -> float:
+        """Return the height of the floors of the areas."""
+        return self.terrain.height_m(xy) + SHEET_M
 
 
 def _slab(area: Area, size_m: tuple[float, float], top_m: float) -> Box:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.blueprint import CUBE, TRIANGLE, Blueprint, tower
-from ba_torchrl.tasks.structures.open_loop import Part, StructureTask
+from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, triangle
 
 
@@ -20,8 +18,5 @@ class HouseBuilding1(StructureTask):
 
     def blueprint(self) -> Blueprint:
         """Return the stack with the triangle."""
-        return tower(*[CUBE] * (self.settings.num_objects - 1), TRIANGLE)
-
-    def parts(self) -> Sequence[Part]:
-        """Return the triangle and the cubes."""
-        return [triangle(self.block_m), *[cube(self.block_m)] * (self.settings.num_objects - 1)]
+        cubes = [cube(self.block_m)] * (self.settings.num_objects - 1)
+        return tower(*cubes, triangle(self.block_m))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.blueprint import CUBE, ROOF, Blueprint, Slot
-from ba_torchrl.tasks.structures.open_loop import Part, StructureTask
+from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, pair_span, roof
 
 
@@ -20,10 +18,6 @@ class HouseBuilding2(StructureTask):
 
     def blueprint(self) -> Blueprint:
         """Return two cubes with the roof across."""
-        return Blueprint(
-            (Slot(CUBE), Slot(CUBE), Slot(ROOF, on=(0, 1), span=pair_span(self.block_m, 2.0)))
-        )
-
-    def parts(self) -> Sequence[Part]:
-        """Return the roof and the cubes."""
-        return [roof(self.block_m), *[cube(self.block_m)] * 2]
+        block = cube(self.block_m)
+        across = Slot(roof(self.block_m), on=(0, 1), span=pair_span(self.block_m, 2.0))
+        return Blueprint((Slot(block), Slot(block), across))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.blueprint import CUBE, CUBOID, ROOF, Blueprint, Slot
-from ba_torchrl.tasks.structures.open_loop import Part, StructureTask
+from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof
 
 
@@ -14,7 +12,7 @@ from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof
 class HouseBuilding3(StructureTask):
     """Two cubes of 3 cm, a cuboid and a roof 12 cm long; success when roof, cuboid and cubes stand.
 
-    The cuboid lies across the cubes, the roof on the cuboid, both above the cubes' middle.
+    The cuboid lies across the cubes, the roof on the cuboid, both above the middle of the cubes.
     """
 
     scale_limits = (0.55, 0.9)
@@ -24,15 +22,12 @@ class HouseBuilding3(StructureTask):
 
     def blueprint(self) -> Blueprint:
         """Return two cubes with cuboid and roof across."""
+        block = cube(self.block_m)
         return Blueprint(
             (
-                Slot(CUBE),
-                Slot(CUBE),
-                Slot(CUBOID, on=(0, 1), span=pair_span(self.block_m, 2.2)),
-                Slot(ROOF, on=(2,), over=(0, 1)),
+                Slot(block),
+                Slot(block),
+                Slot(cuboid(self.block_m), on=(0, 1), span=pair_span(self.block_m, 2.2)),
+                Slot(roof(self.block_m), on=(2,), over=(0, 1)),
             )
         )
-
-    def parts(self) -> Sequence[Part]:
-        """Return roof, cuboid and cubes."""
-        return [roof(self.block_m), cuboid(self.block_m), *[cube(self.block_m)] * 2]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.blueprint import CUBE, CUBOID, ROOF, Blueprint, Slot
-from ba_torchrl.tasks.structures.open_loop import Part, StructureTask
+from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof
 
 
@@ -24,17 +22,14 @@ class HouseBuilding4(StructureTask):
 
     def blueprint(self) -> Blueprint:
         """Return the two storeys and the roof."""
+        block, span = cube(self.block_m), pair_span(self.block_m, 2.3)
         return Blueprint(
             (
-                Slot(CUBE),
-                Slot(CUBE),
-                Slot(CUBOID, on=(0, 1), span=pair_span(self.block_m, 2.3)),
-                Slot(CUBE, on=(2,)),
-                Slot(CUBE, on=(2,)),
-                Slot(ROOF, on=(3, 4), span=pair_span(self.block_m, 2.3)),
+                Slot(block),
+                Slot(block),
+                Slot(cuboid(self.block_m), on=(0, 1), span=span),
+                Slot(block, on=(2,)),
+                Slot(block, on=(2,)),
+                Slot(roof(self.block_m), on=(3, 4), span=span),
             )
         )
-
-    def parts(self) -> Sequence[Part]:
-        """Return roof, cuboid and cubes."""
-        return [roof(self.block_m), cuboid(self.block_m), *[cube(self.block_m)] * 4]

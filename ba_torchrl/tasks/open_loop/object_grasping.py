@@ -7,13 +7,14 @@ from functools import partial
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
+from ba_torchrl.actions import PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import downward_pose
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import DEEPEST_M, PIXEL_M, YAWS
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M
-from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.open_loop_task import OpenLoopControl
+from ba_torchrl.tasks.pick_place_commands import pick_command
 
 USUAL_WIDTH_M = 0.045
 """Of an object between the fingers, where an action leaves the height open."""
@@ -31,7 +32,7 @@ NEAR_COST = 60.0
 
 
 @TASKS.register("open_loop/object_grasping")
-class ObjectGrasping(ClutterTask, OpenLoopTask):
+class ObjectGrasping(OpenLoopControl, ClutterTask):
     """Random objects in a tray, 15 unless told otherwise; success when a pick took one.
 
     An episode is one pick.
@@ -43,11 +44,11 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
     num_objects_range = (1, 20)
     scale_range = (1.0, 1.0)
 
-    def is_goal(self) -> bool:
-        """Whether an object is held."""
-        return self.robot.held_body() is not None
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether an object is held."""
+        return {"is_grasped": self.robot.held_body() is not None}
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a pick, where an action leaves it open.
 
         The fingers reach around the object as far as they are of use; the palm stays above it, and
@@ -55,12 +56,13 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         down as they close.
 
         Args:
-            top_m: of the highest point around the target, above the workspace's floor.
+            top_m: height of the highest point around the target, metres.
+            xy: of the target.
         """
         gripper = self.robot.gripper
         tips_m = gripper.tip_m(USUAL_WIDTH_M / 2)
         depth_m = min(gripper.palm_m - PALM_GAP_M, DEEPEST_M + tips_m)
-        return max(top_m - depth_m, FLOOR_Z_M + FLOOR_GAP_M - tips_m)
+        return max(top_m - depth_m, self.terrain.height_m(xy) + FLOOR_GAP_M - tips_m)
 
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square that is searched for the highest point."""
@@ -83,7 +85,7 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
             return self._squeeze()
         near = [grasp for grasp in found if grasp.cost < found[0].cost + NEAR_COST]
         grasp = near[self.clutter.failures % len(near)]
-        return PickPlaceCommand(PICK, *grasp.position, grasp.yaw_rad)
+        return pick_command(downward_pose(grasp.position, grasp.yaw_rad))
 
     def _penalty(self, highest: np.ndarray, grasps: np.ndarray) -> np.ndarray:
         """Return what speaks against grasps [N, 6] as the planner lists them, [N].
@@ -94,8 +96,12 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         """
         pixels = ((grasps[:, :2] - self.planner.corner) / PIXEL_M).astype(int)
         i, j = np.clip(pixels, 0, len(highest) - 1).T
-        floor = self.settings.workspace.z[0]
-        heights = np.array([self.pick_height_m(top) + floor for top in (highest[i, j] - floor)])
+        heights = np.array(
+            [
+                self.pick_height_m(top, (x, y))
+                for top, (x, y) in zip(highest[i, j], grasps[:, :2], strict=True)
+            ]
+        )
         misfit = np.abs(heights - grasps[:, 2])
         return SLIP_COST * grasps[:, 5] + MISFIT_COST_PER_M * misfit
 
@@ -110,9 +116,9 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         yaws = np.arange(YAWS) * np.pi / YAWS if self.action_limits.turn_rad else np.zeros(1)
         across = points[:, :2] @ np.array([np.cos(yaws), np.sin(yaws)])
         x, y = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
-        z = self.pick_height_m(points[:, 2].max() - self.settings.workspace.z[0])
+        z = self.pick_height_m(points[:, 2].max(), (float(x), float(y)))
         yaw = yaws[np.ptp(across, axis=0).argmin()]
-        return PickPlaceCommand(PICK, float(x), float(y), float(z), float(yaw))
+        return pick_command(downward_pose((float(x), float(y), float(z)), float(yaw)))
 
     def grasped_object(self) -> Body | None:
         """Return what the last pick took: cameras do not see it; contacts wait for a step."""

@@ -9,12 +9,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import pybullet
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
+from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
-from ba_torchrl.sim.geometry import Vector, YawPose
+from ba_torchrl.sim.geometry import Vector, YawPose, downward_pose
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, joined, moved
+from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.packing.footprints import (
     RELEASE_M,
     TIP_M,
@@ -24,6 +25,7 @@ from ba_torchrl.tasks.packing.footprints import (
     narrowest,
     outline,
 )
+from ba_torchrl.tasks.pick_place_commands import pick_command, place_command
 
 SCALE = 0.8
 """At this scale, objects have the sizes of appendix A.1."""
@@ -85,7 +87,7 @@ class Grasp(NamedTuple):
     """Gap between the open fingers and what stands beside them."""
 
 
-class PackingTask(OpenLoopTask):
+class PackingTask(OpenLoopControl, Task):
     """Objects from a pool on the floor, and a container that does not move."""
 
     scale_range = (SCALE, SCALE)
@@ -124,11 +126,11 @@ class PackingTask(OpenLoopTask):
         """Take up what `get_state` returned."""
         self.pool.set_state(state)
 
-    def place_height_m(self, top_m: float) -> float:
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which what is held comes to rest on what is highest there."""
         held = self.robot.held_body()
         if held is None:
-            return super().place_height_m(top_m)
+            return super().place_height_m(top_m, xy)
         return top_m + self.depth_m(held) + RELEASE_GAP_M
 
     def depth_m(self, held: Body) -> float:
@@ -136,12 +138,6 @@ class PackingTask(OpenLoopTask):
         return self.robot.tool_pose()[0][2] - vertical_extent(held)[0]
 
     # -- parts of the experts ----------------------------------------------------------------
-
-    def stay(self) -> PickPlaceCommand:
-        """Return a command that changes nothing: there is nothing left to do."""
-        workspace = self.settings.workspace
-        primitive = PICK if self.robot.held_body() is None else PLACE
-        return PickPlaceCommand(primitive, workspace.x[0], workspace.y[0], 0.1)
 
     def obstacles(self, body: Body | None, above_m: float) -> list[Rectangle]:
         """Return the outlines of what fingers may meet at a height.
@@ -159,7 +155,7 @@ class PackingTask(OpenLoopTask):
 
     def grasp(self, body: Body) -> Grasp:
         """Return where to grasp an object: in its middle, or where the fingers have more room."""
-        height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
+        height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         others = self.obstacles(body, height - TIP_M)
         tall = self.obstacles(body, height + HAND_ABOVE_M)
         half_hand = self.robot.hand_half_m
@@ -169,7 +165,7 @@ class PackingTask(OpenLoopTask):
             for offset in self.grasp_offsets_m:
                 if abs(offset * self.unit) > max(side.half_y - 0.012, 0.0):
                     continue
-                xy = side.at(0.0, offset * self.unit)
+                xy = side.frame.to_world(0.0, offset * self.unit)
                 room = finger_gap_m(xy, side.yaw_rad, half_open, others)
                 hand = Rectangle(*xy, side.yaw_rad, *half_hand)
                 room = min([room, *(gap_m(hand, other) for other in tall)])
@@ -178,8 +174,8 @@ class PackingTask(OpenLoopTask):
 
     def pick(self, body: Body, grasp: Grasp) -> PickPlaceCommand:
         """Return the pick of an object."""
-        height = self.pick_height_m(vertical_extent(body)[1] - self.floor_m) + self.floor_m
-        return PickPlaceCommand(PICK, grasp.x, grasp.y, height, grasp.yaw_rad)
+        height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
+        return pick_command(downward_pose((grasp.x, grasp.y, height), grasp.yaw_rad))
 
     def place(self, held: Body, position: Vector, turn_rad: float) -> PickPlaceCommand:
         """Return the place that brings what is held somewhere, up to half turns.
@@ -189,24 +185,14 @@ class PackingTask(OpenLoopTask):
             position: of its origin.
             turn_rad: about the vertical, from how it is held now.
         """
-        tool, tool_yaw = self.robot.tool_pose()
-        yaw = (tool_yaw + turn_rad) % math.pi if self.action_limits.turn_rad else 0.0
+        tool = self.robot.tool_transform()
+        yaw = (tool.yaw_rad + turn_rad) % math.pi if self.action_limits.turn_rad else 0.0
         if yaw > math.pi - TURN_MARGIN_RAD:
             yaw = 0.0
-        cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
-        ox, oy, oz = (b - t for b, t in zip(held.position, tool, strict=True))
-        x, y, z = position
-        return PickPlaceCommand(
-            PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
-        )
+        return place_command(tool, held.pose, held.pose.moved_to(position, yaw - tool.yaw_rad))
 
     def release_half_m(self, held: Body) -> float:
         """Return how far from the tool point the fingers' inner sides are as they let go."""
         tool, yaw = self.robot.tool_pose()
         around = outline(held, yaw)
-        return abs(around.local(*tool[:2])[0]) + around.half_x + RELEASE_M
-
-    @property
-    def floor_m(self) -> float:
-        """Height of the workspace's floor, from which heights in images count."""
-        return self.settings.workspace.z[0]
+        return abs(around.frame.to_local(*tool[:2])[0]) + around.half_x + RELEASE_M

@@ -10,7 +10,9 @@ import numpy as np
 
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, world_vertices
-from ba_torchrl.tasks.base import Task, Workspace
+from ba_torchrl.sim.geometry import PlanarFrame
+from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.workspace import Workspace
 
 LAYOUTS = 10
 TRIES = 100
@@ -37,16 +39,10 @@ class Rectangle(NamedTuple):
     """Half its extent along its own x axis."""
     half_y: float
 
-    def at(self, along: float, across: float) -> tuple[float, float]:
-        """Return the point of the plane that has these coordinates in the rectangle's frame."""
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        return self.x + cos * along - sin * across, self.y + sin * along + cos * across
-
-    def local(self, x: float, y: float) -> tuple[float, float]:
-        """Return a point of the plane in the rectangle's frame."""
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        dx, dy = x - self.x, y - self.y
-        return cos * dx + sin * dy, cos * dy - sin * dx
+    @property
+    def frame(self) -> PlanarFrame:
+        """Frame of its centre, x along its first side."""
+        return PlanarFrame(self.x, self.y, self.yaw_rad)
 
     def resized(self, half_x: float, half_y: float) -> Rectangle:
         """Return one of another size about the same centre."""
@@ -54,9 +50,7 @@ class Rectangle(NamedTuple):
 
     def contains(self, points: np.ndarray) -> bool:
         """Whether all points [N, 2 or more] lie in it, whatever their height."""
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
-        along, across = np.abs(cos * dx + sin * dy), np.abs(cos * dy - sin * dx)
+        along, across = map(np.abs, self.frame.to_local(points[:, 0], points[:, 1]))
         return bool(along.max() <= self.half_x and across.max() <= self.half_y)
 
     def is_inside(self, workspace: Workspace) -> bool:
@@ -84,7 +78,7 @@ def gap_m(first: Rectangle, second: Rectangle) -> float:
     """
     gap = -math.inf
     for a, b in ((first, second), (second, first)):
-        dx, dy = a.local(b.x, b.y)
+        dx, dy = a.frame.to_local(b.x, b.y)
         ex, ey = b._extent(a.yaw_rad)
         gap = max(gap, abs(dx) - a.half_x - ex, abs(dy) - a.half_y - ey)
     return gap
@@ -133,10 +127,10 @@ def fingers(
         half_opening_m: from the tool point to a finger's inner side.
     """
     along, across = FINGER_M
-    tool = Rectangle(*xy, yaw_rad, 0.0, 0.0)
+    tool = PlanarFrame(*xy, yaw_rad)
     middle = half_opening_m + along / 2
     left, right = (
-        Rectangle(*tool.at(side * middle, 0.0), yaw_rad, along / 2, across / 2)
+        Rectangle(*tool.to_world(side * middle, 0.0), yaw_rad, along / 2, across / 2)
         for side in (-1.0, 1.0)
     )
     return left, right
@@ -259,9 +253,8 @@ def random_rectangle(
 
 def _around(corners: np.ndarray, yaw_rad: float) -> Rectangle:
     """Return the rectangle with this yaw around points [N, 3] seen from above."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    along = corners[:, 0] * cos + corners[:, 1] * sin
-    across = corners[:, 1] * cos - corners[:, 0] * sin
+    frame = PlanarFrame(0.0, 0.0, yaw_rad)
+    along, across = frame.to_local(corners[:, 0], corners[:, 1])
     (x0, x1), (y0, y1) = ((float(values.min()), float(values.max())) for values in (along, across))
-    middle = Rectangle(0.0, 0.0, yaw_rad, 0.0, 0.0).at((x0 + x1) / 2, (y0 + y1) / 2)
+    middle = frame.to_world((x0 + x1) / 2, (y0 + y1) / 2)
     return Rectangle(*middle, yaw_rad, (x1 - x0) / 2, (y1 - y0) / 2)

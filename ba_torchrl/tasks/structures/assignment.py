@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 
-from ba_torchrl.sim.bodies import CONTACT_M, Body
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import CONTACT_M, contacts
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
@@ -25,7 +25,6 @@ class PieceState(NamedTuple):
     position: Vector
     tilt_rad: float
     on_ground: bool
-    on_floor: bool
     below: frozenset[Body]
     """The pieces that it rests on."""
 
@@ -50,14 +49,14 @@ def read_piece_states(
     states = {}
     for body, piece in pieces.items():
         touched, below = set(), set()
-        for point in pybullet.getContactPoints(body.id, physicsClientId=world.client):
-            if point[8] >= CONTACT_M:
+        for point in contacts(world.client, body.id):
+            if point.distance_m >= CONTACT_M:
                 continue
-            touched.add(point[2])
-            other = by_id.get(point[2])
+            touched.add(point.other_id)
+            other = by_id.get(point.other_id)
             if (
                 other is not None
-                and point[7][2] > LYING_COSINE
+                and point.normal[2] > LYING_COSINE
                 and heights[body] - heights[other] >= block_m / 2
             ):
                 below.add(other)
@@ -65,7 +64,6 @@ def read_piece_states(
             body.position,
             piece.tilt_rad(body),
             not ground.isdisjoint(touched),
-            world.floor in touched,
             frozenset(below),
         )
     return states
@@ -184,7 +182,7 @@ class SlotAssigner:
             return False
         partner = self.blueprint.partner(number)
         if supports:
-            if view.on_floor or not view.below.issuperset(supports):
+            if view.on_ground or not view.below.issuperset(supports):
                 return False
         elif not view.on_ground or view.below:
             return False

@@ -11,10 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import pybullet
-
-from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.bodies import Body, Shape
+from ba_torchrl.sim.geometry import Vector, quaternion_matrix
+from ba_torchrl.tasks.workspace import Spot
 
 UPRIGHT_RAD = math.pi / 9
 """A piece that leans less than this is upright."""
@@ -27,7 +26,7 @@ def _both(*axes: Vector) -> tuple[Vector, ...]:
 
 @dataclass(frozen=True)
 class Piece:
-    """A kind of piece; sizes are those of the bodies.
+    """A kind of piece, and the body that is loaded for it.
 
     Args:
         kind: the name that bodies are matched by.
@@ -36,6 +35,9 @@ class Piece:
             stands for its reverse too.
         up: directions of its frame that may point up.
         stays_upright: whether it ends the episode if it tips over.
+        shape: of the body; None where the bodies are given otherwise.
+        spot: space that it needs at the start of an episode; None stands for its own circle.
+        variants: pieces of this kind, of which every episode draws as many as there are slots.
     """
 
     kind: str
@@ -43,19 +45,22 @@ class Piece:
     grasp_yaws_rad: tuple[float, ...] = (0.0,)
     up: tuple[Vector, ...] = (_Z,)
     stays_upright: bool = False
+    shape: Shape | None = None
+    spot: Spot | None = None
+    variants: tuple[Piece, ...] = ()
 
     def tilt_rad(self, body: Body) -> float:
         """Return the angle by which a body is off the nearest way in which it may lie."""
-        down = pybullet.getMatrixFromQuaternion(body.pose[1])[6:]
+        down = quaternion_matrix(body.pose.orientation)[2]
         cosine = max(sum(d * u for d, u in zip(down, up, strict=True)) for up in self.up)
         return math.acos(min(max(cosine, -1.0), 1.0))
 
     def yaw_rad(self, body: Body) -> float:
         """Return a body's heading, whichever of its sides is up."""
-        turn = pybullet.getMatrixFromQuaternion(body.pose[1])
-        if abs(turn[7]) <= abs(turn[6]):  # its y axis lies flatter than its x axis
-            return math.atan2(turn[4], turn[1]) - math.pi / 2
-        return math.atan2(turn[3], turn[0])
+        x_axis, y_axis, _ = zip(*quaternion_matrix(body.pose.orientation), strict=True)
+        if abs(y_axis[2]) <= abs(x_axis[2]):  # the y axis is closer to horizontal than the x axis
+            return math.atan2(y_axis[1], y_axis[0]) - math.pi / 2
+        return math.atan2(x_axis[1], x_axis[0])
 
     def grasp_yaws(self, body: Body) -> list[float]:
         """Return the gripper's yaws at which the fingers close on a body."""

@@ -1,14 +1,20 @@
-"""Assembling: the close-loop expert of the tasks that build a structure."""
+"""Structures under close-loop control: the base of the tasks that build one, and their expert."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
+from collections.abc import Sequence
 from functools import cache
+from typing import ClassVar
+
+import numpy as np
 
 from ba_torchrl.actions import GripperCommand
-from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.bodies import Body, Color
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.base import ActionLimits, Workspace
+from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.close_loop_task import BLUE, GREEN, RED, CloseLoopControl
 from ba_torchrl.tasks.motion_primitives import (
     OPEN,
     carry_to,
@@ -17,28 +23,98 @@ from ba_torchrl.tasks.motion_primitives import (
     nearest_equivalent_yaw,
     pick_up,
 )
+from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.free_space import PlacementArea
+from ba_torchrl.tasks.structures.parts import ORANGE
 from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.structures.structure import Structure
+from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.workspace import ActionLimits, Spot
 
 NO_ROOM_M = 1.0
-"""A piece between others is worth this much of a detour."""
+"""Cost of a piece that no grasp reaches, in metres of detour."""
+
+COLORS: tuple[Color, ...] = (RED, BLUE, ORANGE, GREEN)
+"""Of the cubes, from the bottom up."""
+
+
+class CloseLoopStructureTask(CloseLoopControl, Task):
+    """Pieces scattered on the ground; success when they stand as the blueprint says, released.
+
+    A piece that must stay upright and has tipped over ends the episode: a gripper that points down
+    can lift it, but not turn it upright.
+    """
+
+    spot_blocks: ClassVar[dict[int, Spot]] = {
+        2: Spot(2.4, 2.4),
+        3: Spot(2.4, 2.4),
+        4: Spot(1.6, 2.0),
+    }
+    """Space around each piece at the start in blocks, by the number of pieces: four are closer."""
+
+    @abstractmethod
+    def blueprint(self) -> Blueprint:
+        """Return the structure."""
+
+    def load_scene(self) -> None:
+        """Load the pieces."""
+        self.structure = Structure(
+            self.blueprint(),
+            self.world,
+            self.block_m,
+            self.terrain.support_ids,
+            largest_first=False,
+        )
+
+    def initialize_episode(self, rng: np.random.Generator) -> None:
+        """Put the pieces anywhere, with room for the fingers between them.
+
+        With fixed orientations a gripper at yaw 0 closes on each of them.
+        """
+        self.structure.draw(rng)
+        pieces = self.structure.pieces
+        padding, distance = self.spot_blocks[len(pieces)]
+        spots = [Spot(padding * self.block_m, distance * self.block_m)] * len(pieces)
+        for (body, piece), xy in zip(pieces.items(), self.random_points(rng, spots), strict=True):
+            fixed_yaw = -piece.grasp_yaws_rad[0] % math.pi
+            self.stand(body, xy, fixed_yaw + self.random_yaw(rng, piece.yaw_period_rad))
+
+    @property
+    def planner(self) -> StructurePlanner:
+        """Compares the pieces with the blueprint."""
+        return self.structure.planner
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The pieces."""
+        return list(self.structure.pieces)
+
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the structure stands, with none of its pieces in the gripper."""
+        return self.planner.evaluate(self.robot.held_body())
+
+    def is_valid(self) -> bool:
+        """Whether all pieces are inside the workspace, and upright where they must be."""
+        return super().is_valid() and not self.planner.has_tipped(self.robot.held_body())
+
+    def expert_command(self) -> GripperCommand:
+        """Move the piece that comes next."""
+        return assemble(self.robot, self.planner, self.terrain, self.action_limits)
 
 
 def assemble(
     robot: Robot,
     planner: StructurePlanner,
-    workspace: Workspace,
+    terrain: Terrain,
     limits: ActionLimits,
-    surface_z_m: float = 0.0,
 ) -> GripperCommand:
-    """Build a structure: pick the piece that comes next and place it, from any state.
+    """Pick the piece that comes next and place it; a function of the scene, from any state.
 
     Args:
         robot: the robot.
-        planner: what is to be built.
-        workspace: where pieces may be put down.
+        planner: compares the pieces with the blueprint.
+        terrain: where pieces may be put down.
         limits: of an action.
-        surface_z_m: height of the ground.
     """
     (x, y, _), yaw = robot.tool_pose()
     held = robot.held_body() if robot.opening() < 0.9 else None
@@ -53,17 +129,15 @@ def assemble(
         room = max(finger_room(robot, body, option, others) for option in yaws(body))
         return math.dist((x, y), body.position[:2]) + (0.0 if room > 0 else NO_ROOM_M)
 
-    border = 1.2 * planner.block_m
     area = PlacementArea(
-        (workspace.x[0] + border, workspace.x[1] - border),
-        (workspace.y[0] + border, workspace.y[1] - border),
+        *terrain.build_area.shrunk(1.2 * planner.block_m),
         gap_m=planner.block_m,
-        z_m=surface_z_m,
+        height_m=terrain.height_m,
     )
     move = planner.next_move(area, held, effort)
     if move is None:
         return lift(limits.step_m, OPEN)
-    ceiling_m = workspace.z[1]
+    ceiling_m = terrain.workspace.z[1]
     if move.body is not held:
         return pick_up(
             robot,

@@ -7,20 +7,30 @@ Every action leaves something that undoes it; in reverse order these actions bui
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import pybullet
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Quaternion, Vector, YawPose
+from ba_torchrl.sim.geometry import (
+    ORIGIN,
+    PlanarFrame,
+    Pose,
+    Vector,
+    YawPose,
+    downward_pose,
+)
+from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import Spot
+from ba_torchrl.tasks.base import TaskSettings
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.blueprint import Slot
-from ba_torchrl.tasks.structures.open_loop import StructureTask
+from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.workspace import Spot
 
 APART_BLOCKS = 2.4
 """Pieces that lie apart keep this distance of their centres, as at the start of an episode."""
@@ -37,12 +47,27 @@ BEARINGS = 16
 """Directions along which the gap between two outlines is measured."""
 MOVED_M = 5e-3
 """What moves less than this stays where it is."""
-LEVEL_RAD = 0.02
-"""A tool that leans less than this points straight down."""
 
 _DIRECTIONS = np.array(
     [[math.cos(a), math.sin(a)] for a in np.arange(BEARINGS) * math.pi / BEARINGS]
 ).T
+
+
+class Deconstructible(Protocol):
+    """What deconstruction needs of the task that builds a structure, besides `OpenLoopTask`."""
+
+    settings: TaskSettings
+    world: World
+    robot: Robot
+    terrain: Terrain
+    finger_opening: float
+    planner: StructurePlanner
+
+    def room(self, body: Body, yaw_rad: float, at: Vector | None = None) -> float:
+        """Return the gap between the hand, open around a body, and what stands beside it."""
+
+    def grasp_yaws(self, body: Body) -> list[float]:
+        """Return the yaws at which the gripper grasps a body."""
 
 
 class Deconstruction(OpenLoopTask):
@@ -52,19 +77,17 @@ class Deconstruction(OpenLoopTask):
         task: what builds the structure; its bodies, limits and heights hold here too.
     """
 
-    def __init__(self, task: StructureTask) -> None:
-        super().__init__(task.settings)
+    def __init__(self, task: Deconstructible) -> None:
         self.task = task
+        super().__init__(task.settings, task.world, task.robot, task.terrain)
         self.finger_opening = task.finger_opening
 
-    def build(self, world: World) -> None:
-        """Load the pieces."""
-        self.task.world, self.task.robot = self.world, self.robot
-        self.task.build(world)
+    def load_scene(self) -> None:
+        """The pieces are those of the task."""
 
-    def randomise(self, rng: np.random.Generator) -> None:
+    def initialize_episode(self, rng: np.random.Generator) -> None:
         """Stand the structure somewhere, its pieces drawn as for building it."""
-        self.task.randomise(rng)
+        self.task.initialize_episode(rng)
         planner = self.task.planner
         slots = planner.blueprint.slots
         pool = list(planner.pieces)
@@ -86,13 +109,16 @@ class Deconstruction(OpenLoopTask):
         for number, slot in enumerate(slots):
             self._stand_in(number, slot, bodies, centers.get(number), rng)
 
-    def is_start(self) -> bool:
+    def is_valid_start(self) -> bool:
         """Whether the structure stands."""
-        return self.task.is_valid() and self.task.is_goal() and not self.is_goal()
+        return self.task.is_valid() and self.task.is_success() and not self.is_success()
 
-    def is_goal(self) -> bool:
-        """Whether all lies on the ground, apart, and nothing is held."""
-        return self.robot.held_body() is None and not self._to_move()
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the pieces lie on the ground, apart from each other, none of them held."""
+        return {
+            "is_released": self.robot.held_body() is None,
+            "is_apart": not self._to_move(),
+        }
 
     def is_valid(self) -> bool:
         """Whether the scene is one of the task's."""
@@ -116,7 +142,7 @@ class Deconstruction(OpenLoopTask):
         """Take up what `get_state` returned."""
         self.task.set_state(state)
 
-    def pick_height_m(self, top_m: float) -> float:
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a pick, where an action leaves it open.
 
         The next piece is held as it will be when it is picked from the ground. Its base is that of
@@ -126,12 +152,12 @@ class Deconstruction(OpenLoopTask):
         if to_move := self._to_move():
             top = max(to_move, key=lambda body: body.position[2])
             middle = top.position[2] + top.shape.bounds_m[0][2]
-            base_m = max(vertical_extent(top)[0], middle) - self.settings.workspace.z[0]
-        return self.task.pick_height_m(top_m - base_m) + base_m
+            base_m = max(vertical_extent(top)[0], middle) - self.terrain.height_m(xy)
+        return self.task.pick_height_m(top_m - base_m, xy) + base_m
 
-    def place_height_m(self, top_m: float) -> float:
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a place, where an action leaves it open."""
-        return self.task.place_height_m(top_m)
+        return self.task.place_height_m(top_m, xy)
 
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square searched for the highest point."""
@@ -143,12 +169,12 @@ class Deconstruction(OpenLoopTask):
         if held is not None:
             return self._put_away(held)
         to_move = self._to_move()
-        if not to_move:  # a pick from the bare corner changes nothing
-            x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
-            return PickPlaceCommand(PICK, x, y, 0.1)
+        if not to_move:
+            return no_op(self.settings.workspace, is_holding=False)
 
         def level(body: Body) -> int:
-            return round(2 * (body.position[2] - self.settings.surface_z_m) / self.block_m)
+            x, y, z = body.position
+            return round(2 * (z - self.terrain.height_m((x, y))) / self.block_m)
 
         top = max(map(level, to_move))
         options = [
@@ -159,9 +185,8 @@ class Deconstruction(OpenLoopTask):
         ]
         _, _, body, yaw = max(options, key=lambda option: option[:2])
         x, y, _ = body.position
-        floor = self.settings.workspace.z[0]
-        z = self.pick_height_m(vertical_extent(body)[1] - floor) + floor
-        return PickPlaceCommand(PICK, x, y, z, yaw)
+        z = self.pick_height_m(vertical_extent(body)[1], (x, y))
+        return pick_command(downward_pose((x, y, z), yaw))
 
     # -- the structure -----------------------------------------------------------------------
 
@@ -201,7 +226,7 @@ class Deconstruction(OpenLoopTask):
         if supports:
             lift = max(vertical_extent(support)[1] for support in supports)
             x, y, z = body.position
-            body.place((x, y, z + lift - self.settings.surface_z_m), yaw)
+            body.place((x, y, z + lift - self.terrain.height_m((x, y))), yaw)
         if partner is not None and partner < number:
             self._part(number, bodies, rng)
 
@@ -238,7 +263,6 @@ class Deconstruction(OpenLoopTask):
         """Return the pieces that are not on the ground, or too near another."""
         bodies = list(self.objects)
         shadows = {body: _shadow(world_vertices(body)[:, :2]) for body in bodies}
-        ground = self.settings.surface_z_m + self.block_m / 4
 
         def is_near(body: Body, other: Body) -> bool:
             return (
@@ -249,44 +273,40 @@ class Deconstruction(OpenLoopTask):
         return [
             body
             for body in bodies
-            if vertical_extent(body)[0] > ground
+            if self.terrain.gap_below_m(body) > self.block_m / 4
             or any(is_near(body, other) for other in bodies if other is not body)
         ]
 
     def _put_away(self, held: Body) -> PickPlaceCommand:
         """Return the place on the first of many random sites that has room enough."""
-        tool, tool_yaw = self.robot.tool_pose()
+        tool, pose = self.robot.tool_transform(), held.pose
         others = [other for other in self.objects if other is not held]
         shadows = [_shadow(world_vertices(other)[:, :2]) for other in others]
         outline = world_vertices(held)[:, :2] - held.position[:2]
         border = radius_m(held) + self.block_m / 4
-        ranges = [
-            (low + border, high - border)
-            for low, high in (self.settings.workspace.x, self.settings.workspace.y)
-        ]
-        z = self.settings.surface_z_m + held.position[2] - vertical_extent(held)[0]
+        ranges = self.terrain.build_area.shrunk(border)
+        rise_m = held.position[2] - vertical_extent(held)[0]
         rng = self._generator()
         best, place = -math.inf, None
         for _ in range(SITES):
             x, y = (float(rng.uniform(low, high)) for low, high in ranges)
-            yaw = self._tool_yaw(held, tool_yaw, rng)
-            cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
+            z = self.terrain.height_m((x, y)) + rise_m
+            yaw = self._tool_yaw(held, tool.yaw_rad, rng)
             slack = min(
                 math.dist((x, y), other.position[:2]) - APART_BLOCKS * self.block_m - GAP_M
                 for other in others
             )
             if slack <= best:
                 continue
-            turned = outline @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+            frame = PlanarFrame(x, y, yaw - tool.yaw_rad)
+            turned = np.stack(frame.to_world(*outline.T), axis=1)
             gap = min(_gap_m(_shadow(turned), shadow) for shadow in shadows)
             room = self.task.room(held, yaw, (x, y, z))
             slack = min(slack, gap - GAP_M - AMPLE_GAP_M, room - AMPLE_ROOM_M)
             if slack > best:
                 best = slack
-                ox, oy, oz = (b - t for b, t in zip(held.position, tool, strict=True))
-                place = PickPlaceCommand(
-                    PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
-                )
+                target = pose.moved_to((x, y, z), yaw - tool.yaw_rad)
+                place = place_command(tool, pose, target)
             if slack >= 0:
                 break
         assert place is not None  # the first site is better than nothing
@@ -326,16 +346,16 @@ def _gap_m(one: np.ndarray, other: np.ndarray) -> float:
 class Watch(NamedTuple):
     """How things lay before an action, to tell afterwards what undoes it."""
 
-    poses: Mapping[Body, tuple[Vector, Quaternion]]
+    poses: Mapping[Body, Pose]
     held: Body | None
-    grasp: tuple[Vector, Quaternion] | None
-    """YawPose of what was held in the frame of the tool."""
+    grasp: Pose | None
+    """Pose of what was held in the frame of the tool."""
 
     def undo(
         self,
         held: Body | None,
-        grasp: tuple[Vector, Quaternion] | None,
-        lowest_m: float = -math.inf,
+        grasp: Pose | None,
+        lowest_m: Callable[[tuple[float, float]], float] = lambda xy: -math.inf,
     ) -> PickPlaceCommand | None:
         """Return what undoes the action that has just settled.
 
@@ -346,7 +366,7 @@ class Watch(NamedTuple):
         Args:
             held: what is held now.
             grasp: and how.
-            lowest_m: height of the tool below which fingers cannot close.
+            lowest_m: from x and y to the least height of the tool at which the fingers close.
 
         Returns:
             None if nothing undoes it: it grasped or put down nothing, or another body moved.
@@ -357,31 +377,12 @@ class Watch(NamedTuple):
         for other, (before, _) in self.poses.items():
             if other is not body and math.dist(before, other.position) > MOVED_M:
                 return None
-        pose, in_tool, primitive = (
-            (self.poses[body], grasp, PLACE) if self.held is None else (body.pose, self.grasp, PICK)
-        )
-        (x, y, z), turn = pybullet.multiplyTransforms(*pose, *pybullet.invertTransform(*in_tool))
-        if primitive == PICK:
-            z = max(z, lowest_m)
-        return PickPlaceCommand(primitive, x, y, z, *tool_angles(turn))
+        if self.held is None:
+            return place_command(Pose(ORIGIN), grasp, self.poses[body])
+        command = pick_command(body.pose.compose(self.grasp.inverse()))
+        return command._replace(z_m=max(command.z_m, lowest_m((command.x_m, command.y_m))))
 
 
-def watch(
-    bodies: Sequence[Body], held: Body | None, grasp: tuple[Vector, Quaternion] | None
-) -> Watch:
+def watch(bodies: Sequence[Body], held: Body | None, grasp: Pose | None) -> Watch:
     """Return how bodies lie now, and what is held how."""
     return Watch({body: body.pose for body in bodies}, held, grasp)
-
-
-def tool_angles(orientation: Quaternion) -> tuple[float, float, float]:
-    """Return rz, ry and rx of a tool: the inverse of `tool_rotation`.
-
-    Args:
-        orientation: of the tool (x, y, z, w).
-    """
-    turn = pybullet.getMatrixFromQuaternion(orientation)
-    rz = math.atan2(turn[3], turn[0])
-    ry = math.asin(min(max(-turn[6], -1.0), 1.0))
-    rx = math.atan2(-turn[7], -turn[8])
-    ry, rx = (0.0 if abs(angle) < LEVEL_RAD else angle for angle in (ry, rx))
-    return rz, ry, rx

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import PlanarFrame, Vector
 from ba_torchrl.sim.robots.gripper import Gripper
 
 SPOT_STEP_M = 0.02
@@ -23,7 +23,8 @@ class PlacementArea(NamedTuple):
     y: tuple[float, float]
     gap_m: float
     """Room wanted around a piece."""
-    z_m: float = 0.0
+    height_m: Callable[[tuple[float, float]], float]
+    """Height of the ground at a point, metres."""
     line_yaw_rad: float | None = None
     """Direction in which two pieces for a bridge must stand; None if any will do."""
 
@@ -42,7 +43,8 @@ def nearest_spot(body: Body, others: Sequence[Body], area: PlacementArea) -> Vec
     spots = np.array([(a, b) for a in _steps(*area.x) for b in _steps(*area.y)])
     aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
     best = np.lexsort((aways, placement_deficit_m(spots, body, others, area)))[0]
-    return (*spots[best].tolist(), area.z_m + z - vertical_extent(body)[0])
+    spot = tuple(spots[best].tolist())
+    return (*spot, area.height_m(spot) + z - vertical_extent(body)[0])
 
 
 def placement_deficit_m(
@@ -99,16 +101,15 @@ def finger_path_clearance_m(
         others: bodies that may be in the way.
         at: where the body is, if not where it is now.
     """
-    ux, uy = math.cos(yaw_rad), math.sin(yaw_rad)
     below_m = -min(z for _, z in gripper.arc)
     bx, by, bz = body.position if at is None else at
+    frame = PlanarFrame(bx, by, yaw_rad)
     gap = math.inf
     for other in others:
         corners = world_vertices(other)
         if corners[:, 2].max() < bz - below_m:
             continue
-        px, py = corners[:, 0] - bx, corners[:, 1] - by
-        along, across = px * ux + py * uy, py * ux - px * uy
+        along, across = frame.to_local(corners[:, 0], corners[:, 1])
         aside = max(across.min(), -across.max()) - gripper.half_width_m
         for low, high in ways_m:
             gap = min(gap, max(along.min() - high, low - along.max(), aside))

@@ -7,26 +7,18 @@ start, and every episode draws from it.
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from ba_torchrl.sim.assets.cache import cached_parts
 from ba_torchrl.sim.assets.hulls import convex_hull, surface_samples, volume_and_center
 from ba_torchrl.sim.assets.random_shapes import UNIT_M, read_shape, shape_path
-from ba_torchrl.sim.bodies import Body, Box, Color, Shape, Solid
+from ba_torchrl.sim.bodies import Box, Color, Shape, Solid
 from ba_torchrl.sim.meshes import Mesh
-from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import Spot
-from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.motion_primitives import FINGER_HALF_M
-from ba_torchrl.tasks.open_loop_task import OpenLoopTask
 from ba_torchrl.tasks.structures.blueprint import CUBOID, Piece, Span
-from ba_torchrl.tasks.structures.open_loop import Part, StructureTask
 from ba_torchrl.tasks.structures.parts import BLUE
-from ba_torchrl.tasks.structures.planner import StructurePlanner
 
 NUMBERS = (2, 5, 27, 32, 66, 75, 83, 116, 118, 131, 137, 142, 143, 149, 154, 176, 187, 199, 200)
 """Shapes of figure 12, as PyBullet numbers them."""
@@ -45,8 +37,8 @@ CUBOID_M = ((0.025, 0.035), (0.075, 0.105), (0.02, 0.035))
 SHAPE_GAP_M = (-0.02, 0.008, 0.02)
 """Gap between two shapes next to each other, along the line between their centres: least, aimed
 for, most. Below zero they stand side by side at an angle."""
-ROOM_M = 0.015
-"""Gap between pieces at the start, beyond the circles around them."""
+START_GAP_M = 0.015
+"""Least distance between the circles around two pieces at the start."""
 SAMPLES = 4000
 SKIN_M = 2e-3
 """Points of a surface that is sampled, and the depth of those that a finger meets."""
@@ -60,91 +52,19 @@ it."""
 UP = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
 
 
-class ImproviseTask(StructureTask):
-    """A roof on two random shapes, drawn anew in every episode."""
+def any_shape() -> Piece:
+    """Return a piece that stands for any of the random shapes."""
+    return replace(SHAPE, variants=tuple(shape_piece(shape) for _, shape in random_shapes()))
 
-    has_cuboid: bool = False
-    """Whether there is a cuboid too, which is random as well."""
 
-    @abstractmethod
-    def parts(self) -> Sequence[Part]:
-        """Return the pieces that are the same in every episode."""
+def any_cuboid() -> Piece:
+    """Return a piece that stands for any of the random cuboids."""
+    return replace(CUBOID, variants=tuple(replace(CUBOID, shape=box) for box in random_cuboids()))
 
-    def build(self, world: World) -> None:
-        """Load the pieces, shapes and cuboids of all sizes among them."""
-        self._fixed = [(world.add(part.shape, part.piece.kind), part) for part in self.parts()]
-        shapes = [(f"shape {number:03d}", shape) for number, shape in random_shapes()]
-        cuboids = [("cuboid", shape) for shape in random_cuboids()] if self.has_cuboid else []
-        self._pool = BodyPool(
-            world,
-            [shape for _, shape in [*shapes, *cuboids]],
-            [name for name, _ in [*shapes, *cuboids]],
-        )
-        self._shape_pieces = [shape_piece(shape) for _, shape in shapes]
-        self._shape_count = len(shapes)
-        self._choose([*range(2), *([len(shapes)] if cuboids else [])])
 
-    def randomise(self, rng: np.random.Generator) -> None:
-        """Draw the shapes, and put all pieces anywhere apart from each other."""
-        self._pool.clear()
-        chosen = rng.choice(self._shape_count, size=2, replace=False).tolist()
-        if self.has_cuboid:
-            chosen.append(int(rng.integers(self._shape_count, len(self._pool.bodies))))
-        self._choose(chosen)
-        super().randomise(rng)
-
-    def get_state(self) -> Any:
-        """Return which bodies of the pool are in the scene."""
-        return self._pool.get_state()
-
-    def set_state(self, state: Any) -> None:
-        """Take up what `get_state` returned."""
-        self._pool.set_state(state)
-        self._equip()
-
-    def pick_height_m(self, top_m: float) -> float:
-        """Return the height of the tool for a pick; these pieces are low."""
-        return OpenLoopTask.pick_height_m(self, top_m)
-
-    def window_m(self, held: Body | None) -> float:
-        """Return half the width of the square searched for the highest point.
-
-        Shapes go to the floor: what stands beside them must not count.
-        """
-        if held is not None and self.planner.pieces[held].kind == SHAPE.kind:
-            return OpenLoopTask.window_m(self, held)
-        return super().window_m(held)
-
-    # ----------------------------------------------------------------------------------------
-
-    def _choose(self, indices: Sequence[int]) -> None:
-        """Bring bodies of the pool."""
-        self._pool.clear()
-        for index in indices:
-            self._pool.activate(self._pool.bodies[index])
-        self._equip()
-
-    def _equip(self) -> None:
-        """Make pieces and blueprint of the bodies in the scene."""
-        present = list(self._pool.present)
-        self.bodies = [*(body for body, _ in self._fixed), *present]
-        kinds = {part.piece.kind: [body] for body, part in self._fixed}
-        kinds[SHAPE.kind] = present[:2]
-        if self.has_cuboid:
-            kinds[CUBOID.kind] = present[2:]
-        own = {body: self._shape_pieces[self._pool.bodies.index(body)] for body in present[:2]}
-        self.planner = StructurePlanner(
-            self.blueprint(), self.world, kinds, self.block_m, own_pieces=own
-        )
-        pieces = self.planner.pieces
-        self._parts = []
-        largest_radius_m = 0.0
-        for body in self.bodies:
-            low, high = body.shape.bounds_m
-            radius = math.hypot(*(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True)))
-            spot = Spot(2 * radius, largest_radius_m + radius + ROOM_M)
-            largest_radius_m = max(largest_radius_m, radius)
-            self._parts.append(Part(pieces[body], body.shape, spot))
+def spread(piece: Piece) -> Piece:
+    """Return a piece that needs no more space at the start than the circle around it."""
+    return replace(piece, spot=None)
 
 
 def shape_span() -> Span:
@@ -200,7 +120,13 @@ def shape_piece(shape: Shape) -> Piece:
         return float(square - WIDTH_WEIGHT * np.ptp(along))
 
     yaws = (np.arange(-18, 18) * math.pi / 36).tolist()
-    return Piece(SHAPE.kind, math.pi, (max(yaws, key=quality),), UP, stays_upright=True)
+    return replace(
+        SHAPE,
+        yaw_period_rad=math.pi,
+        grasp_yaws_rad=(max(yaws, key=quality),),
+        up=UP,
+        shape=shape,
+    )
 
 
 def _hull(number: int) -> Mesh:

@@ -5,24 +5,24 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Shape, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Vector
-from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import Spot
+from ba_torchrl.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.sim.bodies import Body, radius_m, world_vertices
+from ba_torchrl.sim.geometry import PlanarFrame, Vector, downward_pose
+from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.motion_primitives import finger_room
-from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.open_loop_task import OpenLoopControl
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps, finger_way_room
-from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
+from ba_torchrl.tasks.structures.blueprint import Blueprint
+from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.planner import CROWDED, Move, StructurePlanner
+from ba_torchrl.tasks.structures.structure import Structure
 
-START_GAP_M = 0.01
-"""Least gap between the circles around two pieces at the start."""
 HAND_OVER_TOOL_M = 0.018
 """What reaches higher than this above the tool point must keep clear of the whole hand."""
 SITE_GAP_M = 0.01
@@ -37,76 +37,73 @@ AMPLE_M = 0.02
 """More room than this is no better."""
 
 
-class Part(NamedTuple):
-    """A piece of a structure: what it is in the blueprint, and in the world."""
+class StructureTask(OpenLoopControl, Task):
+    """Pieces scattered on the ground; success when they stand as the blueprint says."""
 
-    piece: Piece
-    shape: Shape
-    spot: Spot
-    """Room that it gets at the start."""
-
-
-class StructureTask(OpenLoopTask):
-    """Pieces scattered on the floor; success when they stand as the blueprint says."""
-
-    parameters = frozenset({"deconstruct"})
+    can_be_deconstructed = True
     tipping_ends: ClassVar[bool] = True
     """Whether a piece on its side, such as a roof, ends the episode."""
     clears_blocked_pieces: ClassVar[bool] = False
-    """Whether the expert takes down what keeps the hand from a piece: worth it for blocks, beside
-    long pieces it would go on for ever."""
+    """Whether the expert removes pieces that block the grasp of another. Off for structures with
+    long pieces, where the removals would not end."""
+    start_gap_m: ClassVar[float] = 0.01
+    """Least distance between the circles around two pieces at the start."""
+    least_pick_blocks: ClassVar[float] = 0.5
+    """Least height of a pick above the ground in blocks, where an action leaves it open: between
+    two pixels a ridge looks lower than it is, and closing fingers reach lower."""
 
     @abstractmethod
     def blueprint(self) -> Blueprint:
-        """Return what is to be built."""
+        """Return the structure."""
 
-    @abstractmethod
-    def parts(self) -> Sequence[Part]:
-        """Return the pieces, those that need most room first."""
-
-    def build(self, world: World) -> None:
+    def load_scene(self) -> None:
         """Load the pieces."""
-        self._parts = list(self.parts())
-        self.bodies: list[Body] = []
-        kinds: dict[str, list[Body]] = {}
-        for part in self._parts:
-            mates = kinds.setdefault(part.piece.kind, [])
-            body = world.add(part.shape, f"{part.piece.kind} {len(mates) + 1}")
-            mates.append(body)
-            self.bodies.append(body)
-        self.planner = StructurePlanner(self.blueprint(), world, kinds, self.block_m)
+        self.structure = Structure(
+            self.blueprint(), self.world, self.block_m, self.terrain.support_ids
+        )
 
-    def randomise(self, rng: np.random.Generator) -> None:
-        """Put the pieces anywhere apart from each other.
+    def initialize_episode(self, rng: np.random.Generator) -> None:
+        """Put the pieces anywhere, apart from each other.
 
         Fixed orientations are those at which a gripper that does not turn can grasp them.
         """
-        spots, largest_radius_m = [], 0.0
-        for part, body in zip(self._parts, self.bodies, strict=True):
-            apart_m = (
-                radius_m(body) + largest_radius_m + START_GAP_M
-            )  # long pieces may lie end to end
-            spots.append(part.spot._replace(distance_m=max(part.spot.distance_m, apart_m)))
-            largest_radius_m = max(largest_radius_m, radius_m(body))
-        points = self.random_points(rng, spots)
-        for part, body, xy in zip(self._parts, self.bodies, points, strict=True):
-            yaw = self.random_yaw(rng, 2 * math.pi) - part.piece.grasp_yaws_rad[0]
+        self.structure.draw(rng)
+        points = self.random_points(rng, self.structure.spots(self.start_gap_m))
+        for (body, piece), xy in zip(self.structure.pieces.items(), points, strict=True):
+            yaw = self.random_yaw(rng, 2 * math.pi) - piece.grasp_yaws_rad[0]
             self.stand(body, xy, yaw)
 
-    def is_goal(self) -> bool:
-        """Whether the structure stands, let go of."""
-        return self.planner.is_built(self.robot.held_body())
+    @property
+    def planner(self) -> StructurePlanner:
+        """Compares the pieces with the blueprint."""
+        return self.structure.planner
+
+    @property
+    def objects(self) -> Sequence[Body]:
+        """The pieces."""
+        return list(self.structure.pieces)
+
+    def get_state(self) -> Any:
+        """Return which variants of the pieces are in the scene."""
+        return self.structure.get_state()
+
+    def set_state(self, state: Any) -> None:
+        """Restore a state of `get_state`."""
+        self.structure.set_state(state)
+
+    def deconstruction(self) -> Deconstruction:
+        """Return the task that takes the structure apart."""
+        return Deconstruction(self)
+
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the structure stands, with none of its pieces in the gripper."""
+        return self.planner.evaluate(self.robot.held_body())
 
     def is_valid(self) -> bool:
         """Whether all is inside the workspace, and nothing on its side that must not be."""
         if not super().is_valid():
             return False
         return not (self.tipping_ends and self.planner.has_tipped(self.robot.held_body()))
-
-    @property
-    def objects(self) -> Sequence[Body]:
-        """The pieces."""
-        return self.bodies
 
     def expert_command(self) -> PickPlaceCommand:
         """Move the piece that comes next, from any state."""
@@ -115,44 +112,44 @@ class StructureTask(OpenLoopTask):
         move = self.planner.next_move(
             self._placement_area(), held, self._effort, self._crowding, blocks_grasp
         )
-        if move is None:  # it stands: a pick from the bare corner changes nothing
-            x, y = self.settings.workspace.x[0], self.settings.workspace.y[0]
-            return PickPlaceCommand(PLACE if held is not None else PICK, x, y, 0.1)
+        if move is None:
+            return no_op(self.settings.workspace, held is not None)
         if move.body is held:
             return self._place(move)
         candidate = self._best_grasp(move.body)
         yaw, z = candidate.yaw_rad, move.body.position[2]
         x, y = _tool_point(move.body.position, candidate)
-        lowest = self.settings.workspace.z[0] + self.lowest_pick_m
-        return PickPlaceCommand(PICK, x, y, max(z, lowest), yaw)
+        z = max(z, self.lowest_tool_m((x, y)))
+        return pick_command(downward_pose((x, y, z), yaw))
 
-    def pick_height_m(self, top_m: float) -> float:
-        """Return the height of the tool for a pick.
-
-        Between two pixels a ridge looks lower than it is, and closing fingers reach lower.
-        """
-        return max(super().pick_height_m(top_m), self.block_m / 2)
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
+        """Return the height of the tool for a pick, at least `least_pick_blocks`."""
+        least_m = self.terrain.height_m(xy) + self.least_pick_blocks * self.block_m
+        return max(super().pick_height_m(top_m, xy), least_m)
 
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square searched for the highest point.
 
-        A long piece may rest on what is far from its middle.
+        A long piece may rest on others that are far from its middle; one that always goes to the
+        ground must not be placed on what stands beside it.
         """
-        if held is None:
+        if held is None or not self._rests_on_others(held):
             return super().window_m(held)
         low, high = held.shape.bounds_m
         longest = max(high[0] - low[0], high[1] - low[1])
         return max(super().window_m(held), 0.375 * longest)
 
+    def _rests_on_others(self, body: Body) -> bool:
+        kind = self.planner.pieces[body].kind
+        return any(slot.on and slot.piece.kind == kind for slot in self.planner.blueprint.slots)
+
     # ----------------------------------------------------------------------------------------
 
     def _placement_area(self) -> PlacementArea:
-        border = 1.5 * self.block_m
-        (x0, x1), (y0, y1) = self.settings.workspace.x, self.settings.workspace.y
         return PlacementArea(
-            (x0 + border, x1 - border),
-            (y0 + border, y1 - border),
-            2.0 * self.block_m,
+            *self.terrain.build_area.shrunk(1.5 * self.block_m),
+            gap_m=2.0 * self.block_m,
+            height_m=self.terrain.height_m,
             # fingers that do not turn close along x, on what lies along y
             line_yaw_rad=None if self.action_limits.turn_rad else math.pi / 2,
         )
@@ -168,7 +165,7 @@ class StructureTask(OpenLoopTask):
 
         It is infinite, or at least `AMPLE_M`, where nothing stands near.
         """
-        others = [other for other in self.bodies if other is not body]
+        others = [other for other in self.objects if other is not body]
         return self._room_beside(body, GraspCandidate(yaw_rad), others, at)
 
     def _grasp_candidates(self, body: Body) -> list[GraspCandidate]:
@@ -186,7 +183,7 @@ class StructureTask(OpenLoopTask):
         return max(self._grasp_candidates(body), key=lambda candidate: self._ease(body, candidate))
 
     def _is_on_ground(self, body: Body) -> bool:
-        return vertical_extent(body)[0] < self.settings.surface_z_m + self.block_m / 4
+        return self.terrain.gap_below_m(body) < self.block_m / 4
 
     def _ease(self, body: Body, candidate: GraspCandidate) -> tuple[float, bool, float]:
         """Return how easy a way to grasp a body is.
@@ -195,7 +192,7 @@ class StructureTask(OpenLoopTask):
             Metres that are wanting for it, negative; whether it is plain, which is best where
             nothing is; and the room, a finger that wedges itself in counted as well.
         """
-        others = [other for other in self.bodies if other is not body]
+        others = [other for other in self.objects if other is not body]
         room = spare = self._room_beside(body, candidate, others, None)
         if candidate.shift_m:
             gripper, yaw = self.robot.gripper, candidate.yaw_rad
@@ -226,9 +223,8 @@ class StructureTask(OpenLoopTask):
         for other in others:
             corners = world_vertices(other)
             if corners[:, 2].max() > z + HAND_OVER_TOOL_M:
-                cos, sin = math.cos(yaw), math.sin(yaw)
-                along_across = (corners[:, :2] - (x, y)) @ ((cos, -sin), (sin, cos))
-                low, high = along_across.min(axis=0), along_across.max(axis=0)
+                local = np.stack(PlanarFrame(x, y, yaw).to_local(corners[:, 0], corners[:, 1]), 1)
+                low, high = local.min(axis=0), local.max(axis=0)
                 gaps = np.maximum(low, -high) - self.robot.hand_half_m
                 room = min(room, float(gaps.max()))
         return room
@@ -279,8 +275,7 @@ class StructureTask(OpenLoopTask):
         effort_m = BLOCKED_M - CROWDED * lack_m
         if candidate.shift_m and lack_m == 0:
             x, y, _ = body.position
-            cos, sin = math.cos(candidate.yaw_rad), math.sin(candidate.yaw_rad)
-            end = (x + DRIVEN_M * cos, y + DRIVEN_M * sin)
+            end = PlanarFrame(x, y, candidate.yaw_rad).to_world(DRIVEN_M, 0.0)
             spans = self.settings.workspace.x, self.settings.workspace.y
             effort_m += max(
                 max(low - e, e - high, 0.0) for e, (low, high) in zip(end, spans, strict=True)
@@ -289,23 +284,18 @@ class StructureTask(OpenLoopTask):
 
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
-        tool, tool_yaw = self.robot.tool_pose()
-        yaw = tool_yaw
+        tool, held = self.robot.tool_transform(), move.body.pose
+        yaw = tool.yaw_rad
         if not self.action_limits.turn_rad:
             yaw = 0.0
         elif move.yaw_rad is None:
             turns = [math.pi * i / FREE_YAWS for i in range(FREE_YAWS)]
             yaw = self._roomiest(move, turns)
         else:
-            ahead = tool_yaw + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
+            ahead = tool.yaw_rad + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
             count = max(1, round(math.pi / move.yaw_period_rad))  # a half turn swaps the fingers
             yaw = self._roomiest(move, [ahead + move.yaw_period_rad * i for i in range(count)])
-        cos, sin = math.cos(yaw - tool_yaw), math.sin(yaw - tool_yaw)
-        ox, oy, oz = (b - t for b, t in zip(move.body.position, tool, strict=True))
-        x, y, z = move.position
-        return PickPlaceCommand(
-            PLACE, x - (cos * ox - sin * oy), y - (sin * ox + cos * oy), z - oz, yaw
-        )
+        return place_command(tool, held, held.moved_to(move.position, yaw - tool.yaw_rad))
 
     def _roomiest(self, move: Move, yaws_rad: Sequence[float]) -> float:
         """Return the first of the yaws at which the fingers can part most freely."""
@@ -315,7 +305,4 @@ class StructureTask(OpenLoopTask):
 
 def _tool_point(at: Vector, candidate: GraspCandidate) -> tuple[float, float]:
     """Return where the tool is to grasp what is at a place."""
-    return (
-        at[0] + candidate.shift_m * math.cos(candidate.yaw_rad),
-        at[1] + candidate.shift_m * math.sin(candidate.yaw_rad),
-    )
+    return PlanarFrame(*at[:2], candidate.yaw_rad).to_world(candidate.shift_m, 0.0)

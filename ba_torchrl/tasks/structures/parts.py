@@ -1,12 +1,12 @@
-"""The pieces of the open-loop structures; sizes are multiples of a block's edge (appendix A.1)."""
+"""The pieces of the structures; sizes are multiples of a block's edge (appendix A.1)."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from ba_torchrl.sim.bodies import Box, Color, Solid
 from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, moved
-from ba_torchrl.tasks.base import Spot
 from ba_torchrl.tasks.structures.blueprint import (
     CUBE,
     CUBOID,
@@ -17,7 +17,7 @@ from ba_torchrl.tasks.structures.blueprint import (
     Piece,
     Span,
 )
-from ba_torchrl.tasks.structures.open_loop import Part
+from ba_torchrl.tasks.workspace import Spot
 
 LENGTH = 4.0
 """Length of roof and cuboid."""
@@ -29,41 +29,41 @@ BLUE: Color = (0.2, 0.4, 0.8, 1.0)
 GREEN: Color = (0.35, 0.7, 0.35, 1.0)
 ORANGE: Color = (0.9, 0.55, 0.15, 1.0)
 
-_SMALL, _LONG = 2.4, 3.4
-"""Room around pieces."""
+SHORT_SPOT, LONG_SPOT = 2.4, 3.4
+"""Space at the start around pieces as long as a block, and around roof and cuboid."""
 
 
-def cube(block_m: float) -> Part:
+def cube(block_m: float, color: Color = RED) -> Piece:
     """Return a cube."""
-    return Part(
-        CUBE, Box(size_m=(block_m,) * 3, color=RED), Spot(_SMALL * block_m, _SMALL * block_m)
+    return replace(
+        CUBE, shape=Box(size_m=(block_m,) * 3, color=color), spot=_spot(SHORT_SPOT * block_m)
     )
 
 
-def cylinder(block_m: float) -> Part:
+def cylinder(block_m: float) -> Piece:
     """Return an upright cylinder, as high as it is wide."""
     radius, half = block_m / 2, block_m / 2
     (upright,) = lathe_parts(((radius, -half), (radius, half)), CYLINDER_SIDES)
     mesh = moved(upright, (0.0, 0.0, 0.0), math.pi / CYLINDER_SIDES)  # sides, not edges, across x
-    return Part(
-        CYLINDER, Solid(parts=(mesh,), color=ORANGE), Spot(_SMALL * block_m, _SMALL * block_m)
-    )
+    shape = Solid(parts=(mesh,), color=ORANGE)
+    return replace(CYLINDER, shape=shape, spot=_spot(SHORT_SPOT * block_m))
 
 
-def cuboid(block_m: float) -> Part:
+def cuboid(block_m: float) -> Piece:
     """Return a cuboid, its length along y."""
-    box = Box(size_m=(block_m, LENGTH * block_m, block_m), color=BLUE)
-    return Part(CUBOID, box, Spot(_LONG * block_m, _LONG * block_m))
+    shape = Box(size_m=(block_m, LENGTH * block_m, block_m), color=BLUE)
+    return replace(CUBOID, shape=shape, spot=_spot(LONG_SPOT * block_m))
 
 
-def roof(block_m: float) -> Part:
+def roof(block_m: float) -> Piece:
     """Return a roof, its ridge along y."""
-    return _gable(ROOF, (block_m, LENGTH * block_m, block_m), EAVES * block_m, _LONG * block_m)
+    size_m = (block_m, LENGTH * block_m, block_m)
+    return replace(ROOF, shape=_gable(size_m, EAVES * block_m), spot=_spot(LONG_SPOT * block_m))
 
 
-def triangle(block_m: float) -> Part:
+def triangle(block_m: float) -> Piece:
     """Return a triangle, its ridge along y."""
-    return _gable(TRIANGLE, (block_m,) * 3, 0.0, _SMALL * block_m)
+    return replace(TRIANGLE, shape=_gable((block_m,) * 3, 0.0), spot=_spot(SHORT_SPOT * block_m))
 
 
 def pair_span(block_m: float, most: float) -> Span:
@@ -76,7 +76,10 @@ def pair_span(block_m: float, most: float) -> Span:
     return Span(0.0, 1.75 * block_m, most * block_m)
 
 
-def _gable(piece: Piece, size_m: tuple[float, float, float], eaves_m: float, room_m: float) -> Part:
+def _spot(space_m: float) -> Spot:
+    return Spot(space_m, space_m)
+
+
+def _gable(size_m: tuple[float, float, float], eaves_m: float) -> Solid:
     mesh = gable_mesh(size_m, eaves_m)
-    shape = Solid(parts=(mesh,), color=GREEN, center_of_mass_m=centroid([mesh]))
-    return Part(piece, shape, Spot(room_m, room_m))
+    return Solid(parts=(mesh,), color=GREEN, center_of_mass_m=centroid([mesh]))

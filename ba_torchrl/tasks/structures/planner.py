@@ -7,6 +7,7 @@ every question is answered from any state.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 
@@ -49,11 +50,9 @@ class StructurePlanner:
     Args:
         blueprint: what is to be built.
         world: where.
-        bodies: the bodies of each kind; there may be more than the blueprint needs.
-        block_m: edge of a block, the measure of what counts as on top.
-        ground: PyBullet ids of what the lowest pieces stand on; the floor if not given.
-        own_pieces: what is known of some bodies, where it differs from the blueprint's piece of
-            that kind.
+        pieces: the bodies and what each of them is; there may be more than the blueprint needs.
+        block_m: edge of a block, the scale of what counts as on top.
+        support_ids: PyBullet ids of what the lowest pieces stand on; the floor if None.
 
     Raises:
         ValueError: there are too few bodies of a kind.
@@ -63,34 +62,38 @@ class StructurePlanner:
         self,
         blueprint: Blueprint,
         world: World,
-        bodies: Mapping[str, Sequence[Body]],
+        pieces: Mapping[Body, Piece],
         block_m: float,
-        ground: Sequence[int] | None = None,
-        own_pieces: Mapping[Body, Piece] | None = None,
+        support_ids: frozenset[int] | None = None,
     ) -> None:
         self.blueprint = blueprint
         self.world = world
+        self.pieces = dict(pieces)
         self.block_m = block_m
-        self.ground = frozenset((world.floor,) if ground is None else ground)
-        self.pieces: dict[Body, Piece] = {}
-        for piece in {slot.piece for slot in blueprint.slots}:
-            needed = sum(slot.piece == piece for slot in blueprint.slots)
-            found = bodies.get(piece.kind, ())
-            if len(found) < needed:
-                raise ValueError(f"the blueprint needs {needed} of {piece.kind!r}")
-            self.pieces |= dict.fromkeys(found, piece)
-        self.pieces |= own_pieces or {}
+        self.support_ids = frozenset((world.floor,)) if support_ids is None else support_ids
+        needed = Counter(slot.piece.kind for slot in blueprint.slots)
+        found = Counter(piece.kind for piece in self.pieces.values())
+        for kind, count in needed.items():
+            if found[kind] < count:
+                raise ValueError(f"the blueprint needs {count} of {kind!r}, not {found[kind]}")
 
-    def is_built(self, held: Body | None = None) -> bool:
-        """Whether the structure stands, with none of its pieces in the gripper.
+    def evaluate(self, held: Body | None = None) -> dict[str, bool]:
+        """Return whether the structure stands and no piece of it is held.
 
         Args:
-            held: what the gripper holds.
+            held: the body in the gripper.
         """
-        if held in self.pieces:
-            return False
         assigner = self._assigner(held)
-        return any(not assigner.misplaced(assignment) for assignment in assigner.assignments())
+        is_built = any(not assigner.misplaced(found) for found in assigner.assignments())
+        return {"is_released": held not in self.pieces, "is_built": is_built}
+
+    def is_built(self, held: Body | None = None) -> bool:
+        """Whether every condition of `evaluate` holds.
+
+        Args:
+            held: the body in the gripper.
+        """
+        return all(self.evaluate(held).values())
 
     def has_tipped(self, held: Body | None = None) -> bool:
         """Whether a piece that must stay upright does not, and is not in the gripper either."""
@@ -165,7 +168,7 @@ class StructurePlanner:
 
     def _assigner(self, held: Body | None) -> SlotAssigner:
         """Return how the pieces lie."""
-        states = read_piece_states(self.world, self.pieces, self.ground, self.block_m)
+        states = read_piece_states(self.world, self.pieces, self.support_ids, self.block_m)
         return SlotAssigner(self.blueprint, self.pieces, states, self.block_m, held)
 
     def _choices(
@@ -315,7 +318,7 @@ class StructurePlanner:
                 (
                     np.ptp(b.shape.vertices[:, 1])
                     for b, p in self.pieces.items()
-                    if p == bridge.piece
+                    if p.kind == bridge.piece.kind
                 ),
                 default=0.0,
             )
@@ -323,7 +326,8 @@ class StructurePlanner:
             cost = cost + crowding(center + along[:, :, None] * ways[:, None], rest)
         aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
         best = int(np.lexsort((radii + aways, cost.round(6)))[0])
-        place = (*spots[best].tolist(), area.z_m + z - vertical_extent(body)[0])
+        spot = tuple(spots[best].tolist())
+        place = (*spot, area.height_m(spot) + z - vertical_extent(body)[0])
         heading = None if yaw is None else float(yaw + bearings[best])
         return Move(body, piece, place, heading, piece.yaw_period_rad, ()), float(cost[best])
 

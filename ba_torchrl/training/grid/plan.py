@@ -228,9 +228,11 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
         key = (run.task, json.dumps(run.env, sort_keys=True))
         try:
             if key not in problems:
-                # alike but for what no network depends on
-                same = {"seed": 0, "max_depth_m": 1.0, "device": torch.device("cpu")}
-                problems[key] = replace(problem_of(run), **same)
+                problem = problem_of(run)
+                # equal except for what no network depends on
+                images = {name: replace(image, high=1.0) for name, image in problem.images.items()}
+                cpu = torch.device("cpu")
+                problems[key] = replace(problem, images=images, seed=0, device=cpu)
             problem = problems[key]
             learner = repr((problem, run.algorithm_config, run.network_config))
             if learner not in built:

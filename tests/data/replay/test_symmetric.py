@@ -4,6 +4,7 @@ from tensordict import TensorDict
 
 from ba_torchrl.data.replay.codecs import HalfPrecision
 from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.errors import ConfigError
 
 CODEC = HalfPrecision(0.25)
 
@@ -128,7 +129,7 @@ def test_an_empty_or_a_full_replay_says_so():
         replay().sample()
     made = replay(capacity=6)
     made.extend(transitions(range(5), True))
-    with pytest.raises(ValueError, match="2 more demonstrations do not fit: 1 places of 6"):
+    with pytest.raises(ConfigError, match="2 more demonstrations do not fit: 1 places of 6"):
         made.extend(transitions(range(2), True))
 
 

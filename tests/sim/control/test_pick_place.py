@@ -12,8 +12,8 @@ from ba_torchrl.sim.control.pick_place import (
     PickPlace,
     PickPlaceLimits,
     smooth_step,
-    tool_rotation,
 )
+from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.world import Physics, World
 

@@ -99,7 +99,7 @@ def ground_and_block(env, z):
     state = env.reset(seed=1)
     scene = env.scene
     x, y, _ = scene.task.block.position
-    scene.motion.reset(((x, y, z), 0.0))
+    scene.controller.reset(((x, y, z), 0.0))
     depth = env._images(scene)["pixels"][0]
     center = env.config.obs_size // 2
     assert state["pixels"].shape == (1, env.config.obs_size, env.config.obs_size)
@@ -119,7 +119,7 @@ def test_the_image_covers_45_centimetres_around_the_tool():
     env = ba_torchrl.make("close_loop/block_picking", obs_size=90)
     env.reset(seed=0)
     scene = env.scene
-    scene.motion.reset(((0.45, 0.0, 0.2), 0.0))
+    scene.controller.reset(((0.45, 0.0, 0.2), 0.0))
     scene.task.block.place((0.45 + 0.1, 0.0 - 0.05, 0.025), 0.0)
     depth = env._images(scene)["pixels"][0]
     rows, cols = np.nonzero(np.isclose(depth, 0.32 - 0.05, atol=1e-6))
@@ -134,7 +134,7 @@ def test_fingers_are_squares_of_zero_that_open_along_x(size, half):
     env = ba_torchrl.make("close_loop/block_picking", obs_size=size)
     env.reset(seed=0)
     scene = env.scene
-    scene.motion.reset(((0.45, 0.0, 0.2), 0.0))
+    scene.controller.reset(((0.45, 0.0, 0.2), 0.0))
     scene.task.block.place((0.35, 0.12, 0.025))
     depth = env._images(scene)["pixels"][0]
     rows, cols = np.nonzero(depth == 0)
@@ -142,7 +142,7 @@ def test_fingers_are_squares_of_zero_that_open_along_x(size, half):
     middle = rows[rows > size / 2]
     assert middle.mean() + 0.5 - size / 2 == pytest.approx(15 * size / 128, abs=0.5)
     assert set(rows) == {size - 1 - r for r in rows}
-    scene.motion.reset(((0.45, 0.0, 0.2), math.pi / 2))
+    scene.controller.reset(((0.45, 0.0, 0.2), math.pi / 2))
     np.testing.assert_array_equal(np.rot90(depth) == 0, env._images(scene)["pixels"][0] == 0)
     env.close()
 
@@ -152,7 +152,7 @@ def test_turning_the_world_turns_the_image():
     env.reset(seed=3)
     scene = env.scene
     (cx, cy), task = env.workspace.center, scene.task
-    scene.motion.reset(((cx, cy, 0.2), 0.4))
+    scene.controller.reset(((cx, cy, 0.2), 0.4))
     images = []
     for turn in range(2):
         for body, (dx, dy), yaw in (
@@ -163,7 +163,7 @@ def test_turning_the_world_turns_the_image():
                 dx, dy = -dy, dx
             z = body.position[2]
             body.place((cx + dx, cy + dy, z), yaw + turn * math.pi / 2)
-        scene.motion.reset(((cx, cy, 0.2), 0.4 + turn * math.pi / 2))
+        scene.controller.reset(((cx, cy, 0.2), 0.4 + turn * math.pi / 2))
         images.append(env._images(scene)["pixels"][0])
     np.testing.assert_allclose(np.rot90(images[0]), images[1], atol=1e-5)
     env.close()

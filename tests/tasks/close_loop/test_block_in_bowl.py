@@ -88,7 +88,7 @@ def test_the_camera_sees_the_cavity(env):
 def test_layouts_keep_their_distances_and_are_cheap(env):
     task, rng = env.scene.task, np.random.default_rng(0)
     for _ in range(200):
-        task.randomise(rng)
+        task.initialize_episode(rng)
         (x, y, _), (bowl_x, bowl_y, _) = task.block.position, task.bowl.position
         assert math.dist((x, y), (bowl_x, bowl_y)) >= 0.17
         assert max(abs(bowl_x - 0.45), abs(bowl_y)) <= 0.065 + 1e-9
@@ -98,7 +98,7 @@ def test_layouts_keep_their_distances_and_are_cheap(env):
 def lay(env, offset, z, yaw=0.3):
     """Put the block near the bowl's axis and let it come to rest."""
     task, world = env.scene.task, env.scene.world
-    env.scene.motion.reset(((0.45, 0.1, 0.24), 0.0))
+    env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
     task.bowl.place((0.45, -0.05, 0.035))
     task.block.place((0.45 + offset, -0.05, z), yaw)
     assert world.settle(400)
@@ -107,12 +107,12 @@ def lay(env, offset, z, yaw=0.3):
 def test_the_goal_is_a_block_that_lies_inside(env):
     task = env.scene.task
     lay(env, 0.0, FLOOR_M + 0.03)
-    assert task.is_goal()
+    assert task.is_success()
     lay(env, 0.12, 0.025)
-    assert not task.is_goal()  # beside the bowl
+    assert not task.is_success()  # beside the bowl
     task.block.place((0.45, -0.05, 0.2))
     env.scene.world.step(2)
-    assert not task.is_goal()  # falls towards it
+    assert not task.is_success()  # falls towards it
 
 
 def test_a_block_under_the_bowl_does_not_count(env):
@@ -122,35 +122,35 @@ def test_a_block_under_the_bowl_does_not_count(env):
     env.scene.world.step(20)
     assert task.bowl.touches(task.block)
     assert task.bowl.tilt_rad < task.upright_rad
-    assert not task.is_goal()
+    assert not task.is_success()
 
 
 def test_a_block_on_the_rim_does_not_count(env):
     lay(env, 0.07, 0.11)
     task = env.scene.task
     if math.dist(task.block.position[:2], task.bowl.position[:2]) >= 0.03:
-        assert not task.is_goal()
+        assert not task.is_success()
     task.block.place((0.45 + 0.075, -0.05, 0.095 + 2e-4))
     env.scene.world.step()
-    assert not task.is_goal()
+    assert not task.is_success()
 
 
 def test_a_held_block_does_not_count(env):
     scene, task = env.scene, env.scene.task
     lay(env, 0.0, FLOOR_M + 0.03, yaw=0.0)
     x, y, z = task.block.position
-    scene.motion.reset(((x, y, z + 0.05), 0.0))
-    scene.motion.move_to((x, y, z), 0.0)
-    assert task.is_goal()
-    scene.motion.grip(0.0)
+    scene.controller.reset(((x, y, z + 0.05), 0.0))
+    scene.controller.move_to((x, y, z), 0.0)
+    assert task.is_success()
+    scene.controller.grip(0.0)
     assert scene.robot.held_body() is task.block
     assert task.bowl.touches(task.block)
-    assert not task.is_goal()
+    assert not task.is_success()
 
 
 def test_a_tipped_bowl_ends_the_episode(env):
     task = env.scene.task
-    env.scene.motion.reset(((0.45, 0.1, 0.24), 0.0))
+    env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
     task.bowl.move_to((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((2.5, 0.0, 0.0)))
     env.scene.world.settle(400)
     assert task.bowl.tilt_rad > task.tipped_rad
@@ -161,7 +161,7 @@ def test_a_tipped_bowl_ends_the_episode(env):
 
 def test_a_bowl_nudged_up_on_one_side_falls_back(env):
     task = env.scene.task
-    env.scene.motion.reset(((0.45, 0.1, 0.24), 0.0))
+    env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
     task.bowl.move_to((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((0.6, 0.0, 0.0)))
     env.scene.world.settle(400)
     assert task.bowl.tilt_rad < 0.02

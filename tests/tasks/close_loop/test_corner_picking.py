@@ -22,7 +22,7 @@ def test_the_block_is_flush_with_both_walls(env):
     task = env.scene.task
     for _ in range(10):
         env.reset()
-        x, y = task.to_corner(*task.block.position[:2])
+        x, y = task.corner.to_local(*task.block.position[:2])
         assert x == pytest.approx(-0.065, abs=5e-4)
         assert y == pytest.approx(-0.065, abs=5e-4)
         turn = (task.block.yaw_rad - task.corner[2] + math.pi) % (2 * math.pi) - math.pi
@@ -51,8 +51,8 @@ def test_the_corner_is_fixed_and_the_base_smooth(env):
     assert all(body.is_static for body in (task.base, task.walls))
     assert task.base.shape.friction == 0.001
     task.put_corner((0.45, 0.0), 0.0)
-    scene.motion.reset(((0.42, 0.0, 0.05), 0.0), 0.0)
-    scene.motion.move_to((0.3, 0.0, 0.05), 0.0)  # into the wall
+    scene.controller.reset(((0.42, 0.0, 0.05), 0.0), 0.0)
+    scene.controller.move_to((0.3, 0.0, 0.05), 0.0)  # into the wall
     assert scene.robot.tool_pose()[0][0] > 0.36
     assert before != [body.pose for body in (task.base, task.walls)]
     task.put_corner((0.45, 0.0), 0.0)
@@ -66,7 +66,7 @@ def test_the_block_stays_in_the_corner_when_left_alone(env):
     for _ in range(5):
         env.reset()
         env.scene.world.step(600)
-        x, y = task.to_corner(*task.block.position[:2])
+        x, y = task.corner.to_local(*task.block.position[:2])
         assert math.dist((x, y), (-0.065, -0.065)) < 1e-3
 
 
@@ -90,12 +90,12 @@ def test_the_block_cannot_be_grasped_in_the_corner(env, turn):
     task.put_corner((0.45, 0.0), 0.0)
     assert task.room_m(turn) < 0
     x, y, z = task.block.position
-    scene.motion.reset(((x, y, 0.2), turn))
+    scene.controller.reset(((x, y, 0.2), turn))
     for height in (0.15, 0.1, z, z):
-        scene.motion.move_to((x, y, height), turn)
-    scene.motion.grip(0.0)
-    scene.motion.move_to((x, y, 0.18), turn)
-    assert not task.is_goal()
+        scene.controller.move_to((x, y, height), turn)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((x, y, 0.18), turn)
+    assert not task.is_success()
 
 
 def test_the_goal_needs_the_grasp_and_fifteen_centimetres(env):
@@ -103,20 +103,20 @@ def test_the_goal_needs_the_grasp_and_fifteen_centimetres(env):
     task.put_corner((0.45, 0.0), 0.0)
     task.block.place((0.45, 0.0, 0.027))
     assert task.room_m(0.0) > 0
-    scene.motion.reset(((0.45, 0.0, 0.16), 0.0))
-    assert not task.is_goal()  # high, but empty
-    scene.motion.move_to((0.45, 0.0, 0.027), 0.0)
-    scene.motion.grip(0.0)
-    scene.motion.move_to((0.45, 0.0, 0.145), 0.0)
-    assert not task.is_goal()  # held, but low
-    scene.motion.move_to((0.45, 0.0, 0.155), 0.0)
-    assert task.is_goal()
+    scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
+    assert not task.is_success()  # high, but empty
+    scene.controller.move_to((0.45, 0.0, 0.027), 0.0)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.145), 0.0)
+    assert not task.is_success()  # held, but low
+    scene.controller.move_to((0.45, 0.0, 0.155), 0.0)
+    assert task.is_success()
 
 
 def test_room_beside_the_fingers_against_arithmetic(env):
     task = env.scene.task
     task.put_corner((0.45, 0.0), 0.7)
-    task.block.place((*task.to_world(0.01, -0.02), 0.027), 0.7)
+    task.block.place((*task.corner.to_world(0.01, -0.02), 0.027), 0.7)
     along = task.robot.finger_span_m / 2 + 0.015
     assert task.room_m(0.7) == pytest.approx(min(0.1 - along, 0.07 - 0.0095), abs=1e-6)
     assert task.room_m(0.7 + math.pi / 2) == pytest.approx(0.07 - along, abs=1e-6)
@@ -173,7 +173,7 @@ def test_the_expert_starts_from_a_block_turned_in_the_corner(env):
         task = env.scene.task
         yaw = task.corner[2]
         half = 0.025 * (math.cos(turn) + math.sin(turn)) + 1e-3
-        task.block.place((*task.to_world(-0.09 + half, -0.09 + half), 0.027), yaw + turn)
+        task.block.place((*task.corner.to_world(-0.09 + half, -0.09 + half), 0.027), yaw + turn)
         env.scene.world.settle()
         state = env._step(env.full_action_spec.zero())
         while not state["done"]:

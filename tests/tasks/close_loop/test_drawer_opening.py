@@ -131,7 +131,7 @@ def test_layouts_open_towards_the_centre_with_room_for_the_handle(make):
         task, yaws = env.scene.task, []
         rng = np.random.default_rng(0)
         for _ in range(300):
-            task.randomise(rng)
+            task.initialize_episode(rng)
             (x, y, z), yaw = task.cabinet.base.position, task.cabinet.base.yaw_rad
             ux, uy = math.cos(yaw), math.sin(yaw)
             back = (0.45 - x) * ux + (0.0 - y) * uy
@@ -158,12 +158,12 @@ def test_a_workspace_without_room_for_the_handle_is_refused():
 def test_the_goal_is_fifteen_centimetres(make):
     env = make()
     task, cabinet = env.scene.task, env.scene.task.cabinet
-    assert not task.is_goal()
+    assert not task.is_success()
     pose = (cabinet.base.position, cabinet.base.yaw_rad)
     for travel, expected in ((0.149, False), (0.151, True)):
         cabinet.place(*pose, travel)
         env.scene.world.settle()
-        assert task.is_goal() is expected
+        assert task.is_success() is expected
 
 
 def test_a_drawer_that_springs_back_is_no_success(make):
@@ -172,7 +172,7 @@ def test_a_drawer_that_springs_back_is_no_success(make):
     cabinet = env.scene.task.cabinet
     cabinet.place(cabinet.base.position, cabinet.base.yaw_rad, 0.152)
     pybullet.resetJointState(cabinet.id, 0, 0.152, -0.5, physicsClientId=env.scene.world.client)
-    assert env.scene.task.is_goal()
+    assert env.scene.task.is_success()
     success, valid = env._evaluate(env.scene)
     assert valid
     assert not success
@@ -183,7 +183,7 @@ def at_handle(env, ahead, height, opening, turn):
     """Put cabinet and gripper: the rod along y at x = 0.41, opening towards -x."""
     scene = env.scene
     scene.task.cabinet.place((0.57, 0.0, 0.0), math.pi)
-    scene.motion.reset(((0.41 - ahead, 0.0, height), turn), opening)
+    scene.controller.reset(((0.41 - ahead, 0.0, height), turn), opening)
     return scene
 
 
@@ -192,7 +192,7 @@ def test_a_hooked_drawer_follows_the_fingers_and_stays(make):
     travels = []
     for _ in range(6):
         (x, y, z), yaw = scene.robot.tool_pose()
-        scene.motion.move_to((x - 0.05, y, z), yaw)
+        scene.controller.move_to((x - 0.05, y, z), yaw)
         travels.append(scene.task.cabinet.travel_m)
     # 8.5 mm of play first, then 5 cm each, and no farther than the rail
     np.testing.assert_allclose(travels, [0.0415, 0.0915, 0.1415, 0.1915, 0.2, 0.2], atol=4e-3)
@@ -200,18 +200,18 @@ def test_a_hooked_drawer_follows_the_fingers_and_stays(make):
     assert scene.task.cabinet.travel_m == pytest.approx(0.2, abs=2e-3)
     for _ in range(6):
         (x, y, z), yaw = scene.robot.tool_pose()
-        scene.motion.move_to((x + 0.05, y, z), yaw)
+        scene.controller.move_to((x + 0.05, y, z), yaw)
     scene.world.settle()
     assert scene.task.cabinet.travel_m == pytest.approx(0.0, abs=2e-3)
 
 
 def test_fingers_closed_across_the_rod_pull_it_but_hold_nothing(make):
     scene = at_handle(make(), 0.0, 0.08, 0.2, 0.0)
-    scene.motion.grip(0.0)
+    scene.controller.grip(0.0)
     assert scene.robot.held_body() is None
     for _ in range(3):
         (x, y, z), yaw = scene.robot.tool_pose()
-        scene.motion.move_to((x - 0.05, y, z), yaw)
+        scene.controller.move_to((x - 0.05, y, z), yaw)
     assert scene.task.cabinet.travel_m == pytest.approx(0.15, abs=3e-3)
 
 
@@ -219,13 +219,13 @@ def test_the_guard_spares_a_handle_that_cannot_move_that_way(make):
     scene = at_handle(make(), 0.0, 0.14, 0.0, math.pi / 2)
     for _ in range(3):  # onto the rod from above
         (x, y, z), yaw = scene.robot.tool_pose()
-        scene.motion.move_to((x, y, z - 0.05), yaw)
+        scene.controller.move_to((x, y, z - 0.05), yaw)
     assert scene.robot.tool_pose()[0][2] > 0.08
     assert scene.task.handle_pose[0][2] == pytest.approx(0.08, abs=1e-6)
     scene = at_handle(make(), -0.026, 0.07, 0.0, math.pi / 2)
     for _ in range(3):  # along the rod, into a post
         (x, y, z), yaw = scene.robot.tool_pose()
-        scene.motion.move_to((x, y + 0.05, z), yaw)
+        scene.controller.move_to((x, y + 0.05, z), yaw)
     assert scene.robot.tool_pose()[0][1] < 0.035
     np.testing.assert_allclose(scene.task.cabinet.base.position, (0.57, 0.0, 0.0), atol=1e-9)
 
@@ -237,7 +237,7 @@ def test_random_actions_keep_the_drawer_on_its_rail(make):
         state = env.reset()
         scene = env.scene
         handle, heading = scene.task.handle_pose  # start where it matters
-        scene.motion.reset(((*handle[:2], 0.15), heading))
+        scene.controller.reset(((*handle[:2], 0.15), heading))
         while not state["done"]:
             action = rng.choice([-1.0, 1.0], 5) if episode % 2 else rng.uniform(-1, 1, 5)
             state = env.step(state.set("action", torch.tensor(action, dtype=torch.float32)))

@@ -150,7 +150,7 @@ def test_what_was_lifted_is_gone_and_the_rest_stays(make):
     assert lifted.is_hidden
     for body in env.scene.task.objects:
         assert math.dist(body.position, others[body.name]) < 5e-3
-    assert not env.scene.task.is_goal()
+    assert not env.scene.task.is_success()
 
 
 def test_new_objects_fall_when_the_last_one_was_lifted(make):
@@ -272,24 +272,24 @@ def test_the_goal_needs_the_grasp_and_the_height(make):
     env.reset()
     scene = env.scene
     task = scene.task
-    assert not task.is_goal()
-    scene.motion.reset(((0.45, 0.0, 0.2), 0.0))
-    assert not task.is_goal()  # high, but empty
+    assert not task.is_success()
+    scene.controller.reset(((0.45, 0.0, 0.2), 0.0))
+    assert not task.is_success()  # high, but empty
     brick = next(body for body in task.clutter.pool.bodies if body.name == "brick")
     task.clutter.pool.deactivate(task.objects[0])
     task.clutter.pool.activate(brick)
     brick.place((0.45, 0.0, FLOOR_Z_M + 0.02))
     scene.world.settle()
-    scene.motion.move_to((0.45, 0.0, 0.02), 0.0)
-    scene.motion.grip(0.0)
-    scene.motion.move_to((0.45, 0.0, 0.08), 0.0)
-    scene.motion.move_to((0.45, 0.0, 0.14), 0.0)
-    assert not task.is_goal()  # held, but low
-    scene.motion.move_to((0.45, 0.0, 0.16), 0.0)
-    assert task.is_goal()
-    scene.motion.grip(1.0)
+    scene.controller.move_to((0.45, 0.0, 0.02), 0.0)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.08), 0.0)
+    scene.controller.move_to((0.45, 0.0, 0.14), 0.0)
+    assert not task.is_success()  # held, but low
+    scene.controller.move_to((0.45, 0.0, 0.16), 0.0)
+    assert task.is_success()
+    scene.controller.grip(1.0)
     scene.world.settle()
-    assert not task.is_goal()
+    assert not task.is_success()
 
 
 # -- expert -------------------------------------------------------------------------------------

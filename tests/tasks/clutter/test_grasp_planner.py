@@ -2,22 +2,26 @@
 
 import math
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
-from ba_torchrl.tasks.base import ActionLimits, Workspace
 from ba_torchrl.tasks.clutter import grasp_planner
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M, DEEPEST_M, PIXEL_M, GraspPlanner
 from ba_torchrl.tasks.clutter.push_planner import PushPlanner
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 WORKSPACE = Workspace((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))
 REACH = ActionLimits(0.05, math.pi / 4)
 TOOL = ((0.45, 0.0, 0.2), 0.0)
 FLOOR_M = 2e-3
+
+TRAY = SimpleNamespace(height_m=lambda xy: FLOOR_M, half_m=0.125)
 
 JAW = Gripper(
     half_gap_m=0.04,
@@ -51,7 +55,7 @@ class Lying:
     @property
     def pose(self):
         half = self.yaw_rad / 2
-        return self.position, (0.0, 0.0, math.sin(half), math.cos(half))
+        return Pose(self.position, (0.0, 0.0, math.sin(half), math.cos(half)))
 
 
 def block(size_m, xy=(0.45, 0.0), yaw_rad=0.0):
@@ -156,7 +160,7 @@ def test_pushing_fingers_stand_off_the_floor_and_behind_the_body(name):
     gripper = measured_gripper(ROBOTS[name])
     target = block((0.03, 0.03, 0.03), (0.4, 0.0))
     planner, heights = scene(gripper, target)
-    push = PushPlanner(planner).plan([target], TOOL, REACH, heights)
+    push = PushPlanner(planner, TRAY).plan([target], TOOL, REACH, heights)
     tips = push.start[2] + gripper.tip_m(0.0)
     assert FLOOR_M + 2e-3 < tips < FLOOR_M + 0.01
     assert math.dist(push.start[:2], target.position[:2]) > 0.015 + gripper.closed_half_m
@@ -169,7 +173,7 @@ def test_a_wide_hand_is_kept_off_a_wall_where_another_push_will_do():
     for height in (0.09, 0.03):  # of what reaches 9 cm to both sides, over the tool
         gripper = replace(JAW, closed_outline=(*JAW.closed_outline[:-1], (0.09, height)))
         planner, heights = scene(gripper, target, wall)
-        push = PushPlanner(planner).plan([target], TOOL, REACH, heights)
+        push = PushPlanner(planner, TRAY).plan([target], TOOL, REACH, heights)
         rooms.append(wall_x - 0.09 - max(push.start[0], push.end[0]))
     over_the_wall, beside_it = rooms
     assert over_the_wall < 0

@@ -10,15 +10,17 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, RIM_Z_M, add_tray, profile
+from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, RIM_Z_M, Tray, profile
+from ba_torchrl.tasks.workspace import Workspace
 
 CENTER = (0.45, 0.02)
+WORKSPACE = Workspace((0.3, 0.6), (-0.13, 0.17), (0.01, 0.25))
 
 
 @pytest.fixture
 def world():
     with World() as world:
-        add_tray(world, CENTER, 0.3)
+        Tray(world, WORKSPACE)
         yield world
 
 
@@ -28,9 +30,17 @@ def height(heights, x, y, side=0.5, pixels=500):
     return heights[i, j]
 
 
-def test_it_returns_the_height_of_its_floor():
+def test_objects_stand_on_its_base():
     with World() as world:
-        assert add_tray(world, CENTER, 0.3) == FLOOR_Z_M == 0.002
+        tray = Tray(world, WORKSPACE)
+        block = world.add(Box(size_m=(0.03, 0.03, 0.03)), "block")
+        assert tray.height_m(CENTER) == FLOOR_Z_M == 0.002
+        tray.stand(block, CENTER, 0.4)
+        assert block.position == pytest.approx((*CENTER, 0.017))
+        assert tray.gap_below_m(block) == pytest.approx(0.0, abs=1e-9)
+        (base,) = tray.support_ids
+        assert world.settle()
+        assert base in {body.id for body in world.bodies if body.touches(block)}
 
 
 def test_floor_is_22_cm_wide_and_grows_with_the_workspace():

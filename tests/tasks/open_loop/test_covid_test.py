@@ -224,7 +224,7 @@ def test_what_is_held_above_the_test_area_is_not_presented(make):
     assert held in task.tubes
     x, y = task._to_world(task.test_area, (0.0, 0.0))
     joints = task.robot.inverse_kinematics((x, y, 0.1), downward(0.0))
-    env.scene.motion._carry(joints)
+    env.scene.controller._carry(joints)
     env.scene.world.step(2)
     assert math.dist(held.position[:2], (x, y)) < 0.02
     assert task.robot.held_body() is held
@@ -352,7 +352,7 @@ def make_tests(env, rounds=3):
 def test_three_used_tubes_in_their_box_are_a_success(make):
     env = make()
     task = make_tests(env)
-    assert not task.is_goal()
+    assert not task.is_success()
     lay(task, task.tubes[2], task.used_box, (0.0, 0.024), along=0.0)
     state = wait(env)
     assert state["success"]
@@ -399,7 +399,7 @@ def test_a_tube_in_the_gripper_is_not_collected(make):
     task = make_tests(env)
     follow(env, 1)
     assert task.robot.held_body() is task.tubes[2]
-    assert not task.is_goal()
+    assert not task.is_success()
     assert follow(env, 1)["success"]
 
 
@@ -421,7 +421,7 @@ def advance(env, state, count):
 def test_a_state_keeps_the_task_the_hidden_swabs_and_the_future(make):
     env = make(seed=4)
     state = follow(env, 3)  # a tube is presented, a swab held
-    task, motion = env.scene.task, env.scene.motion
+    task, motion = env.scene.task, env.scene.controller
     swab = motion.held
     assert swab in task.swabs
     kept = env.get_state()
@@ -585,7 +585,7 @@ def test_asking_the_expert_when_all_is_done_changes_nothing(make):
     where = [tube.position for tube in task.tubes]
     step(env, command)
     assert [tube.position for tube in task.tubes] == [pytest.approx(p, abs=1e-3) for p in where]
-    assert task.is_goal()
+    assert task.is_success()
 
 
 # -- heights -----------------------------------------------------------------------------------
@@ -601,8 +601,11 @@ def test_heights_from_the_image_suit_thin_things(make, kind):
     assert task.robot.held_body() is body
     x, y = task._to_world(task.test_area, (0.0, 0.03))
     seen = []
-    place = env.scene.motion.place
-    env.scene.motion.place = lambda position, turn: (seen.append(position), place(position, turn))
+    place = env.scene.controller.place
+    env.scene.controller.place = lambda position, turn: (
+        seen.append(position),
+        place(position, turn),
+    )
     tool, _ = task.robot.tool_pose()
     below = tool[2] - vertical_extent(body)[0]
     step(env, PickPlaceCommand(PLACE, x, y, None, 0.0))

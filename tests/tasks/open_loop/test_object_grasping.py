@@ -132,19 +132,21 @@ def test_a_near_miss_is_a_failure(make, action):
 def test_what_was_let_go_of_is_no_success(make):
     env, state = with_brick(make)
     env.step(state.set("action", torch.tensor([PICK, *CENTER, 0.025, 0.0])))
-    task, motion = env.scene.task, env.scene.motion
-    assert task.is_goal()
+    task, motion = env.scene.task, env.scene.controller
+    assert task.is_success()
     motion.robot.set_opening(1.0)
     env.scene.world.step(5)
-    assert not task.is_goal()
+    assert not task.is_success()
 
 
 def test_without_a_height_the_tool_goes_below_what_is_highest_between_the_fingers(make):
     task = with_brick(make)[0].scene.task
     palm_m = task.robot.gripper.palm_m
-    assert 0.005 < 0.1 - task.pick_height_m(0.1) < palm_m  # around it, and the palm above it
+    assert (
+        0.005 < 0.1 - task.pick_height_m(0.1, (0.45, 0.0)) < palm_m
+    )  # around it, and the palm above it
     # never into the tray's floor, nor do the fingertips swing into it
-    assert task.pick_height_m(0.0) + task.robot.gripper.tip_m(0.02) > FLOOR_Z_M
+    assert task.pick_height_m(0.0, (0.45, 0.0)) + task.robot.gripper.tip_m(0.02) > FLOOR_Z_M
     assert task.window_m(None) == pytest.approx(task.robot.gripper.half_width_m, abs=4e-3)
 
 
@@ -166,13 +168,13 @@ def test_what_was_picked_is_gone_and_the_rest_stays(make):
     env = make(expert=True)
     state = play(env, env.reset())
     assert state["success"]
-    picked = env.scene.motion.held
+    picked = env.scene.controller.held
     others = {body.name: body.position for body in env.scene.task.objects if body is not picked}
     assert len(others) == 14
     state = env.reset()
     assert names(env) == list(others)
     assert not state["holding"]
-    assert not env.scene.task.is_goal()
+    assert not env.scene.task.is_success()
     for body in env.scene.task.objects:
         assert math.dist(body.position, others[body.name]) < 5e-3
     # it is out of the way and stays out of sight, the gripper's release notwithstanding
@@ -338,12 +340,12 @@ def test_a_state_brings_back_heap_and_failures(make):
 def test_after_a_success_brought_back_the_next_episode_is_the_same(make):
     env = make(expert=True)
     assert play(env, env.reset())["success"]
-    kept, picked = env.get_state(), env.scene.motion.held.name
+    kept, picked = env.get_state(), env.scene.controller.held.name
     env.reset()
     present = names(env)
     play(env, env.reset())
     env.set_state(kept)
-    held = env.scene.motion.held
+    held = env.scene.controller.held
     assert held.name == picked
     env.reset()  # what is held counts as taken, though no contact was looked for since
     assert names(env) == present

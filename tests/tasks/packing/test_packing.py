@@ -13,13 +13,13 @@ from ba_torchrl.errors import ConfigError, PlacementError
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import Workspace
 from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, pieces
 from ba_torchrl.tasks.open_loop.bottle_arrangement import BOTTLES_CM
 from ba_torchrl.tasks.open_loop.bottle_arrangement import slots as bottle_slots
 from ba_torchrl.tasks.open_loop.box_palletizing import BOX_M, PALLET_M, SLOT_M, slots
 from ba_torchrl.tasks.packing.base import open_box
 from ba_torchrl.tasks.packing.footprints import Footprint, Rectangle, gap_m, narrowest, scatter
+from ba_torchrl.tasks.workspace import Workspace
 
 BIN, BOTTLES, BOXES = (
     f"open_loop/{name}" for name in ("bin_packing", "bottle_arrangement", "box_palletizing")
@@ -70,7 +70,7 @@ def test_gaps_between_rectangles(second, gap):
     first = Rectangle(0.0, 0.0, 0.0, 0.2, 0.1)
     for yaw in (0.0, 0.7):  # turned together, nothing changes
         a = first._replace(yaw_rad=yaw)
-        x, y = a.at(second.x, second.y)
+        x, y = a.frame.to_world(second.x, second.y)
         b = second._replace(x=x, y=y, yaw_rad=second.yaw_rad + yaw)
         assert gap_m(a, b) == pytest.approx(gap_m(b, a))
         if gap is None:
@@ -88,9 +88,11 @@ def test_rectangles_that_touch_by_a_corner_only_after_turning():
 
 def test_points_in_and_out_of_the_frame_of_a_rectangle():
     rectangle = Rectangle(0.4, -0.1, 0.6, 0.2, 0.1)
-    assert rectangle.local(*rectangle.at(0.03, -0.07)) == pytest.approx((0.03, -0.07))
-    inside = np.array([[*rectangle.at(0.19, 0.09), 5.0]])
-    outside = np.array([[*rectangle.at(0.19, 0.11), 5.0]])
+    assert rectangle.frame.to_local(*rectangle.frame.to_world(0.03, -0.07)) == pytest.approx(
+        (0.03, -0.07)
+    )
+    inside = np.array([[*rectangle.frame.to_world(0.19, 0.09), 5.0]])
+    outside = np.array([[*rectangle.frame.to_world(0.19, 0.11), 5.0]])
     assert rectangle.contains(inside)
     assert not rectangle.contains(np.concatenate([inside, outside]))
     workspace = Workspace((0.0, 1.0), (-0.5, 0.5), (0.0, 1.0))
@@ -185,14 +187,15 @@ def filled_bin(make, count=4):
     cells = [(x, y) for x in (-0.06, 0.0, 0.06) for y in (-0.025, 0.025)]
     for body, cell in zip(task.objects, cells, strict=False):
         low = body.shape.bounds_m[0][2]
-        body.place((*inside.at(*cell), 0.004 - low), bin_yaw)
+        body.place((*inside.frame.to_world(*cell), 0.004 - low), bin_yaw)
     for body, cell in zip(task.objects, cells, strict=False):
         if body.shape.bounds_m[1][1] > 0.03:  # long ones would meet: they stand on an end
             turn = yaw_quaternion(bin_yaw)
             x, y, _, w = TURNED
             sz, cz = turn[2], turn[3]
             body.move_to(
-                (*inside.at(*cell), 0.044), (cz * x - sz * y, cz * y + sz * x, sz * w, cz * w)
+                (*inside.frame.to_world(*cell), 0.044),
+                (cz * x - sz * y, cz * y + sz * x, sz * w, cz * w),
             )
     env.scene.world.settle()
     return env, task, inside
@@ -200,7 +203,7 @@ def filled_bin(make, count=4):
 
 def test_objects_in_the_bin_are_packed(make):
     _, task, _ = filled_bin(make)
-    assert task.is_goal()
+    assert task.is_success()
     assert task.is_valid()
 
 
@@ -215,21 +218,21 @@ def test_an_object_that_is_not_within_the_walls_is_not_packed(make, along):
     _, task, inside = filled_bin(make)
     body = task.objects[0]
     for z in (-body.shape.bounds_m[0][2], BIN_M[2] - body.shape.bounds_m[0][2]):
-        body.place((*inside.at(along, 0.0), z), inside.yaw_rad)
+        body.place((*inside.frame.to_world(along, 0.0), z), inside.yaw_rad)
         assert not task.is_packed(body)
-        assert not task.is_goal()
+        assert not task.is_success()
 
 
 def test_an_object_on_the_rim_is_not_packed(make):
     _, task, inside = filled_bin(make, count=1)
     (body,) = task.objects
-    assert task.is_goal()
+    assert task.is_success()
     low = body.shape.bounds_m[0][2]
     # its middle is inside the bin, its end rests on the rim
-    body.place((*inside.at(BIN_M[0] / 2 - 0.015, 0.0), BIN_M[2] - low), inside.yaw_rad)
+    body.place((*inside.frame.to_world(BIN_M[0] / 2 - 0.015, 0.0), BIN_M[2] - low), inside.yaw_rad)
     assert not task.is_packed(body)
     # above the rim altogether
-    body.place((*inside.at(0.0, 0.0), BIN_M[2] - low + 0.001), inside.yaw_rad)
+    body.place((*inside.frame.to_world(0.0, 0.0), BIN_M[2] - low + 0.001), inside.yaw_rad)
     assert not task.is_packed(body)
 
 
@@ -238,17 +241,17 @@ def test_what_is_held_is_not_packed(make):
     state = env.reset()
     (picked,) = follow(env, state, 1)
     assert picked["holding"]
-    assert not env.scene.task.is_goal()
+    assert not env.scene.task.is_success()
 
 
 def test_objects_are_let_go_over_the_rim_or_gently_on_the_ground(make):
     env = make(BIN, num_objects=2)
     follow(env, env.reset(), 1)
     task = env.scene.task
-    depth = task.depth_m(env.scene.motion.held)
-    assert task.place_height_m(0.0) == pytest.approx(depth, abs=2e-3)
-    assert task.place_height_m(0.004) > BIN_M[2] + 0.009  # the fingertips
-    assert task.place_height_m(0.12) == pytest.approx(0.12 + depth, abs=2e-3)
+    depth = task.depth_m(env.scene.controller.held)
+    assert task.place_height_m(0.0, (0.4, 0.0)) == pytest.approx(depth, abs=2e-3)
+    assert task.place_height_m(0.004, (0.4, 0.0)) > BIN_M[2] + 0.009  # the fingertips
+    assert task.place_height_m(0.12, (0.4, 0.0)) == pytest.approx(0.12 + depth, abs=2e-3)
 
 
 def test_kinds_are_drawn_with_replacement(make):
@@ -272,22 +275,23 @@ def stand_bottles(make):
     task = env.scene.task
     tray = Rectangle(*task.container.position[:2], task.container.yaw_rad, 0.0, 0.0)
     for body, slot in zip(task.objects, bottle_slots(), strict=True):
-        body.place((*tray.at(*slot), 0.005), 0.3)
+        body.place((*tray.frame.to_world(*slot), 0.005), 0.3)
     env.scene.world.settle()
     return env, task, tray
 
 
 def test_bottles_that_stand_in_the_tray_are_arranged(make):
     _, task, _ = stand_bottles(make)
-    assert task.is_goal()
+    assert task.is_success()
     assert task.is_valid()
 
 
 def test_a_bottle_lying_in_the_tray_ends_the_episode(make):
     _, task, tray = stand_bottles(make)
     body = task.objects[1]
-    body.move_to((*tray.at(0.0, 0.0), 0.2), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
-    assert not task.is_goal()
+    lying = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+    body.move_to((*tray.frame.to_world(0.0, 0.0), 0.2), lying)
+    assert not task.is_success()
     assert not task.is_valid()
 
 
@@ -302,15 +306,15 @@ def test_a_bottle_lying_in_the_tray_ends_the_episode(make):
 )
 def test_a_bottle_that_does_not_stand_on_the_trays_floor(make, place, z):
     _, task, tray = stand_bottles(make)
-    task.objects[1].place((*tray.at(*place), z), 0.0)
+    task.objects[1].place((*tray.frame.to_world(*place), z), 0.0)
     assert not task.stands_in_tray(task.objects[1])
-    assert not task.is_goal()
+    assert not task.is_success()
 
 
 def test_bottles_may_stand_off_their_slots(make):
     _, task, tray = stand_bottles(make)
-    task.objects[0].place((*tray.at(-0.083, -0.041), 0.005), 0.0)
-    assert task.is_goal()
+    task.objects[0].place((*tray.frame.to_world(-0.083, -0.041), 0.005), 0.0)
+    assert task.is_success()
 
 
 def test_bottles_right_themselves(make):
@@ -349,7 +353,7 @@ class Pallet:
         x, y, yaw = slots(layer)[place]
         z = PALLET_M[2] + (layer + level + 0.5) * BOX_M[2]
         body = self.task.objects[number if box is None else box]
-        body.place((*self.frame.at(x + dx, y + dy), z), self.frame.yaw_rad + yaw + turn)
+        body.place((*self.frame.frame.to_world(x + dx, y + dy), z), self.frame.yaw_rad + yaw + turn)
         return body
 
 
@@ -362,7 +366,7 @@ def test_layers_fit_the_pallet_and_cross_each_other():
             assert gap_m(a, b) >= 0.015 - 1e-9
         for rectangle in rectangles:
             for sx, sy in itertools.product((-1, 1), repeat=2):
-                x, y = rectangle.at(sx * rectangle.half_x, sy * rectangle.half_y)
+                x, y = rectangle.frame.to_world(sx * rectangle.half_x, sy * rectangle.half_y)
                 assert abs(x) <= PALLET_M[0] / 2
                 assert abs(y) <= PALLET_M[1] / 2
     assert sorted(slots(0)) == sorted(slots(2))
@@ -384,7 +388,7 @@ def test_full_layers_are_the_goal_and_stand(make):
     for count in (6, 12, 18):
         env = make(BOXES, num_objects=count)
         pallet = Pallet(env, count)
-        assert pallet.task.is_goal()
+        assert pallet.task.is_success()
         assert pallet.task.is_valid()
         before = [body.position for body in pallet.task.objects]
         env.scene.world.step(240)
@@ -411,7 +415,7 @@ def test_full_layers_are_the_goal_and_stand(make):
 def test_a_box_counts_in_its_slot_only(make, off, counts):
     pallet = Pallet(make(BOXES, num_objects=6), 6)
     pallet.put(0, **off)
-    assert pallet.task.is_goal() is counts
+    assert pallet.task.is_success() is counts
 
 
 def test_boxes_count_on_full_layers_only(make):

@@ -32,6 +32,19 @@ def make():
         env.close()
 
 
+def of_kind(task, kind):
+    return [body for body, piece in task.structure.pieces.items() if piece.kind == kind]
+
+
+def cubes_of(task):
+    return of_kind(task, "cube")
+
+
+def triangle_of(task):
+    (triangle,) = of_kind(task, "triangle")
+    return triangle
+
+
 def wait(env):
     """Take a step in which the open gripper does not move."""
     action = torch.zeros(env.action_spec.shape)
@@ -52,12 +65,12 @@ def follow(env):
 
 
 def test_sizes_are_the_papers(make):
-    blocks = make(STACKING).scene.task.blocks
+    blocks = cubes_of(make(STACKING).scene.task)
     assert [block.shape.size_m for block in blocks] == [(0.05, 0.05, 0.05)] * 2
     task = make(HOUSE).scene.task
-    low, high = np.array(task.triangle.shape.bounds_m)
+    low, high = np.array(triangle_of(task).shape.bounds_m)
     np.testing.assert_allclose(high - low, 0.05)
-    vertices = task.triangle.shape.mesh().vertices
+    vertices = triangle_of(task).shape.mesh().vertices
     ridge = vertices[vertices[:, 2] > 0.02]
     np.testing.assert_allclose(ridge, [[0, 0.025, 0.025], [0, -0.025, 0.025]])
 
@@ -82,24 +95,24 @@ def test_fixed_orientations_turn_the_ends_of_the_triangle_to_the_fingers(make):
     for _ in range(3):
         env.reset()
         task = env.scene.task
-        assert task.blocks[0].yaw_rad == pytest.approx(0.0, abs=1e-3)
-        assert task.triangle.yaw_rad == pytest.approx(math.pi / 2, abs=1e-3)
+        assert cubes_of(task)[0].yaw_rad == pytest.approx(0.0, abs=1e-3)
+        assert triangle_of(task).yaw_rad == pytest.approx(math.pi / 2, abs=1e-3)
 
 
 def test_a_triangle_is_held_level_by_its_ends(make):
     scene = make(HOUSE).scene
     task = scene.task
-    task.stand(task.blocks[0], (0.35, 0.1), 0.0)
-    task.stand(task.triangle, (0.45, 0.0), math.pi / 2)
-    scene.motion.reset(((0.45, 0.0, 0.1), 0.0))
+    task.stand(cubes_of(task)[0], (0.35, 0.1), 0.0)
+    task.stand(triangle_of(task), (0.45, 0.0), math.pi / 2)
+    scene.controller.reset(((0.45, 0.0, 0.1), 0.0))
     scene.world.settle()
-    scene.motion.move_to((0.45, 0.0, 0.025), 0.0)
-    scene.motion.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.025), 0.0)
+    scene.controller.grip(0.0)
     for z in (0.075, 0.125):
-        scene.motion.move_to((0.45, 0.0, z), 0.0)
-    assert scene.robot.held_body() is task.triangle
-    assert vertical_extent(task.triangle)[0] > 0.09
-    assert task.triangle.tilt_rad < 0.05
+        scene.controller.move_to((0.45, 0.0, z), 0.0)
+    assert scene.robot.held_body() is triangle_of(task)
+    assert vertical_extent(triangle_of(task))[0] > 0.09
+    assert triangle_of(task).tilt_rad < 0.05
 
 
 # -- the goals ---------------------------------------------------------------------------------
@@ -108,20 +121,20 @@ def test_a_triangle_is_held_level_by_its_ends(make):
 def test_stacking_succeeds_when_let_go_of_and_not_before(make):
     env = make(STACKING)
     scene = env.scene
-    lower, upper = scene.task.blocks
+    lower, upper = cubes_of(scene.task)
     lower.place((0.45, 0.0, 0.025))
     upper.place((0.4, 0.1, 0.025))
-    scene.motion.reset(((0.4, 0.1, 0.1), 0.0))
+    scene.controller.reset(((0.4, 0.1, 0.1), 0.0))
     scene.world.settle()
-    scene.motion.move_to((0.4, 0.1, 0.025), 0.0)
-    scene.motion.grip(0.0)
+    scene.controller.move_to((0.4, 0.1, 0.025), 0.0)
+    scene.controller.grip(0.0)
     for target in ((0.4, 0.1, 0.1), (0.45, 0.0, 0.1), (0.45, 0.0, 0.0755)):
-        scene.motion.move_to(target, 0.0)
+        scene.controller.move_to(target, 0.0)
     assert scene.robot.held_body() is upper
-    assert not scene.task.is_goal()
-    scene.motion.grip(1.0)
+    assert not scene.task.is_success()
+    scene.controller.grip(1.0)
     scene.world.settle()
-    assert scene.task.is_goal()
+    assert scene.task.is_success()
 
 
 @pytest.mark.parametrize(
@@ -136,8 +149,8 @@ def test_stacking_succeeds_when_let_go_of_and_not_before(make):
 )
 def test_stacking_is_judged_at_rest(make, position, expected):
     env = make(STACKING)
-    lower, upper = env.scene.task.blocks
-    env.scene.motion.reset(((0.35, -0.1, 0.2), 0.0))
+    lower, upper = cubes_of(env.scene.task)
+    env.scene.controller.reset(((0.35, -0.1, 0.2), 0.0))
     lower.place((0.45, 0.0, 0.025))
     upper.place(position)
     env.scene.world.settle()
@@ -150,8 +163,8 @@ def test_stacking_is_judged_at_rest(make, position, expected):
 def test_a_house_has_its_triangle_on_top(make):
     env = make(HOUSE, num_objects=3)
     task = env.scene.task
-    env.scene.motion.reset(((0.35, -0.1, 0.25), 0.0))
-    first, second = task.blocks
+    env.scene.controller.reset(((0.35, -0.1, 0.25), 0.0))
+    first, second = cubes_of(task)
     for first_z, second_z, triangle_xy, triangle_z, expected in (
         (0.025, 0.075, (0.5, 0.1), 0.025, False),
         (0.025, 0.075, (0.45, 0.0), 0.125, True),
@@ -162,19 +175,19 @@ def test_a_house_has_its_triangle_on_top(make):
         env.scene.world.settle()
         first.place((0.45, 0.0, first_z))
         second.place((0.45, 0.0, second_z))
-        task.triangle.place((*triangle_xy, triangle_z), 0.5)
+        triangle_of(task).place((*triangle_xy, triangle_z), 0.5)
         env.scene.world.settle()
-        assert task.is_goal() is expected
+        assert task.is_success() is expected
     second.place((0.5, 0.1, 0.025))
     first.place((0.45, 0.0, 0.025))
-    task.triangle.place((0.45, 0.0, 0.075))
+    triangle_of(task).place((0.45, 0.0, 0.075))
     env.scene.world.settle()
-    assert not task.is_goal()
+    assert not task.is_success()
 
 
 def test_a_tipped_triangle_ends_the_episode_without_reward(make):
     env = make(HOUSE)
-    triangle = env.scene.task.triangle
+    triangle = triangle_of(env.scene.task)
     slope = math.pi - math.atan2(0.05, 0.025)
     triangle.move_to((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
     env.scene.world.settle()
@@ -188,8 +201,9 @@ def test_a_tipped_triangle_ends_the_episode_without_reward(make):
 def test_a_tumbled_cube_is_as_good_as_any(make):
     env = make(HOUSE, expert=True)
     task = env.scene.task
-    task.blocks[0].move_to(
-        (*task.blocks[0].position[:2], 0.025), (math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4))
+    cubes_of(task)[0].move_to(
+        (*cubes_of(task)[0].position[:2], 0.025),
+        (math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4)),
     )
     assert follow(env)["success"]
 
@@ -214,7 +228,7 @@ def test_expert_takes_blocks_that_touch(make):
     env = make(STACKING)
     for yaw in (-0.6, 0.0, 0.4, 0.8):
         env.reset()
-        first, second = env.scene.task.blocks
+        first, second = cubes_of(env.scene.task)
         first.place((0.42, 0.0, 0.025), yaw)
         second.place((0.42 + 0.051 * math.cos(yaw), 0.051 * math.sin(yaw), 0.025), yaw)
         assert follow(env)["success"]
@@ -223,9 +237,9 @@ def test_expert_takes_blocks_that_touch(make):
 def test_expert_takes_a_triangle_down_that_was_put_on_too_early(make):
     env = make(HOUSE, num_objects=3)
     task = env.scene.task
-    task.blocks[0].place((0.4, -0.05, 0.025), 0.3)
-    task.blocks[1].place((0.52, 0.05, 0.025), 0.0)
-    task.triangle.place((0.4, -0.05, 0.075), 0.3)
+    cubes_of(task)[0].place((0.4, -0.05, 0.025), 0.3)
+    cubes_of(task)[1].place((0.52, 0.05, 0.025), 0.0)
+    triangle_of(task).place((0.4, -0.05, 0.075), 0.3)
     env.scene.world.settle()
     assert follow(env)["success"]
 
@@ -234,13 +248,13 @@ def test_expert_lets_go_of_what_is_needed_later(make):
     env = make(HOUSE)
     scene = env.scene
     task = scene.task
-    block = task.blocks[0]
+    block = cubes_of(task)[0]
     block.place((0.45, 0.0, 0.025))
-    task.triangle.place((0.35, 0.1, 0.025))
-    scene.motion.reset(((0.45, 0.0, 0.1), 0.0))
-    scene.motion.move_to((0.45, 0.0, 0.025), 0.0)
-    scene.motion.grip(0.0)
-    scene.motion.move_to((0.45, 0.0, 0.1), 0.0)
+    triangle_of(task).place((0.35, 0.1, 0.025))
+    scene.controller.reset(((0.45, 0.0, 0.1), 0.0))
+    scene.controller.move_to((0.45, 0.0, 0.025), 0.0)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.1), 0.0)
     assert scene.robot.held_body() is block
     state = None
     while state is None or not state["done"]:
@@ -285,11 +299,11 @@ def test_fingers_close_on_sides_of_a_cylinder_at_every_grasp_yaw(cylinders):
 
 
 def test_a_stack_of_cylinders_is_the_goal_whichever_end_is_up(cylinders):
-    assert cylinders.is_goal()
+    assert cylinders.is_success()
     top = cylinders.objects[-1]
     top.move_to(top.position, (1.0, 0.0, 0.0, 0.0))
     cylinders.world.settle()
-    assert cylinders.is_goal()
+    assert cylinders.is_success()
     assert cylinders.is_valid()
 
 
@@ -297,14 +311,14 @@ def test_a_stack_of_cylinders_is_the_goal_whichever_end_is_up(cylinders):
 def test_a_cylinder_beside_the_stack_does_not_count(cylinders, place):
     cylinders.objects[-1].place(place)
     cylinders.world.settle()
-    assert not cylinders.is_goal()
+    assert not cylinders.is_success()
     assert cylinders.is_valid()
 
 
 def test_a_cylinder_over_the_edge_falls_and_ends_the_episode(cylinders):
     cylinders.objects[-1].place((0.45, 0.018, 0.1055))
     cylinders.world.settle()
-    assert not cylinders.is_goal()
+    assert not cylinders.is_success()
     assert not cylinders.is_valid()
 
 
@@ -313,7 +327,7 @@ def test_a_cylinder_on_its_side_ends_the_episode_on_top_or_on_the_floor(cylinder
         on_its_side(cylinders.objects[-1], position)
         cylinders.world.step(2)
         assert cylinders.objects[-1].position[2] == pytest.approx(position[2], abs=1e-3)
-        assert not cylinders.is_goal()
+        assert not cylinders.is_success()
         assert not cylinders.is_valid()
 
 

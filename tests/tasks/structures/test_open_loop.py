@@ -66,10 +66,10 @@ class House:
     def top(self):
         return max(self.task.objects, key=lambda body: body.position[2])
 
-    def is_goal(self):
+    def is_success(self):
         self.world.step(2)
         self.world.settle()
-        return self.task.is_goal()
+        return self.task.is_success()
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def house():
 @pytest.mark.parametrize("name", HOUSES)
 def test_the_finished_structure_is_the_goal(house, name):
     h = house(name)
-    assert h.is_goal()
+    assert h.is_success()
     assert h.task.is_valid()
 
 
@@ -97,7 +97,7 @@ def test_a_top_piece_beside_the_rest_does_not_count(house, name):
     h = house(name)
     low = h.top.shape.bounds_m[0][2]
     h.top.place((X + 0.12, Y, -low))
-    assert not h.is_goal()
+    assert not h.is_success()
     assert h.task.is_valid()
 
 
@@ -111,7 +111,7 @@ def test_a_block_that_only_leans_against_the_stack_does_not_count(house, name):
     if name == "house_building_1":
         h.put(h.named["triangle 1"], 0.0, len(others) + 1)
     h.world.settle()
-    assert not h.is_goal()
+    assert not h.is_success()
     assert lowest.position[2] == pytest.approx(B / 2, abs=1e-3)
 
 
@@ -123,7 +123,7 @@ def test_a_tipped_roof_ends_the_episode_and_does_not_count(house, name, kind):
     h = house(name)
     turn = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
     h.named[kind].move_to((X + 0.13, Y, 0.02), turn)
-    assert not h.is_goal()
+    assert not h.is_success()
     assert not h.task.is_valid()
 
 
@@ -140,7 +140,7 @@ def test_a_roof_that_misses_a_support_does_not_count(house, name):
         side = math.copysign(1.0, other.position[1] - Y)
         other.place((X, Y + side * 0.14, B / 2))
         roof.place((x, y - side * APART, z))
-    assert not h.is_goal()
+    assert not h.is_success()
     assert roof.tilt_rad < 0.1
     assert roof.position[2] == pytest.approx(z, abs=2e-3)
 
@@ -153,7 +153,7 @@ def test_a_storey_may_not_be_missing(house, name):
         cube.place((X + 0.1 * (1 if cube is h.cubes[2] else -1), Y, B / 2))
     cuboid.place((X + 0.15, Y, B / 2))
     h.put(roof, 0.0, 1)
-    assert not h.is_goal()
+    assert not h.is_success()
 
 
 @pytest.mark.parametrize("name", [*HOUSES, *IMPROVISED])
@@ -213,7 +213,7 @@ def test_a_restored_state_brings_its_shapes_back():
     scene = env.scene
     first, state = list(scene.task.objects), scene.get_state()
     poses = [body.pose for body in first]
-    scene.task.randomise(np.random.default_rng(5))
+    scene.task.initialize_episode(np.random.default_rng(5))
     assert list(scene.task.objects) != first
     scene.set_state(state)
     assert list(scene.task.objects) == first
@@ -234,7 +234,7 @@ def test_an_improvised_roof_on_one_shape_does_not_count():
     world.step(2)
     world.settle()
     assert roof.touches(first)
-    assert not task.is_goal()
+    assert not task.is_success()
     env.close()
 
 

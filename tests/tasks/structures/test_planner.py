@@ -25,7 +25,7 @@ from ba_torchrl.tasks.structures.planner import StructurePlanner
 
 B = 0.03
 SPAN = Span(1.5 * B, 1.75 * B, 2.2 * B)
-AREA = PlacementArea((0.3, 0.6), (-0.15, 0.15), gap_m=B)
+AREA = PlacementArea((0.3, 0.6), (-0.15, 0.15), gap_m=B, height_m=lambda xy: 0.0)
 
 SHAPES = {
     "cube": Box(size_m=(B, B, B)),
@@ -61,10 +61,12 @@ class Scene:
     def __init__(self, world, blueprint, **spare):
         self.world = world
         self.bodies = {}
-        for kind in {slot.piece.kind for slot in blueprint.slots}:
+        for kind in dict.fromkeys(slot.piece.kind for slot in blueprint.slots):
             count = sum(slot.piece.kind == kind for slot in blueprint.slots) + spare.get(kind, 0)
             self.bodies[kind] = [world.add(SHAPES[kind], f"{kind} {i}") for i in range(count)]
-        self.planner = StructurePlanner(blueprint, world, self.bodies, B)
+        kinds = {slot.piece.kind: slot.piece for slot in blueprint.slots}
+        pieces = {body: kinds[kind] for kind, bodies in self.bodies.items() for body in bodies}
+        self.planner = StructurePlanner(blueprint, world, pieces, B)
         self.cubes = self.bodies.get("cube", [])
         self.scatter(np.random.default_rng(0))
 
@@ -150,7 +152,7 @@ def test_a_building_needs_enough_bodies():
     with World() as world:
         cube = world.add(SHAPES["cube"], "cube")
         with pytest.raises(ValueError, match="needs 2 of 'cube'"):
-            StructurePlanner(tower(CUBE, CUBE), world, {"cube": [cube]}, B)
+            StructurePlanner(tower(CUBE, CUBE), world, {cube: CUBE}, B)
 
 
 # -- pieces ------------------------------------------------------------------------------------
@@ -492,8 +494,9 @@ def test_a_structure_may_have_to_stand_on_something_else_than_the_floor():
         platform = world.add(Box(size_m=(0.2, 0.2, 0.02), mass_kg=0.0), "platform")
         platform.place((0.45, 0.0, 0.01))
         cubes = [world.add(SHAPES["cube"], f"cube {i}") for i in range(2)]
+        pieces = dict.fromkeys(cubes, CUBE)
         planner = StructurePlanner(
-            tower(CUBE, CUBE), world, {"cube": cubes}, B, ground=[platform.id]
+            tower(CUBE, CUBE), world, pieces, B, support_ids=frozenset({platform.id})
         )
         for base, expected in ((0.0, False), (0.02, True)):
             x = 0.45 if base else 0.7

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 REACH, PICK = "close_loop/block_reaching", "close_loop/block_picking"
 PLACE = "open_loop/block_stacking"
 PRESETS = {
-    ("algorithm", "sac"): {"name": "sac", "demonstration_weight": 0.0, "prioritized": False},
+    ("algorithm", "sac"): {"name": "sac", "demonstration_weight": 0.0, "replay": "uniform"},
     ("algorithm", "sacfd"): {"name": "sac", "demonstration_weight": 1.0},
     ("network", "cnn"): {"name": "cnn"},
     ("network", "small"): {"name": "cnn", "width": 0.25},
@@ -83,7 +83,7 @@ def test_a_grid_is_the_product_of_its_axes_seed_by_seed(tmp_path):
     first = runs[0]
     assert (first.task, first.label, first.seed) == (REACH, "sac cnn", 0)
     assert (first.benchmark, first.resume, first.total_updates) == ("little", True, 6)
-    assert first.algorithm_config.prioritized is False
+    assert first.algorithm_config.replay == "uniform"
     assert first.algorithm_config.batch_size == 8
     assert first.run_dir.endswith("grid/close_loop_block_reaching/sac_cnn/seed0")
     assert [run.seed for run in planned(tmp_path, seeds=[7, 3])] == [7, 3]
@@ -202,7 +202,7 @@ def test_close_loop_benchmarks_are_the_papers(name, actions, turned):
         assert (algorithm.learning_rate, algorithm.gamma) == (1e-3, 0.99)
         assert (algorithm.batch_size, algorithm.buffer_size) == (64, 100_000)
         assert (algorithm.alpha_init, algorithm.target_entropy) == (0.01, -5.0)
-        assert algorithm.prioritized is run.label.startswith("sacfd")
+        assert (algorithm.replay == "prioritized") is run.label.startswith("sacfd")
     first = next(run for run in runs if run.label == "sacfd equi").algorithm_config
     assert (first.priority_exponent, first.importance_exponent, first.expert_bonus) == (
         0.6,

@@ -1,0 +1,138 @@
+"""Structure: the pieces of a blueprint as bodies of a world.
+
+A world takes no new bodies once it is sealed. A kind of piece whose shape varies between episodes
+is therefore loaded in all its variants, and every episode activates as many as there are slots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ba_torchrl.sim.bodies import Body, radius_m
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
+from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.workspace import Spot
+
+
+class _Variants(NamedTuple):
+    """The variants of one kind of piece."""
+
+    pieces: tuple[Piece, ...]
+    count: int
+    """Number of slots to fill."""
+    first: int
+    """Index of the first variant in the pool."""
+
+
+class Structure:
+    """The pieces of a blueprint in a world.
+
+    Args:
+        blueprint: the structure; its pieces have shapes or variants.
+        world: not sealed yet.
+        block_m: edge of a block, metres.
+        support_ids: PyBullet ids of what the lowest pieces stand on.
+        largest_first: order in which pieces are placed at random: those that need most space first,
+            or from the bottom slot up.
+    """
+
+    def __init__(
+        self,
+        blueprint: Blueprint,
+        world: World,
+        block_m: float,
+        support_ids: frozenset[int],
+        *,
+        largest_first: bool = True,
+    ) -> None:
+        self.blueprint = blueprint
+        self.world = world
+        self.block_m = block_m
+        self.support_ids = support_ids
+        pieces = [slot.piece for slot in blueprint.slots]
+        if largest_first:
+            pieces.reverse()
+            pieces.sort(key=_needed_distance_m, reverse=True)
+        self._fixed: dict[Body, Piece] = {}
+        numbers: dict[str, int] = {}
+        for piece in pieces:
+            if not piece.variants:
+                numbers[piece.kind] = numbers.get(piece.kind, 0) + 1
+                body = world.add(piece.shape, f"{piece.kind} {numbers[piece.kind]}")
+                self._fixed[body] = piece
+        self._variants: list[_Variants] = []
+        variants: list[Piece] = []
+        for piece in dict.fromkeys(slot.piece for slot in blueprint.slots):
+            if piece.variants:
+                count = sum(slot.piece == piece for slot in blueprint.slots)
+                self._variants.append(_Variants(piece.variants, count, len(variants)))
+                variants += piece.variants
+        self._pool = BodyPool(
+            world,
+            [piece.shape for piece in variants],
+            [f"{piece.kind} variant {i + 1}" for i, piece in enumerate(variants)],
+        )
+        self._pool_pieces = variants
+        self._activate([kind.first + i for kind in self._variants for i in range(kind.count)])
+
+    def draw(self, rng: np.random.Generator) -> None:
+        """Choose the variants of an episode."""
+        chosen: list[int] = []
+        for pieces, count, first in self._variants:
+            if count == 1:
+                chosen.append(first + int(rng.integers(len(pieces))))
+            else:
+                drawn = rng.choice(len(pieces), size=count, replace=False)
+                chosen += (first + drawn).tolist()
+        self._activate(chosen)
+
+    def spots(self, gap_m: float) -> list[Spot]:
+        """Return the space that each piece needs at the start of an episode.
+
+        Args:
+            gap_m: least distance between the circles around two pieces, which may lie end to end.
+        """
+        spots, largest_radius_m = [], 0.0
+        for body, piece in self.pieces.items():
+            radius = radius_m(body)
+            padding_m, distance_m = (2 * radius, 0.0) if piece.spot is None else piece.spot
+            spots.append(Spot(padding_m, max(distance_m, radius + largest_radius_m + gap_m)))
+            largest_radius_m = max(largest_radius_m, radius)
+        return spots
+
+    def get_state(self) -> tuple[int, ...]:
+        """Return the active variants."""
+        return self._pool.get_state()
+
+    def set_state(self, state: tuple[int, ...]) -> None:
+        """Restore a state of `get_state`; the world restores poses and visibility."""
+        self._pool.set_state(state)
+        self._update()
+
+    def _activate(self, indices: Sequence[int]) -> None:
+        """Bring these variants into the scene, and no others."""
+        if self._pool.bodies:
+            self._pool.clear()
+        for index in indices:
+            self._pool.activate(self._pool.bodies[index])
+        self._update()
+
+    def _update(self) -> None:
+        """Plan for the bodies that are in the scene."""
+        drawn = {
+            body: self._pool_pieces[self._pool.bodies.index(body)] for body in self._pool.present
+        }
+        self.pieces: dict[Body, Piece] = {**self._fixed, **drawn}
+        """The bodies in the scene, in the order in which they are placed."""
+        self.planner = StructurePlanner(
+            self.blueprint, self.world, self.pieces, self.block_m, self.support_ids
+        )
+
+
+def _needed_distance_m(piece: Piece) -> float:
+    return 0.0 if piece.spot is None else piece.spot.distance_m

@@ -1,0 +1,169 @@
+"""Rotations, poses and frames, against SciPy's rotations and homogeneous matrices."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import ba_torchrl
+from ba_torchrl.sim.geometry import (
+    IDENTITY,
+    PlanarFrame,
+    Pose,
+    bullet_compose,
+    bullet_inverse,
+    cross,
+    dot,
+    downward,
+    downward_quaternion,
+    euler_matrix,
+    perpendicular,
+    quaternion_matrix,
+    quaternion_product,
+    quaternion_tilt,
+    quaternion_yaw,
+    rotation_array,
+    tool_angles,
+    tool_rotation,
+    yaw_quaternion,
+)
+
+ANGLES = [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (1.0, -0.2, 0.5), (3.0, 1.2, -2.8), (0.0, 0.0, 0.0)]
+FLIP = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+
+
+@pytest.fixture(params=range(5))
+def rng(request):
+    return np.random.default_rng(request.param)
+
+
+def random_pose(rng):
+    turn = Rotation.random(random_state=int(rng.integers(2**31)))
+    return Pose(tuple(rng.normal(size=3).tolist()), tuple(turn.as_quat().tolist()))
+
+
+def homogeneous(pose):
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(pose.orientation).as_matrix()
+    matrix[:3, 3] = pose.position
+    return matrix
+
+
+def is_same(pose, matrix):
+    np.testing.assert_allclose(homogeneous(pose), matrix, atol=1e-12)
+
+
+@pytest.mark.parametrize("angles", ANGLES)
+def test_matrices_of_angles_and_quaternions(angles):
+    turn = Rotation.from_euler("ZYX", angles)
+    quaternion = tuple(turn.as_quat())
+    np.testing.assert_allclose(euler_matrix(*angles), turn.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(quaternion_matrix(quaternion), turn.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotation_array(quaternion), turn.as_matrix(), atol=1e-12)
+    x_axis, _, z_axis = turn.as_matrix().T
+    assert quaternion_yaw(quaternion) == pytest.approx(math.atan2(x_axis[1], x_axis[0]))
+    assert quaternion_tilt(quaternion) == pytest.approx(math.acos(z_axis[2]), abs=1e-7)
+
+
+def test_quaternions_multiply(rng):
+    first, second = (Rotation.from_quat(random_pose(rng).orientation) for _ in range(2))
+    product = quaternion_product(tuple(first.as_quat()), tuple(second.as_quat()))
+    np.testing.assert_allclose(rotation_array(product), (first * second).as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("angles", ANGLES)
+def test_a_tool_points_down_at_zero_angles(angles):
+    tool = Rotation.from_euler("ZYX", angles) * FLIP
+    np.testing.assert_allclose(tool_rotation(*angles), tool.as_matrix(), atol=1e-12)
+    assert tool_angles(tuple(tool.as_quat())) == pytest.approx(angles, abs=1e-9)
+
+
+def test_a_tool_without_tilt():
+    down = Rotation.from_euler("z", 2.2) * FLIP
+    np.testing.assert_allclose(downward(2.2), down.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(tool_rotation(2.2), down.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        quaternion_matrix(downward_quaternion(2.2)), down.as_matrix(), atol=1e-12
+    )
+
+
+def test_a_turn_about_the_vertical():
+    assert yaw_quaternion(0.8) == pytest.approx(Rotation.from_euler("z", 0.8).as_quat())
+    assert quaternion_yaw(yaw_quaternion(-2.9)) == pytest.approx(-2.9)
+
+
+def test_poses_compose_and_invert(rng):
+    outer, inner = random_pose(rng), random_pose(rng)
+    is_same(outer.compose(inner), homogeneous(outer) @ homogeneous(inner))
+    is_same(outer.inverse(), np.linalg.inv(homogeneous(outer)))
+    is_same(outer.compose(outer.inverse()), np.eye(4))
+    is_same(Pose((1.0, 2.0, 3.0)).compose(outer), homogeneous(outer) + _shift(1.0, 2.0, 3.0))
+    assert Pose((0.0, 0.0, 0.0)).orientation == IDENTITY
+
+
+def test_pybullet_composes_and_inverts_in_single_precision(rng):
+    outer, inner = random_pose(rng), random_pose(rng)
+    np.testing.assert_allclose(
+        homogeneous(bullet_compose(outer, inner)),
+        homogeneous(outer) @ homogeneous(inner),
+        atol=2e-6,
+    )
+    np.testing.assert_allclose(
+        homogeneous(bullet_inverse(outer)), np.linalg.inv(homogeneous(outer)), atol=2e-6
+    )
+
+
+def _shift(x, y, z):
+    shift = np.zeros((4, 4))
+    shift[:3, 3] = x, y, z
+    return shift
+
+
+def test_a_pose_applies_to_points_and_directions(rng):
+    pose, points = random_pose(rng), rng.normal(size=(4, 2, 3))
+    matrix = homogeneous(pose)
+    expected = np.einsum("ij,abj->abi", matrix[:3, :3], points)
+    np.testing.assert_allclose(pose.rotate(points), expected, atol=1e-12)
+    np.testing.assert_allclose(pose.apply(points), expected + matrix[:3, 3], atol=1e-12)
+
+
+def test_a_pose_moves_and_turns_about_the_vertical(rng):
+    pose = random_pose(rng)
+    moved = pose.moved_to((0.1, 0.2, 0.3), 0.7)
+    turn = Rotation.from_euler("z", 0.7) * Rotation.from_quat(pose.orientation)
+    assert moved.position == (0.1, 0.2, 0.3)
+    np.testing.assert_allclose(rotation_array(moved.orientation), turn.as_matrix(), atol=1e-12)
+    assert pose.moved_to((0.1, 0.2, 0.3)).orientation == pose.orientation
+    x_axis = turn.as_matrix()[:, 0]
+    assert moved.yaw_rad == pytest.approx(math.atan2(x_axis[1], x_axis[0]))
+
+
+def test_frames_of_the_plane(rng):
+    x, y, yaw, px, py = rng.normal(size=5).tolist()
+    frame = PlanarFrame(x, y, yaw)
+    expected = complex(x, y) + complex(px, py) * complex(math.cos(yaw), math.sin(yaw))
+    assert frame.to_world(px, py) == pytest.approx((expected.real, expected.imag))
+    assert frame.to_local(expected.real, expected.imag) == pytest.approx((px, py))
+    many = np.array([px, 0.0]), np.array([py, 0.0])
+    np.testing.assert_allclose(frame.to_world(*many), [(expected.real, x), (expected.imag, y)])
+
+
+def test_vectors():
+    a, b = (0.3, -1.0, 2.0), (1.5, 0.2, -0.4)
+    assert dot(a, b) == pytest.approx(np.dot(a, b))
+    assert cross(a, b) == pytest.approx(np.cross(a, b))
+    across = perpendicular(a, (0.0, 0.0, 1.0))
+    assert across == pytest.approx((0.3 / math.hypot(0.3, 1.0), -1.0 / math.hypot(0.3, 1.0), 0.0))
+    assert perpendicular((0.0, 0.0, 2.0), (0.0, 0.0, 1.0)) == (0.0, 0.0, 0.0)
+
+
+TRANSFORMS = r"getMatrixFrom|multiplyTransforms|invertTransform|getQuaternionFrom|getEuler"
+
+
+def test_no_other_file_of_the_package_does_this_algebra():
+    files = sorted(Path(ba_torchrl.__file__).parent.rglob("*.py"))
+    found = {path.name for path in files if re.search(TRANSFORMS, path.read_text("utf-8"))}
+    assert found == {"geometry.py"}

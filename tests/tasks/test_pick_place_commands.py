@@ -1,0 +1,87 @@
+"""Commands from poses, against homogeneous matrices."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ba_torchrl.actions import PICK, PLACE
+from ba_torchrl.sim.geometry import Pose, downward_pose
+from ba_torchrl.tasks.pick_place_commands import (
+    LEVEL_RAD,
+    carrying_pose,
+    no_op,
+    pick_command,
+    place_command,
+)
+from ba_torchrl.tasks.workspace import Workspace
+
+FLIP = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+"""Of a tool that points down."""
+
+
+def pose_of(position, rz, ry=0.0, rx=0.0, flip=False):
+    turn = Rotation.from_euler("ZYX", (rz, ry, rx))
+    return Pose(position, tuple((turn * FLIP if flip else turn).as_quat().tolist()))
+
+
+def matrix_of(pose):
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(pose.orientation).as_matrix()
+    matrix[:3, 3] = pose.position
+    return matrix
+
+
+@pytest.mark.parametrize("angles", [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (3.0, -0.1, 0.2)])
+def test_a_pick_is_the_pose_of_the_tool(angles):
+    command = pick_command(pose_of((0.4, 0.1, 0.05), *angles, flip=True))
+    assert command.primitive == PICK
+    assert command[1:4] == (0.4, 0.1, 0.05)
+    assert command.angles_rad == pytest.approx(angles)
+    assert pick_command(downward_pose((0.4, 0.1, 0.05), 1.3)).angles_rad == pytest.approx(
+        (1.3, 0.0, 0.0)
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_held_moves_rigidly_with_the_tool(seed):
+    rng = np.random.default_rng(seed)
+    tool = pose_of(tuple(rng.normal(size=3)), *rng.uniform(-1, 1, 3), flip=True)
+    held, target = (pose_of(tuple(rng.normal(size=3)), *rng.uniform(-1, 1, 3)) for _ in range(2))
+    goal = carrying_pose(tool, held, target)
+    in_tool = np.linalg.inv(matrix_of(tool)) @ matrix_of(held)
+    np.testing.assert_allclose(matrix_of(goal) @ in_tool, matrix_of(target), atol=1e-12)
+
+
+def test_a_place_on_a_slope_tilts_the_tool():
+    tool = pose_of((0.5, 0.0, 0.3), 0.4, flip=True)
+    held = Pose((0.5, 0.01, 0.28), pose_of((0, 0, 0), 0.4).orientation)
+    slope = pose_of((0.4, 0.1, 0.06), 1.0, 0.0, 0.2)
+    command = place_command(tool, held, slope)
+    assert command.primitive == PLACE
+    assert command.angles_rad == pytest.approx((1.0, 0.0, 0.2))
+    placed = pose_of(command[1:4], *command.angles_rad, flip=True)
+    in_tool = np.linalg.inv(matrix_of(tool)) @ matrix_of(held)
+    np.testing.assert_allclose(matrix_of(placed) @ in_tool, matrix_of(slope), atol=1e-12)
+
+
+def test_a_turn_about_the_vertical_swings_what_is_held_about_the_tool():
+    tool, held = downward_pose((0.5, 0.0, 0.3), 0.2), Pose((0.53, 0.0, 0.28))
+    command = place_command(tool, held, held.moved_to((0.4, 0.1, 0.02), math.pi / 2))
+    # 3 cm ahead of the tool along x, it comes to be 3 cm ahead along y
+    assert command[1:4] == pytest.approx((0.4, 0.07, 0.04))
+    assert command.rz_rad == pytest.approx(0.2 + math.pi / 2)
+
+
+def test_a_small_lean_and_rounding_are_dropped():
+    leaning = pose_of((0.4, 0.0, 0.1), -1e-12, 0.9 * LEVEL_RAD, -0.9 * LEVEL_RAD, flip=True)
+    assert pick_command(leaning).angles_rad == (0.0, 0.0, 0.0)
+    leaning = pose_of((0.4, 0.0, 0.1), -1e-3, 1.1 * LEVEL_RAD, 0.0, flip=True)
+    assert pick_command(leaning).angles_rad == pytest.approx((-1e-3, 1.1 * LEVEL_RAD, 0.0))
+
+
+def test_nothing_is_left_to_do():
+    workspace = Workspace(x=(0.2, 0.6), y=(-0.3, 0.1), z=(0.0, 0.4))
+    assert no_op(workspace, is_holding=False)[:3] == (PICK, 0.2, -0.3)
+    assert no_op(workspace, is_holding=True)[:3] == (PLACE, 0.2, -0.3)
