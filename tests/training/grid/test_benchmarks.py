@@ -69,7 +69,7 @@ def test_close_loop_benchmarks_have_the_values_of_the_paper(name, actions, turne
     [
         ("networks=[fcn,asr]", "sdqfd asr: .*no rz"),
         ("env.obs_size=90", "multiple of 16"),
-        ("algorithm.augmentation=d4", "no yaw to turn"),
+        ("algorithm.augmentation=d4", "no yaw to rotate"),
     ],
 )
 def test_networks_for_other_actions_or_images_are_refused(override, message):
