@@ -1,4 +1,4 @@
-"""Collect demonstrations from a task's expert, or by taking structures apart, and save them.
+"""Collect demonstrations from a task's expert or by deconstruction of structures, and save them.
 
 python recipes/collect_demos.py task=close_loop/block_picking episodes=100 path=demos/picking
 python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction
@@ -26,7 +26,7 @@ hydra_schema.register(sys.argv[1:])
 
 @hydra.main(config_path="../configs", config_name="collect_demos", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Let the expert play, and write the episodes as a memory-mapped TensorDict."""
+    """Play the expert's episodes and write them as a memory-mapped TensorDict."""
     limit_library_logs()
     load_plugins(settings.plugins)
     if Path(settings.path).exists():

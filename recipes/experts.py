@@ -1,4 +1,4 @@
-"""Measure the experts: success and length over random episodes, as a table in Markdown.
+"""Measure the experts: success rate and length of random episodes, as a table in Markdown.
 
 python recipes/experts.py                                 # every task, kuka, with and without yaw
 python recipes/experts.py robots=[panda,ur5] episodes=50 tasks=[close_loop/block_picking]

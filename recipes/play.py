@@ -1,4 +1,4 @@
-"""Watch a task: the expert, or random actions, in a video or in a window.
+"""Show a task: the expert or random actions, in a video or in a window.
 
 python recipes/play.py task=open_loop/covid_test video=covid_test.mp4
 python recipes/play.py task=close_loop/block_pushing policy=random episodes=3

@@ -3,6 +3,7 @@
 python recipes/train.py task=close_loop/block_picking algorithm=sacfd network=equi seed=0
 python recipes/train.py --config-name quickstart
 python recipes/train.py task=close_loop/block_picking run_dir=runs/mine resume=true
+python recipes/train.py plugins=[my_tasks] task=mine/push_far
 """
 
 from ba_torchrl._malloc import tune_malloc
@@ -24,7 +25,7 @@ hydra_schema.register(sys.argv[1:])
 
 @hydra.main(config_path="../configs", config_name="train", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Run the experiment that the configuration describes, or go on with it."""
+    """Run or resume the experiment of the configuration."""
     limit_library_logs()
     config = ExperimentConfig.parse(OmegaConf.to_container(settings, resolve=True))
     result = Experiment(config).run()

@@ -54,7 +54,7 @@ class CurvePoint(StrictModel):
     env_steps: int
     """Steps of all environments so far, demonstrations not counted."""
     seconds: float
-    """Since the run began, time between an interruption and its resumption not counted."""
+    """Since the start of the run, without the time between an interruption and its resumption."""
     episodes: int
     success_rate: float
     standard_error: float
@@ -64,11 +64,11 @@ class CurvePoint(StrictModel):
 
 
 class FinalEvaluation(StrictModel):
-    """The evaluation that is reported, on episodes that chose nothing."""
+    """The reported evaluation, on episodes that did not select the checkpoint."""
 
     policy: Literal["last", "best"]
     updates: int
-    """Age of the policy."""
+    """Updates of the evaluated policy."""
     episodes: int
     success_rate: float
     standard_error: float
@@ -76,7 +76,7 @@ class FinalEvaluation(StrictModel):
 
 
 class RunResult(StrictModel):
-    """Everything a report needs to know about a run."""
+    """Results and settings of a run, from which reports are made."""
 
     format: Literal[1] = 1
     task: str
@@ -95,9 +95,9 @@ class RunResult(StrictModel):
     hardware: dict[str, Any]
     """`cpu`, `cores`, `memory_gb`, `gpu` (None on the CPU) and the learner's `threads`."""
     seconds: float
-    """Wall time of the run, time between an interruption and its resumption not counted."""
+    """Wall time of the run, without the time between an interruption and its resumption."""
     resumed_at: list[int] = Field(default_factory=list)
-    """Updates after which the run went on from where it had been interrupted."""
+    """Updates after which the run was resumed."""
     finished: str
     """When, UTC, ISO 8601."""
     files: dict[str, str]
@@ -105,7 +105,7 @@ class RunResult(StrictModel):
 
 
 def write_result(folder: str | Path, result: RunResult) -> Path:
-    """Write ``result.json`` into a run folder, whole or not at all."""
+    """Write ``result.json`` into a run folder; the file appears when it is complete."""
     path = Path(folder) / RESULT_FILE
     scratch = path.with_suffix(".tmp")
     scratch.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -118,13 +118,13 @@ def read_result(folder: str | Path) -> RunResult:
 
     Raises:
         FileNotFoundError: the run is not finished.
-        ValueError: the file is something else.
+        ValueError: the file is not the result of a run.
     """
     path = Path(folder) / RESULT_FILE
     try:
         return RunResult.model_validate_json(path.read_text(encoding="utf-8"))
     except ValidationError as error:
-        raise ValueError(f"{path} is no result of a run: {error}") from None
+        raise ValueError(f"{path} is not the result of a run: {error}") from None
 
 
 def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
@@ -161,17 +161,17 @@ def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def differences(
     first: Mapping[str, Any],
     second: Mapping[str, Any],
-    besides: Collection[str] = NON_LEARNING_FIELDS,
+    ignored: Collection[str] = NON_LEARNING_FIELDS,
 ) -> dict[str, tuple[Any, Any]]:
     """Return the settings in which two runs' configurations differ, and both values.
 
     Args:
         first: a configuration with every default filled in.
         second: another.
-        besides: fields that may differ.
+        ignored: fields that may differ.
     """
     a, b = (
-        flat({key: value for key, value in config.items() if key not in besides})
+        flat({key: value for key, value in config.items() if key not in ignored})
         for config in (first, second)
     )
     return {
@@ -182,7 +182,7 @@ def differences(
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that shape results."""
+    """Return the versions of Python and of the packages that affect results."""
     found = {"python": platform.python_version(), "ba_torchrl": __version__}
     for name in PACKAGES:
         try:
@@ -193,10 +193,10 @@ def versions() -> dict[str, str]:
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
-    """Return what a run is computed on.
+    """Return the hardware that a run is computed on.
 
     Args:
-        device: the learner's.
+        device: of the learner.
     """
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     return {

@@ -62,21 +62,21 @@ class ExperimentConfig(StrictModel):
     threads: int | None = Field(default=None, ge=1)
     """torch threads of the learner; None leaves torch's choice."""
     num_envs: int = Field(default=5, ge=1)
-    """Environments that collect side by side."""
+    """Number of environments that step together."""
     parallel: bool = True
     """One process per environment, or all in the learner's process."""
     start_method: Literal["spawn", "fork"] = "spawn"
-    """How those processes start."""
+    """How these processes start."""
     demonstrations: int = Field(default=100, ge=0)
-    """Expert episodes that are played for the replay, before the start."""
+    """Expert episodes in the replay before the first update."""
     demonstrations_source: Source = "expert"
-    """Where they come from: "expert", or "deconstruction" of structures, reversed in time."""
+    """Their source: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
-    """Leave out those that failed; so that there are fewer, where the expert is not perfect."""
+    """Leave out failed episodes; fewer remain where the expert fails."""
     demonstrations_path: str | None = None
     """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
     pretrain_updates: int = Field(default=0, ge=0)
-    """Updates on the demonstrations alone, before the first step."""
+    """Updates on the demonstrations before the first environment step."""
     total_updates: int = Field(default=10_000, ge=1)
     """Gradient updates of the run, pretraining included."""
     updates_per_step: int = Field(default=1, ge=1)
@@ -84,27 +84,27 @@ class ExperimentConfig(StrictModel):
     min_replay: int = Field(default=100, ge=1)
     """Transitions in the replay before the first update."""
     eval_every: int = Field(default=500, ge=1)
-    """Updates between evaluations of the greedy policy; each is followed by a checkpoint, of
-    which the best and the newest are kept."""
+    """Updates between evaluations of the greedy policy; a checkpoint follows each, and the best and
+    the latest ones are kept."""
     eval_episodes: int = Field(default=100, ge=1)
-    """Episodes of each of them."""
+    """Episodes of each of these evaluations."""
     final_eval_episodes: int = Field(default=100, ge=1)
-    """Episodes of the last evaluation, the one that is reported."""
+    """Episodes of the last evaluation, which is reported."""
     report: Literal["last", "best"] = "last"
-    """Which policy the last evaluation is of: the run's last, or that of the checkpoint with the
-    best evaluation. Its episodes are others than those that chose the checkpoint."""
+    """The reported policy: the last one, or that of the checkpoint with the best evaluation. The
+    episodes of its evaluation differ from those that selected the checkpoint."""
     log_every: int = Field(default=50, ge=1)
     """Updates between rows of the losses."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"
-    """Where scalars go, besides the run folder's CSV."""
+    """Logger of scalars in addition to the run folder's CSV file."""
     video_episodes: int = Field(default=3, ge=0)
     """Greedy episodes in the video at the end."""
     label: str = "run"
     """Name of the curve in plots, such as "sacfd equi"."""
     run_dir: str = "runs/run"
-    """Folder of everything the run writes."""
+    """Folder of the run's files."""
     resume: bool = False
-    """Go on with the run in that folder if it was interrupted."""
+    """Continue the run in that folder if it was interrupted."""
     benchmark: str | None = None
     """Name of the benchmark that the run belongs to, for reports."""
 
@@ -127,8 +127,8 @@ class ExperimentConfig(StrictModel):
         """Return the first seed of the environments that serve ``use``.
 
         Args:
-            use: what for.
-            part: another number gives others, as a resumed run needs.
+            use: what the environments serve.
+            part: number of a further set of episodes for the same use, after a resumption.
         """
         return int(np.random.SeedSequence([self.seed, use, part]).generate_state(1)[0])
 

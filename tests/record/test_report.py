@@ -144,10 +144,10 @@ def test_benchmarks_are_reported_apart_and_loose_runs_last(tmp_path):
     assert [section.title for section in sections] == ["close_loop_3d", "close_loop_4d", "runs"]
 
 
-def test_the_same_run_twice_is_refused(tmp_path):
+def test_two_runs_of_one_seed_are_refused(tmp_path):
     for name in ("a", "b"):
         leave_run(tmp_path / name, (0, 0, 1))
-    with pytest.raises(ValueError, match=r"twice: .*/a, .*/b"):
+    with pytest.raises(ValueError, match=r"settings and seed: .*/a, .*/b"):
         load_sections([tmp_path])
 
 

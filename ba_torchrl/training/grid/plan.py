@@ -52,21 +52,21 @@ class BenchmarkConfig(StrictModel):
     networks: list[str] = Field(min_length=1)
     """Names of preset files in ``configs/network``."""
     seeds: int | list[int] = 4
-    """How many, from 0 on, or which."""
+    """A number of seeds, from 0 on, or a list of seeds."""
     skip: list[dict[str, str | list[str]]] = Field(default_factory=list)
-    """What to leave out of the grid: each entry names a ``task``, an ``algorithm``, a ``network``
-    or several of these, one or a list of each; runs that match all it names are left out."""
+    """Runs to leave out: each entry gives a name or a list of names for ``task``, ``algorithm``,
+    ``network`` or several of these; runs that match all of them are left out."""
     per_task: Overrides = Field(default_factory=dict)
-    """By task, what differs from the fields common to all runs."""
+    """By task, fields that override those common to all runs."""
     per_algorithm: Overrides = Field(default_factory=dict)
-    """By algorithm; wins over `per_task`."""
+    """By algorithm; overrides `per_task`."""
     per_network: Overrides = Field(default_factory=dict)
-    """By network; wins over `per_algorithm`."""
+    """By network; overrides `per_algorithm`."""
     jobs: int = Field(default=1, ge=1)
     """Runs at the same time."""
     max_hours: float | None = Field(default=None, gt=0)
-    """Time limit of a run; one that takes longer is stopped, counts as failed, and is resumed by
-    the next call."""
+    """Time limit of a run. A run that exceeds it is stopped and counts as failed; the next call
+    resumes it."""
 
     def seed_list(self) -> list[int]:
         """Return the seeds of the grid."""
@@ -88,7 +88,7 @@ class BenchmarkConfig(StrictModel):
 
 @dataclass(frozen=True)
 class Status:
-    """Where a run of the grid stands."""
+    """State of a run of the grid."""
 
     state: State
     detail: str = ""
@@ -162,7 +162,7 @@ def plan(
 
 
 def status(run: ExperimentConfig) -> Status:
-    """Return where a run stands.
+    """Return the state of a run.
 
     Raises:
         ConfigError: its folder holds a run with other settings.
@@ -185,12 +185,12 @@ def status(run: ExperimentConfig) -> Status:
         return Status("failed", reason)
     if (folder / CONFIG_FILE).exists():
         updates = resumable_updates(folder) or 0
-        return Status("interrupted", f"goes on after update {updates} of {run.total_updates}")
+        return Status("interrupted", f"continues after update {updates} of {run.total_updates}")
     return Status("missing")
 
 
 def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
-    """Refuse unknown names on every axis and in every override, and names that come twice."""
+    """Refuse unknown and repeated names on every axis, and unknown ones in every override."""
     known: dict[str, Callable[[str], Any]] = {
         "task": TASKS.__getitem__,
         "algorithm": lambda name: preset("algorithm", name),
@@ -208,7 +208,7 @@ def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
 
 
 def _mentioned(config: BenchmarkConfig) -> Iterator[tuple[str, Sequence[str]]]:
-    """Yield (axis, names) of whatever overrides and ``skip`` speak of."""
+    """Yield (axis, names) of the overrides and of ``skip``."""
     yield "task", list(config.per_task)
     yield "algorithm", list(config.per_algorithm)
     yield "network", list(config.per_network)
@@ -218,9 +218,9 @@ def _mentioned(config: BenchmarkConfig) -> Iterator[tuple[str, Sequence[str]]]:
 
 
 def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
-    """Make every environment of the grid once, and every learner that differs from the others.
+    """Make every environment and every learner of the grid once.
 
-    Some parameters are checked by tasks and robots, some sizes and actions by networks.
+    Tasks and robots check some parameters, networks some sizes and actions.
     """
     problems: dict[tuple[str, str], Problem] = {}
     built = set()

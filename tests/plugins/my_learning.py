@@ -1,4 +1,4 @@
-"""A module as a user writes it: a task, a robot, a network and an algorithm of their own."""
+"""A network and an algorithm as a user writes them."""
 
 from typing import ClassVar
 
@@ -9,22 +9,6 @@ from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.algorithms.sac import SACConfig
 from ba_torchrl.config import StrictModel
 from ba_torchrl.modules.base import NETWORKS, ActorCritic
-from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.robots.kuka import Kuka
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
-
-
-@TASKS.register("mine/reach_near")
-class ReachNear(BlockReaching):
-    """Block reaching with a tolerance of 2 cm."""
-
-    goal_distance_m = 0.02
-
-
-@ROBOTS.register("mine/kuka")
-class MyKuka(Kuka):
-    """The Kuka arm under another name."""
 
 
 class FlatActor(nn.Module):
