@@ -3,6 +3,7 @@
 python recipes/fingerprint.py --out before.json                  # every task, robot and option
 python recipes/fingerprint.py --compare before.json              # exit code 1 if anything differs
 python recipes/fingerprint.py --compare before.json --parts envs --tasks close_loop/block_picking
+python recipes/fingerprint.py --compare before.json --match kuka # cases by a part of their name
 
 For changes of the code that must not change what it computes. A record holds for each case the
 first 64 bits of the SHA-256 of every tensor at every step, and the numbers of small tensors.
@@ -16,6 +17,7 @@ import csv
 import hashlib
 import importlib.metadata
 import json
+import logging
 import math
 import multiprocessing
 import os
@@ -679,6 +681,7 @@ RUNNERS: dict[str, Callable[[Case, dict[str, Any], dict[str, Any]], None]] = {
 def run_case(case: Case) -> dict[str, Any]:
     """Run a case and return its record: what is refused or fails is recorded as such."""
     torch.set_num_threads(1)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.manual_seed(case.seed)
     np.random.seed(case.seed)  # noqa: NPY002 -- in case a library draws from it
     random.seed(case.seed)
@@ -811,6 +814,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--compare", type=Path, help="file of an earlier record")
     parser.add_argument("--tasks", help="ids, separated by commas; all if left out")
     parser.add_argument("--parts", help=f"of {','.join(PARTS)}; all, or those of the old record")
+    parser.add_argument("--match", default="", help="only cases whose name contains this")
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--lines", type=int, default=12, help="to print of each case that differs")
     options = parser.parse_args(arguments)
@@ -826,7 +830,8 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"unknown: {', '.join(sorted(unknown))}")
 
     started = time.perf_counter()
-    records = run_all(cases(parts, tasks), options.workers)
+    wanted = [case for case in cases(parts, tasks) if options.match in case.name]
+    records = run_all(wanted, options.workers)
     seconds = time.perf_counter() - started
     for word in ("refused", "failed"):
         names = [name for name, record in records.items() if word in record["facts"]]
@@ -851,7 +856,9 @@ def main(arguments: list[str] | None = None) -> int:
     before = {
         name: record
         for name, record in old["cases"].items()
-        if record["part"] in parts and (tasks is None or record["task"] in tasks)
+        if record["part"] in parts
+        and (tasks is None or record["task"] in tasks)
+        and options.match in name
     }
     found = compare(before, json.loads(json.dumps(records)))
     for name, lines in found.items():
