@@ -219,7 +219,7 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
 @pytest.mark.parametrize("view", ["camera_side_rgbd", "camera_center_xy"])
 def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view):
     config = tiny(tmp_path, env={**TINY["env"], "view_type": view})
-    with pytest.raises(ConfigError, match="choose another view_type|takes values from zero"):
+    with pytest.raises(ConfigError, match=r"choose another view_type|takes values from zero"):
         Experiment(config, progress=False)
     assert not (tmp_path / "run").exists()
 
