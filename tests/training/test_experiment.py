@@ -11,7 +11,13 @@ import torch
 
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, find_checkpoint, load
+from ba_torchrl.training.checkpoint import (
+    Checkpoints,
+    build_algorithm,
+    find_checkpoint,
+    load,
+    read_config,
+)
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
@@ -219,7 +225,7 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
 @pytest.mark.parametrize("view", ["camera_side_rgbd", "camera_center_xy"])
 def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view):
     config = tiny(tmp_path, env={**TINY["env"], "view_type": view})
-    with pytest.raises(ConfigError, match="choose another view_type|takes values from zero"):
+    with pytest.raises(ConfigError, match=r"choose another view_type|takes values from zero"):
         Experiment(config, progress=False)
     assert not (tmp_path / "run").exists()
 
@@ -306,4 +312,7 @@ def test_the_recipes_from_the_command_line(tmp_path):
         "evaluate", f"checkpoint={tmp_path}/run", "episodes=3", f"video={gif}", "video_episodes=1"
     )
     assert "over 3 episodes of close_loop/block_reaching" in out
+    config = read_config(tmp_path / "run")
+    assert f"seed {config.derived_seed(SeedUse.TEST)}, none of which training used" in out
+    assert f"update 3, {find_checkpoint(tmp_path / 'run')}" in out
     assert gif.read_bytes().startswith(b"GIF")
