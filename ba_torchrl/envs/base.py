@@ -19,7 +19,7 @@ from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.episodes import SETTLE_STEPS, Episodes
 from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.envs.observations import ExtraObservations
+from ba_torchrl.envs.observations import enabled_observations, joined
 from ba_torchrl.envs.scene import (
     Controller,
     Scene,
@@ -85,9 +85,9 @@ class ManipulationEnv(EnvBase):
         num_objects = config.num_objects or self.task_class.num_objects
         self.max_steps = config.max_steps or self.task_class.step_limit(num_objects)
         self.action_sequence = (
-            config.action_sequence
-            or self.task_class.default_action_sequence
-            or self.default_action_sequence
+            self.task_class.default_action_sequence or self.default_action_sequence
+            if config.action_sequence is None
+            else config.action_sequence
         )
         """One letter per action component."""
         self.half_rotation = (
@@ -100,7 +100,7 @@ class ManipulationEnv(EnvBase):
         self._episodes = Episodes(scales, self._build_scene, self._place_robot)
         self._identity = object()
         self._observation: dict[str, torch.Tensor] = {}
-        self._extras = ExtraObservations(config, self.workspace)
+        self._observations = enabled_observations(config, self.workspace)
         self._memory: dict[str, Any] = {}
         """Content of observations that stems from earlier steps; replaced, never modified."""
         self._ends: dict[str, bool] = {}
@@ -335,10 +335,11 @@ class ManipulationEnv(EnvBase):
 
         action = self._make_action_spec()
         images = self._declare_images() if self.config.obs_type == "pixel" else {}
-        self.images = {**images, **self._extras.images()}
+        self.images = joined([images, *(extra.images() for extra in self._observations)])
         """Declaration of each image that is observed, by key."""
         seen = {key: image.to_tensor_spec() for key, image in self.images.items()}
-        seen |= self._extras.specs(self._episodes.largest_scene)
+        largest = self._episodes.largest_scene
+        seen = joined([seen, *(extra.specs(largest) for extra in self._observations)])
         observation = {
             **seen,
             keys.HOLDING: flag(),
@@ -391,7 +392,8 @@ class ManipulationEnv(EnvBase):
         if self.config.obs_type == "pixel":
             for key, image in self._images(scene).items():
                 observation[key] = torch.from_numpy(image.astype(np.float32))
-        observation |= self._extras.observe(scene)
+        for extra in self._observations:
+            observation |= extra.observe(scene)
         if self.config.expert:
             observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
         return observation

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.envs.settings import parse_env_config
 from ba_torchrl.envs.vector.make import make_vector_env
 from ba_torchrl.plugins import (
@@ -43,7 +44,7 @@ def resolve(task: str, **config: Any) -> EnvConfig:
     control, box = CONTROLS[task_class.control], task_class.workspace
     settings = parse_env_config(task, config)
     defaults = {
-        "action_sequence": control.default_action_sequence,
+        "action_sequence": task_class.default_action_sequence or control.default_action_sequence,
         "half_rotation": control.default_half_rotation,
         "workspace": (box.x, box.y, box.z),
         "object_scale_range": task_class.scale_range,
@@ -82,10 +83,12 @@ def _plugins_of(task: str, settings: EnvConfig) -> tuple[str, ...]:
     """Return the modules that a new process imports before it can make an environment.
 
     Raises:
-        ConfigError: the task or the robot is defined where no other process can import it.
+        ConfigError: one of them is defined where no other process can import it.
     """
     modules = []
-    for registry, name in ((TASKS, task), (ROBOTS, settings.robot)):
+    needed = [(TASKS, task), (ROBOTS, settings.robot)]
+    needed += [(OBSERVATIONS, name) for name in settings.observations]
+    for registry, name in needed:
         module = registry.plugin_module(name)
         if module in MAIN:
             check_spawned_process_knows(registry.kind, name)

@@ -353,7 +353,6 @@ def test_render_needs_a_display(monkeypatch):
         ({"object_set": "household"}, "no meaning"),
         ({"asset_root": "somewhere"}, "no meaning"),
         ({"object_type": "cylinder"}, "no meaning"),
-        ({"object_type": "ball"}, "'cube' or 'cylinder'"),
         ({"num_objects": 2}, "takes 1 "),
         ({"solver_iterations": 10}, "physics_mode='custom'"),
         ({"physics_mode": "custom"}, "time_step_s"),
@@ -371,6 +370,19 @@ def test_render_needs_a_display(monkeypatch):
 def test_what_has_no_meaning_is_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         ba_torchrl.make(PICKING, **settings)
+
+
+def test_a_value_that_the_tasks_own_parameter_does_not_take_is_refused():
+    with pytest.raises(ConfigError, match="'cube' or 'cylinder'"):
+        ba_torchrl.make("open_loop/block_stacking", object_type="ball")
+
+
+def test_a_parameter_of_other_tasks_names_them_and_passes_at_its_default():
+    with pytest.raises(ConfigError, match=r"parameter of .*open_loop/block_stacking"):
+        ba_torchrl.make(PICKING, object_type="cylinder")
+    env = ba_torchrl.make(PICKING, object_type="cube", object_set="random", obs_size=16)
+    assert not hasattr(env.config, "object_type")
+    env.close()
 
 
 def test_values_of_numpy_are_taken():
