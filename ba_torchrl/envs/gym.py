@@ -48,7 +48,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         register_modules: Sequence[str] = (),
         **config: Any,
     ) -> None:
-        if "frameskip" in config:  # TorchRL's GymEnv tries it first, and goes on after this
+        if "frameskip" in config:  # TorchRL's GymEnv tries it first and handles this error
             raise TypeError("GymEnv.__init__() got an unexpected keyword argument 'frameskip'")
         if render_mode not in (None, *self.metadata["render_modes"]):
             known = ", ".join(self.metadata["render_modes"])

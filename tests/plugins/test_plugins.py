@@ -48,7 +48,7 @@ def last_line(done):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_make_knows_what_an_import_registers(folder):
+def test_make_knows_a_task_and_a_robot_after_the_import(folder):
     code = f"""
 import json, ba_torchrl, my_tasks
 env = ba_torchrl.make("mine/reach_near", robot="mine/kuka", expert=True, {SMALL})
@@ -67,7 +67,7 @@ print(json.dumps([robot, env.task_class.__name__, "mine/reach_near" in ba_torchr
         "import gymnasium, ba_torchrl; ba_torchrl.list_tasks(); import my_tasks",
     ],
 )
-def test_gymnasium_knows_a_task_whatever_is_imported_first(folder, imports):
+def test_gymnasium_knows_a_task_in_any_order_of_imports(folder, imports):
     code = f"{imports}\nimport json; print(json.dumps(gymnasium.spec({GYM_ID!r}).kwargs))"
     kwargs = last_line(run(folder, "-c", code))
     assert kwargs == {"task": "mine/reach_near", "register_modules": ["my_tasks"]}
@@ -125,7 +125,7 @@ def play(**options):
 """
 
 
-def test_a_task_of_a_notebook_says_what_its_workers_need(folder):
+def test_a_task_of_a_notebook_is_refused_in_spawned_workers(folder):
     code = f"""{IN_MAIN}
 from ba_torchrl.errors import ConfigError
 message = ""
@@ -261,7 +261,7 @@ def test_the_recipes_take_a_plugin(folder):
     assert "cannot import the plugin 'my_tasks'" in done.stderr
 
 
-def test_a_run_from_a_script_records_the_plugin_without_being_told(folder):
+def test_a_run_from_a_script_records_its_plugins(folder):
     code = """
 import json, my_tasks, my_learning
 from ba_torchrl.training.config import ExperimentConfig

@@ -11,7 +11,13 @@ import torch
 
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, find_checkpoint, load
+from ba_torchrl.training.checkpoint import (
+    Checkpoints,
+    build_algorithm,
+    find_checkpoint,
+    load,
+    read_config,
+)
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
@@ -40,7 +46,7 @@ def tiny(tmp_path, **changes):
     return ExperimentConfig.parse({**TINY, "run_dir": str(tmp_path / "run"), **changes})
 
 
-def test_a_run_leaves_everything_behind(tmp_path):
+def test_a_run_writes_its_files(tmp_path):
     result = Experiment(tiny(tmp_path), progress=False).run()
     folder = tmp_path / "run"
     assert result.evaluation.episodes == 4
@@ -100,7 +106,7 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
     assert set(a.keys()) == {"pixels", "holding", "action"}
 
 
-def test_a_crash_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeypatch):
+def test_a_crash_while_saving_keeps_the_last_checkpoint(tmp_path, monkeypatch):
     config = tiny(tmp_path)
     algorithm = build_algorithm(config)
     checkpoints = Checkpoints(config.folder, algorithm, config.torch_device)
@@ -148,7 +154,7 @@ def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
     assert seeds[0] == seeds[1] != seeds[2]
 
 
-def test_a_missing_checkpoint_says_what_is_needed(tmp_path):
+def test_a_missing_checkpoint_is_explained(tmp_path):
     with pytest.raises(ConfigError, match=r"config\.json and checkpoints"):
         load(tmp_path)
 
@@ -306,4 +312,7 @@ def test_the_recipes_from_the_command_line(tmp_path):
         "evaluate", f"checkpoint={tmp_path}/run", "episodes=3", f"video={gif}", "video_episodes=1"
     )
     assert "over 3 episodes of close_loop/block_reaching" in out
+    config = read_config(tmp_path / "run")
+    assert f"seed {config.derived_seed(SeedUse.TEST)}, none of which training used" in out
+    assert f"update 3, {find_checkpoint(tmp_path / 'run')}" in out
     assert gif.read_bytes().startswith(b"GIF")

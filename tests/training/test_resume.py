@@ -146,7 +146,7 @@ def test_learner_replay_priorities_and_generators_come_back_bit_by_bit(tmp_path,
             assert torch.equal(a[key], b[key]), key
     a, b = old.augmentation(old.replay.sample()), new.augmentation(new.replay.sample())
     assert torch.equal(a["action"], b["action"])
-    # what is added next goes where it would have gone
+    # the next transitions are stored at the same places
     more = old.replay.storage[:2].exclude("index").clone()
     assert new.replay.extend(more).tolist() == old.replay.extend(more).tolist()
 
@@ -170,7 +170,7 @@ def test_a_resumed_run_collects_other_episodes(tmp_path, monkeypatch):
     assert config.derived_seed(SeedUse.COLLECTION, 0) == config.derived_seed(SeedUse.COLLECTION)
 
 
-def test_a_crash_while_saving_leaves_the_last_state_whole(tmp_path):
+def test_a_crash_while_saving_keeps_the_last_state(tmp_path):
     config = config_for(tmp_path)
     experiment = Experiment(config, progress=False)
     save = experiment.algorithm.save_replay
@@ -222,7 +222,7 @@ def test_a_run_interrupted_before_its_first_evaluation_starts_again(tmp_path, ca
     assert read_result(result.record.parent).resumed_at == []
 
 
-def test_nothing_to_resume_starts_a_run_and_says_so(tmp_path, caplog):
+def test_without_a_run_to_resume_a_new_one_starts_with_a_warning(tmp_path, caplog):
     assert run(config_for(tmp_path, resume=True, total_updates=3)).updates == 3
     assert "no run to resume" in caplog.text
 
@@ -327,7 +327,7 @@ def test_checkpoints_without_a_state_are_not_overwritten(tmp_path):
         Experiment(config_for(tmp_path, resume=True), progress=False)
 
 
-def test_the_result_tells_the_whole_run(tmp_path):
+def test_the_result_holds_the_whole_run(tmp_path):
     config = config_for(tmp_path, video_episodes=1, benchmark="some", label="sac cnn", seed=3)
     result = run(config)
     values = json.loads((config.folder / "result.json").read_text())

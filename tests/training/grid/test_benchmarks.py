@@ -18,7 +18,9 @@ ROOT = Path(__file__).parents[3]
 
 
 def tasks_of(control):
-    return [task for task in TASKS if TASKS[task].control == control]
+    """Return the built-in tasks of a control."""
+    built_in = (task for task in TASKS if TASKS.plugin_module(task) is None)
+    return [task for task in built_in if TASKS[task].control == control]
 
 
 def shipped(name, *overrides):
