@@ -182,6 +182,6 @@ def test_networks_and_tasks_of_the_other_kind_are_refused():
         spatial.check(cnn, "open_loop")
     with pytest.raises(ConfigError, match=r"for open_loop tasks; close_loop tasks take .* cnn"):
         close.check(fcn, "close_loop")
-    with pytest.raises(ConfigError, match="for open_loop tasks, not for close_loop ones"):
+    with pytest.raises(ConfigError, match="learns open_loop tasks, not close_loop ones"):
         spatial.check(cnn, "close_loop")
     spatial.check(fcn, "open_loop")
