@@ -14,10 +14,10 @@ from ba_torchrl.sim.contacts import bearing_force_n, contacts, gap_m
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, moved
 from ba_torchrl.tasks.base import BLOCK_M, TASKS
+from ba_torchrl.tasks.clearance import reach_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     CLOSED,
-    HALF_FINGER_DEPTH_M,
     HOVER_M,
     OPEN,
     lift,
@@ -153,7 +153,7 @@ class CornerPicking(CloseLoopTask):
             yaw_rad: the gripper's; the gap is in metres, negative where there is none.
         """
         turn = yaw_rad - self.corner.yaw_rad
-        along = self.robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
+        along = reach_m(self.robot.gripper)
         across = self.robot.gripper.half_width_m
         cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
         extents = (along * cos + across * sin, along * sin + across * cos)
