@@ -32,7 +32,7 @@ GRIPPER = Gripper(
     closed_half_m=0.018,
     palm_m=0.05,
     arc=((0.004, -0.01), (0.04, -0.006)),
-    outline=((0.0, math.inf), (0.04, -0.01), (0.06, 0.02), (0.07, 0.045)),
+    outline=((0.0, math.inf), (0.04, -0.01), (0.06, 0.015), (0.07, 0.045)),
     closed_outline=((0.0, -0.01), (0.02, 0.01), (0.035, 0.03)),
 )
 WIDE = replace(GRIPPER, half_width_m=0.015)
@@ -45,7 +45,7 @@ def cubes():
         yield world.add(shape, "grasped"), world.add(shape, "other")
 
 
-def test_a_gripper_reaches_as_far_as_its_outline_below_half_the_palm():
+def test_a_gripper_reaches_as_far_as_its_x():
     assert GRIPPER.finger_depth_m == pytest.approx(0.014)
     assert GRIPPER.finger_reach_m == 0.06
     tips_only = replace(GRIPPER, outline=((0.0, math.inf), (0.04, -0.01)))

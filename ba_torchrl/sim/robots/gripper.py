@@ -15,6 +15,8 @@ from ba_torchrl.sim.world import World
 
 FLOOR_GAP_M = 1e-3
 """Distance that fingertips keep from the floor while they close."""
+GRASPING_M = 0.02
+"""Height above the tool point up to which fingers are beside what they grasp."""
 TIPS_M = 0.01
 """The lowest part of the fingers, which counts as their tips."""
 
@@ -81,12 +83,9 @@ class Gripper:
 
     @property
     def finger_reach_m(self) -> float:
-        """Distance from the tool point to the outside of the open fingers.
-
-        They count up to half the height of the palm; at least as far as their tips.
-        """
+        """Distance from the tool point to the outside of the open fingers, where they grasp."""
         tips_m = self.half_gap_m + self.finger_depth_m
-        return max([tips_m, *(u for u, z in self.outline if z < self.palm_m / 2)])
+        return max([tips_m, *(u for u, z in self.outline if z < GRASPING_M)])
 
     @property
     def lowest_m(self) -> float:
