@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,18 +15,18 @@ from torchrl.envs import EnvBase
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.episodes import SETTLE_STEPS, Episodes
+from ba_torchrl.envs.checks import checked_action
+from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import enabled_observations, joined
 from ba_torchrl.envs.scene import (
     Controller,
     Scene,
-    SceneState,
     build_scene,
     check_action_limits,
 )
 from ba_torchrl.envs.settings import check_action_components, check_task_parameters
-from ba_torchrl.errors import ConfigError, InvalidActionError, PlacementError, SimulationError
+from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.vision.rgb import LIGHT_FLOOR, render_rgb
@@ -41,21 +39,6 @@ logger = logging.getLogger(__name__)
 CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torchrl.envs")
 
 MAX_CONSECUTIVE_FAULTS = 10
-
-
-@dataclass(frozen=True)
-class EnvState:
-    """The full state of an environment; see `ManipulationEnv.get_state`."""
-
-    owner: object
-    scale: float
-    scene: SceneState
-    observation: dict[str, torch.Tensor]
-    memory: dict[str, Any]
-    base_seed: int
-    episode: int
-    step_count: int
-    ends: dict[str, bool]
 
 
 class ManipulationEnv(EnvBase):
@@ -297,7 +280,7 @@ class ManipulationEnv(EnvBase):
         return self._tensordict(self._observation)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = self._checked(tensordict.get(keys.ACTION))
+        action = checked_action(tensordict.get(keys.ACTION), self.task_id, self.action_sequence)
         scene = self.scene
         self._step_count += 1
         success = valid = False
@@ -305,7 +288,8 @@ class ManipulationEnv(EnvBase):
         try:
             self._act(scene, action)
             scene.task.after_action()
-            success, valid = self._evaluate(scene)
+            self._conditions, valid = evaluate_at_rest(scene)
+            success = valid and all(self._conditions.values())
             self._observation = self._observe(scene)
         except Exception:
             fault, self._conditions = True, {}
@@ -376,17 +360,6 @@ class ManipulationEnv(EnvBase):
             make_controller=self._make_controller,
         )
 
-    def _evaluate(self, scene: Scene) -> tuple[bool, bool]:
-        """Return whether the goal holds, once everything is at rest, and the scene is valid."""
-        if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
-            raise SimulationError("a body's position is not finite")
-        self._conditions = scene.task.evaluate()
-        if all(self._conditions.values()):
-            scene.world.settle(max_steps=SETTLE_STEPS)
-            self._conditions = scene.task.evaluate()
-        valid = scene.task.is_valid()
-        return valid and all(self._conditions.values()), valid
-
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
         observation = {keys.HOLDING: torch.tensor([self._is_holding(scene)])}
         if self.config.obs_type == "pixel":
@@ -412,21 +385,6 @@ class ManipulationEnv(EnvBase):
         for key in (keys.SUCCESS, keys.FAULT, keys.DONE, keys.TERMINATED, keys.TRUNCATED):
             out[key] = torch.tensor([ends.get(key, False)])
         return TensorDict(out, batch_size=[])
-
-    def _checked(self, action: torch.Tensor | None) -> np.ndarray:
-        (size,) = self.action_spec.shape
-        if action is None:
-            raise InvalidActionError(f"the input has no {keys.ACTION!r}: write it before step()")
-        if action.shape != (size,) or action.dtype != torch.float32:
-            raise InvalidActionError(
-                f"{self.task_id} takes a float32 action of shape ({size},), one component per "
-                f"letter of {self.action_sequence!r}; got {action.dtype} of shape "
-                f"{tuple(action.shape)}"
-            )
-        array = action.detach().numpy()
-        if not np.isfinite(array).all():
-            raise InvalidActionError(f"the action is not finite: {array.tolist()}")
-        return array
 
     def _on_fault(self) -> None:
         """Count and log a simulator fault; the next reset builds a new world."""

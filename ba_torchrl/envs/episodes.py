@@ -1,16 +1,35 @@
-"""Episodes: the scenes of an environment, one for each scale of the objects, and their starts."""
+"""Episodes: the scenes of an environment, one per scale of the objects, their starts and states."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
 
-from ba_torchrl.envs.scene import Scene
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.envs.scene import Scene, SceneState
+from ba_torchrl.errors import PlacementError, SimulationError
 
 RESET_ATTEMPTS = 50
 SETTLE_STEPS = 100
+
+
+@dataclass(frozen=True)
+class EnvState:
+    """The full state of an environment; see `ManipulationEnv.get_state`."""
+
+    owner: object
+    scale: float
+    scene: SceneState
+    observation: dict[str, torch.Tensor]
+    memory: dict[str, Any]
+    base_seed: int
+    episode: int
+    step_count: int
+    ends: dict[str, bool]
 
 
 class Episodes:
@@ -108,3 +127,20 @@ class Episodes:
             f"{RESET_ATTEMPTS - invalid} were solved from the start; objects of this size need "
             "another workspace"
         )
+
+
+def evaluate_at_rest(scene: Scene) -> tuple[dict[str, bool], bool]:
+    """Return the named conditions of success, once everything is at rest, and whether it is valid.
+
+    The scene is settled only if the conditions hold before.
+
+    Raises:
+        SimulationError: the position of a body is not finite.
+    """
+    if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
+        raise SimulationError("a body's position is not finite")
+    conditions = scene.task.evaluate()
+    if all(conditions.values()):
+        scene.world.settle(max_steps=SETTLE_STEPS)
+        conditions = scene.task.evaluate()
+    return conditions, scene.task.is_valid()

@@ -340,51 +340,6 @@ def test_colours_of_floor_and_workspace_show_in_pictures_only(make):
     assert (before != after).any(axis=-1).mean() > 0.2
 
 
-def test_render_needs_a_display(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(ConfigError, match="DISPLAY"):
-        ba_torchrl.make(PICKING, render=True)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"in_hand_size": 40}, "open-loop"),
-        ({"object_set": "household"}, "no meaning"),
-        ({"asset_root": "somewhere"}, "no meaning"),
-        ({"object_type": "cylinder"}, "no meaning"),
-        ({"num_objects": 2}, "takes 1 "),
-        ({"solver_iterations": 10}, "physics_mode='custom'"),
-        ({"physics_mode": "custom"}, "time_step_s"),
-        ({"floor_color": (0.1, 0.2)}, "red, green and blue"),
-        ({"workspace_color": (0.1, 0.2, 2.0)}, "red, green and blue"),
-        ({"view_type": "from_below"}, "camera_center_xyz"),
-        ({"num_object": 2}, "Did you mean 'num_objects'"),
-        ({"drot": math.inf}, "finite"),
-        ({"dpos": math.nan}, "dpos"),
-        ({"view_scale": math.inf}, "finite"),
-        ({"action_sequence": ""}, "pxyzr"),
-        ({"workspace": ((0.3, 0.6), (-0.15, 0.15), (0.0, 0.02))}, "50 had an object outside"),
-    ],
-)
-def test_what_has_no_meaning_is_refused(settings, message):
-    with pytest.raises(ConfigError, match=message):
-        ba_torchrl.make(PICKING, **settings)
-
-
-def test_a_value_that_the_tasks_own_parameter_does_not_take_is_refused():
-    with pytest.raises(ConfigError, match="'cube' or 'cylinder'"):
-        ba_torchrl.make("open_loop/block_stacking", object_type="ball")
-
-
-def test_a_parameter_of_other_tasks_names_them_and_passes_at_its_default():
-    with pytest.raises(ConfigError, match=r"parameter of .*open_loop/block_stacking"):
-        ba_torchrl.make(PICKING, object_type="cylinder")
-    env = ba_torchrl.make(PICKING, object_type="cube", object_set="random", obs_size=16)
-    assert not hasattr(env.config, "object_type")
-    env.close()
-
-
 def test_values_of_numpy_are_taken():
     env = ba_torchrl.make(
         PICKING, seed=np.int64(3), object_scale_range=np.array([0.8, 0.9]), dpos=np.float32(0.04)

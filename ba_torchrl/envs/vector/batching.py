@@ -5,58 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 from tensordict import TensorDictBase
-from torchrl.data import TensorSpec
 
-from ba_torchrl.errors import InvalidActionError
-
-
-def check_actions(
-    actions: torch.Tensor | None, spec: TensorSpec, stepped: torch.Tensor | None = None
-) -> None:
-    """Refuse actions that are missing, not finite or of the wrong shape or type.
-
-    Args:
-        actions: [n, A], one row per environment.
-        spec: of ``actions``; values out of its bounds are allowed, the environments clip them.
-        stepped: [n] or [n, 1] bool, the environments that are about to step; None means all.
-
-    Raises:
-        InvalidActionError: an action is missing, not finite, or not shaped and typed like ``spec``.
-    """
-    if actions is None:
-        raise InvalidActionError(
-            f"there is no action; every environment needs {_describe(spec[0])}"
-        )
-    same_layout = actions.shape == spec.shape and actions.dtype == spec.dtype
-    if same_layout and bool(torch.isfinite(actions).all()):
-        return
-    for index, action in enumerate(actions.unbind(0)):
-        if stepped is not None and not bool(stepped[index].any()):
-            continue
-        allowed = spec[index]
-        if action.shape != allowed.shape:
-            problem = f"has shape {list(action.shape)}"
-        elif action.dtype != allowed.dtype:
-            problem = f"has type {action.dtype}"
-        elif bool(torch.isnan(action).any()):
-            problem = f"holds NaN: {action.tolist()}"
-        elif not bool(torch.isfinite(action).all()):
-            problem = f"holds an infinite value: {action.tolist()}"
-        else:
-            continue
-        raise InvalidActionError(
-            f"the action of environment {index} {problem}; allowed is {_describe(allowed)}. "
-            "Nothing has moved."
-        )
-
-
-def _describe(spec: TensorSpec) -> str:
-    """Return a description of the actions that ``spec`` allows."""
-    low, high = getattr(spec.space, "low", None), getattr(spec.space, "high", None)
-    bounds = "" if low is None else f", from {low.tolist()} to {high.tolist()}"
-    return f"a finite {spec.dtype} tensor of shape {list(spec.shape)}{bounds}"
+from ba_torchrl.envs.checks import check_actions
 
 
 class SeededVector:

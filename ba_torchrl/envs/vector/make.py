@@ -8,7 +8,8 @@ from typing import Literal
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, SerialEnv
 
-from ba_torchrl.envs.vector.batching import SeededVector, check_actions
+from ba_torchrl.envs.checks import check_actions
+from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.parallel import VectorEnv
 
 __all__ = ["SerialVectorEnv", "VectorEnv", "check_actions", "make_vector_env"]
