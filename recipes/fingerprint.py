@@ -40,7 +40,7 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 import ba_torchrl
-from ba_torchrl.config import ConfigError
+from ba_torchrl.errors import ConfigError
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 PARTS = ("envs", "training")

@@ -150,8 +150,8 @@ class AlgorithmConfig(StrictModel, ABC):
         """
         if control not in self.controls:
             raise ConfigError(
-                f"{type(self).__name__} is an algorithm for {' and '.join(sorted(self.controls))} "
-                f"tasks, not for {control} ones"
+                f"{type(self).__name__} learns {' and '.join(sorted(self.controls))} tasks, not "
+                f"{control} ones"
             )
         if network.control != control:
             known = [name for name in NETWORKS if NETWORKS[name].control == control]

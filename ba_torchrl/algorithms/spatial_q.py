@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import torch
 from pydantic import Field
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
+from torch import Tensor
 from torchrl.objectives import HardUpdate
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
-from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
+from ba_torchrl.data.augmentation.rigid import (
+    RigidAugmentation,
+    RigidTransforms,
+    reverse_gripper_axes,
+)
 from ba_torchrl.data.replay.make import ReplayKind
+from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial import SpatialSpec
 from ba_torchrl.modules.spatial_policy import (
@@ -104,7 +113,8 @@ class SpatialQ(Learner):
             half_rotation=actions.half_rotation,
         )
         net = network.build(spec)
-        values = SpatialValues(net, SpatialActions(actions, net.levels), list(self.images))
+        self.actions = SpatialActions(actions, net.levels)
+        values = SpatialValues(net, self.actions, list(self.images))
         return values.to(self.problem.device)
 
     def make_policy(self, networks: SpatialValues) -> TensorDictModule:
@@ -141,6 +151,43 @@ class SpatialQ(Learner):
             probability=config.augmentation_probability,
             order=config.augmentation_order,
         )
+
+    def nearest_action(self, action: Tensor) -> Tensor:
+        """Return the nearest action that the network's levels can choose."""
+        return self.actions.nearest(action)
+
+    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
+        """Store demonstrations; actions that were executed off the grid become the nearest on it.
+
+        Args:
+            episodes: TensorDicts [T].
+        """
+        super().on_demonstrations([self._on_grid(episode) for episode in episodes])
+
+    def _on_grid(self, episode: TensorDictBase) -> TensorDictBase:
+        """Return an episode [T] with the nearest actions on the grid.
+
+        Where a yaw close to half a turn becomes zero, the fingers are swapped, and images in the
+        gripper's axes of what this pick holds are reversed.
+        """
+        action = episode[keys.ACTION]
+        nearest = self.nearest_action(action)
+        out = episode.copy().set(keys.ACTION, nearest)
+        components = self.problem.actions.components
+        if "rz" not in components or not self.problem.actions.half_rotation:
+            return out
+        rz = components.index("rz")
+        is_swapped = (nearest[:, rz] - action[:, rz]).abs() > math.pi / 2
+        is_over = torch.zeros(len(episode) + 1, dtype=torch.bool)
+        for t, is_holding in enumerate(episode[keys.HOLDING].flatten().tolist()):
+            is_over[t + 1] = is_over[t] if is_holding else is_swapped[t]
+        for key, image in self.images.items():
+            if image.frame == "gripper":
+                for nested, over in ((key, is_over[:-1]), ((keys.NEXT, key), is_over[1:])):
+                    reversed_images = reverse_gripper_axes(episode[nested], image.axes, "xy")
+                    over = over.reshape(-1, 1, 1, 1)
+                    out.set(nested, torch.where(over, reversed_images, episode[nested]))
+        return out
 
     def update(self) -> TensorDict:
         """Take one step, see `Learner.update`, and change the share of random actions.

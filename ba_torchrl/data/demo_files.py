@@ -29,7 +29,7 @@ def save_demonstrations(
     seed: int,
     source: Source = "expert",
 ) -> None:
-    """Write episodes as one memory-mapped TensorDict, with what they were collected from.
+    """Write episodes as one memory-mapped TensorDict, with their task and parameters.
 
     Args:
         path: a new folder.
@@ -106,7 +106,7 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     if not {"task", "env"} <= metadata.keys():
         raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
-    # Fields that came into being since had no other value than their default.
+    # A field that was added later had its default value.
     found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
     wanted = {"task": task, **_env_values(task, env)}
     differences = [

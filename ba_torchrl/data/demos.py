@@ -1,4 +1,4 @@
-"""Demonstrations: episodes played by the tasks' experts, or reversed from taking the goal apart."""
+"""Demonstrations: episodes played by experts, or deconstruction episodes reversed in time."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def collect_demonstrations(
     nearest_action: Callable[[Tensor], Tensor] | None = None,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
-    """Let the expert play.
+    """Play episodes with the expert.
 
     Args:
         env: a vector of environments made with ``expert=True``, and with ``deconstruct=True`` if
             that is the source.
-        episodes: how many to play.
+        episodes: number of episodes to play.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        source: "expert", or "deconstruction" for episodes reversed in time; of those, what cannot
-            be reversed is always left out, and all that is left succeeds.
+        source: "expert", or "deconstruction" for episodes reversed in time. Episodes that cannot
+            be reversed are left out; all others succeed.
         only_successful: leave out episodes that did not reach the goal.
         nearest_action: from the expert's action to the one that is executed and recorded, which a
             policy with discrete actions needs; by default the expert's own.
         on_episode: called with each episode when it ends, for progress bars.
 
     Returns:
-        Episodes as TensorDicts [T], with what an environment without ``expert`` gives.
+        Episodes as TensorDicts [T], with the entries of an environment without ``expert``.
 
     Raises:
         ConfigError: the source is unknown.
@@ -82,26 +82,26 @@ def source_config(source: Source) -> dict[str, bool]:
 
 
 class ExpertScores(NamedTuple):
-    """How an expert did."""
+    """Results of an expert."""
 
     success_rate: float
     mean_length: float
     """Steps of the episodes that reached the goal; nan if none did."""
     median_length: float
-    """Likewise."""
+    """Median of the same."""
 
 
 def expert_scores(
     task: str, episodes: int, *, seed: int, num_envs: int = 1, parallel: bool = False, **env: Any
 ) -> ExpertScores:
-    """Let a task's expert play and keep score.
+    """Play episodes with a task's expert and return its results.
 
     Args:
         task: id of the task.
-        episodes: how many to play.
+        episodes: number of episodes.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        num_envs: environments side by side.
-        parallel: each in a process of its own.
+        num_envs: number of environments.
+        parallel: one process per environment.
         env: fields of `EnvConfig`.
     """
     envs = make_vector(

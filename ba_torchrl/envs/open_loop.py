@@ -79,7 +79,7 @@ class OpenLoopEnv(ManipulationEnv):
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
-            surface_height_m=task.terrain.height_m,
+            lowest_tool_m=task.terrain.lowest_tool_m,
         )
 
     @property

@@ -81,6 +81,13 @@ class SpatialActions:
             columns.append(index)
         return torch.stack(columns, dim=-1)
 
+    def nearest(self, action: Tensor) -> Tensor:
+        """Return the nearest actions on the grid of actions [..., A], the primitive unchanged."""
+        indices, out = self.to_indices(action), action.clone()
+        for i, (place, axis) in enumerate(zip(self._places, self.axes, strict=True)):
+            out[..., place] = (axis.first + axis.step * indices[..., i].double()).to(out)
+        return out
+
     def part(self, indices: Tensor, level: int) -> Tensor:
         """Return the indices of one level, of indices [..., n]."""
         return indices[..., self._parts[level]]

@@ -14,18 +14,18 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.tasks.clearance import (
+    grasp_clearance_m,
+    passing_height_m,
+    reach_m,
+    tips_below_tool_m,
+)
 from ba_torchrl.tasks.pick_place_commands import carrying_pose
-from ba_torchrl.tasks.structures.free_space import finger_path_clearance_m
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
 ALIGNED_M = 4e-3
 ALIGNED_RAD = 0.08
-FINGER_HALF_M = 0.0095
-"""Half the width of a finger that layouts count on, whichever robot comes: across the direction in
-which fingers open."""
-CLEARANCE_M = 0.03
-"""Height of the tool above a body's top at which the fingertips pass over it."""
 
 
 def move_toward(
@@ -74,7 +74,7 @@ def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
     (x, y, z), yaw = robot.tool_pose()
     bx, by, bz = body.position
     target_yaw = nearest_equivalent_yaw(yaw, body.yaw_rad, limits, math.pi / 2)
-    above_z = bz + body.shape.height_m / 2 + CLEARANCE_M
+    above_z = bz + body.shape.height_m / 2 + passing_height_m(robot.gripper)
     is_beside = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
     is_aligned = is_beside and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
     if robot.opening() < 0.9:
@@ -127,7 +127,7 @@ def push(
         return move_toward(robot, target, target_yaw, opening)
 
     behind = behind_point(robot, body, (ux, uy), workspace)
-    over_z = body.position[2] + half + CLEARANCE_M
+    over_z = body.position[2] + half + passing_height_m(robot.gripper)
     arrived = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
     in_the_way = not arrived and _distance_to_segment((bx, by), (x, y), behind) < 0.9 * math.dist(
         behind, (bx, by)
@@ -177,8 +177,6 @@ SLACK_M = 8e-3
 """Part of that gap that may be missing on the way."""
 RELEASE_GAP_M = 1e-3
 """A body is let go this far above what it will rest on."""
-HALF_FINGER_DEPTH_M = 0.015
-"""Half the extent of a fingertip, along the direction in which the fingers open."""
 
 
 def carry_to(
@@ -225,7 +223,7 @@ def carry_to(
         yaw + turn,
         CLOSED,
         limits,
-        below_m=max(tool[2] - vertical_extent(body)[0], tip_below_tool_m(robot)),
+        below_m=max(tool[2] - vertical_extent(body)[0], tips_below_tool_m(robot)),
         obstacles=[other for other in obstacles if other is not body],
         ceiling_m=ceiling_m,
         hover_m=hover_m,
@@ -258,7 +256,7 @@ def pick_up(
     target_yaw = min(
         (nearest_equivalent_yaw(yaw, wanted, limits, math.pi) for wanted in yaws_rad),
         key=lambda wanted: (
-            finger_room(robot, body, wanted, others) <= 0,
+            grasp_clearance_m(robot.gripper, body, wanted, others) <= 0,
             abs(wrap_angle(wanted - yaw)),
         ),
     )
@@ -270,7 +268,7 @@ def pick_up(
         return move_toward(
             robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= limits.step_m else OPEN
         )
-    below_m = tip_below_tool_m(robot)
+    below_m = tips_below_tool_m(robot)
     over_z = min(vertical_extent(body)[1] + below_m + HOVER_M, ceiling_m)
     return travel(
         robot,
@@ -282,11 +280,6 @@ def pick_up(
         obstacles=[body, *others],
         ceiling_m=ceiling_m,
     )
-
-
-def tip_below_tool_m(robot: Robot) -> float:
-    """Return how far below the tool point the fingers end as they are opened now, metres."""
-    return -robot.gripper.tip_m(robot.opening() * robot.gripper.half_gap_m)
 
 
 def travel(
@@ -319,7 +312,7 @@ def travel(
         s + min(max(t - s, -limits.step_m), limits.step_m)
         for s, t in zip(start, target, strict=True)
     )
-    hand = robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
+    hand = reach_m(robot.gripper)
     zones = [
         (body.position, hand + radius_m(body), vertical_extent(body)[1] + below_m + hover_m)
         for body in obstacles
@@ -330,31 +323,6 @@ def travel(
     if needed is None or start[2] >= ceiling_m - 1e-3:
         return move_toward(robot, (target[0], target[1], start[2]), yaw_rad, opening)
     return lift(min(needed + 1e-3, ceiling_m) - start[2], opening)
-
-
-def finger_room(
-    robot: Robot,
-    body: Body,
-    yaw_rad: float,
-    others: Sequence[Body],
-    opening: float = 1.0,
-    at: Vector | None = None,
-) -> float:
-    """Return the gap between the fingers, open around a body, and what stands beside it.
-
-    It is in metres, negative where something stands in their way.
-
-    Args:
-        robot: whose fingers.
-        body: what they are to close on.
-        yaw_rad: the gripper's.
-        others: bodies that may stand in their way.
-        opening: of the gripper, 0 to 1.
-        at: where the body is, if not where it is now.
-    """
-    apart = HALF_FINGER_DEPTH_M + opening * (robot.finger_span_m / 2 - HALF_FINGER_DEPTH_M)
-    ways_m = [(x - HALF_FINGER_DEPTH_M, x + HALF_FINGER_DEPTH_M) for x in (-apart, apart)]
-    return finger_path_clearance_m(robot.gripper, body, yaw_rad, ways_m, others, at)
 
 
 def _height_needed(

@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
@@ -182,6 +183,55 @@ def test_networks_and_tasks_of_the_other_kind_are_refused():
         spatial.check(cnn, "open_loop")
     with pytest.raises(ConfigError, match=r"for open_loop tasks; close_loop tasks take .* cnn"):
         close.check(fcn, "close_loop")
-    with pytest.raises(ConfigError, match="for open_loop tasks, not for close_loop ones"):
+    with pytest.raises(ConfigError, match="learns open_loop tasks, not close_loop ones"):
         spatial.check(cnn, "close_loop")
     spatial.check(fcn, "open_loop")
+
+
+def test_demonstrations_are_executed_as_they_are_learnt():
+    algorithm = build()
+    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
+    episodes = collect_demonstrations(env, 3, seed=0, nearest_action=algorithm.nearest_action)
+    plain = collect_demonstrations(env, 3, seed=0)
+    env.close()
+    for episode in episodes:
+        assert torch.equal(algorithm.nearest_action(episode["action"]), episode["action"])
+    moved = (algorithm.nearest_action(plain[0]["action"]) - plain[0]["action"]).abs()
+    assert moved[:, 3].max() > 0.01  # the expert's own actions are off the grid
+    algorithm.on_demonstrations(episodes)
+    stored = algorithm.replay.expert.storage.column("action")
+    assert torch.equal(stored, torch.cat([episode["action"] for episode in episodes]))
+
+
+@pytest.mark.parametrize("yaw", [3.1, 1.5])
+def test_a_yaw_that_wraps_reverses_the_image_of_what_is_held(yaw):
+    algorithm = build()  # yaws at multiples of pi / 4
+    image = torch.rand(1, 24, 24).half().float()
+    states = TensorDict(
+        {
+            "pixels": torch.zeros(4, 1, 32, 32),
+            "in_hand": torch.stack(
+                [torch.zeros_like(image), image, image, torch.zeros_like(image)]
+            ),
+            "holding": torch.tensor([False, True, True, False])[:, None],
+        },
+        [4],
+    )
+    episode = states[:3].clone()
+    # a pick, a place that does nothing, and one that releases
+    episode["action"] = torch.tensor(
+        [[0, 0.45, 0, yaw], [1, 0.4, 0.1, 0.8], [1, 0.4, 0.1, 0.8]], dtype=torch.float32
+    )
+    episode["next"] = states[1:].clone()
+    episode["next", "reward"] = torch.zeros(3, 1)
+    for key in ("done", "terminated", "truncated", "fault"):
+        episode["next", key] = torch.zeros(3, 1, dtype=torch.bool)
+    algorithm.on_demonstrations([episode])
+    stored = algorithm.replay.expert.storage[:3]
+    wraps = yaw > 3
+    expected = image.flip(-2, -1) if wraps else image
+    assert stored["action"][0, 3] == pytest.approx(0.0 if wraps else math.pi / 2)
+    for shown in (stored["next", "in_hand"][:2], stored["in_hand"][1:]):
+        assert torch.equal(shown, expected.expand(2, -1, -1, -1))
+    assert not stored["in_hand"][0].any()
+    assert not stored["next", "in_hand"][2].any()

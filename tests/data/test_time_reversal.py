@@ -154,9 +154,9 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
     assert undo.primitive == PICK
     assert undo[1:4] == pytest.approx((0.3, -0.104, 0.015))
     assert undo.rz_rad == pytest.approx(math.pi / 2)
-    assert held.undo(None, None, lowest_m=0.014) == undo
-    assert held.undo(None, None, lowest_m=0.017) == undo._replace(z_m=0.017)
-    assert before.undo(body, grasp, lowest_m=0.2).z_m == pytest.approx(0.05)  # a place
+    assert held.undo(None, None, lowest_m=lambda _: 0.014) == undo
+    assert held.undo(None, None, lowest_m=lambda _: 0.017) == undo._replace(z_m=0.017)
+    assert before.undo(body, grasp, lowest_m=lambda _: 0.2).z_m == pytest.approx(0.05)  # a place
 
 
 def test_nothing_undoes_an_action_that_moved_nothing_or_two_things():

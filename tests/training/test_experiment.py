@@ -61,7 +61,7 @@ def test_a_run_writes_its_files(tmp_path):
     assert scalars["demonstrations/success_rate"].values[0] == 1.0
     # two pretraining updates, then one per step of both environments
     assert scalars["train/env_steps"].values[-1] == 8
-    assert find_checkpoint(folder, "latest").name.endswith("6")
+    assert find_checkpoint(folder).name.endswith("6")
 
 
 @pytest.mark.parametrize("parallel", [False, True])
@@ -115,7 +115,7 @@ def test_a_crash_while_saving_keeps_the_last_checkpoint(tmp_path, monkeypatch):
         patch.setattr(algorithm, "state_dict", lambda: {"loss": 1 / 0})
         with pytest.raises(ZeroDivisionError):
             checkpoints.save(2, 0.2)
-    assert find_checkpoint(config.folder, "latest").name.endswith("1")
+    assert find_checkpoint(config.folder).name.endswith("1")
 
 
 def test_the_best_checkpoint_outlives_the_rotation(tmp_path):
@@ -127,10 +127,6 @@ def test_the_best_checkpoint_outlives_the_rotation(tmp_path):
         checkpoints.save(updates, rate)
     kept = sorted(path.name[-1] for path in (config.folder / "checkpoints").iterdir())
     assert kept == ["1", "3"]
-    assert find_checkpoint(config.folder).name.endswith("1")
-    assert find_checkpoint(config.folder, "latest").name.endswith("3")
-    with pytest.raises(ConfigError, match="'newest' is none of best, latest"):
-        find_checkpoint(config.folder, "newest")
 
 
 def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
@@ -166,7 +162,7 @@ def test_a_missing_checkpoint_is_explained(tmp_path):
         ({"env": {"obs_sise": 64}}, "Did you mean 'obs_size'"),
         ({"env": {"seed": 3}}, "set by the experiment"),
         ({"env": {"obs_type": "vec"}}, "obs_type"),
-        ({"task": "open_loop/block_stacking"}, "an algorithm for close_loop tasks, not"),
+        ({"task": "open_loop/block_stacking"}, "SACConfig learns close_loop tasks"),
         ({"algorithm": {"name": "ppo"}}, "unknown algorithm 'ppo'.*sac"),
         ({"algorithm": {"name": "sac", "gama": 0.9}}, "Did you mean 'gamma'"),
         ({"algorithm": {"batch_size": 3}}, "algorithm.name is missing"),
@@ -218,14 +214,17 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
     assert result.evaluation.episodes == 4
     scalars = read_scalars(tmp_path / "run")
     assert scalars["demonstrations/success_rate"].values == [1.0]
-    _, algorithm = load(tmp_path / "run", "latest")
+    _, algorithm = load(tmp_path / "run")
     assert algorithm.updates == 6
 
 
-@pytest.mark.parametrize("view", ["camera_side_rgbd", "camera_center_xy"])
-def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view):
+@pytest.mark.parametrize(
+    ("view", "reason"),
+    [("camera_side_rgbd", "choose another view_type"), ("camera_center_xy", "values from zero")],
+)
+def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view, reason):
     config = tiny(tmp_path, env={**TINY["env"], "view_type": view})
-    with pytest.raises(ConfigError, match=r"choose another view_type|takes values from zero"):
+    with pytest.raises(ConfigError, match=reason):
         Experiment(config, progress=False)
     assert not (tmp_path / "run").exists()
 

@@ -279,7 +279,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             update_priority: see TorchRL.
 
         Returns:
-            Their indices, int64 [M], M <= N.
+            Indices of those that were stored, int64 [M], M <= N.
 
         Raises:
             ReplaySchemaError: entries, types or shapes are not those of the stored ones.
@@ -299,6 +299,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             data = data[sound]
         if not len(data):
             return torch.zeros(0, dtype=torch.long)
+        data = self.writer.fitting(data)
         return super().extend(data, update_priority=update_priority)
 
     def _check_schema(self, data: TensorDictBase) -> None:

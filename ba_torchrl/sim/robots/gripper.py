@@ -15,6 +15,8 @@ from ba_torchrl.sim.world import World
 
 FLOOR_GAP_M = 1e-3
 """Distance that fingertips keep from the floor while they close."""
+GRASPING_M = 0.02
+"""Height above the tool point up to which fingers are beside what they grasp."""
 TIPS_M = 0.01
 """The lowest part of the fingers, which counts as their tips."""
 
@@ -73,6 +75,26 @@ class Gripper:
     """Distances, ascending from zero, and the height at which the open gripper begins there."""
     closed_outline: tuple[tuple[float, float], ...]
     """The same of the closed gripper."""
+
+    @property
+    def finger_depth_m(self) -> float:
+        """Extent of a fingertip along the line on which the fingers close."""
+        return self.closed_half_m - self.arc[0][0]
+
+    @property
+    def finger_reach_m(self) -> float:
+        """Distance from the tool point to the outside of the open fingers, where they grasp."""
+        tips_m = self.half_gap_m + self.finger_depth_m
+        return max([tips_m, *(u for u, z in self.outline if z < GRASPING_M)])
+
+    @property
+    def lowest_m(self) -> float:
+        """Height at which the fingers end where their arc is lowest."""
+        return min(z for _, z in self.arc)
+
+    def closed_reach_m(self, height_m: float) -> float:
+        """Return how far the closed hand reaches from the tool point below a height."""
+        return max((u for u, z in self.closed_outline if z < height_m), default=0.0)
 
     def tip_m(self, half_gap_m: float) -> float:
         """Return the height at which the fingers end, given half the distance between them."""

@@ -13,11 +13,11 @@ from ba_torchrl.sim.bodies import Body, Box, Color, Solid, vertical_extent
 from ba_torchrl.sim.contacts import bearing_force_n, contacts, gap_m
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, moved
-from ba_torchrl.tasks.base import BLOCK_M, TASKS
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.clearance import reach_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     CLOSED,
-    HALF_FINGER_DEPTH_M,
     HOVER_M,
     OPEN,
     lift,
@@ -47,23 +47,16 @@ NEAR_M = 5e-4
 """Fingers come down to this gap above the block before they press: what starts closer than a
 millimetre creeps, and does not hit the block."""
 TOUCH_M = 3e-3
-"""Gap above the block at which the approach ends."""
+"""Tolerance of the height at which the approach ends."""
 PRESS_ASIDE_M = 5e-3
 """The place to press on is met within this distance."""
 PRESS_TURN_RAD = 0.15
 """The fingers stand along a wall within this angle."""
 WALL_GAP_M = 1.5e-3
 """The low hand comes this much closer to a wall than where it presses, and no more."""
-HAND_HALF_M = 0.04
-"""Half the closed hand's width along the fingers, with 2 mm to spare; with more, the press would be
-farther from the block's middle and tilt it. At scale 1: less of the hand is beside a lower wall."""
-TIP_HALF_M = 8e-3
-"""At scale 1, the middle of the fingertips stays this far from the edge of the block's top."""
-
-TIP_BELOW_TOOL_M = 0.011
-"""About how far below the tool point closed fingers end: where it matters, gaps are measured."""
-OPENING_HEIGHT_M = TIP_BELOW_TOOL_M + HOVER_M
-"""Height of the tool above the block's top at which the fingers open."""
+HAND_MARGIN_M = 0.01
+"""Gap wanted between the closed hand and a wall beside it; with more, the press would be farther
+from the block's middle and tilt it."""
 
 
 @TASKS.register("close_loop/corner_picking")
@@ -142,7 +135,9 @@ class CornerPicking(CloseLoopTask):
             return self._pull() if is_pressing else self._press()
         if is_pressing:  # no turn yet, and steeply up: else the fingers would take the block along
             x, y, z = block.position
-            return move_toward(robot, (x, y, z + self.block_m / 2 + OPENING_HEIGHT_M), yaw, OPEN)
+            return move_toward(
+                robot, (x, y, z + self.block_m / 2 + self._tips_below_m + HOVER_M), yaw, OPEN
+            )
         ceiling = self.settings.workspace.z[1]
         return pick_up(robot, block, limits, yaws_rad=yaws, ceiling_m=ceiling)
 
@@ -153,7 +148,7 @@ class CornerPicking(CloseLoopTask):
             yaw_rad: the gripper's; the gap is in metres, negative where there is none.
         """
         turn = yaw_rad - self.corner.yaw_rad
-        along = self.robot.finger_span_m / 2 + HALF_FINGER_DEPTH_M
+        along = reach_m(self.robot.gripper)
         across = self.robot.gripper.half_width_m
         cos, sin = abs(math.cos(turn)), abs(math.sin(turn))
         extents = (along * cos + across * sin, along * sin + across * cos)
@@ -165,6 +160,11 @@ class CornerPicking(CloseLoopTask):
             for b, extent in zip(place, extents, strict=True)
         )
 
+    @property
+    def _tips_below_m(self) -> float:
+        """How far below the tool point the closed fingers end."""
+        return -self.robot.gripper.tip_m(0.0)
+
     def _press(self) -> GripperCommand:
         """Go over the block with closed fingers, come down to it, and press."""
         robot, limits = self.robot, self.action_limits
@@ -172,15 +172,17 @@ class CornerPicking(CloseLoopTask):
         target_yaw = nearest_equivalent_yaw(yaw, self.corner.yaw_rad, limits, math.pi / 2)
         turn = wrap_angle(target_yaw - yaw)
         # the hand is wider than the block along the fingers, and has the wall beside it
+        top, wall_top = vertical_extent(self.block)[1], vertical_extent(self.walls)[1]
+        gripper = robot.gripper
+        hand_half = gripper.closed_reach_m(wall_top - top - self._tips_below_m) + HAND_MARGIN_M
+        away = min(hand_half - self.block_m / 2, self.block_m / 2 - gripper.half_width_m)
         px, py = self.corner.to_local(*self.block.position[:2])
-        away = min(HAND_HALF_M - BLOCK_M / 2, BLOCK_M / 2 - TIP_HALF_M) * self.settings.scale
         if abs(math.cos(target_yaw - self.corner.yaw_rad)) > 0.7:
             px += away
         else:
             py += away
         tool_x, tool_y = self.corner.to_local(x, y)
-        top = vertical_extent(self.block)[1]
-        low_z = top + TIP_BELOW_TOOL_M + TOUCH_M
+        low_z = top + self._tips_below_m + NEAR_M
         aside = max(abs(tool_x - px), abs(tool_y - py))
         is_clear = min(tool_x - px, tool_y - py) > -WALL_GAP_M and abs(turn) < PRESS_TURN_RAD
         target = self.corner.to_world(px, py)
@@ -193,7 +195,7 @@ class CornerPicking(CloseLoopTask):
         if z < low_z - TOUCH_M / 2 and aside > PRESS_ASIDE_M:
             return lift(low_z + TOUCH_M - z)  # not from the side: that pushes the block back
         if not is_clear or robot.opening() >= 0.1:
-            low_z = vertical_extent(self.walls)[1] + TIP_BELOW_TOOL_M + HOVER_M
+            low_z = wall_top + self._tips_below_m + HOVER_M
             if z < low_z - 1e-3:
                 return lift(low_z - z)
         return move_toward(robot, (*target, low_z), target_yaw, CLOSED)

@@ -15,13 +15,12 @@ from ba_torchrl.sim.bodies import Body, Color, Solid
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.clearance import passing_height_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
-    CLEARANCE_M,
     CLOSED,
-    FINGER_HALF_M,
     lift,
     move_toward,
     nearest_equivalent_yaw,
@@ -49,11 +48,12 @@ LIGHT_WOOD: Color = (0.9, 0.78, 0.6, 1.0)
 HOOK_DEPTH_M = 0.01
 """The expert's tool below the rod's axis; the fingertips reach another 1.5 cm down."""
 PLAY_BEHIND_M = 0.0085
-"""Gap between rod and fingers when they come down behind it, in the middle of the room there."""
+"""Gap between rod and fingers when they come down behind it; less for fingers that nearly fill the
+room there."""
 SLIGHT_TURN_RAD = 0.4
 """Turned farther than this, the gripper needs room for its open fingers in front of the cabinet."""
-SPAN_HALF_M = 0.07
-"""Half the width of the gripper, across its open fingers."""
+BEHIND_ROD_M = 0.0095
+"""The workspace reaches at least this far behind the rod on its way, for the middle of fingers."""
 MARGIN_M = 0.01
 """The expert pulls this much farther than the goal asks."""
 
@@ -146,17 +146,19 @@ class DrawerOpening(CloseLoopTask):
             target = handle.to_world(ahead + min(farther, longest), 0.0)
             return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
 
-        behind = -radius - finger - PLAY_BEHIND_M
+        play = min(PLAY_BEHIND_M, (-radius - front) / 2 - finger)
+        behind = -radius - finger - play
         hx, hy = handle.to_world(behind, 0.0)
         is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
         if is_beside and turn <= ALIGNED_RAD and is_closed:
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
-        across = 2 * finger if turn < SLIGHT_TURN_RAD else SPAN_HALF_M
+        across = 2 * finger if turn < SLIGHT_TURN_RAD else robot.hand_half_m[0]
         is_over_cabinet = ahead < front + across
         top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
-        if z < top + CLEARANCE_M - 1e-3:
-            return lift(top + CLEARANCE_M - z, robot.opening())
-        return move_toward(robot, (hx, hy, top + CLEARANCE_M), target_yaw, CLOSED)
+        over_z = top + passing_height_m(robot.gripper)
+        if z < over_z - 1e-3:
+            return lift(over_z - z, robot.opening())
+        return move_toward(robot, (hx, hy, over_z), target_yaw, CLOSED)
 
     @property
     def handle_pose(self) -> YawPose:
@@ -186,7 +188,7 @@ class DrawerOpening(CloseLoopTask):
         """Whether the handle of the closed drawer stays in the workspace on its way to the goal."""
         (x, y, z), heading = self.handle_pose
         ux, uy = math.cos(heading), math.sin(heading)
-        behind = -ROD_DIAMETER_M - FINGER_HALF_M
+        behind = -ROD_DIAMETER_M - BEHIND_ROD_M
         return all(
             self.settings.workspace.contains((x + s * ux, y + s * uy, z - HOOK_DEPTH_M))
             for s in (behind, self._goal_m)

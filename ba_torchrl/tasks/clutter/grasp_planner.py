@@ -84,7 +84,7 @@ class GraspPlanner:
             half_gap=gripper.half_gap_m,
             band_half=self.band_half_m,
             palm=gripper.palm_m,
-            depth=gripper.closed_half_m - gripper.arc[0][0],
+            depth=gripper.finger_depth_m,
             arc_u=np.array([u for u, _ in gripper.arc]),
             arc_z=np.array([z for _, z in gripper.arc]),
             outline_u=outline[:, 0].copy(),

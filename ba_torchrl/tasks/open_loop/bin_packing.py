@@ -16,15 +16,9 @@ from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_me
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.footprints import Rectangle, narrowest, outline
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
-from ba_torchrl.tasks.packing.footprints import (
-    Footprint,
-    Rectangle,
-    narrowest,
-    outline,
-    random_rectangle,
-    scatter,
-)
+from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.pick_place_commands import no_op
 
 BIN_M = (0.176, 0.144, 0.08)
@@ -38,8 +32,8 @@ PICK_BELOW_M = 0.011
 """Objects are held this far below their top: the fingers stay out of what a flat one lies on."""
 LOWEST_PICK_M = 0.012
 EAVES_M = 0.026
-HAND_M = (0.06, 0.016)
-"""Half the room of the hand as it picks an object."""
+FREE_HALF_M = (0.06, 0.016)
+"""Half the extents of the area around an object that is free at the start, for the pick."""
 LAYOUTS = 20
 
 PIXEL_M = 0.001
@@ -116,7 +110,7 @@ class BinPacking(PackingTask):
         """Put the bin anywhere, and random objects around it."""
         count = self.settings.num_objects
         half_x, half_y, _ = (size * self.unit / 2 for size in BIN_M)
-        hand = tuple(size * self.unit for size in HAND_M)
+        hand = tuple(size * self.unit for size in FREE_HALF_M)
         for attempt in range(LAYOUTS):
             # fixed orientations: two by three of the largest objects lie side by side
             around = random_rectangle(self, rng, half_x, half_y, fixed_yaw_rad=math.pi / 2)

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
+from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.packing.base import OPEN_M, RELEASE_GAP_M, Grasp, PackingTask, open_box
-from ba_torchrl.tasks.packing.footprints import (
-    TIP_M,
-    Footprint,
-    Rectangle,
-    finger_gap_m,
-    random_rectangle,
-    scatter,
-)
+from ba_torchrl.tasks.clearance import half_gap_m, outline_clearance_m
+from ba_torchrl.tasks.footprints import Rectangle
+from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, Grasp, PackingTask, open_box
+from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
@@ -166,11 +163,11 @@ class BottleArrangement(PackingTask):
             floor = self._floor_z_m()
             yaw = self.robot.tool_pose()[1]
             if self.action_limits.turn_rad:
-                others = self.obstacles(held, floor + self.depth_m(held) - TIP_M)
+                others = self.obstacles(held, floor + self.depth_m(held) + self.tips_m)
                 half = self.release_half_m(held)
                 yaw = max(
                     self._yaws(),
-                    key=lambda option: round(finger_gap_m((x, y), option, half, others), 4),
+                    key=lambda option: round(self._finger_gap_m((x, y), option, half, others), 4),
                 )
             turn = yaw - self.robot.tool_pose()[1]
             return self.place(held, (x, y, floor + RELEASE_GAP_M), turn)
@@ -190,15 +187,26 @@ class BottleArrangement(PackingTask):
     def grasp(self, body: Body) -> Grasp:
         """Return where to grasp a bottle: by its neck, from the side with most room."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
-        others = self.obstacles(body, height - TIP_M)
+        others = self.obstacles(body, height + self.tips_m)
         x, y, _ = body.position
-        half = self.finger_opening * OPEN_M / 2
+        half = half_gap_m(self.robot.gripper, self.finger_opening)
         choices = [
-            Grasp(x, y, yaw, finger_gap_m((x, y), yaw, half, others)) for yaw in self._yaws()
+            Grasp(x, y, yaw, self._finger_gap_m((x, y), yaw, half, others)) for yaw in self._yaws()
         ]
         return max(choices, key=lambda choice: round(choice.room_m, 4))
 
     # ----------------------------------------------------------------------------------------
+
+    def _finger_gap_m(
+        self,
+        xy: tuple[float, float],
+        yaw_rad: float,
+        half_opening_m: float,
+        others: Sequence[Rectangle],
+    ) -> float:
+        """Return the gap between the fingers at a place and the outlines of others."""
+        tool = PlanarFrame(*xy, yaw_rad)
+        return outline_clearance_m(self.robot.gripper, tool, half_opening_m, others)
 
     def _yaws(self) -> list[float]:
         """Return the yaws to grasp or let go of a bottle at, a diagonal of the tray first."""

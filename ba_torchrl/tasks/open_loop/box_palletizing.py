@@ -12,16 +12,9 @@ from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, Box, vertical_extent
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
 from ba_torchrl.tasks.packing.base import ENOUGH_M, RELEASE_GAP_M, PackingTask
-from ba_torchrl.tasks.packing.footprints import (
-    Footprint,
-    Rectangle,
-    gap_m,
-    narrowest,
-    outline,
-    random_rectangle,
-    scatter,
-)
+from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.pick_place_commands import no_op
 from ba_torchrl.tasks.structures.blueprint import CUBOID, UPRIGHT_RAD
 
@@ -40,15 +33,15 @@ SLOT_M = 0.01
 SLOT_RAD = math.pi / 8
 GRIP_M = 0.008
 """Boxes are held this far below their top, where fingers fit between their neighbours."""
-FINGER_GAP_M = 0.019
+NEIGHBOR_GAP_M = 0.019
 """Between boxes side by side a finger fits that lets go."""
 SHIFTS = (0.0, 0.3, -0.3, 0.6, -0.6)
 """Where in a slot a box may go, as a multiple of what is tolerated."""
 TIP_OVER_M = 0.008
 """A box that stands on its end is set down with its middle this far beyond the pallet's edge."""
 TIP_PLACES = 2
-HAND_M = (0.056, 0.016)
-"""Half the room of the hand as it picks a box."""
+FREE_HALF_M = (0.056, 0.016)
+"""Half the extents of the area around an object that is free at the start, for the pick."""
 SETTLE_STEPS = 100
 LAYOUTS = 20
 
@@ -93,7 +86,7 @@ class BoxPalletizing(PackingTask):
         """Put the pallet anywhere, and the first box beside it."""
         half_x, half_y, _ = (size * self.unit / 2 for size in PALLET_M)
         width, length, _ = (size * self.unit / 2 for size in BOX_M)
-        hand = tuple(size * self.unit for size in HAND_M)
+        hand = tuple(size * self.unit for size in FREE_HALF_M)
         room = Footprint(width, length, *hand)
         for attempt in range(LAYOUTS):
             pallet = random_rectangle(self, rng, half_x, half_y, fixed_yaw_rad=math.pi / 2)
@@ -239,7 +232,7 @@ class BoxPalletizing(PackingTask):
                 spots,
                 key=lambda spot: (
                     min((gap_m(spot, other) for other in beside), default=math.inf)
-                    > FINGER_GAP_M * self.unit
+                    > NEIGHBOR_GAP_M * self.unit
                 ),
             )
             if all(gap_m(spot, other) > 0 for other in astray):

@@ -15,7 +15,8 @@ from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
-from ba_torchrl.tasks.motion_primitives import RELEASE_GAP_M, finger_room
+from ba_torchrl.tasks.clearance import grasp_clearance_m
+from ba_torchrl.tasks.motion_primitives import RELEASE_GAP_M
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 
@@ -348,7 +349,7 @@ class CovidTest(OpenLoopTask):
     def _room(self, body: Body) -> float:
         others = [other for other in self.objects if other is not body] + self._walls
         yaw = self._grasp_yaw(body)
-        return finger_room(self.robot, body, yaw, others, self.finger_opening)
+        return grasp_clearance_m(self.robot.gripper, body, yaw, others, self.finger_opening)
 
     # -- places ------------------------------------------------------------------------------
 

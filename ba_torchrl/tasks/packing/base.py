@@ -11,28 +11,19 @@ import pybullet
 
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
-from ba_torchrl.sim.geometry import Vector, YawPose, downward_pose
+from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose, downward_pose
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, joined, moved
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.clearance import half_gap_m, hand_rectangle, outline_clearance_m
+from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
-from ba_torchrl.tasks.packing.footprints import (
-    RELEASE_M,
-    TIP_M,
-    Rectangle,
-    finger_gap_m,
-    gap_m,
-    narrowest,
-    outline,
-)
 from ba_torchrl.tasks.pick_place_commands import pick_command, place_command
 
 SCALE = 0.8
 """At this scale, objects have the sizes of appendix A.1."""
-OPEN_M = 0.074
-"""Between the fingers of a fully open gripper."""
-HAND_ABOVE_M = 0.05
-"""Above the fingers, this far above the tool point, the hand is wider than they are."""
+RELEASE_M = 0.004
+"""How far a finger opens to let go."""
 RELEASE_GAP_M = 1e-3
 """What is held is let go this far above what it will rest on."""
 ENOUGH_M = 4e-3
@@ -156,18 +147,19 @@ class PackingTask(OpenLoopControl, Task):
     def grasp(self, body: Body) -> Grasp:
         """Return where to grasp an object: in its middle, or where the fingers have more room."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
-        others = self.obstacles(body, height - TIP_M)
-        tall = self.obstacles(body, height + HAND_ABOVE_M)
-        half_hand = self.robot.hand_half_m
-        half_open = self.finger_opening * OPEN_M / 2
+        gripper = self.robot.gripper
+        others = self.obstacles(body, height + self.tips_m)
+        tall = self.obstacles(body, height + gripper.palm_m)
+        half_open = half_gap_m(gripper, self.finger_opening)
         choices = []
         for side in narrowest(body, None if self.action_limits.turn_rad else 0.0):
             for offset in self.grasp_offsets_m:
                 if abs(offset * self.unit) > max(side.half_y - 0.012, 0.0):
                     continue
                 xy = side.frame.to_world(0.0, offset * self.unit)
-                room = finger_gap_m(xy, side.yaw_rad, half_open, others)
-                hand = Rectangle(*xy, side.yaw_rad, *half_hand)
+                tool = PlanarFrame(*xy, side.yaw_rad)
+                room = outline_clearance_m(gripper, tool, half_open, others)
+                hand = hand_rectangle(self.robot, tool)
                 room = min([room, *(gap_m(hand, other) for other in tall)])
                 choices.append(Grasp(*xy, side.yaw_rad, room))
         return max(choices, key=lambda choice: min(choice.room_m, ENOUGH_M))
@@ -190,6 +182,12 @@ class PackingTask(OpenLoopControl, Task):
         if yaw > math.pi - TURN_MARGIN_RAD:
             yaw = 0.0
         return place_command(tool, held.pose, held.pose.moved_to(position, yaw - tool.yaw_rad))
+
+    @property
+    def tips_m(self) -> float:
+        """Height above the tool point at which the open fingers end."""
+        gripper = self.robot.gripper
+        return gripper.tip_m(self.finger_opening * gripper.half_gap_m)
 
     def release_half_m(self, held: Body) -> float:
         """Return how far from the tool point the fingers' inner sides are as they let go."""

@@ -12,7 +12,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.tasks.structures.blueprint import Piece
-from ba_torchrl.tasks.structures.free_space import extent_along_m, finger_path_clearance_m
+from ba_torchrl.tasks.structures.free_space import extent_along_m
 
 SPARE_M = 2e-3
 """Room between a piece and a finger that comes down close by it."""
@@ -66,7 +66,7 @@ def edge_grasps(
         One for each finger; none if the body nearly fills the gripper.
     """
     half_gap_m = opening * gripper.half_gap_m
-    finger_m = gripper.closed_half_m - gripper.arc[0][0]
+    finger_m = gripper.finger_depth_m
     candidates = []
     for yaw in (yaw_rad, yaw_rad + math.pi):
         ahead = np.array([math.cos(yaw), math.sin(yaw)])
@@ -80,29 +80,6 @@ def edge_grasps(
                 )
             )
     return candidates
-
-
-def finger_way_room(
-    gripper: Gripper,
-    body: Body,
-    yaw_rad: float,
-    way_m: tuple[float, float],
-    others: Sequence[Body],
-    at: Vector | None = None,
-) -> float:
-    """Return the gap between a finger's way beside a body and what stands there.
-
-    It is in metres, negative where something is in the way.
-
-    Args:
-        gripper: its fingertips reach down to the ground.
-        body: what they are to close on.
-        yaw_rad: the gripper's.
-        way_m: ends of the way, from the body along the line on which the fingers close.
-        others: bodies that may be in the way.
-        at: where the body is, if not where it is now.
-    """
-    return finger_path_clearance_m(gripper, body, yaw_rad, (way_m,), others, at)
 
 
 class GraspBlocking:

@@ -14,11 +14,11 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, Color
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.clearance import grasp_clearance_m
 from ba_torchrl.tasks.close_loop_task import BLUE, GREEN, RED, CloseLoopControl
 from ba_torchrl.tasks.motion_primitives import (
     OPEN,
     carry_to,
-    finger_room,
     lift,
     nearest_equivalent_yaw,
     pick_up,
@@ -125,7 +125,7 @@ def assemble(
     @cache
     def effort(body: Body) -> float:
         others = [other for other in pieces if other is not body]
-        room = max(finger_room(robot, body, option, others) for option in yaws(body))
+        room = max(grasp_clearance_m(robot.gripper, body, option, others) for option in yaws(body))
         return math.dist((x, y), body.position[:2]) + (0.0 if room > 0 else NO_ROOM_M)
 
     area = PlacementArea(

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import PlanarFrame, Vector
-from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.geometry import Vector
 
 SPOT_STEP_M = 0.02
 """Spots are looked for in steps of this length."""
@@ -79,38 +77,3 @@ def extent_along_m(body: Body, ways: np.ndarray) -> np.ndarray:
 def _steps(low: float, high: float) -> list[float]:
     count = max(1, round((high - low) / SPOT_STEP_M))
     return [low + (high - low) * i / count for i in range(count + 1)]
-
-
-def finger_path_clearance_m(
-    gripper: Gripper,
-    body: Body,
-    yaw_rad: float,
-    ways_m: Sequence[tuple[float, float]],
-    others: Sequence[Body],
-    at: Vector | None = None,
-) -> float:
-    """Return the gap between the ways of fingertips beside a body and what stands there.
-
-    It is in metres, negative where something is in the way.
-
-    Args:
-        gripper: what is as low as its fingertips lies under them, and in no one's way.
-        body: what they are to close on.
-        yaw_rad: the gripper's.
-        ways_m: ends of the ways, from the body along the line on which the fingers close.
-        others: bodies that may be in the way.
-        at: where the body is, if not where it is now.
-    """
-    below_m = -min(z for _, z in gripper.arc)
-    bx, by, bz = body.position if at is None else at
-    frame = PlanarFrame(bx, by, yaw_rad)
-    gap = math.inf
-    for other in others:
-        corners = world_vertices(other)
-        if corners[:, 2].max() < bz - below_m:
-            continue
-        along, across = frame.to_local(corners[:, 0], corners[:, 1])
-        aside = max(across.min(), -across.max()) - gripper.half_width_m
-        for low, high in ways_m:
-            gap = min(gap, max(along.min() - high, low - along.max(), aside))
-    return float(gap)

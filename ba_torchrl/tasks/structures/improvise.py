@@ -16,7 +16,6 @@ from ba_torchrl.sim.assets.hulls import convex_hull, surface_samples, volume_and
 from ba_torchrl.sim.assets.random_shapes import UNIT_M, read_shape, shape_path
 from ba_torchrl.sim.bodies import Box, Color, Shape, Solid
 from ba_torchrl.sim.meshes import Mesh
-from ba_torchrl.tasks.motion_primitives import FINGER_HALF_M
 from ba_torchrl.tasks.structures.blueprint import CUBOID, Piece, Span
 from ba_torchrl.tasks.structures.parts import BLUE
 
@@ -42,6 +41,8 @@ START_GAP_M = 0.015
 SAMPLES = 4000
 SKIN_M = 2e-3
 """Points of a surface that is sampled, and the depth of those that a finger meets."""
+PATCH_HALF_M = 0.0095
+"""Half the height, and half the width, of the patch of a surface that counts as met by a finger."""
 WIDTH_WEIGHT = 2.0
 """What a metre of width costs, measured in cosines between sides and fingers."""
 ORANGE: Color = (0.9, 0.55, 0.2, 1.0)
@@ -107,12 +108,12 @@ def shape_piece(shape: Shape) -> Piece:
     to them, and narrow.
     """
     points, normals = surface_samples(shape.mesh(), SAMPLES)
-    level = np.abs(points[:, 2]) < FINGER_HALF_M
+    level = np.abs(points[:, 2]) < PATCH_HALF_M
     points, normals = points[level, :2], normals[level, :2]
 
     def quality(yaw: float) -> float:
         axis = np.array([math.cos(yaw), math.sin(yaw)])
-        met = np.abs(points @ (-axis[1], axis[0])) < FINGER_HALF_M
+        met = np.abs(points @ (-axis[1], axis[0])) < PATCH_HALF_M
         along, facing = points[met] @ axis, normals[met]
         first = facing[along < along.min() + SKIN_M].mean(axis=0)
         last = facing[along > along.max() - SKIN_M].mean(axis=0)

@@ -10,21 +10,19 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, radius_m, world_vertices
+from ba_torchrl.sim.bodies import Body, radius_m
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, downward_pose
 from ba_torchrl.tasks.base import Task
-from ba_torchrl.tasks.motion_primitives import finger_room
+from ba_torchrl.tasks.clearance import grasp_clearance_m, hand_clearance_m, path_clearance_m
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
-from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps, finger_way_room
+from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.planner import CROWDED, Move, StructurePlanner
 from ba_torchrl.tasks.structures.structure import Structure
 
-HAND_OVER_TOOL_M = 0.018
-"""What reaches higher than this above the tool point must keep clear of the whole hand."""
 SITE_GAP_M = 0.01
 """Gap wanted between a structure and the hand that fetches a piece beside it."""
 FREE_YAWS = 8
@@ -196,9 +194,8 @@ class StructureTask(OpenLoopControl, Task):
         room = spare = self._room_beside(body, candidate, others, None)
         if candidate.shift_m:
             gripper, yaw = self.robot.gripper, candidate.yaw_rad
-            spare = min(
-                room, finger_way_room(gripper, body, yaw, candidate.near_finger_range_m, others)
-            )
+            near = (candidate.near_finger_range_m,)
+            spare = min(room, path_clearance_m(gripper, body, yaw, near, others))
         return min(room, 0.0), not candidate.shift_m, spare
 
     def _room_beside(
@@ -213,21 +210,13 @@ class StructureTask(OpenLoopControl, Task):
             for other in others
             if math.dist(other.position[:2], (x, y)) < extent + radius_m(other)
         ]
-        yaw = candidate.yaw_rad
+        gripper, yaw = self.robot.gripper, candidate.yaw_rad
         if candidate.shift_m:
-            room = finger_way_room(
-                self.robot.gripper, body, yaw, candidate.far_finger_range_m, others, at
-            )
+            far = (candidate.far_finger_range_m,)
+            fingers = path_clearance_m(gripper, body, yaw, far, others, at)
         else:
-            room = finger_room(self.robot, body, yaw, others, self.finger_opening, at)
-        for other in others:
-            corners = world_vertices(other)
-            if corners[:, 2].max() > z + HAND_OVER_TOOL_M:
-                local = np.stack(PlanarFrame(x, y, yaw).to_local(corners[:, 0], corners[:, 1]), 1)
-                low, high = local.min(axis=0), local.max(axis=0)
-                gaps = np.maximum(low, -high) - self.robot.hand_half_m
-                room = min(room, float(gaps.max()))
-        return room
+            fingers = grasp_clearance_m(gripper, body, yaw, others, self.finger_opening, at)
+        return min(fingers, hand_clearance_m(self.robot, PlanarFrame(x, y, yaw), z, others))
 
     def _crowding(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
         """Return how much room is wanting at sites for the hand to fetch the rest, load and all.

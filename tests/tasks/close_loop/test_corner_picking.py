@@ -117,7 +117,7 @@ def test_room_beside_the_fingers_against_arithmetic(env):
     task = env.scene.task
     task.put_corner((0.45, 0.0), 0.7)
     task.block.place((*task.corner.to_world(0.01, -0.02), 0.027), 0.7)
-    along = task.robot.finger_span_m / 2 + 0.015
+    along = task.robot.gripper.finger_reach_m + 0.0075
     assert task.room_m(0.7) == pytest.approx(min(0.1 - along, 0.07 - 0.0095), abs=1e-6)
     assert task.room_m(0.7 + math.pi / 2) == pytest.approx(0.07 - along, abs=1e-6)
 

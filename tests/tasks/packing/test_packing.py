@@ -13,12 +13,13 @@ from ba_torchrl.errors import ConfigError, PlacementError
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest
 from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, pieces
 from ba_torchrl.tasks.open_loop.bottle_arrangement import BOTTLES_CM
 from ba_torchrl.tasks.open_loop.bottle_arrangement import slots as bottle_slots
 from ba_torchrl.tasks.open_loop.box_palletizing import BOX_M, PALLET_M, SLOT_M, slots
 from ba_torchrl.tasks.packing.base import open_box
-from ba_torchrl.tasks.packing.footprints import Footprint, Rectangle, gap_m, narrowest, scatter
+from ba_torchrl.tasks.packing.layout import Footprint, scatter
 from ba_torchrl.tasks.workspace import Workspace
 
 BIN, BOTTLES, BOXES = (

@@ -9,7 +9,8 @@ from ba_torchrl.sim.bodies import Box, Solid
 from ba_torchrl.sim.meshes import box_mesh, moved
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.structures.blocking import edge_grasps, finger_way_room
+from ba_torchrl.tasks.clearance import path_clearance_m
+from ba_torchrl.tasks.structures.blocking import edge_grasps
 
 CUBE = Box(size_m=(0.03, 0.03, 0.03))
 AT = (0.45, 0.02, 0.015)
@@ -89,11 +90,11 @@ def test_room_on_the_way_of_a_finger(world, offset, yaw, gap_m):
     body.place(AT)
     other.place((AT[0] + offset[0], AT[1] + offset[1], AT[2]))
     way_m = (0.015, 0.077)
-    assert finger_way_room(GRIPPER, body, yaw, way_m, [other]) == pytest.approx(gap_m, abs=1e-4)
+    assert path_clearance_m(GRIPPER, body, yaw, (way_m,), [other]) == pytest.approx(gap_m, abs=1e-4)
     # what counts is the place of one beside that of the other
     other.place((AT[0] + offset[0] + 0.05, AT[1] + offset[1], AT[2]))
     at = (AT[0] + 0.05, *AT[1:])
-    room = finger_way_room(GRIPPER, body, yaw, way_m, [other], at)
+    room = path_clearance_m(GRIPPER, body, yaw, (way_m,), [other], at)
     assert room == pytest.approx(gap_m, abs=1e-4)
 
 
@@ -101,6 +102,6 @@ def test_fingertips_pass_over_what_is_low(world):
     body, low = world.add(CUBE, "cube"), world.add(Box(size_m=(0.03, 0.03, 0.006)), "low")
     body.place(AT)
     low.place((AT[0] + 0.05, AT[1], 0.003))
-    assert finger_way_room(GRIPPER, body, 0.0, (0.015, 0.077), [low]) < 0
+    assert path_clearance_m(GRIPPER, body, 0.0, ((0.015, 0.077),), [low]) < 0
     raised = (*AT[:2], AT[2] + 0.01)
-    assert finger_way_room(GRIPPER, body, 0.0, (0.015, 0.077), [low], raised) == np.inf
+    assert path_clearance_m(GRIPPER, body, 0.0, ((0.015, 0.077),), [low], raised) == np.inf

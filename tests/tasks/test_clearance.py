@@ -1,0 +1,113 @@
+"""Room that a gripper needs, against arithmetic by hand."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.geometry import PlanarFrame
+from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.clearance import (
+    ASIDE_M,
+    INSIDE_M,
+    OUTSIDE_M,
+    finger_ranges_m,
+    finger_rectangles,
+    grasp_clearance_m,
+    hand_clearance_m,
+    hand_rectangle,
+    outline_clearance_m,
+    passing_height_m,
+    tips_below_tool_m,
+)
+from ba_torchrl.tasks.footprints import Rectangle
+
+EDGE_M = 0.03
+GRIPPER = Gripper(
+    half_gap_m=0.04,
+    half_width_m=0.01,
+    closed_half_m=0.018,
+    palm_m=0.05,
+    arc=((0.004, -0.01), (0.04, -0.006)),
+    outline=((0.0, math.inf), (0.04, -0.01), (0.06, 0.015), (0.07, 0.045)),
+    closed_outline=((0.0, -0.01), (0.02, 0.01), (0.035, 0.03)),
+)
+WIDE = replace(GRIPPER, half_width_m=0.015)
+
+
+@pytest.fixture
+def cubes():
+    with World() as world:
+        shape = Box(size_m=(EDGE_M,) * 3)
+        yield world.add(shape, "grasped"), world.add(shape, "other")
+
+
+def test_a_gripper_reaches_as_far_as_its_x():
+    assert GRIPPER.finger_depth_m == pytest.approx(0.014)
+    assert GRIPPER.finger_reach_m == 0.06
+    tips_only = replace(GRIPPER, outline=((0.0, math.inf), (0.04, -0.01)))
+    assert tips_only.finger_reach_m == pytest.approx(0.054)
+    assert GRIPPER.lowest_m == -0.01
+    assert [GRIPPER.closed_reach_m(z) for z in (-0.02, 0.0, 0.02, 0.1)] == [0, 0, 0.02, 0.035]
+
+
+@pytest.mark.parametrize("opening", [0.5, 1.0])
+def test_the_ranges_of_the_fingers(opening):
+    left, right = finger_ranges_m(GRIPPER, opening)
+    inner = opening * (0.04 - INSIDE_M)
+    assert right == pytest.approx((inner, 0.06 - (1 - opening) * 0.04 + OUTSIDE_M))
+    assert left == (-right[1], -right[0])
+
+
+@pytest.mark.parametrize("gripper", [GRIPPER, WIDE])
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_wider_fingers_have_less_room_beside_a_neighbour(cubes, gripper, yaw):
+    body, other = cubes
+    frame = PlanarFrame(0.45, 0.02, yaw)
+    body.place((0.45, 0.02, EDGE_M / 2), yaw)
+    # where a finger comes down, but aside
+    other.place((*frame.to_world(0.05, 0.035), EDGE_M / 2), yaw)
+    gap = grasp_clearance_m(gripper, body, yaw, [other])
+    assert gap == pytest.approx(0.035 - EDGE_M / 2 - gripper.half_width_m, abs=1e-4)
+
+
+def test_what_the_fingers_pass_over_is_in_no_ones_way(cubes):
+    body, other = cubes
+    body.place((0.45, 0.0, 0.1))
+    other.place((0.5, 0.0, EDGE_M / 2))
+    assert grasp_clearance_m(GRIPPER, body, 0.0, [other]) == math.inf
+    low = (0.45, 0.0, EDGE_M + 0.01 - 1e-3)  # the tips end 1 cm below the tool
+    assert grasp_clearance_m(GRIPPER, body, 0.0, [other], at=low) < 0
+
+
+def test_the_hand_meets_what_reaches_up_to_its_palm(cubes):
+    _, other = cubes
+    robot = SimpleNamespace(gripper=GRIPPER, hand_half_m=(0.07, 0.03))
+    tool = PlanarFrame(0.45, 0.0, math.pi / 2)
+    other.place((0.45, 0.1, EDGE_M / 2))
+    above = EDGE_M - GRIPPER.palm_m
+    assert hand_clearance_m(robot, tool, above + 1e-3, [other]) == math.inf
+    gap = hand_clearance_m(robot, tool, above - 1e-3, [other])
+    assert gap == pytest.approx(0.1 - EDGE_M / 2 - 0.07, abs=1e-4)
+    assert hand_rectangle(robot, tool) == Rectangle(0.45, 0.0, math.pi / 2, 0.07, 0.03)
+
+
+def test_fingers_from_above_and_their_gap_to_an_outline():
+    tool = PlanarFrame(0.4, 0.1, math.pi / 2)
+    left, right = finger_rectangles(GRIPPER, tool, 0.03)
+    assert left[:2] == pytest.approx((0.4, 0.1 - 0.04))
+    assert right == pytest.approx((0.4, 0.1 + 0.04, math.pi / 2, 0.01, 0.01 + ASIDE_M))
+    wall = Rectangle(0.4, 0.2, 0.0, 0.1, 0.01)
+    gap = outline_clearance_m(GRIPPER, tool, 0.03, [wall])
+    assert gap == pytest.approx(0.2 - 0.01 - (0.1 + 0.05))
+    assert outline_clearance_m(GRIPPER, tool, 0.03, []) == math.inf
+
+
+def test_heights_follow_from_how_deep_the_fingers_end():
+    assert passing_height_m(GRIPPER) == 0.03
+    assert passing_height_m(replace(GRIPPER, arc=((0.0, -0.04),))) == pytest.approx(0.052)
+    robot = SimpleNamespace(gripper=GRIPPER, opening=lambda: 1.0)
+    assert tips_below_tool_m(robot) == pytest.approx(0.006)
