@@ -47,6 +47,7 @@ class FlatConfig(StrictModel):
     """Hyper-parameters of the linear actor-critic."""
 
     control: ClassVar[str] = "close_loop"
+    image_keys: ClassVar[tuple[str, ...]] = ("pixels",)
     hidden: int = 8
 
     def build(self, spec):

@@ -204,7 +204,7 @@ from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
 
 @TASKS.register("mine/always_here")
 class AlwaysHere(BlockReaching):
-    def randomise(self, rng):
+    def initialize_episode(self, rng):
         self.stand(self.block, self.settings.workspace.center, 0.0)
 """
     )
