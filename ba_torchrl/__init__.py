@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ba_torchrl.envs.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from torchrl.envs import EnvBase
 
     from ba_torchrl.envs.base import ManipulationEnv
@@ -42,7 +45,13 @@ def make(task: str, **config: Any) -> ManipulationEnv:
 
 
 def make_vector_env(
-    task: str, num_envs: int, *, parallel: bool = True, start_method: str = "spawn", **config: Any
+    task: str,
+    num_envs: int,
+    *,
+    parallel: bool = True,
+    start_method: str = "spawn",
+    register_modules: Sequence[str | ModuleType] = (),
+    **config: Any,
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.
 
@@ -53,6 +62,9 @@ def make_vector_env(
             in this process (``SerialEnv``). The same seed gives the same episodes in both.
         start_method: ``spawn`` or ``fork``, how processes start. With ``spawn``, scripts need
             an ``if __name__ == "__main__":`` guard.
+        register_modules: modules outside the package that each process imports before it makes its
+            environment, such as ``["my_tasks"]``. Those that register the task and the robot are
+            found without being named.
         config: as for `make`.
 
     Raises:
@@ -60,4 +72,11 @@ def make_vector_env(
     """
     from ba_torchrl.envs.factory import make_vector
 
-    return make_vector(task, num_envs, parallel=parallel, start_method=start_method, **config)
+    return make_vector(
+        task,
+        num_envs,
+        parallel=parallel,
+        start_method=start_method,
+        register_modules=register_modules,
+        **config,
+    )

@@ -131,6 +131,8 @@ class EnvConfig(StrictModel):
     deconstruct: bool = False
     """Structures: start with the structure standing and take it apart; every observation contains
     the action that reverses the last one. See `ba_torchrl.data.time_reversal`."""
+    observations: tuple[str, ...] = ()
+    """Further observations by their registered names; see `ba_torchrl.envs.observations`."""
     floor_color: Rgb | None = None
     """Colour of the floor in pictures, each component from 0 to 1; light by default, and in
     PyBullet's window and `rgb` a chequered blue."""
@@ -182,6 +184,11 @@ class EnvConfig(StrictModel):
             raise ValueError("must be a number or a (low, high) pair")
         if isinstance(value, int | float):
             return (float(value), float(value))
+        return tuple(value) if isinstance(value, list) else value
+
+    @field_validator("observations", mode="before")
+    @classmethod
+    def _as_names(cls, value: Any) -> Any:
         return tuple(value) if isinstance(value, list) else value
 
     @field_validator("floor_color", "workspace_color", mode="before")

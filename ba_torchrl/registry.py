@@ -5,45 +5,82 @@ from __future__ import annotations
 import difflib
 import importlib
 import pkgutil
+import sys
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 from ba_torchrl.errors import UnknownNameError
+from ba_torchrl.plugins import load_entry_points
 
 T = TypeVar("T")
+
+PACKAGE = __name__.partition(".")[0]
+
+_LISTENERS: dict[str, list[Callable[[str], None]]] = {}
+"""By kind of entry, functions that are called with the name of each new entry."""
+
+
+def call_on_registration(kind: str, listener: Callable[[str], None]) -> None:
+    """Call a function with the name of every entry that registers from now on.
+
+    Args:
+        kind: of the entries, as given to `Registry`.
+        listener: gets the name, after the registry holds the entry.
+    """
+    _LISTENERS.setdefault(kind, []).append(listener)
 
 
 class Registry(Generic[T]):
     """Maps names to objects that register themselves when their module is imported.
 
-    Looking anything up first imports every module of ``package``, so that a new file there is
-    all it takes to add an entry.
+    The first look-up imports every module of ``package`` and the plugins that installed packages
+    declare (`ba_torchrl.plugins`). A module elsewhere adds its entries when it is imported.
 
     Args:
         kind: what the entries are, in the singular, for error messages ("task").
-        package: dotted name of the package whose modules hold the entries.
+        package: dotted name of the package whose modules hold the built-in entries.
     """
 
     def __init__(self, kind: str, package: str) -> None:
         self.kind = kind
         self.package = package
         self._entries: dict[str, T] = {}
-        self._scanned = False
+        self._modules: dict[str, str] = {}
+        self._is_scanned = False
 
     def register(self, name: str) -> Callable[[T], T]:
         """Return a decorator that files its argument under ``name``.
 
+        A class may be defined again by its own module, as in a notebook whose cell runs twice; the
+        new definition replaces the old one.
+
         Raises:
             ValueError: another object already has that name.
         """
+        module = sys._getframe(1).f_globals.get("__name__", "__main__")
 
         def decorate(entry: T) -> T:
-            known = self._entries.setdefault(name, entry)
-            if known is not entry:
+            known = self._entries.get(name, entry)
+            if known is not entry and not _is_redefinition(known, entry):
                 raise ValueError(f"two {self.kind}s are named {name!r}: {known!r} and {entry!r}")
+            self._entries[name] = entry
+            self._modules[name] = module
+            for listener in _LISTENERS.get(self.kind, ()):
+                listener(name)
             return entry
 
         return decorate
+
+    def plugin_module(self, name: str) -> str | None:
+        """Return the module outside the package that registered ``name``; None if it is built in.
+
+        Raises:
+            UnknownNameError: nothing is registered under ``name``.
+        """
+        if name not in self._modules:  # no look-up otherwise: it would scan in mid-import
+            _ = self[name]
+        module = self._modules[name]
+        return None if module.partition(".")[0] == PACKAGE else module
 
     def __getitem__(self, name: str) -> T:
         self._scan()
@@ -53,7 +90,9 @@ class Registry(Generic[T]):
             close = difflib.get_close_matches(str(name), self._entries, n=1)
             hint = f" Did you mean {close[0]!r}?" if close else ""
             raise UnknownNameError(
-                f"unknown {self.kind} {name!r}.{hint} Known: {', '.join(self)}"
+                f"unknown {self.kind} {name!r}.{hint} Known: {', '.join(self)}. A {self.kind} from "
+                "outside the package is known once its module is imported (recipes: "
+                "plugins=[module]; worker processes: register_modules=[module])"
             ) from None
 
     def __contains__(self, name: object) -> bool:
@@ -69,9 +108,19 @@ class Registry(Generic[T]):
         return len(self._entries)
 
     def _scan(self) -> None:
-        if self._scanned:
+        if self._is_scanned:
             return
         package = importlib.import_module(self.package)
         for module in pkgutil.walk_packages(package.__path__, prefix=f"{self.package}."):
             importlib.import_module(module.name)
-        self._scanned = True
+        load_entry_points()
+        self._is_scanned = True
+
+
+def _is_redefinition(known: object, entry: object) -> bool:
+    """Whether two classes are definitions of the same name in the same module."""
+    return (
+        isinstance(known, type)
+        and isinstance(entry, type)
+        and (known.__module__, known.__qualname__) == (entry.__module__, entry.__qualname__)
+    )

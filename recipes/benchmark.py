@@ -1,7 +1,7 @@
 """Run a benchmark: tasks x algorithms x networks x seeds. The same command continues a grid.
 
 python recipes/benchmark.py benchmark=close_loop_4d seeds=4
-python recipes/benchmark.py benchmark=close_loop_4d dry_run=true       # what is done, what is not
+python recipes/benchmark.py benchmark=close_loop_4d dry_run=true       # list the states of the runs
 python recipes/benchmark.py tasks=[close_loop/block_picking] networks=[cnn] total_updates=600 \
     env.obs_size=64 network.width=0.5 folder=runs/small
 """
@@ -14,18 +14,18 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl.config import parse
-from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 
-hydra_schema.register()
+hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="benchmark", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Run what is missing of the grid, or list it."""
-    quiet_libraries()
+    """Run the unfinished runs of the grid, or list all of them."""
+    limit_library_logs()
     values = OmegaConf.to_container(settings, resolve=True)
     dry_run = values.pop("dry_run")
     grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields if name in values}
@@ -38,7 +38,7 @@ def main(settings: DictConfig) -> None:
         counts = Counter(state.state for state in states.values())
         print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
         return
-    # so that the runs end with this process
+    # the runs end with this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     failures = run_all(runs, jobs=config.jobs, max_hours=config.max_hours)
     print(f"{len(runs) - len(failures)} of {len(runs)} runs done in {config.folder}")

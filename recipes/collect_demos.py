@@ -1,30 +1,34 @@
-"""Collect demonstrations from a task's expert, or by taking structures apart, and save them.
+"""Collect demonstrations from a task's expert or by deconstruction of structures, and save them.
 
 python recipes/collect_demos.py task=close_loop/block_picking episodes=100 path=demos/picking
 python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction
 python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction replays=200
 """
 
+import sys
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.data.demos import collect_demonstrations, save_demonstrations, source_config
+from ba_torchrl.data.demo_files import save_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.data.time_reversal import replay_scores
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.record.logging import progress_bar, quiet_libraries
+from ba_torchrl.plugins import load_plugins
+from ba_torchrl.record.logging import limit_library_logs, progress_bar
 from ba_torchrl.training import hydra_schema
 
-hydra_schema.register()
+hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="collect_demos", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Let the expert play, and write the episodes as a memory-mapped TensorDict."""
-    quiet_libraries()
+    """Play the expert's episodes and write them as a memory-mapped TensorDict."""
+    limit_library_logs()
+    load_plugins(settings.plugins)
     if Path(settings.path).exists():
         raise ConfigError(f"{settings.path} exists already; choose another path")
     env_settings = OmegaConf.to_container(settings.env, resolve=True)
@@ -32,6 +36,7 @@ def main(settings: DictConfig) -> None:
         settings.task,
         settings.num_envs,
         parallel=settings.parallel,
+        register_modules=settings.plugins,
         **{**env_settings, "seed": settings.seed, **source_config(settings.source)},
     )
     try:
@@ -47,7 +52,7 @@ def main(settings: DictConfig) -> None:
     finally:
         env.close()
     if not episodes:
-        raise ConfigError(f"none of {settings.episodes} episodes of {settings.task} is of use")
+        raise ConfigError(f"none of {settings.episodes} episodes of {settings.task} can be used")
     save_demonstrations(
         settings.path,
         episodes,

@@ -1,6 +1,7 @@
 """Evaluate a trained policy.
 
 python recipes/evaluate.py checkpoint=runs/my-run episodes=100 video=my-run.mp4
+python recipes/evaluate.py checkpoint=runs/my-run which=latest
 """
 
 from ba_torchrl._malloc import tune_malloc
@@ -11,9 +12,10 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
-from ba_torchrl.record.logging import progress_bar, quiet_libraries  # noqa: E402
+from ba_torchrl.plugins import load_plugins  # noqa: E402
+from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
 from ba_torchrl.record.video import write_video  # noqa: E402
-from ba_torchrl.training.checkpoint import load  # noqa: E402
+from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
 from ba_torchrl.training.config import SeedUse  # noqa: E402
 from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes  # noqa: E402
 
@@ -21,14 +23,21 @@ from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes 
 @hydra.main(config_path="../configs", config_name="evaluate", version_base="1.3")
 def main(settings: DictConfig) -> None:
     """Play greedy episodes with the policy of a checkpoint."""
-    quiet_libraries()
-    config, algorithm = load(settings.checkpoint)
+    limit_library_logs()
+    load_plugins(settings.plugins)
+    checkpoint = find_checkpoint(settings.checkpoint, settings.which)
+    config, algorithm = load(checkpoint, device=settings.device)
     policy = acting_on(algorithm.policy, config.torch_device)
-    seed = settings.seed
+    seed, chosen = settings.seed, ""
     if seed is None:
-        seed = config.derived_seed(SeedUse.EVALUATION)
+        chosen = ", none of which training used"
+        seed = config.derived_seed(SeedUse.TEST)
     env = make_vector_env(
-        config.task, settings.num_envs, parallel=settings.parallel, **{**config.env, "seed": seed}
+        config.task,
+        settings.num_envs,
+        parallel=settings.parallel,
+        register_modules=config.plugins,
+        **{**config.env, "seed": seed},
     )
     try:
         with progress_bar(total=settings.episodes, unit="episode") as bar:
@@ -40,9 +49,11 @@ def main(settings: DictConfig) -> None:
         f"(standard error {evaluation.standard_error:.3f}) over {evaluation.episodes} episodes "
         f"of {config.task}, {evaluation.mean_length:.1f} steps each"
     )
+    print(f"  policy    update {algorithm.updates}, {checkpoint}")
+    print(f"  episodes  seed {seed}{chosen}")
     if settings.video is not None:
         frames = record_episodes(config.task, config.env, policy, settings.video_episodes, seed)
-        print(f"  video  {write_video(settings.video, frames, fps=5)}")
+        print(f"  video     {write_video(settings.video, frames, fps=5)}")
 
 
 if __name__ == "__main__":

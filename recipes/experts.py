@@ -1,9 +1,10 @@
-"""Measure the experts: success and length over random episodes, as a table in Markdown.
+"""Measure the experts: success rate and length of random episodes, as a table in Markdown.
 
 python recipes/experts.py                                 # every task, kuka, with and without yaw
 python recipes/experts.py robots=[panda,ur5] episodes=50 tasks=[close_loop/block_picking]
 """
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,19 @@ from tqdm import tqdm
 from ba_torchrl import list_tasks
 from ba_torchrl.data.demos import expert_scores
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.plugins import load_plugins
+from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
-hydra_schema.register()
+hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="experts", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Let the experts play, and print how they did."""
-    quiet_libraries()
+    """Play the experts' episodes and print their success and length."""
+    limit_library_logs()
+    load_plugins(settings.plugins)
     variants = OmegaConf.to_container(settings.variants, resolve=True)
     tables = []
     for control, columns in variants.items():

@@ -1,4 +1,4 @@
-"""Draw the tasks: for each the expert at work, and all of them on one page.
+"""Draw the tasks: an episode of each expert, and one picture of all tasks.
 
 python recipes/gallery.py                       # docs/gallery/*.png and docs/gallery.png
 python recipes/gallery.py tasks=[close_loop/block_picking] folder=pictures overview=null
@@ -11,12 +11,14 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
+from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
 
 
 @hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Play one episode per task and write the pictures."""
+    """Play one episode per task and write its pictures."""
+    load_plugins(settings.plugins)
     strips = {}
     for task in tqdm(settings.tasks or list_tasks(), unit="task"):
         strips[task] = expert_strip(task, settings.seed, settings.pictures)
@@ -25,7 +27,7 @@ def main(settings: DictConfig) -> None:
     for task in settings.deconstructions:
         strip = expert_strip(task, settings.seed, settings.pictures, deconstruct=True)
         path = Path(settings.folder) / f"{task.replace('/', '_')}_deconstruction.png"
-        print(strip_figure(f"{task}, taken apart", strip, path))
+        print(strip_figure(f"{task}, deconstruction", strip, path))
     if settings.overview is not None:
         print(overview_figure(strips, settings.overview))
 

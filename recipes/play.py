@@ -1,9 +1,11 @@
-"""Watch a task: the expert, or random actions, in a video or in a window.
+"""Show a task: the expert or random actions, in a video or in a window.
 
 python recipes/play.py task=open_loop/covid_test video=covid_test.mp4
 python recipes/play.py task=close_loop/block_pushing policy=random episodes=3
 python recipes/play.py task=close_loop/corner_picking video=null env.render=true   # needs a display
 """
+
+import sys
 
 import hydra
 import torch
@@ -11,20 +13,22 @@ from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl.data.demos import expert_policy
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.record.logging import quiet_libraries
+from ba_torchrl.plugins import load_plugins
+from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.record.video import write_video
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.evaluation import record_episodes
 
 POLICIES = {"expert": expert_policy, "random": None}
 
-hydra_schema.register()
+hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="play", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Play episodes and write their pictures."""
-    quiet_libraries()
+    """Play episodes and write a video of them."""
+    limit_library_logs()
+    load_plugins(settings.plugins)
     if settings.policy not in POLICIES:
         raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
     torch.manual_seed(settings.seed)

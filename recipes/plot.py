@@ -16,7 +16,7 @@ def main(settings: DictConfig) -> None:
     """Plot the success rate of the greedy policies against the updates."""
     curves = {}
     for run in settings.runs:
-        config = read_config(run)
+        config = read_config(run, device="cpu")  # that of the run may not be here
         scalars = read_scalars(run)
         rate, error = scalars["eval/success_rate"], scalars["eval/standard_error"]
         name = f"{config.label}, {config.task.split('/')[-1]}, seed {config.seed}"

@@ -1,4 +1,4 @@
-"""Report what runs came to: curves with standard errors, tables, and a page with videos.
+"""Report the results of runs: curves with standard errors, tables, and a page with videos.
 
 python recipes/report.py runs/
 python recipes/report.py runs=[runs/close_loop_3d,runs/close_loop_4d] folder=report
@@ -15,7 +15,7 @@ from ba_torchrl.record.report import write_report
 
 @hydra.main(config_path="../configs", config_name="report", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Write the report and say where it is."""
+    """Write the report and print its tables."""
     roots = [settings.runs] if isinstance(settings.runs, str) else list(settings.runs)
     page = write_report(roots, settings.folder or Path(roots[0]) / "report")
     print((page.parent / "table.md").read_text(encoding="utf-8"))
@@ -24,7 +24,7 @@ def main(settings: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    # Folders may be given as they are: report.py runs/a runs/b
+    # folders may be positional: report.py runs/a runs/b
     folders = [argument for argument in sys.argv[1:] if "=" not in argument and argument[0] != "-"]
     if folders:
         others = [argument for argument in sys.argv[1:] if argument not in folders]

@@ -1,4 +1,4 @@
-"""Print what steps, images, updates and the replay cost here, as a table in Markdown.
+"""Print times of steps, images and updates and the replay's memory, as a table in Markdown.
 
 python recipes/speed.py
 python recipes/speed.py which=simulation repeats=50
@@ -12,15 +12,17 @@ tune_malloc()  # before torch allocates anything: halves the time of an update o
 import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
+from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.profiling.table import as_markdown, machine, measure  # noqa: E402
-from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
+from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="speed", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Measure, and compare with the budgets."""
-    quiet_libraries()
-    where = machine()  # the load before this starts adding to it
+    """Measure, and print a table with the budgets."""
+    limit_library_logs()
+    load_plugins(settings.plugins)
+    where = machine()  # includes the load before the measurement
     profiles: dict[str, str] | None = {} if settings.profile else None
     rows = measure(settings.which, settings.repeats, profiles=profiles)
     for work, operations in (profiles or {}).items():

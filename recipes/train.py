@@ -3,27 +3,30 @@
 python recipes/train.py task=close_loop/block_picking algorithm=sacfd network=equi seed=0
 python recipes/train.py --config-name quickstart
 python recipes/train.py task=close_loop/block_picking run_dir=runs/mine resume=true
+python recipes/train.py plugins=[my_tasks] task=mine/push_far
 """
 
 from ba_torchrl._malloc import tune_malloc
 
 tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
 
+import sys  # noqa: E402
+
 import hydra  # noqa: E402
 from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
-from ba_torchrl.record.logging import quiet_libraries  # noqa: E402
+from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
 from ba_torchrl.training import hydra_schema  # noqa: E402
 from ba_torchrl.training.config import ExperimentConfig  # noqa: E402
 from ba_torchrl.training.experiment import Experiment  # noqa: E402
 
-hydra_schema.register()
+hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="train", version_base="1.3")
 def main(settings: DictConfig) -> None:
-    """Run the experiment that the configuration describes, or go on with it."""
-    quiet_libraries()
+    """Run or resume the experiment of the configuration."""
+    limit_library_logs()
     config = ExperimentConfig.parse(OmegaConf.to_container(settings, resolve=True))
     result = Experiment(config).run()
     evaluation = result.evaluation

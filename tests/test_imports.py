@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = "ba_torchrl"
 
-BASE = {"errors", "config", "registry", "actions"}
+BASE = {"errors", "config", "plugins", "registry", "actions"}
 # Each part may import itself, what comes before it, and what EXTRA names. `__init__` is the
 # package itself, whose functions make environments.
 CHAIN = ["sim", "tasks", "envs", "data", "algorithms", "training", "profiling", "recipes"]
@@ -27,7 +27,8 @@ EXTRA = {
 SHARED = {"_malloc"}
 APART = {
     "__init__": BASE | {"tasks", "envs"},
-    "modules": BASE | {"modules", "envs.keys"},
+    "testing": BASE | {"testing", "tasks", "envs", "__init__"},
+    "modules": BASE | {"modules", "envs.keys", "envs.images"},
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
     "_malloc": set(),

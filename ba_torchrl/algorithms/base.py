@@ -1,52 +1,94 @@
-"""Algorithm: a policy, a replay and an update, ready for the experiment loop."""
+"""Algorithm: a policy, a replay and an update; the experiment loop drives it."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import StrictModel
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.modules.base import NETWORKS, NetworkConfig
+from ba_torchrl.modules.base import NETWORKS, Control, NetworkConfig
 from ba_torchrl.registry import Registry
 
-__all__ = ["ALGORITHMS", "NETWORKS", "Algorithm", "AlgorithmConfig", "NetworkConfig", "Problem"]
+__all__ = [
+    "ALGORITHMS",
+    "NETWORKS",
+    "Algorithm",
+    "AlgorithmConfig",
+    "Control",
+    "NetworkConfig",
+    "Problem",
+]
 
 ALGORITHMS: Registry[type[AlgorithmConfig]] = Registry("algorithm", "ba_torchrl.algorithms")
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What an algorithm must know about the environments it learns from."""
+    """What an algorithm knows about its environments and its run."""
 
-    image_size: int
+    control: Control
+    """Kind of control of the task."""
+    images: Mapping[str, ImageSpec]
+    """Declarations of the images that the environment observes, by key."""
     actions: CloseLoopActions | OpenLoopActions
     """The action vector."""
-    max_depth_m: float
-    """Greatest value of the image."""
-    in_hand_shape: tuple[int, int] | None
-    """Channels and size of the in-hand image; None where there is none."""
     total_updates: int
-    """Length of the run; schedules end with it."""
+    """Length of the run, over which schedules extend."""
     seed: int
     device: torch.device
 
 
 class Algorithm(ABC):
-    """Learns from transitions; owned and driven by `ba_torchrl.training.experiment`."""
+    """Learns from transitions; `ba_torchrl.training.experiment` collects them and calls it."""
 
     policy: TensorDictModuleBase
-    """From a root TensorDict of any batch shape to ``action``; explores as TorchRL's
-    ``set_exploration_type`` says."""
+    """From a root TensorDict of any batch shape to ``action``; explores under TorchRL's
+    exploration type RANDOM and is greedy under DETERMINISTIC."""
     updates: int = 0
     """Gradient updates so far."""
+    stores_expert_action: ClassVar[bool] = False
+    """Whether the environments are made with ``expert=True``, and transitions keep
+    ``expert_action``."""
+
+    def nearest_action(self, action: Tensor) -> Tensor:
+        """Return the action that the policy can choose and that is nearest to another one.
+
+        Demonstrations are executed with it, so that what is learnt is what was executed. By
+        default every action can be chosen.
+
+        Args:
+            action: [..., A].
+        """
+        return action
+
+    @abstractmethod
+    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDictBase:
+        """Return the transitions [N] that the replay stores of collected data.
+
+        Args:
+            data: steps of any batch shape, those of an episode in order.
+            is_expert: whether they are demonstrations.
+        """
+
+    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
+        """Receive the demonstrations, before the first update; by default the replay stores them.
+
+        Args:
+            episodes: TensorDicts [T].
+        """
+        for episode in episodes:
+            self.extend(self.to_transitions(episode, is_expert=True))
 
     @abstractmethod
     def extend(self, transitions: TensorDictBase) -> None:
@@ -78,7 +120,7 @@ class Algorithm(ABC):
         """Write the replay into a folder: transitions, priorities and the state of its draws.
 
         Args:
-            folder: is there, and empty.
+            folder: an empty folder.
         """
 
     @abstractmethod
@@ -86,27 +128,36 @@ class Algorithm(ABC):
         """Restore what `save_replay` wrote.
 
         Args:
-            folder: may be gone afterwards.
+            folder: may be deleted afterwards.
         """
 
 
 class AlgorithmConfig(StrictModel, ABC):
     """Hyper-parameters of an algorithm; building it needs a network and the problem."""
 
-    control: ClassVar[Literal["open_loop", "close_loop"]]
-    """Which tasks it learns."""
+    controls: ClassVar[frozenset[Control]]
+    """Kinds of control of the tasks that it learns."""
 
-    def check(self, network: NetworkConfig) -> None:
-        """Refuse a network that the algorithm does not go with.
+    def check(self, network: NetworkConfig, control: Control) -> None:
+        """Refuse a task or a network that the algorithm does not go with.
+
+        Args:
+            network: hyper-parameters of the network.
+            control: kind of control of the task.
 
         Raises:
-            ConfigError: it does not.
+            ConfigError: the algorithm does not learn such tasks, or the network is for others.
         """
-        if network.control != self.control:
-            known = [name for name in NETWORKS if NETWORKS[name].control == self.control]
+        if control not in self.controls:
             raise ConfigError(
-                f"{type(network).__name__} is a network for {network.control} tasks; this "
-                f"algorithm learns {self.control} ones, with network: {', '.join(known)}"
+                f"{type(self).__name__} learns {' and '.join(sorted(self.controls))} tasks, not "
+                f"{control} ones"
+            )
+        if network.control != control:
+            known = [name for name in NETWORKS if NETWORKS[name].control == control]
+            raise ConfigError(
+                f"{type(network).__name__} is a network for {network.control} tasks; "
+                f"{control} tasks take network: {', '.join(known)}"
             )
 
     @abstractmethod

@@ -1,7 +1,8 @@
-"""Learner: gradient steps on batches of a replay, whatever the loss."""
+"""Learner: gradient steps on batches from a replay. An algorithm overrides its parts."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -9,89 +10,157 @@ import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import LinearLR, LRScheduler
+from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from ba_torchrl.algorithms.base import Algorithm, AlgorithmConfig, Problem
-from ba_torchrl.data.replay.buffer import FrameReplayBuffer
+from ba_torchrl.algorithms.acting import ActingPolicy
+from ba_torchrl.algorithms.base import Algorithm, AlgorithmConfig, NetworkConfig, Problem
+from ba_torchrl.data.replay.codecs import make_codecs
+from ba_torchrl.data.replay.make import ReplayKind, make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
-from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 
 
 class LearnerConfig(AlgorithmConfig):
     """Hyper-parameters of every algorithm that learns from a replay."""
 
-    learning_rate: float = Field(gt=0)
-    """Adam's."""
+    learning_rate: float = Field(default=1e-3, gt=0)
+    """Learning rate of Adam."""
     learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
-    """Share of the learning rate that is left at the end of the run; it falls linearly."""
+    """Share of the learning rate at the end of the run, to which it falls linearly."""
     weight_decay: float = Field(default=0.0, ge=0)
-    """Adam's L2 term."""
+    """Adam's L2 term on the networks' parameters."""
     gradient_clamp: float | None = Field(default=None, gt=0)
-    """Bound of every element of the gradient; none leaves it as it is."""
-    gamma: float = Field(gt=0, le=1)
-    """Discount factor."""
-    batch_size: int = Field(ge=1)
+    """Bound of each element of the networks' gradient; by default there is none."""
+    batch_size: int = Field(default=64, ge=1)
     """Transitions per update."""
+    replay: ReplayKind = "uniform"
+    """How transitions are drawn: "uniform", "prioritized" or "symmetric"."""
     buffer_size: int = Field(default=100_000, ge=1)
-    """Transitions the replay holds; of a split one, each half."""
+    """Transitions in the replay; in each half of a symmetric one."""
     priority_exponent: float = Field(default=0.6, ge=0)
-    """How strongly priorities act, where transitions are drawn by them."""
+    """Exponent alpha of the priorities of a prioritised replay."""
     importance_exponent: float = Field(default=0.4, ge=0, le=1)
-    """First value of beta, which grows to 1 over the run."""
+    """First value of its exponent beta of the weights, which grows to 1 over the run."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
-    augmentation_probability: float = Field(ge=0, le=1)
-    """Share of the sampled transitions that is moved."""
 
 
 class Learner(Algorithm):
-    """A loss, its optimiser and target, and a replay.
+    """Networks, a loss, an optimiser and a replay.
 
-    An update descends the sum of the loss module's ``loss_`` entries; where the replay draws by
-    priority, it gets the new ones that the loss wrote into its input.
+    The constructor calls the ``make_...`` methods in the order in which they stand here. An
+    algorithm implements the first three and overrides others where the defaults do not fit. An
+    update minimises the sum of the ``loss_...`` entries of the loss module.
 
     Args:
         config: hyper-parameters.
-        problem: shapes, device, seed and length of the run.
-        policy: see `Algorithm`.
-        loss: on the device, its value estimator made.
-        target_updater: steps once per update.
-        replay: a prioritised one is annealed and refreshed.
-        augmentation: of sampled transitions.
+        network: builds the networks.
+        problem: images, actions, device, seed and length of the run.
+
+    Raises:
+        ConfigError: the environment lacks an image that the network sees.
+        ValueError: the network, the images or the actions do not go together.
     """
 
-    def __init__(
-        self,
-        config: LearnerConfig,
-        problem: Problem,
-        *,
-        policy: TensorDictModuleBase,
-        loss: LossModule,
-        target_updater: TargetNetUpdater,
-        replay: FrameReplayBuffer | SymmetricReplay,
-        augmentation: nn.Module,
-    ) -> None:
+    def __init__(self, config: LearnerConfig, network: NetworkConfig, problem: Problem) -> None:
         self.config = config
         self.problem = problem
-        self.policy = policy
-        self.loss = loss
-        self.target_updater = target_updater
-        self.replay = replay
-        self.augmentation = augmentation
-        self.optimizer = torch.optim.Adam(
-            loss.parameters(),
-            lr=config.learning_rate,
-            weight_decay=config.weight_decay,
+        missing = [key for key in network.image_keys if key not in problem.images]
+        if missing:
+            raise ConfigError(
+                f"the network sees {', '.join(missing)}; the environment observes "
+                f"{', '.join(problem.images) or 'no images'}"
+            )
+        self.images = {key: problem.images[key] for key in network.image_keys}
+        """Declarations of the images that the networks see and the replay stores."""
+        self.observation_keys = [*self.images, keys.HOLDING]
+        self.codecs = make_codecs(self.images)
+        networks = self.make_networks(network)
+        policy = ActingPolicy(self.make_policy(networks), self.codecs)
+        self.loss = self.make_loss(networks).to(problem.device)
+        self.policy = policy.to(problem.device)
+        self.target_updater = self.make_target_updater()
+        self.replay = self.make_replay()
+        self.augmentation = self.make_augmentation()
+        self.optimizer = self.make_optimizer()
+        self.scheduler = self.make_scheduler()
+
+    # -- parts -------------------------------------------------------------------------------
+
+    @abstractmethod
+    def make_networks(self, network: NetworkConfig) -> Any:
+        """Return the freshly initialised networks, for `make_policy` and `make_loss`."""
+
+    @abstractmethod
+    def make_policy(self, networks: Any) -> TensorDictModuleBase:
+        """Return the policy, from the observation to ``action``; see `Algorithm.policy`."""
+
+    @abstractmethod
+    def make_loss(self, networks: Any) -> LossModule:
+        """Return the loss module, its value estimator made."""
+
+    def make_target_updater(self) -> TargetNetUpdater | None:
+        """Return what moves the target network after each update; by default there is none."""
+        return None
+
+    def make_replay(self) -> ReplayBuffer:
+        """Return the replay that the configuration names."""
+        config = self.config
+        return make_replay(
+            config.replay,
+            config.buffer_size,
+            config.batch_size,
+            codecs=self.codecs,
+            seed=self.problem.seed,
+            priority_exponent=config.priority_exponent,
+            weight_exponent=config.importance_exponent,
+            expert_bonus=config.expert_bonus,
+        )
+
+    def make_augmentation(self) -> nn.Module:
+        """Return the augmentation of sampled batches; by default there is none."""
+        return nn.Identity()
+
+    def make_optimizer(self) -> torch.optim.Optimizer:
+        """Return Adam, whose weight decay leaves all but the networks' parameters alone."""
+        networks = self.network_parameters()
+        known = set(map(id, networks))
+        others = [p for p in self.loss.parameters() if id(p) not in known]
+        groups = [
+            {"params": networks, "weight_decay": self.config.weight_decay},
+            {"params": others, "weight_decay": 0.0},
+        ]
+        return torch.optim.Adam(
+            [group for group in groups if group["params"]],
+            lr=self.config.learning_rate,
             fused=True,
         )
-        self.scheduler = torch.optim.lr_scheduler.LinearLR(
+
+    def make_scheduler(self) -> LRScheduler:
+        """Return the schedule of the learning rate, which steps once per update."""
+        return LinearLR(
             self.optimizer,
             start_factor=1.0,
-            end_factor=config.learning_rate_end_factor,
-            total_iters=problem.total_updates,
+            end_factor=self.config.learning_rate_end_factor,
+            total_iters=self.problem.total_updates,
+        )
+
+    def network_parameters(self) -> list[nn.Parameter]:
+        """Return the parameters that weight decay and the gradient's bound apply to."""
+        return list(self.loss.parameters())
+
+    # -- data --------------------------------------------------------------------------------
+
+    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+        """Return the transitions [N] that the replay stores of collected data."""
+        return as_transitions(
+            data, self.images, is_expert=is_expert, expert_action=self.stores_expert_action
         )
 
     def extend(self, transitions: TensorDictBase) -> None:
@@ -103,34 +172,50 @@ class Learner(Algorithm):
         """Number of transitions in the replay."""
         return len(self.replay)
 
+    def sample(self) -> TensorDictBase:
+        """Return an augmented batch from the replay, on the learner's device."""
+        sampler = self._prioritized_sampler()
+        if sampler is not None:
+            sampler.anneal(self.updates / max(self.problem.total_updates, 1))
+        return self.augmentation(self.replay.sample().to(self.problem.device))
+
+    # -- updates -----------------------------------------------------------------------------
+
     def update(self) -> TensorDict:
         """Sample a batch, step networks and target, and refresh the priorities if there are any.
 
         Raises:
             FloatingPointError: a loss is not finite.
         """
-        sampler = getattr(self.replay, "sampler", None)  # of a split replay: none, but two sides
-        is_prioritized = isinstance(sampler, ExpertPrioritizedSampler)
-        if is_prioritized:
-            sampler.anneal(self.updates / max(self.problem.total_updates, 1))
-        batch = self.augmentation(self.replay.sample().to(self.problem.device))
+        batch = self.sample()
         scalars = self.loss(batch)
         total = sum(value for name, value in scalars.items() if name.startswith("loss_"))
         if not torch.isfinite(total):
             values = {key: value.item() for key, value in scalars.items()}
             raise FloatingPointError(f"a loss is not finite at update {self.updates}: {values}")
-        self.optimizer.zero_grad()
-        total.backward()
-        if self.config.gradient_clamp is not None:
-            nn.utils.clip_grad_value_(self.loss.parameters(), self.config.gradient_clamp)
-        self.optimizer.step()
-        self.scheduler.step()
-        self.target_updater.step()
-        if is_prioritized:
-            # the sampler's trees are on the CPU, wherever the learner is
+        self.step(total)
+        if self.target_updater is not None:
+            self.target_updater.step()
+        if self._prioritized_sampler() is not None:
+            # the sampler's trees are on the CPU for any device of the learner
             self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
         self.updates += 1
         return scalars.detach()
+
+    def step(self, loss: Tensor) -> None:
+        """Take one step of the optimiser and of the learning rate's schedule."""
+        self.optimizer.zero_grad()
+        loss.backward()
+        if self.config.gradient_clamp is not None:
+            nn.utils.clip_grad_value_(self.network_parameters(), self.config.gradient_clamp)
+        self.optimizer.step()
+        self.scheduler.step()
+
+    def _prioritized_sampler(self) -> ExpertPrioritizedSampler | None:
+        sampler = self.replay.sampler
+        return sampler if isinstance(sampler, ExpertPrioritizedSampler) else None
+
+    # -- state -------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
         """Return networks, target, optimiser, schedule, augmentation and counter."""
@@ -143,7 +228,7 @@ class Learner(Algorithm):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned, on any device."""
         for name in ("loss", "optimizer", "scheduler", "augmentation"):
             getattr(self, name).load_state_dict(state[name])
         self.updates = state["updates"]

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
+import torch
 from pydantic import Field
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
 from torchrl.objectives import HardUpdate
 
 from ba_torchrl.actions import OpenLoopActions
-from ba_torchrl.algorithms.base import ALGORITHMS, Problem
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
-from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidMotions
-from ba_torchrl.data.replay.buffer import FrameReplayBuffer, make_replay_buffer
-from ba_torchrl.data.replay.codecs import HalfPrecision
-from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.augmentation.rigid import (
+    RigidAugmentation,
+    RigidTransforms,
+    reverse_gripper_axes,
+)
+from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial import SpatialSpec
@@ -34,30 +41,31 @@ class SpatialQConfig(LearnerConfig):
     The defaults are those of SDQfD in the paper (appendix G.1).
     """
 
-    control: ClassVar[Literal["open_loop", "close_loop"]] = "open_loop"
+    controls: ClassVar[frozenset[Control]] = frozenset({"open_loop"})
 
     demonstrations: Demonstrations = "sdqfd"
-    """The term on the experts' actions: "none", "dqfd", "sdqfd" or "adet"."""
+    """The term on demonstrated actions: "none", "dqfd", "sdqfd" or "adet"."""
     demonstration_weight: float = Field(default=0.1, ge=0)
     """Factor of that term."""
     margin: float = Field(default=0.1, ge=0)
-    """Of the margin terms: experts' actions shall be better by this much."""
+    """Margin of "dqfd" and "sdqfd" between demonstrated actions and others."""
     first_beta: float = Field(default=100.0, gt=0)
-    """Inverse temperature of ADET where the pixel is chosen."""
+    """Inverse temperature of "adet" at the first level."""
     later_beta: float = Field(default=1.0, gt=0)
-    """Inverse temperature of ADET at the levels after it."""
+    """Inverse temperature of "adet" at later levels."""
     learning_rate: float = Field(default=1e-4, gt=0)
     weight_decay: float = Field(default=1e-5, ge=0)
     gradient_clamp: float | None = Field(default=1.0, gt=0)
     gamma: float = Field(default=0.95, gt=0, le=1)
+    """Discount factor."""
     batch_size: int = Field(default=16, ge=1)
-    augmentation_probability: float = Field(default=1.0, ge=0, le=1)
     target_interval: int = Field(default=100, ge=1)
     """Updates between copies of the network to its target."""
-    replay: Literal["split", "prioritized", "uniform"] = "split"
-    """Half of every batch from demonstrations, or by TD error with the experts' bonus, or any."""
-    augmentation: RigidMotions = "none"
-    """Rigid motions of sampled transitions: "translation", "cn", "d4" or "se2"."""
+    replay: ReplayKind = "symmetric"
+    augmentation: RigidTransforms = "none"
+    """Rigid transforms of sampled transitions: "translation", "cn", "d4" or "se2"."""
+    augmentation_probability: float = Field(default=1.0, ge=0, le=1)
+    """Share of the sampled transitions that is transformed."""
     augmentation_order: int = Field(default=16, ge=1)
     """n of "cn"."""
     epsilon_init: float = Field(default=0.0, ge=0, le=1)
@@ -65,7 +73,7 @@ class SpatialQConfig(LearnerConfig):
     epsilon_end: float = Field(default=0.0, ge=0, le=1)
     """Share of random actions at the end."""
     epsilon_updates: int = Field(default=1000, ge=1)
-    """Updates over which one becomes the other, linearly."""
+    """Updates over which the share changes linearly."""
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
         """Return a freshly initialised learner.
@@ -77,69 +85,112 @@ class SpatialQConfig(LearnerConfig):
 
 
 class SpatialQ(Learner):
-    """A network of spatial Q values, its target, and a replay with demonstrations.
+    """A network of spatial Q values with a target that is copied at intervals.
 
     Args:
         config: hyper-parameters.
         network: builds the network.
-        problem: shapes, device, seed and length of the run.
+        problem: images, actions, device, seed and length of the run.
 
     Raises:
         ValueError: the network or the augmentation does not go with the task's images or actions.
     """
 
+    config: SpatialQConfig
+    loss: LevelDQNLoss
+
     def __init__(self, config: SpatialQConfig, network: NetworkConfig, problem: Problem) -> None:
-        actions = problem.actions
+        super().__init__(config, network, problem)
+        self._set_epsilon()
+
+    def make_networks(self, network: NetworkConfig) -> SpatialValues:
+        """Return the values of actions."""
+        actions = self.problem.actions
         assert isinstance(actions, OpenLoopActions), "open_loop tasks have no other"
-        channels, size = problem.in_hand_shape
         spec = SpatialSpec(
-            image_size=problem.image_size,
-            in_hand_size=size,
-            in_hand_channels=channels,
+            self.images,
             components=tuple(name for name in actions.components if name != "p"),
             half_rotation=actions.half_rotation,
         )
         net = network.build(spec)
-        values = SpatialValues(net, SpatialActions(actions, net.levels)).to(problem.device)
-        rounding = HalfPrecision(problem.max_depth_m)
-        self.acting = SpatialPolicy(values, rounding, seed=problem.seed).to(problem.device)
+        self.actions = SpatialActions(actions, net.levels)
+        values = SpatialValues(net, self.actions, list(self.images))
+        return values.to(self.problem.device)
+
+    def make_policy(self, networks: SpatialValues) -> TensorDictModule:
+        """Return the greedy policy with a share of random actions."""
+        self.explorer = SpatialPolicy(networks, seed=self.problem.seed)
+        return spatial_policy(self.explorer)
+
+    def make_loss(self, networks: SpatialValues) -> LevelDQNLoss:
+        """Return the TD loss with the term on demonstrated actions."""
+        config = self.config
         loss = LevelDQNLoss(
-            values,
+            networks,
             demonstrations=config.demonstrations,
             demonstration_weight=config.demonstration_weight,
             margin=config.margin,
             first_beta=config.first_beta,
             later_beta=config.later_beta,
-        ).to(problem.device)
-        loss.make_value_estimator(gamma=config.gamma)
-        super().__init__(
-            config,
-            problem,
-            policy=spatial_policy(self.acting),
-            loss=loss,
-            # TorchRL copies at the step after its interval: one less makes the period ours.
-            target_updater=HardUpdate(
-                loss, value_network_update_interval=config.target_interval - 1
-            ),
-            replay=_make_replay(config, rounding, problem.seed),
-            augmentation=RigidAugmentation(
-                config.augmentation,
-                actions,
-                seed=problem.seed,
-                probability=config.augmentation_probability,
-                order=config.augmentation_order,
-            ),
         )
-        self._set_epsilon()
+        return loss.make_value_estimator(gamma=config.gamma)
 
-    def _set_epsilon(self) -> None:
+    def make_target_updater(self) -> HardUpdate:
+        """Return the copy at intervals."""
+        # TorchRL copies one step after its interval.
+        return HardUpdate(self.loss, value_network_update_interval=self.config.target_interval - 1)
+
+    def make_augmentation(self) -> RigidAugmentation:
+        """Return the rigid transforms of sampled transitions."""
         config = self.config
-        share = min(self.updates / config.epsilon_updates, 1.0)
-        epsilon = config.epsilon_init + share * (config.epsilon_end - config.epsilon_init)
-        self.acting.epsilon.fill_(epsilon)
+        return RigidAugmentation(
+            config.augmentation,
+            self.problem.actions,
+            self.images,
+            seed=self.problem.seed,
+            probability=config.augmentation_probability,
+            order=config.augmentation_order,
+        )
+
+    def nearest_action(self, action: Tensor) -> Tensor:
+        """Return the nearest action that the network's levels can choose."""
+        return self.actions.nearest(action)
+
+    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
+        """Store demonstrations; actions that were executed off the grid become the nearest on it.
+
+        Args:
+            episodes: TensorDicts [T].
+        """
+        super().on_demonstrations([self._on_grid(episode) for episode in episodes])
+
+    def _on_grid(self, episode: TensorDictBase) -> TensorDictBase:
+        """Return an episode [T] with the nearest actions on the grid.
+
+        Where a yaw close to half a turn becomes zero, the fingers are swapped, and images in the
+        gripper's axes of what this pick holds are reversed.
+        """
+        action = episode[keys.ACTION]
+        nearest = self.nearest_action(action)
+        out = episode.copy().set(keys.ACTION, nearest)
+        components = self.problem.actions.components
+        if "rz" not in components or not self.problem.actions.half_rotation:
+            return out
+        rz = components.index("rz")
+        is_swapped = (nearest[:, rz] - action[:, rz]).abs() > math.pi / 2
+        is_over = torch.zeros(len(episode) + 1, dtype=torch.bool)
+        for t, is_holding in enumerate(episode[keys.HOLDING].flatten().tolist()):
+            is_over[t + 1] = is_over[t] if is_holding else is_swapped[t]
+        for key, image in self.images.items():
+            if image.frame == "gripper":
+                for nested, over in ((key, is_over[:-1]), ((keys.NEXT, key), is_over[1:])):
+                    reversed_images = reverse_gripper_axes(episode[nested], image.axes, "xy")
+                    over = over.reshape(-1, 1, 1, 1)
+                    out.set(nested, torch.where(over, reversed_images, episode[nested]))
+        return out
 
     def update(self) -> TensorDict:
-        """Take one step, see `Learner.update`, and move the share of random actions.
+        """Take one step, see `Learner.update`, and change the share of random actions.
 
         Raises:
             FloatingPointError: a loss is not finite.
@@ -148,31 +199,19 @@ class SpatialQ(Learner):
         self._set_epsilon()
         return scalars
 
+    def _set_epsilon(self) -> None:
+        config = self.config
+        share = min(self.updates / config.epsilon_updates, 1.0)
+        epsilon = config.epsilon_init + share * (config.epsilon_end - config.epsilon_init)
+        self.explorer.epsilon.fill_(epsilon)
+
     def state_dict(self) -> dict[str, Any]:
         """Return network, target, optimiser, schedule, generators and counter."""
-        return {**super().state_dict(), "acting": self.acting.get_generator_state()}
+        return {**super().state_dict(), "exploration": self.explorer.get_generator_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned, on any device."""
         super().load_state_dict(state)
-        self.acting.set_generator_state(state["acting"])
+        self.explorer.set_generator_state(state["exploration"])
         self.target_updater.counter = self.updates % self.config.target_interval
         self._set_epsilon()
-
-
-def _make_replay(
-    config: SpatialQConfig, rounding: HalfPrecision, seed: int
-) -> FrameReplayBuffer | SymmetricReplay:
-    codecs = {keys.PIXELS: rounding, keys.IN_HAND: rounding}
-    if config.replay == "split":
-        return SymmetricReplay(config.buffer_size, config.batch_size, codecs=codecs, seed=seed)
-    return make_replay_buffer(
-        config.buffer_size,
-        config.batch_size,
-        codecs=codecs,
-        seed=seed,
-        prioritized=config.replay == "prioritized",
-        priority_exponent=config.priority_exponent,
-        weight_exponent=config.importance_exponent,
-        expert_bonus=config.expert_bonus,
-    )

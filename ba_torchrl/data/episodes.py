@@ -1,4 +1,4 @@
-"""Whole episodes from a vector of environments, each with its own quota."""
+"""Whole episodes from a vector of environments, a fixed number from each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 def quotas(episodes: int, num_envs: int) -> list[int]:
-    """Return how many episodes each environment plays; they differ by one at most."""
+    """Return the number of episodes of each environment; they differ by at most one."""
     return [episodes // num_envs + (i < episodes % num_envs) for i in range(num_envs)]
 
 
@@ -34,17 +34,17 @@ def collect_episodes(
 ) -> list[TensorDict]:
     """Play whole episodes, a fixed number in each environment.
 
-    Waiting for the first so many to finish would favour short episodes; quotas do not. An episode
-    lost to a fault is played again with the next seed and counts for nothing.
+    Taking the first episodes that finish would favour short ones. An episode with a fault is left
+    out and replaced by one with the next seed.
 
     Args:
         env: a vector of environments, batch size [num_envs].
         policy: writes the action.
-        episodes: how many in all.
+        episodes: number of episodes in all.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        exclude: entries not to keep, such as the pixels when only results matter.
+        exclude: entries to leave out, such as the pixels when only results are needed.
         on_episode: called with each episode when it ends, for progress bars.
-        max_lost: faults to put up with.
+        max_lost: number of faults that are tolerated.
 
     Returns:
         Episodes as TensorDicts [T], those of the first environment first.

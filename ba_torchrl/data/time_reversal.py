@@ -1,7 +1,7 @@
-"""Demonstrations by deconstruction: episodes in which a structure is taken apart, reversed in time.
+"""Time reversal: episodes that take a structure apart become demonstrations that build it.
 
-`reverse_episode` is arithmetic on recorded episodes; no simulator takes part. That the reversed
-actions do build the structure is measured by `replay_scores`.
+`reverse_episode` works on recorded episodes, without a simulator. `replay_scores` measures whether
+the reversed actions build the structure.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _EXTRA = (keys.UNDO_ACTION, keys.UNDO_IN_HAND, keys.CAN_UNDO, keys.EXPERT_ACTION
 
 
 def is_reversible(episode: TensorDictBase) -> bool:
-    """Whether an episode [T] of taking apart, reversed, is one of building.
+    """Return whether the reverse of a deconstruction episode [T] builds the structure.
 
-    It must end with all apart, every action must move one object and can be undone, and picks and
-    places must take turns, a pick first.
+    The episode must succeed, each of its actions must move one object and have an inverse, and
+    picks and places must alternate, starting with a pick.
     """
     holding = episode[keys.HOLDING].flatten().tolist()
     return (
@@ -44,20 +44,20 @@ def is_reversible(episode: TensorDictBase) -> bool:
 
 
 def reverse_episode(episode: TensorDictBase) -> TensorDict:
-    """Return the episode [T] of building that an episode of taking apart is in reverse.
+    """Return a deconstruction episode [T] reversed in time, which builds the structure.
 
-    It comes out as the expert's would: the last observation of the one is the first of the other,
-    the actions are those that undo, the held object is shown as their picks see it, and the last
-    step, which completes the structure, has the reward and terminates.
+    It has the form of an expert's episode: observations come in reverse order, actions are the
+    inverse ones, in-hand images are those that the inverse picks see, and the last step completes
+    the structure, has the reward and terminates.
 
     Args:
         episode: steps [T] of an environment with ``deconstruct=True``.
 
     Raises:
-        ValueError: it is not `is_reversible`.
+        ValueError: the episode is not `is_reversible`.
     """
     if not is_reversible(episode):
-        raise ValueError("the episode cannot be reversed: an action moved nothing, or too much")
+        raise ValueError("the episode cannot be reversed: an action moved no object, or several")
     steps = len(episode)
     following = episode[keys.NEXT]
     seen = [key for key in episode.keys() if key not in {*_ENDS, *_EXTRA, keys.ACTION, keys.NEXT}]  # noqa: SIM118 -- a TensorDict
@@ -93,21 +93,21 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
 
 
 class ReplayScores(NamedTuple):
-    """How reversed episodes fare in the simulator."""
+    """Results of reversed episodes in the simulator."""
 
     reversible: float
-    """Share of the episodes of taking apart that can be reversed."""
+    """Share of the deconstruction episodes that can be reversed."""
     success_rate: float
-    """Share of these whose reverse, played from the scattered pieces, reaches the goal."""
+    """Share of the reversible ones whose inverse actions reach the goal."""
     mean_length: float
 
 
 def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> ReplayScores:
-    """Take structures apart, and play the reversed actions from the scattered pieces.
+    """Play deconstruction episodes, then their inverse actions from the state that they end in.
 
     Args:
-        task: id of a task that can be deconstructed.
-        episodes: how many.
+        task: id of a task with a structure.
+        episodes: number of deconstruction episodes.
         seed: of the first episode.
         config: other fields of `EnvConfig`.
     """
@@ -132,7 +132,7 @@ def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> 
 
 
 def _play(env: ManipulationEnv, actions: Tensor) -> bool:
-    """Return whether actions [T, A] build what lies scattered, the last one completing it."""
+    """Return whether actions [T, A] build the structure, completed by the last one."""
     scene = env.scene
     deconstruction, scene.task = scene.task, scene.task.task
     try:

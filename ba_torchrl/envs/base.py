@@ -14,9 +14,12 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.observations import ExtraObservations
+from ba_torchrl.envs.episodes import SETTLE_STEPS, Episodes
+from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.envs.observations import enabled_observations, joined
 from ba_torchrl.envs.scene import (
     Controller,
     Scene,
@@ -38,13 +41,11 @@ logger = logging.getLogger(__name__)
 CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torchrl.envs")
 
 MAX_CONSECUTIVE_FAULTS = 10
-RESET_ATTEMPTS = 50
-SETTLE_STEPS = 100
 
 
 @dataclass(frozen=True)
 class EnvState:
-    """Everything an environment's future follows from; see `ManipulationEnv.get_state`."""
+    """The full state of an environment; see `ManipulationEnv.get_state`."""
 
     owner: object
     scale: float
@@ -60,8 +61,8 @@ class EnvState:
 class ManipulationEnv(EnvBase):
     """A manipulation task as an unbatched TorchRL environment on the CPU.
 
-    Episodes follow from the seed alone: episode n of seed s is the same in any process, whatever
-    happened before. Only tasks that go on with the objects of the last episode depend on it.
+    Episodes are determined by the seed alone: episode n of seed s is the same in any process and
+    after any other episodes. Only tasks that keep the objects of the last episode depend on it.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
@@ -84,9 +85,9 @@ class ManipulationEnv(EnvBase):
         num_objects = config.num_objects or self.task_class.num_objects
         self.max_steps = config.max_steps or self.task_class.step_limit(num_objects)
         self.action_sequence = (
-            config.action_sequence
-            or self.task_class.default_action_sequence
-            or self.default_action_sequence
+            self.task_class.default_action_sequence or self.default_action_sequence
+            if config.action_sequence is None
+            else config.action_sequence
         )
         """One letter per action component."""
         self.half_rotation = (
@@ -95,16 +96,17 @@ class ManipulationEnv(EnvBase):
         self._configure()
         check_action_components(task_id, self.actions.components)
         low, high = config.object_scale_range or self.task_class.scale_range
-        self._scales = np.arange(low, high + 1e-9, SCALE_STEP)
+        scales = np.arange(low, high + 1e-9, SCALE_STEP)
+        self._episodes = Episodes(scales, self._build_scene, self._place_robot)
         self._identity = object()
-        self._scenes: dict[float, Scene] = {}
-        self._scene: Scene | None = None
         self._observation: dict[str, torch.Tensor] = {}
-        self._extras = ExtraObservations(config, self.workspace)
+        self._observations = enabled_observations(config, self.workspace)
         self._memory: dict[str, Any] = {}
-        """What an observation shows of earlier steps; replaced, never changed in place."""
+        """Content of observations that stems from earlier steps; replaced, never modified."""
         self._ends: dict[str, bool] = {}
         """How the last step ended, by key."""
+        self._conditions: dict[str, bool] | None = None
+        """The conditions of success after the last step, None before the first."""
         self._step_count = 0
         self._episode = 0
         self.faults = 0
@@ -117,18 +119,21 @@ class ManipulationEnv(EnvBase):
 
     # -- for subclasses ----------------------------------------------------------------------
 
+    actions: CloseLoopActions | OpenLoopActions
+    """The action space; set by `_configure`."""
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine in the mode "fast"."""
     camera_pose: ClassVar[tuple[float, float, float]] = (-0.06, 0.2, 1.05)
-    """Of `render`: its middle along x from the workspace's, its height, and how far away it is."""
+    """Of `render`: offset of the target from the workspace's centre along x, its height, and the
+    distance of the camera, metres."""
     default_action_sequence: ClassVar[str]
-    """`action_sequence` unless it is given."""
+    """Default `action_sequence`."""
     default_half_rotation: ClassVar[bool]
-    """`half_rotation` unless it is given."""
+    """Default `half_rotation`."""
 
     @abstractmethod
     def _configure(self) -> None:
-        """Check the parameters that concern the control, and set up what it needs."""
+        """Check the parameters of the control, and build `actions`."""
 
     @abstractmethod
     def _make_controller(self, robot: Robot, task: Task) -> Controller:
@@ -137,7 +142,7 @@ class ManipulationEnv(EnvBase):
     @property
     @abstractmethod
     def action_limits(self) -> ActionLimits:
-        """What one action covers."""
+        """Displacement and rotation of one action."""
 
     @property
     @abstractmethod
@@ -149,12 +154,12 @@ class ManipulationEnv(EnvBase):
         """Return the specification of an action."""
 
     @abstractmethod
-    def _image_specs(self) -> dict[str, Bounded]:
-        """Return the specifications of the images that a policy sees, by key."""
+    def _declare_images(self) -> dict[str, ImageSpec]:
+        """Return what `_images` gives, by key."""
 
     @abstractmethod
     def _place_robot(self, scene: Scene) -> None:
-        """Put the robot into the pose an episode starts from."""
+        """Put the robot into the initial pose of an episode."""
 
     @abstractmethod
     def _act(self, scene: Scene, action: np.ndarray) -> None:
@@ -181,12 +186,22 @@ class ManipulationEnv(EnvBase):
         Raises:
             SimulationError: the environment was not reset yet.
         """
-        if self._scene is None:
+        if self._episodes.scene is None:
             raise SimulationError("reset the environment first")
-        return self._scene
+        return self._episodes.scene
+
+    @property
+    def conditions(self) -> dict[str, bool]:
+        """The task's named conditions of success, such as ``is_grasped``; see `Task.evaluate`.
+
+        Empty after a simulator fault.
+        """
+        if self._conditions is None:
+            self._conditions = self.scene.task.evaluate()
+        return dict(self._conditions)
 
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
-        """Return a picture of the scene for people, [height, width, 3] uint8."""
+        """Return an RGB image of the scene, [height, width, 3] uint8."""
         x, y = self.workspace.center
         floor = self.config.floor_color or LIGHT_FLOOR
         aside, z, distance = self.camera_pose
@@ -200,12 +215,12 @@ class ManipulationEnv(EnvBase):
         )
 
     def get_state(self) -> EnvState:
-        """Return the whole state, to come back to with `set_state`.
+        """Return the full state, for `set_state`.
 
-        It lives in this process and costs a few milliseconds; ten thousand of them cost memory.
-        The future from here is that from `set_state`, bit by bit; had nobody asked, it might
-        differ in the last bits. Tasks with a clutter or a bin go on in a world built anew, here
-        and after each `set_state`: that takes tenths of a second.
+        A state is valid in this process only and takes a few milliseconds. Continuing after this
+        call and continuing after `set_state` give the same future bit by bit; without this call,
+        the future may differ in the last bits. Tasks with clutter or a bin continue in a newly
+        built world, here and after each `set_state`, which takes tenths of a second.
 
         Raises:
             SimulationError: the environment was not reset yet.
@@ -214,7 +229,7 @@ class ManipulationEnv(EnvBase):
         needs_fresh_world = self.task_class.needs_fresh_world
         state = EnvState(
             owner=self._identity,
-            scale=next(key for key, value in self._scenes.items() if value is scene),
+            scale=self._episodes.scale(),
             scene=scene.get_state(outlives_world=needs_fresh_world),
             observation=self._observation,
             memory=self._memory,
@@ -228,13 +243,13 @@ class ManipulationEnv(EnvBase):
         return state
 
     def set_state(self, state: EnvState) -> TensorDict:
-        """Return to a state of this environment: the same actions then give the same future.
+        """Restore a state of this environment: the same actions then give the same future.
 
         Args:
-            state: what `get_state` returned, at any time before.
+            state: from `get_state`.
 
         Returns:
-            What was observed in it, as `step` gives under "next", without reward.
+            The observation in that state, as `step` gives it under "next", without reward.
 
         Raises:
             SimulationError: it is the state of another environment, or of a simulation that
@@ -243,19 +258,18 @@ class ManipulationEnv(EnvBase):
         if state.owner is not self._identity:
             raise SimulationError("the state is of another environment")
         if self.task_class.needs_fresh_world:
-            self._drop_scenes()
-        scene = self._scene_for(state.scale)
-        scene.set_state(state.scene)
-        self._scene = scene
+            self._episodes.close()
+        self._episodes.scene = self._episodes.scene_for(state.scale)
+        self.scene.set_state(state.scene)
         self._observation, self._memory = state.observation, state.memory
         self.base_seed, self._episode = state.base_seed, state.episode
         self._step_count = state.step_count
-        self._ends = state.ends
+        self._ends, self._conditions = state.ends, None
         return self._tensordict(self._observation, **self._ends)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close every world of this environment."""
-        self._drop_scenes()
+        self._episodes.close()
         super().close(raise_if_closed=raise_if_closed)
 
     # -- TorchRL -----------------------------------------------------------------------------
@@ -274,12 +288,12 @@ class ManipulationEnv(EnvBase):
         rng = np.random.default_rng([self.base_seed, self._episode])
         self._episode += 1
         self._step_count = 0
-        afresh = self._episode == 1
-        if afresh and self.task_class.needs_fresh_world:
-            self._drop_scenes()
-        self._scene = self._new_episode(rng, afresh)
-        self._observation = self._observe(self._scene)
-        self._ends = {}
+        is_first = self._episode == 1
+        if is_first and self.task_class.needs_fresh_world:
+            self._episodes.close()
+        scene = self._episodes.begin(rng, with_new_objects=is_first)
+        self._observation = self._observe(scene)
+        self._ends, self._conditions = {}, None
         return self._tensordict(self._observation)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -294,7 +308,7 @@ class ManipulationEnv(EnvBase):
             success, valid = self._evaluate(scene)
             self._observation = self._observe(scene)
         except Exception:
-            fault = True
+            fault, self._conditions = True, {}
             self._on_fault()
         else:
             self._consecutive_faults = 0
@@ -320,8 +334,12 @@ class ManipulationEnv(EnvBase):
             return Binary(n=1, shape=(1,), dtype=torch.bool)
 
         action = self._make_action_spec()
-        seen = self._image_specs() if self.config.obs_type == "pixel" else {}
-        seen |= self._extras.specs(self._scene_for(float(self._scales[-1])))
+        images = self._declare_images() if self.config.obs_type == "pixel" else {}
+        self.images = joined([images, *(extra.images() for extra in self._observations)])
+        """Declaration of each image that is observed, by key."""
+        seen = {key: image.to_tensor_spec() for key, image in self.images.items()}
+        largest = self._episodes.largest_scene
+        seen = joined([seen, *(extra.specs(largest) for extra in self._observations)])
         observation = {
             **seen,
             keys.HOLDING: flag(),
@@ -339,88 +357,43 @@ class ManipulationEnv(EnvBase):
         )
 
     def _check_feasible(self) -> None:
-        """Fail now, not in a worker, if the objects or the robot do not fit the workspace."""
-        check_action_limits(
-            self._scene_for(float(self._scales[-1])).robot, self.workspace, self._heights_to_reach
-        )
-        for scale in {float(self._scales[0]), float(self._scales[-1])}:
-            try:
-                self._start(self._scene_for(scale), np.random.default_rng(0))
-            except PlacementError as error:
-                raise ConfigError(f"{self.task_id}: {error}") from None
+        """Raise, before any worker starts, if the objects or the robot do not fit the workspace."""
+        largest = self._episodes.largest_scene
+        check_action_limits(largest.robot, self.workspace, self._heights_to_reach)
+        try:
+            self._episodes.check_starts()
+        except PlacementError as error:
+            raise ConfigError(f"{self.task_id}: {error}") from None
 
-    def _scene_for(self, scale: float) -> Scene:
-        """Return the sealed world for objects of this scale, building it the first time."""
-        key = round(scale, 6)
-        if key not in self._scenes:
-            self._scenes[key] = build_scene(
-                self.task_id,
-                self.config,
-                workspace=self.workspace,
-                limits=self.action_limits,
-                scale=scale,
-                physics=self.physics,
-                make_controller=self._make_controller,
-            )
-        return self._scenes[key]
-
-    def _drop_scenes(self) -> None:
-        for scene in self._scenes.values():
-            scene.world.close()
-        self._scenes.clear()
-        self._scene = None
-
-    def _new_episode(self, rng: np.random.Generator, afresh: bool) -> Scene:
-        """Return a scene at the start of an episode: with new objects, or the last one's."""
-        scene = self._scene
-        if scene is not None and not afresh and scene.task.continues:
-            scene.task.resume()
-            self._place_robot(scene)
-            scene.world.settle(max_steps=SETTLE_STEPS)
-            if scene.task.is_valid_start():
-                return scene
-        scene = self._scene_for(float(rng.choice(self._scales)))
-        self._start(scene, rng)
-        return scene
-
-    def _start(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Bring new objects into a scene.
-
-        Raises:
-            PlacementError: no attempt gave a valid scene that still has to be solved.
-        """
-        invalid = 0
-        for _ in range(RESET_ATTEMPTS):
-            scene.world.restore_pristine()
-            self._place_robot(scene)
-            scene.task.initialize_episode(rng)
-            scene.world.settle(max_steps=SETTLE_STEPS)
-            if scene.task.is_valid_start():
-                return
-            invalid += not scene.task.is_valid()
-        raise PlacementError(
-            f"of {RESET_ATTEMPTS} random scenes {invalid} had an object outside the workspace and "
-            f"{RESET_ATTEMPTS - invalid} were solved from the start; objects of this size need "
-            "another workspace"
+    def _build_scene(self, scale: float) -> Scene:
+        return build_scene(
+            self.task_id,
+            self.config,
+            workspace=self.workspace,
+            limits=self.action_limits,
+            scale=scale,
+            physics=self.physics,
+            make_controller=self._make_controller,
         )
 
     def _evaluate(self, scene: Scene) -> tuple[bool, bool]:
         """Return whether the goal holds, once everything is at rest, and the scene is valid."""
         if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
             raise SimulationError("a body's position is not finite")
-        success = scene.task.is_success()
-        if success:
+        self._conditions = scene.task.evaluate()
+        if all(self._conditions.values()):
             scene.world.settle(max_steps=SETTLE_STEPS)
-            success = scene.task.is_success()
+            self._conditions = scene.task.evaluate()
         valid = scene.task.is_valid()
-        return valid and success, valid
+        return valid and all(self._conditions.values()), valid
 
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
         observation = {keys.HOLDING: torch.tensor([self._is_holding(scene)])}
         if self.config.obs_type == "pixel":
             for key, image in self._images(scene).items():
                 observation[key] = torch.from_numpy(image.astype(np.float32))
-        observation |= self._extras.observe(scene)
+        for extra in self._observations:
+            observation |= extra.observe(scene)
         if self.config.expert:
             observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
         return observation
@@ -456,11 +429,11 @@ class ManipulationEnv(EnvBase):
         return array
 
     def _on_fault(self) -> None:
-        """Count and report a simulator fault; the next reset starts with a new world."""
+        """Count and log a simulator fault; the next reset builds a new world."""
         self.faults += 1
         self._consecutive_faults += 1
         logger.exception("%s: simulator fault %d, episode dropped", self.task_id, self.faults)
-        self._drop_scenes()
+        self._episodes.close()
         if self._consecutive_faults > MAX_CONSECUTIVE_FAULTS:
             raise SimulationError(
                 f"{self.task_id} failed {self._consecutive_faults} times in a row; the log above "

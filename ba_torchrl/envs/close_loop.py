@@ -11,6 +11,7 @@ from torchrl.data import Bounded
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
@@ -65,11 +66,10 @@ class CloseLoopEnv(ManipulationEnv):
     def _make_action_spec(self) -> Bounded:
         return Bounded(-1.0, 1.0, shape=(self.actions.size,), dtype=torch.float32)
 
-    def _image_specs(self) -> dict[str, Bounded]:
-        size = self.config.obs_size
+    def _declare_images(self) -> dict[str, ImageSpec]:
         low, high = self._view.range_m(self._view_setup)
-        shape = (self._view.channels, size, size)
-        return {keys.PIXELS: Bounded(low, high, shape=shape, dtype=torch.float32)}
+        channels, size = self._view.channels, self.config.obs_size
+        return {keys.PIXELS: ImageSpec(channels, size, high, low, storage="uint8")}
 
     def _place_robot(self, scene: Scene) -> None:
         x, y = self.workspace.center

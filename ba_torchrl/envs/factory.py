@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
+from types import ModuleType
 from typing import Any
 
 from torchrl.envs import EnvBase
 
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.envs.settings import parse_env_config
 from ba_torchrl.envs.vector.make import make_vector_env
+from ba_torchrl.plugins import (
+    MAIN,
+    check_spawned_process_knows,
+    import_modules,
+    module_names,
+)
+from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 
 
@@ -34,7 +44,7 @@ def resolve(task: str, **config: Any) -> EnvConfig:
     control, box = CONTROLS[task_class.control], task_class.workspace
     settings = parse_env_config(task, config)
     defaults = {
-        "action_sequence": control.default_action_sequence,
+        "action_sequence": task_class.default_action_sequence or control.default_action_sequence,
         "half_rotation": control.default_half_rotation,
         "workspace": (box.x, box.y, box.z),
         "object_scale_range": task_class.scale_range,
@@ -46,14 +56,47 @@ def resolve(task: str, **config: Any) -> EnvConfig:
 
 
 def make_vector(
-    task: str, num_envs: int, *, parallel: bool, start_method: str, **config: Any
+    task: str,
+    num_envs: int,
+    *,
+    parallel: bool,
+    start_method: str,
+    register_modules: Sequence[str | ModuleType] = (),
+    **config: Any,
 ) -> EnvBase:
     """Make environments that step together; see `ba_torchrl.make_vector_env`."""
-    seed = parse_env_config(task, config).seed
+    modules = module_names(register_modules)
+    import_modules(modules)
+    settings = parse_env_config(task, config)
+    if parallel and start_method == "spawn":
+        modules += _plugins_of(task, settings)
     return make_vector_env(
-        partial(make_env, task, **config),
+        partial(_import_and_make_env, modules, task, **config),
         num_envs,
-        seed=seed,
+        seed=settings.seed,
         parallel=parallel,
         start_method=start_method,
     )
+
+
+def _plugins_of(task: str, settings: EnvConfig) -> tuple[str, ...]:
+    """Return the modules that a new process imports before it can make an environment.
+
+    Raises:
+        ConfigError: one of them is defined where no other process can import it.
+    """
+    modules = []
+    needed = [(TASKS, task), (ROBOTS, settings.robot)]
+    needed += [(OBSERVATIONS, name) for name in settings.observations]
+    for registry, name in needed:
+        module = registry.plugin_module(name)
+        if module in MAIN:
+            check_spawned_process_knows(registry.kind, name)
+        elif module is not None:
+            modules.append(module)
+    return tuple(modules)
+
+
+def _import_and_make_env(modules: Sequence[str], task: str, **config: Any) -> ManipulationEnv:
+    import_modules(modules)
+    return make_env(task, **config)

@@ -1,7 +1,8 @@
-"""The environments for Gymnasium: NumPy in, NumPy out, nothing of torch to be seen."""
+"""The environments for Gymnasium: NumPy arrays in and out, no tensors."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -14,11 +15,12 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_env
 from ba_torchrl.errors import ConfigError, InvalidActionError
+from ba_torchrl.plugins import import_modules
 
 Observation = dict[str, np.ndarray]
 
 INFO_KEYS = (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT, keys.EXPERT_ACTION)
-"""What a policy is not to see."""
+"""Entries of ``info``: a policy does not observe them."""
 
 
 class GymEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -30,6 +32,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     Args:
         task: as listed by `ba_torchrl.list_tasks`.
         render_mode: ``rgb_array`` for pictures from `render`, ``human`` for PyBullet's window.
+        register_modules: names of modules outside the package that register the task or its robot.
         config: fields of `ba_torchrl.config.EnvConfig`.
 
     Raises:
@@ -38,14 +41,21 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}
 
-    def __init__(self, task: str, render_mode: str | None = None, **config: Any) -> None:
-        if "frameskip" in config:  # TorchRL's GymEnv tries it first, and goes on after this
+    def __init__(
+        self,
+        task: str,
+        render_mode: str | None = None,
+        register_modules: Sequence[str] = (),
+        **config: Any,
+    ) -> None:
+        if "frameskip" in config:  # TorchRL's GymEnv tries it first and handles this error
             raise TypeError("GymEnv.__init__() got an unexpected keyword argument 'frameskip'")
         if render_mode not in (None, *self.metadata["render_modes"]):
             known = ", ".join(self.metadata["render_modes"])
             raise ConfigError(f"unknown render_mode {render_mode!r}. Known: {known}")
         if render_mode == "human":
             config = {**config, "render": True}
+        import_modules(register_modules)
         self.render_mode = render_mode
         self.torchrl_env = make_env(task, **config)
         """The same environment for TorchRL; stepping it steps this one."""
@@ -112,6 +122,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
             key: state[key].item() for key in (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT)
         }
         info["is_success"] = info[keys.SUCCESS]
+        info |= self.torchrl_env.conditions
         if keys.EXPERT_ACTION in state:
             info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
         return observation, info

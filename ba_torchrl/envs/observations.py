@@ -1,68 +1,113 @@
-"""Observations beside the image that a policy acts on: poses, pictures and points."""
+"""Observations beside the images of the control: poses, RGB-D images and point clouds.
+
+Each is a class that registers its name. Adding one takes a file with such a class; it is enabled by
+its name in the environment's parameter `observations`.
+"""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
-from torchrl.data import Bounded, TensorSpec, Unbounded
+from torchrl.data import TensorSpec, Unbounded
 
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.scene import Scene
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.registry import Registry
 from ba_torchrl.sim.vision.depth import point_cloud
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_rgbd
 from ba_torchrl.sim.vision.views import finger_posts
 from ba_torchrl.tasks.workspace import Workspace
 
+OBSERVATIONS: Registry[type[Observation]] = Registry("observation", "ba_torchrl.envs")
 
-class ExtraObservations:
-    """What `rgb`, `point_cloud` and ``obs_type="vec"`` add.
+
+class Observation(ABC):
+    """Entries that are added to every observation.
 
     Args:
         config: the environment's parameters.
-        workspace: where the task takes place.
+        workspace: bounds of the task.
     """
+
+    parameter: ClassVar[str | None] = None
+    """Field of `EnvConfig` that enables it, besides its name in `observations`."""
 
     def __init__(self, config: EnvConfig, workspace: Workspace) -> None:
         self.config = config
         self.workspace = workspace
 
+    @classmethod
+    def is_enabled(cls, config: EnvConfig) -> bool:
+        """Whether `parameter` enables it."""
+        return cls.parameter is not None and bool(getattr(config, cls.parameter))
+
+    def images(self) -> dict[str, ImageSpec]:
+        """Return the declarations of its images, by key."""
+        return {}
+
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specifications of what is added, by key."""
-        config, specs = self.config, {}
-        if config.obs_type == "vec":
-            length = 1 + 4 * (1 + len(scene.task.landmarks))
-            specs[keys.OBSERVATION] = Unbounded(shape=(length,), dtype=torch.float32)
-        if config.rgb:
-            size = config.obs_size
-            specs[keys.RGB] = Bounded(0, 255, shape=(3, size, size), dtype=torch.uint8)
-            near, far = RGBD_RANGE_M
-            specs[keys.RGB_DEPTH] = Bounded(near, far, shape=(1, size, size), dtype=torch.float32)
-        if config.point_cloud:
-            specs[keys.POINT_CLOUD] = Unbounded(shape=(config.point_cloud, 3), dtype=torch.float32)
-        return specs
+        """Return the specifications of its entries other than images, by key."""
+        return {}
+
+    @abstractmethod
+    def observe(self, scene: Scene) -> dict[str, Tensor]:
+        """Return its entries, by key."""
+
+
+def enabled_observations(config: EnvConfig, workspace: Workspace) -> list[Observation]:
+    """Return the observations that a configuration enables.
+
+    Raises:
+        ConfigError: a name is unknown.
+    """
+    for name in config.observations:
+        _ = OBSERVATIONS[name]
+    return [
+        OBSERVATIONS[name](config, workspace)
+        for name in OBSERVATIONS
+        if name in config.observations or OBSERVATIONS[name].is_enabled(config)
+    ]
+
+
+def joined(parts: list[dict]) -> dict:
+    """Return the entries of several observations.
+
+    Raises:
+        ConfigError: two of them use the same key.
+    """
+    entries: dict = {}
+    for part in parts:
+        if repeated := entries.keys() & part.keys():
+            raise ConfigError(f"observations: two of them use the key {', '.join(repeated)}")
+        entries |= part
+    return entries
+
+
+@OBSERVATIONS.register("vec")
+class PoseVector(Observation):
+    """The poses of gripper and landmarks, and the opening of the gripper."""
+
+    @classmethod
+    def is_enabled(cls, config: EnvConfig) -> bool:
+        """Whether ``obs_type="vec"``."""
+        return config.obs_type == "vec"
+
+    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
+        """Return the specification of the vector."""
+        length = 1 + 4 * (1 + len(scene.task.landmarks))
+        return {keys.OBSERVATION: Unbounded(shape=(length,), dtype=torch.float32)}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
-        """Return what is added, by key."""
-        config, out = self.config, {}
-        if config.obs_type == "vec":
-            out[keys.OBSERVATION] = torch.from_numpy(self._vector(scene))
-        if config.rgb:
-            rgb, depth = render_rgbd(
-                scene.world, oblique_lens(self.workspace.center), config.obs_size
-            )
-            out[keys.RGB] = torch.from_numpy(rgb).permute(2, 0, 1)
-            out[keys.RGB_DEPTH] = torch.from_numpy(depth.astype(np.float32))[None]
-        if config.point_cloud:
-            out[keys.POINT_CLOUD] = torch.from_numpy(self._points(scene))
-        return out
-
-    def _vector(self, scene: Scene) -> np.ndarray:
-        """Return the poses of gripper and landmarks, scaled to [-1, 1] by the workspace."""
+        """Return the vector, positions scaled to [-1, 1] by the workspace."""
         axes = (self.workspace.x, self.workspace.y, self.workspace.z)
         values = [2 * scene.robot.opening() - 1]
         for position, yaw in (scene.robot.tool_pose(), *scene.task.landmarks):
@@ -71,15 +116,52 @@ class ExtraObservations:
                 for value, (low, high) in zip(position, axes, strict=True)
             ]
             values.append(yaw / math.pi)
-        return np.array(values, dtype=np.float32)
+        return {keys.OBSERVATION: torch.tensor(values, dtype=torch.float64).to(torch.float32)}
 
-    def _points(self, scene: Scene) -> np.ndarray:
-        """Return points of floor, bodies and fingers that two cameras at the sides see."""
+
+@OBSERVATIONS.register("rgb")
+class RgbDepth(Observation):
+    """An RGB image of the scene, arm included, and its depth."""
+
+    parameter = "rgb"
+
+    def images(self) -> dict[str, ImageSpec]:
+        """Return the declarations of the colour image and of its depth."""
+        size, (near, far) = self.config.obs_size, RGBD_RANGE_M
+        return {
+            keys.RGB: ImageSpec(3, size, 255, storage="exact", frame="camera", dtype=torch.uint8),
+            keys.RGB_DEPTH: ImageSpec(1, size, far, near, frame="camera"),
+        }
+
+    def observe(self, scene: Scene) -> dict[str, Tensor]:
+        """Return the image and its depth, from the camera opposite the robot."""
+        lens = oblique_lens(self.workspace.center)
+        rgb, depth = render_rgbd(scene.world, lens, self.config.obs_size)
+        return {
+            keys.RGB: torch.from_numpy(rgb).permute(2, 0, 1),
+            keys.RGB_DEPTH: torch.from_numpy(depth.astype(np.float32))[None],
+        }
+
+
+@OBSERVATIONS.register("point_cloud")
+class PointCloud(Observation):
+    """Points on the surfaces of floor, bodies and fingers, seen by two cameras at the sides."""
+
+    parameter = "point_cloud"
+
+    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
+        """Return the specification of the points."""
+        shape = (self.config.point_cloud, 3)
+        return {keys.POINT_CLOUD: Unbounded(shape=shape, dtype=torch.float32)}
+
+    def observe(self, scene: Scene) -> dict[str, Tensor]:
+        """Return the points, metres."""
         robot, workspace = scene.robot, self.workspace
         fingers = finger_posts(robot.tool_pose(), robot.finger_span_m * robot.opening() / 2)
-        return point_cloud(
+        points = point_cloud(
             [scene.camera.surface, fingers],
             side_lenses(workspace.center, workspace.width),
             self.config.point_cloud,
             (workspace.x, workspace.y, workspace.z),
         )
+        return {keys.POINT_CLOUD: torch.from_numpy(points)}

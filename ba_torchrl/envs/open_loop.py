@@ -12,7 +12,9 @@ from torchrl.data import Binary, Bounded, Unbounded
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import CONTROLS, SETTLE_STEPS, ManipulationEnv
+from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.episodes import SETTLE_STEPS
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits
@@ -77,7 +79,7 @@ class OpenLoopEnv(ManipulationEnv):
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
-            surface_height_m=task.terrain.height_m,
+            lowest_tool_m=task.terrain.lowest_tool_m,
         )
 
     @property
@@ -102,15 +104,15 @@ class OpenLoopEnv(ManipulationEnv):
                 undo[keys.UNDO_IN_HAND] = self.observation_spec[keys.IN_HAND].clone()
             self.observation_spec.update(undo)
 
-    def _image_specs(self) -> dict[str, Bounded]:
-        size, patch = self.config.obs_size, self.config.in_hand_size
-        channels = self._in_hand_kind.channels
-        most = patch if channels == 3 else self.workspace.z[1]
+    def _declare_images(self) -> dict[str, ImageSpec]:
+        highest_m, patch = self.workspace.z[1], self.config.in_hand_size
+        if self._in_hand_kind.channels == 1:
+            in_hand = ImageSpec(1, patch, highest_m, frame="gripper")
+        else:  # projections: numbers of voxels
+            in_hand = ImageSpec(3, patch, patch, frame="gripper", channel_axes=("yz", "xz", "xy"))
         return {
-            keys.PIXELS: Bounded(
-                0.0, self.workspace.z[1], shape=(1, size, size), dtype=torch.float32
-            ),
-            keys.IN_HAND: Bounded(0.0, most, shape=(channels, patch, patch), dtype=torch.float32),
+            keys.PIXELS: ImageSpec(1, self.config.obs_size, highest_m),
+            keys.IN_HAND: in_hand,
         }
 
     def _place_robot(self, scene: Scene) -> None:

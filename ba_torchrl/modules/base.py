@@ -1,12 +1,15 @@
-"""What every actor-critic network is built from and built into, and the registry of networks."""
+"""The interface of actor-critic networks, and the registry of networks."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 from torch import nn
 
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.registry import Registry
 
 Control = Literal["open_loop", "close_loop"]
@@ -20,21 +23,18 @@ LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
 @dataclass(frozen=True)
 class ActorCriticSpec:
-    """The shapes that a task hands to a network.
+    """What an actor-critic network is built for.
 
     Args:
-        image_size: height and width of the square image, pixels.
+        images: declarations of the images that it sees, by key, in the order of its arguments.
         action_sequence: one letter per action component, in the order of the action ("pxyzr").
-        image_channels: channels of the image, the holding flag not counted.
 
     Raises:
-        ValueError: the sequence is empty, repeats a letter or holds one outside "pxyzr"; a size
-            is not positive.
+        ValueError: the sequence is empty, repeats a letter or holds one outside "pxyzr".
     """
 
-    image_size: int
+    images: Mapping[str, ImageSpec]
     action_sequence: str
-    image_channels: int = 1
 
     def __post_init__(self) -> None:
         letters = self.action_sequence
@@ -43,8 +43,16 @@ class ActorCriticSpec:
                 f"action_sequence must hold different letters of {ACTION_LETTERS!r}, "
                 f"got {letters!r}"
             )
-        if self.image_size < 1 or self.image_channels < 1:
-            raise ValueError(f"image_size and image_channels must be positive, got {self}")
+
+    @property
+    def image_size(self) -> int:
+        """Rows and columns of ``pixels``."""
+        return self.images[keys.PIXELS].size
+
+    @property
+    def image_channels(self) -> int:
+        """Channels of ``pixels``."""
+        return self.images[keys.PIXELS].channels
 
     @property
     def action_size(self) -> int:
@@ -53,12 +61,12 @@ class ActorCriticSpec:
 
 
 class ActorCritic(NamedTuple):
-    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, none included.
+    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, also none.
 
     Fields:
-        actor: (pixels [..., C, H, W] metres, holding [..., 1]) -> (loc [..., A], scale [..., A])
-            of the Gaussian before its squashing.
-        encoder: (pixels, holding) -> features [..., F], shared by the two critics.
+        actor: (images [..., C, H, W] each, holding [..., 1]) -> (loc [..., A], scale [..., A]) of
+            the Gaussian before it is squashed.
+        encoder: (images, holding) -> features [..., F], shared by the two critics.
         critic: (features [..., F], action [..., A]) -> twin values [..., 2].
     """
 
@@ -68,11 +76,13 @@ class ActorCritic(NamedTuple):
 
 
 class NetworkConfig(Protocol):
-    """What a registered network is: a pydantic model of its hyper-parameters that can build."""
+    """A registered network: a pydantic model of its hyper-parameters that builds it."""
 
     control: ClassVar[Control]
     """Which tasks it is for: close-loop ones take an `ActorCritic`, open-loop ones a
     `ba_torchrl.modules.spatial.SpatialQNetwork`."""
+    image_keys: ClassVar[tuple[str, ...]]
+    """Keys of the images that it sees, in the order of its arguments; the holding flag follows."""
 
     def build(self, spec: Any) -> Any:
         """Return freshly initialised modules for an `ActorCriticSpec`, or for a `SpatialSpec`."""

@@ -98,11 +98,12 @@ class CNNConfig(ImageNetworkConfig):
         """Return freshly initialised modules.
 
         Args:
-            spec: shapes of image and action.
+            spec: the images and the action.
 
         Raises:
-            ValueError: the image size is not 64 or 128.
+            ValueError: the image size is not 64 or 128, or the image is not depth or height.
         """
+        self.check_images(spec)
         features = scaled_width(_WIDTHS[-1], self.width)
         networks = ActorCritic(
             actor=CNNActor(self._trunk(spec), features, spec.action_size),

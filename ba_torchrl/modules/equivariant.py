@@ -145,13 +145,14 @@ class EquivariantConfig(ImageNetworkConfig):
         """Return freshly initialised modules.
 
         Args:
-            spec: shapes of image and action.
+            spec: the images and the action.
 
         Raises:
             ImportError: escnn is missing; the message names the fix.
-            ValueError: the image size is not 64 or 128, ``n_hidden`` does not divide into whole
-                fields, or the action lacks x or y.
+            ValueError: the image size is not 64 or 128, the image is not depth or height,
+                ``n_hidden`` does not divide into whole fields, or the action lacks x or y.
         """
+        self.check_images(spec)
         gspace = planar_rotations(self.group_order)
         action = ActionFields(spec.action_sequence)
         features = [(gspace.regular_repr, self.n_hidden)]

@@ -1,45 +1,59 @@
-"""What a network with spatial Q values is: one value per pixel, and per angle where it has any."""
+"""The interface of networks with spatial Q values: one value per pixel, and per angle if any."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
+
 
 @dataclass(frozen=True)
 class SpatialSpec:
-    """The shapes that an open-loop task hands to a network.
+    """What a network with spatial Q values is built for.
 
     Args:
-        image_size: height and width of the heightmap, pixels.
-        in_hand_size: height and width of the in-hand image, pixels.
-        in_hand_channels: its channels: 1 for "raw" and "sub", 3 for "proj".
+        images: declarations of the images that it sees, by key, in the order of its arguments: the
+            heightmap, the in-hand image (1 channel for "raw" and "sub", 3 for "proj"), others.
         components: of the action without its primitive, in the order of the action: some of x, y,
             z, rz, ry, rx.
         half_rotation: yaws half a turn apart are the same.
 
     Raises:
-        ValueError: a size is not positive, or x or y is missing.
+        ValueError: x or y is missing.
     """
 
-    image_size: int
-    in_hand_size: int
-    in_hand_channels: int
+    images: Mapping[str, ImageSpec]
     components: tuple[str, ...]
     half_rotation: bool = True
 
     def __post_init__(self) -> None:
-        if min(self.image_size, self.in_hand_size, self.in_hand_channels) < 1:
-            raise ValueError(f"sizes must be positive, got {self}")
         if not {"x", "y"} <= set(self.components):
             raise ValueError(f"the action needs x and y, got {self.components}")
 
+    @property
+    def image_size(self) -> int:
+        """Rows and columns of the heightmap."""
+        return self.images[keys.PIXELS].size
+
+    @property
+    def in_hand_size(self) -> int:
+        """Rows and columns of the in-hand image."""
+        return self.images[keys.IN_HAND].size
+
+    @property
+    def in_hand_channels(self) -> int:
+        """Channels of the in-hand image."""
+        return self.images[keys.IN_HAND].channels
+
 
 class Level(NamedTuple):
-    """One decision of a policy: components of the action that are chosen together.
+    """Components of the action that are chosen together.
 
     Fields:
         components: their names in the order of the axes of the Q values: x (rows of the image),
@@ -52,25 +66,25 @@ class Level(NamedTuple):
 
 
 class SpatialQNetwork(nn.Module, ABC):
-    """Q values of an action that is chosen level by level, each level knowing the ones before.
+    """Q values of an action that is chosen level by level, each given the levels before it.
 
-    Which primitive it is, pick or place, is not chosen: an open hand picks, a full one places, and
-    the values are those of that primitive.
+    The primitive is not chosen: an empty gripper picks, a holding one places, and the values are
+    those of that primitive.
     """
 
     levels: tuple[Level, ...]
 
     @abstractmethod
     def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
-        """Return the Q values of the first level, and what the later ones need besides.
+        """Return the Q values of the first level, and the state that `later` needs.
 
         Args:
             pixels: heightmaps [B, 1, H, W], metres.
             in_hand: images of what is held [B, C, h, w].
-            holding: [B, 1], true where something is held.
+            holding: [B, 1], true where something is held; after all images that it sees.
 
         Returns:
-            float32 [B, *levels[0].shape], and an opaque state for `later`.
+            float32 [B, *levels[0].shape], and a state of any type.
         """
 
     def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Shared by the networks with spatial Q values: their input, and which actions suit them."""
+"""Inputs of the networks with spatial Q values, and the actions that they take."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from ba_torchrl.config import StrictModel
+from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import Control
 from ba_torchrl.modules.spatial import SpatialSpec
 from ba_torchrl.modules.trunk import Precision, compute_dtype
@@ -33,6 +34,7 @@ class SpatialImageConfig(StrictModel):
     """
 
     control: ClassVar[Control] = "open_loop"
+    image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS, keys.IN_HAND)
 
     precision: Precision = "auto"
     height_scale_m: float = Field(default=1.0, gt=0)
@@ -53,10 +55,10 @@ class SpatialImageConfig(StrictModel):
 
 
 def of_primitive(values: Tensor, holding: Tensor) -> Tensor:
-    """Return the values of the primitive that is up: the first half for open hands, else the last.
+    """Return the values of one primitive: of picks where nothing is held, else of places.
 
     Args:
-        values: [B, 2n, ...].
+        values: [B, 2n, ...], those of picks first.
         holding: [B, 1].
 
     Returns:
@@ -74,12 +76,12 @@ def has_yaw(name: str, spec: SpatialSpec) -> bool:
         spec: names the action's components.
 
     Raises:
-        ValueError: it has something else, too.
+        ValueError: the action has other components.
     """
     others = [c for c in spec.components if c not in ("x", "y", "rz")]
     if others:
         raise ValueError(
-            f"network {name!r} chooses x, y and rz, not {', '.join(others)}; take an "
+            f"network {name!r} chooses x, y and rz, not {', '.join(others)}; use an "
             "action_sequence without, such as 'pxy' or 'pxyr'"
         )
     return "rz" in spec.components

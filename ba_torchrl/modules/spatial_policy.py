@@ -1,4 +1,4 @@
-"""Policies on spatial Q values: from maps of values to an action in the environment's units."""
+"""Policies on spatial Q values, whose actions are in the environment's units."""
 
 from __future__ import annotations
 
@@ -14,23 +14,21 @@ from ba_torchrl.actions import PLACE, OpenLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.spatial import Level, SpatialQNetwork
 
-OBSERVATION_KEYS = [keys.PIXELS, keys.IN_HAND, keys.HOLDING]
-
-GROUND_M = 0.01
-"""Random actions go to pixels higher than this, if there are any."""
+OBJECT_HEIGHT_M = 0.01
+"""Random actions choose pixels higher than this, if there are any."""
 
 
 class SpatialActions:
-    """The bijection between what the levels choose and the action, in the environment's units.
+    """The bijection between the choices of the levels and the actions on their grid.
 
     Indices of x and y are rows and columns of the heightmap, and stand for the centres of pixels.
 
     Args:
         actions: the environment's action vector.
-        levels: what is chosen, in this order.
+        levels: the components that are chosen, in this order.
 
     Raises:
-        ValueError: the levels do not choose just the components of the action.
+        ValueError: the components of the levels are not those of the action.
     """
 
     def __init__(self, actions: OpenLoopActions, levels: Sequence[Level]) -> None:
@@ -55,14 +53,14 @@ class SpatialActions:
         ]
 
     def to_action(self, indices: Tensor, holding: Tensor) -> Tensor:
-        """Return the action [..., A] of indices; the primitive follows from what is held.
+        """Return the action [..., A] of indices: a pick if nothing is held, else a place.
 
         Args:
-            indices: int64 [..., n], of all levels' components in their order.
+            indices: int64 [..., n], of the components of all levels in their order.
             holding: [..., 1], true where something is held.
         """
         shape = (*indices.shape[:-1], self.actions.size)
-        # float64 in between: the float32 next to the true centre, whatever the device
+        # float64 in between: the float32 nearest to the exact value on any device
         action = torch.zeros(shape, dtype=torch.float64, device=indices.device)
         for i, (place, axis) in enumerate(zip(self._places, self.axes, strict=True)):
             action[..., place] = axis.first + axis.step * indices[..., i].double()
@@ -83,12 +81,19 @@ class SpatialActions:
             columns.append(index)
         return torch.stack(columns, dim=-1)
 
+    def nearest(self, action: Tensor) -> Tensor:
+        """Return the nearest actions on the grid of actions [..., A], the primitive unchanged."""
+        indices, out = self.to_indices(action), action.clone()
+        for i, (place, axis) in enumerate(zip(self._places, self.axes, strict=True)):
+            out[..., place] = (axis.first + axis.step * indices[..., i].double()).to(out)
+        return out
+
     def part(self, indices: Tensor, level: int) -> Tensor:
-        """Return one level's share of indices [..., n]."""
+        """Return the indices of one level, of indices [..., n]."""
         return indices[..., self._parts[level]]
 
     def before(self, indices: Tensor, level: int) -> Tensor:
-        """Return what the levels before one have chosen, of indices [..., n]."""
+        """Return the indices of the levels before one, of indices [..., n]."""
         return indices[..., : self._parts[level].start]
 
     def flat(self, indices: Tensor, level: int) -> Tensor:
@@ -106,32 +111,35 @@ class SpatialActions:
 
 
 class SpatialValues(nn.Module):
-    """A network's values of actions in the environment's units, level by level.
+    """The values of actions in the environment's units, level by level.
 
     Args:
-        network: gives the values.
-        actions: between its choices and the environment's actions.
+        network: computes the values of its choices.
+        actions: the bijection between its choices and the environment's actions.
+        image_keys: keys of the images that the network sees, in the order of its arguments.
     """
 
-    in_keys = OBSERVATION_KEYS
-
-    def __init__(self, network: SpatialQNetwork, actions: SpatialActions) -> None:
+    def __init__(
+        self,
+        network: SpatialQNetwork,
+        actions: SpatialActions,
+        image_keys: Sequence[str] = (keys.PIXELS, keys.IN_HAND),
+    ) -> None:
         super().__init__()
         self.network = network
         self.actions = actions
+        self.in_keys = [*image_keys, keys.HOLDING]
 
-    def greedy(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+    def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return the choices of greatest value, level after level, and the last level's value.
 
         Args:
-            pixels: heightmaps [B, 1, H, W], metres.
-            in_hand: [B, C, h, w].
-            holding: [B, 1].
+            observation: the images [B, C, H, W] each, and the holding flag [B, 1].
 
         Returns:
             int64 [B, n] and float32 [B, 1].
         """
-        q, state = self.network.first(pixels, in_hand, holding)
+        q, state = self.network.first(*observation)
         value, best = q.flatten(1).max(dim=1, keepdim=True)
         chosen = self.actions.unflat(best[:, 0], 0)
         for level in range(1, len(self.actions.levels)):
@@ -140,22 +148,19 @@ class SpatialValues(nn.Module):
             chosen = torch.cat([chosen, self.actions.unflat(best[:, 0], level)], dim=-1)
         return chosen, value
 
-    def forward(
-        self, pixels: Tensor, in_hand: Tensor, holding: Tensor, action: Tensor
-    ) -> list[tuple[Tensor, Tensor]]:
-        """Return every level's values, given what an action chose at the levels before.
+    def forward(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the values of every level, given the action's choices at the levels before.
 
         Args:
-            pixels: heightmaps [B, 1, H, W], metres.
-            in_hand: [B, C, h, w].
-            holding: [B, 1].
-            action: [B, A].
+            observation_and_action: the images [B, C, H, W] each, the holding flag [B, 1] and the
+                action [B, A].
 
         Returns:
             For each level the values of all its choices [B, N], and the action's choice [B].
         """
+        *observation, action = observation_and_action
         indices = self.actions.to_indices(action)
-        q, state = self.network.first(pixels, in_hand, holding)
+        q, state = self.network.first(*observation)
         found = [(q.flatten(1), self.actions.flat(indices, 0))]
         for level in range(1, len(self.actions.levels)):
             q = self.network.later(level, state, self.actions.before(indices, level))
@@ -166,51 +171,47 @@ class SpatialValues(nn.Module):
 class SpatialPolicy(nn.Module):
     """Acts on spatial Q values: greedily, or with probability epsilon at random.
 
-    A random action goes to a pixel where something stands, if there is one, at a random angle.
-    TorchRL's ``EGreedyModule`` would draw the primitive as well, which is not free.
-    ``set_exploration_type`` chooses, as everywhere in TorchRL: only RANDOM explores.
+    A random action has a random angle and chooses a pixel of an object, if there is one. TorchRL's
+    ``EGreedyModule`` would draw the primitive as well, which follows from the state. Only under
+    the exploration type RANDOM does it explore, as everywhere in TorchRL.
 
     Args:
-        values: of the actions.
-        rounding: of heightmap and in-hand image, to what the replay stores.
+        values: of the actions; the first image is the heightmap.
         seed: of random actions.
     """
 
     epsilon: Tensor
 
-    def __init__(self, values: SpatialValues, rounding: nn.Module, seed: int) -> None:
+    def __init__(self, values: SpatialValues, seed: int) -> None:
         super().__init__()
         self.values = values
-        self.rounding = rounding
         self.register_buffer("epsilon", torch.zeros(()))
         self._generator = torch.Generator().manual_seed(seed)
 
     def get_generator_state(self) -> Tensor:
-        """Return the state of the source of random actions."""
+        """Return the state of the generator of random actions."""
         return self._generator.get_state()
 
     def set_generator_state(self, state: Tensor) -> None:
-        """Take over what `get_generator_state` returned."""
+        """Restore the state of the generator, from any device."""
         self._generator.set_state(state.cpu())
 
     @torch.no_grad()
-    def forward(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> Tensor:
-        """Return actions [..., A] of heightmaps [..., 1, H, W] and what else is observed.
+    def forward(self, *observation: Tensor) -> Tensor:
+        """Return actions [..., A].
 
         Args:
-            pixels: [..., 1, H, W], metres.
-            in_hand: [..., C, h, w].
-            holding: [..., 1].
+            observation: the images [..., C, H, W] each, and the holding flag [..., 1].
         """
+        *images, holding = observation
         leading = holding.shape[:-1]
         count = math.prod(leading)
-        pixels = self.rounding(pixels.reshape(count, *pixels.shape[-3:]))
-        in_hand = self.rounding(in_hand.reshape(count, *in_hand.shape[-3:]))
+        images = [image.reshape(count, *image.shape[-3:]) for image in images]
         holding = holding.reshape(count, 1)
-        indices, _ = self.values.greedy(pixels, in_hand, holding)
+        indices, _ = self.values.greedy(*images, holding)
         if exploration_type() == ExplorationType.RANDOM and self.epsilon > 0:
             explores = torch.rand(count, generator=self._generator) < self.epsilon.cpu()
-            random = self._random_indices(pixels).to(indices.device)
+            random = self._random_indices(images[0]).to(indices.device)
             indices = torch.where(explores.to(indices.device)[:, None], random, indices)
         return self.values.actions.to_action(indices, holding).reshape(*leading, -1)
 
@@ -219,7 +220,7 @@ class SpatialPolicy(nn.Module):
         actions = self.values.actions
         components = [name for level in actions.levels for name in level.components]
         count, width = len(pixels), pixels.shape[-1]
-        weights = (pixels[:, 0] > GROUND_M).flatten(1).float().cpu()
+        weights = (pixels[:, 0] > OBJECT_HEIGHT_M).flatten(1).float().cpu()
         weights[weights.sum(dim=1) == 0] = 1.0
         pixel = torch.multinomial(weights, 1, generator=self._generator)[:, 0]
         columns = {"x": pixel // width, "y": pixel % width}
@@ -231,4 +232,4 @@ class SpatialPolicy(nn.Module):
 
 def spatial_policy(policy: SpatialPolicy) -> TensorDictModule:
     """Return the policy as a TensorDict module, from the observation to ``action``."""
-    return TensorDictModule(policy, in_keys=OBSERVATION_KEYS, out_keys=[keys.ACTION])
+    return TensorDictModule(policy, in_keys=policy.values.in_keys, out_keys=[keys.ACTION])

@@ -13,7 +13,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.config import StrictModel
-from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, Control
+from ba_torchrl.envs import keys
+from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -85,10 +86,25 @@ class ImageNetworkConfig(StrictModel):
     """
 
     control: ClassVar[Control] = "close_loop"
+    image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS,)
 
     precision: Precision = "auto"
     depth_center_m: float = 0.0
     depth_scale_m: float = Field(default=1.0, gt=0)
+
+    def check_images(self, spec: ActorCriticSpec) -> None:
+        """Refuse images that are not depth or height.
+
+        Raises:
+            ValueError: an image has several channels, or values below zero.
+        """
+        for key, image in spec.images.items():
+            if image.channels != 1 or image.low < 0:
+                raise ValueError(
+                    f"{key} has {image.channels} channels with values from {image.low:g}; this "
+                    "network takes depth or height in one channel, nothing below zero: choose "
+                    "another view_type"
+                )
 
     def image_trunk(self, convs: Iterable[nn.Module], pools: Iterable[bool]) -> ImageTrunk:
         """Return a trunk of these convolutions; ``pools`` says which a 2x2 max pool follows."""

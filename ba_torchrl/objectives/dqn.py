@@ -11,91 +11,112 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.modules import QValueActor
 
 from ba_torchrl.envs import keys
-from ba_torchrl.objectives.transitions import TransitionLoss
+from ba_torchrl.objectives.base import Reduction, TransitionLoss, reduce_loss, reduce_over
+from ba_torchrl.objectives.single_level import SingleLevelValues
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
-"""What the loss asks of the experts' actions beside the TD error."""
+"""The term on demonstrated actions beside the TD error."""
 
 
 class LevelValues(Protocol):
-    """A module that gives the values of an action's choices, level by level."""
+    """A module that computes the values of the choices of an action, level by level."""
 
     in_keys: list[NestedKey]
-    """Of the observation, in the order of the arguments."""
+    """Keys of the observation, in the order of the arguments."""
 
     def __call__(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return each level's values [B, N] and the action's choice among them [B].
+        """Return the values [B, N] of each level and the action's choice among them [B].
 
-        The levels before are as the action chose them.
+        The values of a level are given the action's choices at the levels before.
         """
         ...
 
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the choices of greatest value, level after level, and the last one's value.
-
-        The value is [B, 1].
-        """
+        """Return the greedy choices, level after level, and the last one's value [B, 1]."""
         ...
 
 
-def large_margin(q: Tensor, chosen: Tensor, is_expert: Tensor, margin: float) -> Tensor:
-    """Return the margin loss of DQfD: by how much any action comes too near to the expert's.
+def large_margin(
+    q: Tensor,
+    chosen: Tensor,
+    is_expert: Tensor,
+    margin: float,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Return the margin loss of DQfD (appendix E).
 
-    max_a [Q(a) + margin * 1(a != a_e)] - Q(a_e), averaged over the experts' samples.
+    max_a [Q(a) + margin * 1(a != a_e)] - Q(a_e); the mean is over the demonstrations.
 
     Args:
         q: values of all actions [B, N].
         chosen: the stored action [B].
         is_expert: bool [B].
-        margin: the experts' actions shall be better by this much.
+        margin: by which Q(a_e) must exceed the other values.
+        reduction: of the samples' losses; samples that are no demonstrations are zero.
     """
     of_chosen = q.gather(1, chosen[:, None])
     is_other = torch.ones_like(q).scatter_(1, chosen[:, None], 0.0)
     excess = (q + margin * is_other).amax(dim=1) - of_chosen[:, 0]
-    return _mean_over(excess, is_expert)
+    return reduce_over(excess, is_expert, reduction)
 
 
-def strict_large_margin(q: Tensor, chosen: Tensor, is_expert: Tensor, margin: float) -> Tensor:
-    """Return the margin loss of SDQfD: it presses on every action that comes too near.
+def strict_large_margin(
+    q: Tensor,
+    chosen: Tensor,
+    is_expert: Tensor,
+    margin: float,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Return the margin loss of SDQfD, which applies to every violating action (appendix E).
 
-    The mean of Q(a) - Q(a_e) + margin over {a != a_e: Q(a) > Q(a_e) - margin}, zero where there
-    is none, averaged over the whole batch, in which samples of the policy count as zero.
+    The mean of Q(a) - Q(a_e) + margin over {a != a_e: Q(a) > Q(a_e) - margin}, zero if that is
+    empty; the mean is over the whole batch, in which other samples than demonstrations are zero.
 
     Args:
         q: values of all actions [B, N].
         chosen: the stored action [B].
         is_expert: bool [B].
-        margin: the experts' actions shall be better by this much.
+        margin: by which Q(a_e) must exceed the other values.
+        reduction: of the samples' losses.
     """
     gap = q - q.gather(1, chosen[:, None]) + margin
     violates = (gap > 0).scatter(1, chosen[:, None], False)
     violates &= is_expert[:, None]
     count = violates.sum(dim=1).clamp_min(1)
-    return (torch.where(violates, gap, 0.0).sum(dim=1) / count).mean()
+    return reduce_loss(torch.where(violates, gap, 0.0).sum(dim=1) / count, reduction)
 
 
-def cross_entropy(q: Tensor, chosen: Tensor, is_expert: Tensor, beta: float) -> Tensor:
+def cross_entropy(
+    q: Tensor,
+    chosen: Tensor,
+    is_expert: Tensor,
+    beta: float,
+    reduction: Reduction = "mean",
+) -> Tensor:
     """Return the loss of ADET: the cross-entropy of softmax(beta Q) with the expert's action.
 
-    Averaged over the experts' samples.
+    The mean is over the demonstrations.
 
     Args:
         q: values of all actions [B, N].
         chosen: the stored action [B].
         is_expert: bool [B].
         beta: inverse temperature.
+        reduction: of the samples' losses; samples that are no demonstrations are zero.
     """
-    return _mean_over(F.cross_entropy(beta * q, chosen, reduction="none"), is_expert)
+    losses = F.cross_entropy(beta * q, chosen, reduction="none")
+    return reduce_over(losses, is_expert, reduction)
 
 
 class LevelDQNLoss(TransitionLoss):
     """Deep Q-learning on levels of choices, alone or with demonstrations (appendix G.1).
 
-    Every level regresses the value of what the stored action chose, the levels before being as
-    it chose them, towards one target: the value that the last level of the *target* network gives
-    to the choices which that network finds best, level after level::
+    The value of the stored action at each level, given its choices at the levels before, is
+    regressed to one target: the last level's value of the greedy choices of the *target* network,
+    level after level::
 
         y        = r + gamma (1 - terminated) Q'_last(s', a'_1, ..., a'_k)
         loss_qvalue        = sum over levels of the mean of w_i huber(Q_level(s_i, a_i) - y_i)
@@ -105,13 +126,15 @@ class LevelDQNLoss(TransitionLoss):
     the mean of |Q_level - y| over the levels, of shape [B, 1], into its input.
 
     Args:
-        value_network: gives the levels' values.
+        value_network: computes the values of the levels; a `QValueActor` of TorchRL is one level,
+            see `SingleLevelValues`.
         demonstrations: "dqfd" `large_margin`, "sdqfd" `strict_large_margin`, "adet"
             `cross_entropy`, or "none" for plain DQN, whose batches may lack the expert flag.
         demonstration_weight: factor on that term.
         margin: of the margin terms.
         first_beta: of ADET at the first level.
         later_beta: of ADET at the later ones.
+        reduction: of the samples' losses; the formulas above are "mean".
     """
 
     @dataclass
@@ -145,27 +168,28 @@ class LevelDQNLoss(TransitionLoss):
 
     def __init__(
         self,
-        value_network: LevelValues,
+        value_network: LevelValues | QValueActor,
         *,
         demonstrations: Demonstrations = "sdqfd",
         demonstration_weight: float = 0.1,
         margin: float = 0.1,
         first_beta: float = 100.0,
         later_beta: float = 1.0,
+        reduction: Reduction | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(reduction)
+        if isinstance(value_network, QValueActor):
+            value_network = SingleLevelValues(value_network)
         self.demonstrations = demonstrations
         self.demonstration_weight = demonstration_weight
         self.margin = margin
         self.first_beta = first_beta
         self.later_beta = later_beta
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
-        # Not left to the first forward pass: its gamma is part of the state_dict.
+        # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=self._default_device)
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` needs."""
+    def _required_keys(self) -> list[NestedKey]:
         names = self._transition_keys(self.value_network.in_keys)
         return names if self.demonstrations == "none" else [*names, self.tensor_keys.is_expert]
 
@@ -177,12 +201,13 @@ class LevelDQNLoss(TransitionLoss):
             tensordict: transitions [B]; gets the priority written into it.
 
         Returns:
-            Scalars ``loss_qvalue`` and ``loss_demonstration``, whose sum is to be minimised; and
-            without gradient ``demonstration_error`` (the term before its weight), ``td_error``,
-            ``q_value`` and ``target_value`` (means over the batch; levels averaged).
+            ``loss_qvalue`` and ``loss_demonstration``, scalars or, with the reduction "none", of
+            shape [B], whose sum is to be minimised; and without gradient the scalars
+            ``demonstration_error`` (the term before its weight), ``td_error``, ``q_value`` and
+            ``target_value`` (means over the batch; levels averaged).
 
         Raises:
-            KeyError: an entry is missing, the expert flag included unless built without a term.
+            KeyError: an entry is missing, such as the expert flag if there is a term on it.
         """
         target = self._target(tensordict)
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
@@ -196,12 +221,14 @@ class LevelDQNLoss(TransitionLoss):
         errors = errors if weights is None else weights[:, None, None] * errors
         difference = (q.detach() - target[..., None]).abs().mean(dim=-1)
         tensordict.set(self.tensor_keys.priority, difference)
-        demonstration = self._demonstration_error(tensordict, levels)
+        demonstration = self._demonstration_error(tensordict, levels, self.reduction)
         return TensorDict(
             {
-                "loss_qvalue": errors.mean(dim=(0, 1)).sum(),
+                "loss_qvalue": self._sum_over_levels(errors[:, 0]),
                 "loss_demonstration": self.demonstration_weight * demonstration,
-                "demonstration_error": demonstration.detach(),
+                "demonstration_error": self._demonstration_error(
+                    tensordict, [(q.detach(), chosen) for q, chosen in levels], "mean"
+                ),
                 "td_error": difference.mean(),
                 "q_value": q.detach().mean(),
                 "target_value": target.mean(),
@@ -218,26 +245,29 @@ class LevelDQNLoss(TransitionLoss):
             _, value = self.value_network.greedy(*observation)
         return self.value_estimator.value_estimate(tensordict, next_value=value)
 
+    def _sum_over_levels(self, losses: Tensor) -> Tensor:
+        """Return losses [B, levels] summed over the levels and reduced over the batch."""
+        if self.reduction == "none":
+            return losses.sum(dim=-1)
+        return (losses.mean(dim=0) if self.reduction == "mean" else losses.sum(dim=0)).sum()
+
     def _demonstration_error(
-        self, tensordict: TensorDictBase, levels: list[tuple[Tensor, Tensor]]
+        self,
+        tensordict: TensorDictBase,
+        levels: list[tuple[Tensor, Tensor]],
+        reduction: Reduction,
     ) -> Tensor:
-        """Return the sum of the levels' terms, zero without experts in the batch."""
+        """Return the sum of the levels' terms, zero without demonstrations in the batch."""
         if self.demonstrations == "none":
-            return levels[0][0].new_zeros(())
+            return reduce_loss(levels[0][0].new_zeros(len(levels[0][0])), reduction)
         is_expert = tensordict[self.tensor_keys.is_expert].reshape(-1)
         terms = []
         for number, (q, chosen) in enumerate(levels):
             if self.demonstrations == "adet":
                 beta = self.later_beta if number else self.first_beta
-                terms.append(cross_entropy(q, chosen, is_expert, beta))
+                terms.append(cross_entropy(q, chosen, is_expert, beta, reduction))
             elif self.demonstrations == "dqfd":
-                terms.append(large_margin(q, chosen, is_expert, self.margin))
+                terms.append(large_margin(q, chosen, is_expert, self.margin, reduction))
             else:
-                terms.append(strict_large_margin(q, chosen, is_expert, self.margin))
-        return torch.stack(terms).sum()
-
-
-def _mean_over(values: Tensor, chosen: Tensor) -> Tensor:
-    """Return the mean of the values [B] where ``chosen``, zero if nowhere."""
-    share = chosen.to(values.dtype)
-    return (values * share).sum() / share.sum().clamp_min(1)
+                terms.append(strict_large_margin(q, chosen, is_expert, self.margin, reduction))
+        return torch.stack(terms).sum(dim=0)

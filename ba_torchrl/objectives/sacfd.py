@@ -1,4 +1,4 @@
-"""Soft Actor-Critic from demonstrations (appendix G.2), and plain Soft Actor-Critic within it."""
+"""Soft Actor-Critic from demonstrations, of which plain SAC is a special case (appendix G.2)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
-from ba_torchrl.objectives.transitions import TransitionLoss
+from ba_torchrl.objectives.base import Reduction, TransitionLoss, reduce_loss, reduce_over
 
 
 class SACfDLoss(TransitionLoss):
@@ -42,6 +42,7 @@ class SACfDLoss(TransitionLoss):
         target_entropy: entropy that the temperature steers to, nats.
         demonstration_weight: factor on the behaviour term; 0 gives plain SAC, and the batch may
             then lack the expert flag.
+        reduction: of the samples' losses; the formulas above are "mean".
 
     Raises:
         ValueError: ``alpha_init`` is not positive, or the encoder has several outputs.
@@ -94,6 +95,7 @@ class SACfDLoss(TransitionLoss):
         alpha_init: float = 0.01,
         target_entropy: float = -5.0,
         demonstration_weight: float = 1.0,
+        reduction: Reduction | None = None,
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
@@ -101,7 +103,7 @@ class SACfDLoss(TransitionLoss):
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
-        super().__init__()
+        super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
         self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
         self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
@@ -112,7 +114,7 @@ class SACfDLoss(TransitionLoss):
         )
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
         self._needs_expert_flag = demonstration_weight != 0
-        # Not left to the first forward pass: its gamma is part of the state_dict.
+        # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=device)
 
     @property
@@ -120,9 +122,7 @@ class SACfDLoss(TransitionLoss):
         """The entropy temperature, without gradient."""
         return self.log_alpha.detach().exp()
 
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` needs."""
+    def _required_keys(self) -> list[NestedKey]:
         observation = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
         names = self._transition_keys(observation)
         if self._needs_expert_flag:
@@ -137,12 +137,13 @@ class SACfDLoss(TransitionLoss):
             tensordict: transitions [..., B]; gets the priority written into it.
 
         Returns:
-            Scalars ``loss_actor``, ``loss_qvalue``, ``loss_alpha``; and without gradient
-            ``alpha``, ``entropy``, ``demonstration_error`` (the unweighted behaviour term) and
-            ``q_value`` (mean of the twin values of the stored actions).
+            ``loss_actor``, ``loss_qvalue``, ``loss_alpha``, scalars or, with the reduction
+            "none", of shape [..., B]; and without gradient the scalars ``alpha``, ``entropy``,
+            ``demonstration_error`` (the unweighted behaviour term) and ``q_value`` (mean of the
+            twin values of the stored actions).
 
         Raises:
-            KeyError: an entry is missing, the expert flag included unless built without weight.
+            KeyError: an entry is missing, such as the expert flag if the behaviour term has weight.
         """
         weights = self._importance_weights(tensordict)
         target = self._target(tensordict)
@@ -151,18 +152,20 @@ class SACfDLoss(TransitionLoss):
         action = tensordict[self.tensor_keys.action]
         q = self._twin_values(features, action, self.qvalue_network_params)
         error = q - target
-        loss_qvalue = _weighted(error.square().sum(dim=-1), weights)
+        loss_qvalue = self._reduced(error.square().sum(dim=-1), weights)
         priority = error.detach().abs().mean(dim=-1, keepdim=True)
         tensordict.set(self.tensor_keys.priority, priority)
 
         sample, log_prob = self._sample_action(tensordict)
-        # Frozen heads on detached features: the action is the only way back to any parameter.
+        # Frozen heads on detached features: only the action passes a gradient to a parameter.
         q_pi = self._twin_values(features.detach(), sample, self.qvalue_network_params.data)
         policy_term = self.alpha * log_prob - q_pi.amin(dim=-1)
-        demonstration = self._demonstration_error(tensordict, sample, action)
-        loss_actor = _weighted(policy_term, weights) + self.demonstration_weight * demonstration
+        is_expert = self._expert_flag(tensordict)
+        error = (sample - action).square().mean(dim=-1)
+        demonstration = reduce_over(error, is_expert, self.reduction)
+        loss_actor = self._reduced(policy_term, weights) + self.demonstration_weight * demonstration
         log_prob = log_prob.detach()
-        loss_alpha = -(self.log_alpha * (log_prob + self.target_entropy)).mean()
+        loss_alpha = -reduce_loss(self.log_alpha * (log_prob + self.target_entropy), self.reduction)
         return TensorDict(
             {
                 "loss_actor": loss_actor,
@@ -170,7 +173,7 @@ class SACfDLoss(TransitionLoss):
                 "loss_alpha": loss_alpha,
                 "alpha": self.alpha,
                 "entropy": -log_prob.mean(),
-                "demonstration_error": demonstration.detach(),
+                "demonstration_error": reduce_over(error.detach(), is_expert, "mean"),
                 "q_value": q.detach().mean(),
             }
         )
@@ -205,22 +208,22 @@ class SACfDLoss(TransitionLoss):
         with params.to_module(self.qvalue_network, preserve_module_state=False):
             return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
 
-    def _demonstration_error(
-        self, tensordict: TensorDictBase, sample: Tensor, action: Tensor
-    ) -> Tensor:
-        """Return the squared error to the experts' actions, zero if the batch holds none."""
+    def _expert_flag(self, tensordict: TensorDictBase) -> Tensor:
+        """Return which samples are demonstrations, bool [..., B]; none if the flag may be absent.
+
+        Raises:
+            KeyError: the flag is absent, and the behaviour term needs it.
+        """
         flag = tensordict.get(self.tensor_keys.is_expert, None)
-        if flag is None:
-            if self._needs_expert_flag:
-                raise KeyError(
-                    f"the batch lacks {self.tensor_keys.is_expert!r}, which the behaviour term "
-                    "needs; for plain SAC set demonstration_weight=0"
-                )
-            return sample.new_zeros(())
-        flag = flag.reshape(tensordict.batch_size).to(sample.dtype)
-        error = (sample - action).square().mean(dim=-1)
-        return (flag * error).sum() / flag.sum().clamp_min(1)
+        if flag is not None:
+            return flag.reshape(tensordict.batch_size)
+        if self._needs_expert_flag:
+            raise KeyError(
+                f"the batch lacks {self.tensor_keys.is_expert!r}, which the behaviour term "
+                "needs; for plain SAC set demonstration_weight=0"
+            )
+        action = tensordict[self.tensor_keys.action]
+        return torch.zeros(tensordict.batch_size, dtype=torch.bool, device=action.device)
 
-
-def _weighted(loss: Tensor, weights: Tensor | None) -> Tensor:
-    return (loss if weights is None else weights * loss).mean()
+    def _reduced(self, losses: Tensor, weights: Tensor | None) -> Tensor:
+        return reduce_loss(losses if weights is None else weights * losses, self.reduction)

@@ -1,7 +1,6 @@
-"""What a step, an image and an update cost, against the project's budgets and a unit of work.
+"""Times of steps, images and updates, compared with the project's budgets and a unit of work.
 
-Machines differ by more than programs do, so every time is also given as a multiple of a unit that
-is timed in between, in the same process: a step of PyBullet for the simulation, a convolution for
-the learner. To add a row, write a function in one of these files, or in a new one, and decorate it
-with `table.measurement`.
+Times on different machines are not comparable, so each is also given as a multiple of a unit that
+is timed in turn in the same process: a step of PyBullet for the simulation, a convolution for the
+learner. A function in this package that is decorated with `table.measurement` adds rows.
 """

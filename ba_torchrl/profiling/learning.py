@@ -11,9 +11,10 @@ from torch import nn
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import Algorithm
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.buffer import FrameStorage
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.profiling.table import Bench, Budget, Row, measurement, timed_row
 from ba_torchrl.training.checkpoint import build_algorithm
@@ -57,8 +58,7 @@ def _learner(experiment: dict[str, Any], network: dict[str, Any], obs_size: int)
         }
     )
     algorithm = build_algorithm(config)
-    for episode in _expert_episodes(config.task, obs_size, 20)[1]:
-        algorithm.extend(as_transitions(episode, is_expert=True))
+    algorithm.on_demonstrations(_expert_episodes(config.task, obs_size, 20)[1])
     return algorithm
 
 
@@ -139,7 +139,7 @@ def _replay_memory(
     storage = FrameStorage(CAPACITY, codecs(high))
     stored = 0
     for number in bench.rounds():
-        data = as_transitions(episodes[number], is_expert=True)
+        data = as_transitions(episodes[number], storage.codecs, is_expert=True)
         storage.set(torch.arange(stored, stored + len(data)), data)
         stored += len(data)
     megabytes = storage.nbytes / stored * CAPACITY / 1e6

@@ -1,4 +1,4 @@
-"""The height camera again in plain NumPy: what the compiled one is compared with."""
+"""The height camera in NumPy, for comparison with the compiled one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ba_torchrl.sim.bodies import Body
 
 
 class NumpyHeightCamera:
-    """Computes what `HeightCamera` of `ba_torchrl.sim.vision.depth` does, without decals and numba.
+    """The heightmap of `ba_torchrl.sim.vision.depth.HeightCamera`, without decals and numba.
 
-    Every pair of a triangle and a pixel of its bounding box is worked out at once.
+    All pairs of a triangle and a pixel of its bounding box are computed at once.
 
     Args:
-        bodies: what the camera sees besides the floor (height 0).
+        bodies: visible bodies; the floor has height 0.
     """
 
     def __init__(self, bodies: Sequence[Body]) -> None:
@@ -27,7 +27,7 @@ class NumpyHeightCamera:
         )
 
     def heightmap(self, center_m: tuple[float, float], side_m: float, pixels: int) -> np.ndarray:
-        """Return the height of what is seen.
+        """Return the height of the highest surface at each pixel.
 
         Args:
             center_m: x and y of the image's centre.

@@ -17,6 +17,7 @@ from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
 
 SEED = 0
 CAMERA_M = 1.0
@@ -38,7 +39,7 @@ class SimulationUnit:
         self.world.settle()
 
     def __call__(self) -> None:
-        """Take the step."""
+        """Step once."""
         self.world.step()
 
 
@@ -53,7 +54,7 @@ BUDGETS: dict[str, tuple[Budget, Budget | None]] = {
     "open_loop/bin_packing": (Budget("181", 18.0, 8.0), None),
     "open_loop/object_grasping": (Budget("2650", 200.0, 60.0), Budget("2210", 250.0, 150.0)),
 }
-"""Of a step and of a reset, for a task or for all the others of its kind."""
+"""Budgets of a step and of a reset by task, or by control for the tasks that are not listed."""
 
 
 def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
@@ -72,9 +73,9 @@ def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
 
 @measurement("simulation/step", over=list_tasks)
 def step_and_reset(bench: Bench, task: str) -> list[Row]:
-    """Steps and resets of a task, the actions the expert's but not asked for while the clock runs.
+    """Times of steps and resets of a task under the expert's actions.
 
-    The same seed gives the same episodes, so the actions are recorded beforehand.
+    The actions are computed before the measurement; the same seed gives the same episodes.
     """
     unit = SimulationUnit()
     env = make(task, seed=SEED)
@@ -97,7 +98,7 @@ def step_and_reset(bench: Bench, task: str) -> list[Row]:
     size = env.observation_spec[keys.PIXELS].shape[-1]
     env.close()
     unit.world.close()
-    of_step, of_reset = BUDGETS.get(task, BUDGETS.get(task.split("/")[0], (None, None)))
+    of_step, of_reset = BUDGETS.get(task, BUDGETS.get(TASKS[task].control, (None, None)))
     notes = f"{np.mean(physics):.1f} physics steps per action, {len(steps)} actions"
     return [
         timed_row(f"{task}, step, {size} px", "ms", steps, units, of_step, notes),

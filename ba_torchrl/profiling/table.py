@@ -23,14 +23,14 @@ GROUPS = ("simulation", "learning", "memory")
 MEASUREMENTS: Registry[Measurement] = Registry("measurement", "ba_torchrl.profiling")
 
 WARM_UP = 3
-"""Calls before the first one that counts: their memory is touched for the first time."""
+"""Calls before the first one that is timed: they allocate the memory."""
 
 PROFILE_ROWS = 40
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a row is measured against, in the row's unit."""
+    """Values that a row is compared with, in the row's unit."""
 
     reference: str
     """The reference implementation's figure, on two cores of a Xeon with AMX."""
@@ -45,20 +45,20 @@ class Row:
     work: str
     unit: Literal["ms", "s", "MB"]
     values: Sequence[float]
-    """Every measurement, in `unit`."""
+    """All measurements, in `unit`."""
     budget: Budget | None = None
     multiple: float | None = None
-    """Median, in units of work."""
+    """Median as a multiple of the unit of work."""
     notes: str = ""
 
 
 class Bench:
-    """Counts rounds and times units of work beside what a measurement times.
+    """Repeats a measurement, and times a unit of work in turn with the measured calls.
 
     Args:
         repeats: rounds of each measurement.
         bar: shows the rounds.
-        profiles: gets, for each call that is timed, where its time goes; none if not given.
+        profiles: receives a profile of each timed call, by name; None for no profiles.
     """
 
     def __init__(self, repeats: int, bar: tqdm, profiles: dict[str, str] | None = None) -> None:
@@ -67,7 +67,7 @@ class Bench:
         self._profiles = profiles
 
     def rounds(self) -> Iterator[int]:
-        """Yield as many times as a measurement shall repeat itself."""
+        """Yield the number of each round."""
         for i in range(self.repeats):
             yield i
             self._bar.update()
@@ -75,12 +75,12 @@ class Bench:
     def time_against(
         self, unit: Callable[[], Any], calls: dict[str, Callable[[], Any]], repeats: int = 1
     ) -> tuple[list[float], dict[str, list[float]]]:
-        """Time some calls and a unit of work in turns; return the seconds of each.
+        """Time calls and a unit of work in turn; return the seconds of each.
 
         Args:
             unit: the unit of work.
-            calls: what to time.
-            repeats: how often in each round.
+            calls: the measured calls, by name.
+            repeats: times of each call in a round.
         """
         for call in (unit, *calls.values()):
             for _ in range(WARM_UP):
@@ -98,17 +98,14 @@ class Bench:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Return how long a call takes."""
+    """Return the duration of a call, seconds."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
 
 
 def operations(call: Callable[[], Any]) -> str:
-    """Return a table of the operations of PyTorch that take most of a call's time.
-
-    The seconds are of all threads together.
-    """
+    """Return a table of the PyTorch operations of a call, the longest first, over all threads."""
     with torch.profiler.profile(record_shapes=True) as profile:
         call()
     averages = profile.key_averages(group_by_input_shape=True)
@@ -122,7 +119,7 @@ def operations(call: Callable[[], Any]) -> str:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A function from a `Bench`, and a name if there are any, to rows of the table."""
+    """A function that measures rows of the table, and the names that it is called with."""
 
     function: Callable[..., list[Row]]
     names: Callable[[], Iterable[str]] | None
@@ -134,8 +131,8 @@ def measurement(
     """Return a decorator that adds a function's rows to the table.
 
     Args:
-        name: one of `GROUPS`, a slash, and what is measured.
-        over: gives names, for each of which the function is called with that name besides.
+        name: one of `GROUPS`, a slash, and the name of the measurement.
+        over: returns names; the function is called with each of them as its second argument.
     """
 
     def decorate(function: Callable[..., list[Row]]) -> Callable[..., list[Row]]:
@@ -154,10 +151,10 @@ def measure(
         which: the group, or the measurement as "group/name".
         repeats: rounds of each measurement.
         progress: show a progress bar.
-        profiles: gets, for each call that is timed, where its time goes; none if not given.
+        profiles: receives a profile of each timed call, by name; None for no profiles.
 
     Raises:
-        ConfigError: there is no such group, or no round to measure in.
+        ConfigError: ``which`` is unknown, or ``repeats`` is below 1.
     """
     known = (*GROUPS, "all", *MEASUREMENTS)
     if which not in known:
@@ -193,12 +190,12 @@ def timed_row(
     """Return the row of some times.
 
     Args:
-        work: what was timed.
-        unit: to give the times in.
-        times: seconds.
-        units: seconds that the unit of work took in between.
-        budget: to compare with.
-        notes: anything else.
+        work: name of the timed work.
+        unit: of the table.
+        times: seconds of the work.
+        units: seconds of the unit of work, timed in turn.
+        budget: reference and limits.
+        notes: further text.
     """
     scale = {"ms": 1e3, "s": 1.0}[unit]
     multiple = statistics.median(times) / statistics.median(units)
@@ -229,14 +226,14 @@ def as_markdown(rows: Sequence[Row]) -> str:
 
 
 def _digits(value: float | None) -> str:
-    """Return a number with three digits that count."""
+    """Return a number with three significant digits."""
     if value is None:
         return ""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def machine() -> str:
-    """Return what the figures were measured on, and when."""
+    """Return processor, packages, date and load of the measurement."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "pybullet"))
     load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return (

@@ -1,4 +1,4 @@
-"""Pictures of tasks: what an expert's episode looks like, to people and to a policy."""
+"""Pictures of tasks: the expert's episode as rendered images, and the policy's observation."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ba_torchrl.envs import keys
 
 
 class Strip(NamedTuple):
-    """An episode in pictures."""
+    """Rendered images of an episode."""
 
     pictures: list[np.ndarray]
     """[H, W, 3] uint8, from the first scene to the last."""
     first_image: np.ndarray
-    """What a policy sees first, [H, W] metres."""
+    """The policy's first observation, [H, W] metres."""
 
 
 def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool = False) -> Strip:
@@ -31,8 +31,8 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
     Args:
         task: id of the task.
         seed: of the episode.
-        pictures: how many to take, evenly spread from the first scene to the last.
-        deconstruct: the episode takes the structure apart.
+        pictures: their number, evenly spaced from the first scene to the last.
+        deconstruct: whether the episode takes the structure apart.
     """
     env = make(task, expert=True, seed=seed, deconstruct=deconstruct)
     try:
@@ -50,11 +50,11 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
 
 
 def strip_figure(name: str, strip: Strip, path: str | Path) -> Path:
-    """Write one row: what the policy sees first, then the expert's episode.
+    """Write one row: the policy's first observation, then the expert's episode.
 
     Args:
         name: title.
-        strip: what `expert_strip` returned.
+        strip: the episode, from `expert_strip`.
         path: the PNG to write.
     """
     columns = 1 + len(strip.pictures)
@@ -67,10 +67,10 @@ def strip_figure(name: str, strip: Strip, path: str | Path) -> Path:
 
 
 def overview_figure(strips: Mapping[str, Strip], path: str | Path, columns: int = 5) -> Path:
-    """Write a grid with one picture per task, taken half-way through the expert's episode.
+    """Write a grid with one picture per task, from the middle of the expert's episode.
 
     Args:
-        strips: name of each task, and what `expert_strip` returned.
+        strips: by task, the episode from `expert_strip`.
         path: the PNG to write.
         columns: pictures side by side.
     """

@@ -1,4 +1,4 @@
-"""Scalars of a run: one tidy CSV always, and a TorchRL logger beside it on request."""
+"""Scalars of a run: always one CSV file, and a TorchRL logger on request."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Series(NamedTuple):
 def make_logger(
     backend: Backend, run_dir: str | Path, name: str, config: Mapping[str, Any]
 ) -> Logger | None:
-    """Return TorchRL's logger for ``backend``; none is needed for "csv", see `ScalarLog`.
+    """Return TorchRL's logger for ``backend``, None for "csv"; `ScalarLog` writes the CSV file.
 
     Args:
         backend: "csv", "tensorboard" or "wandb".
-        run_dir: folder of the run, where the logger keeps its files.
+        run_dir: folder of the run, for the logger's files.
         name: of the run.
-        config: shown with the run; may be nested.
+        config: of the run, logged as its hyper-parameters; may be nested.
 
     Raises:
         ValueError: the backend is unknown.
@@ -65,14 +65,14 @@ def is_available(backend: Backend) -> bool:
     return backend == "csv" or importlib.util.find_spec(backend) is not None
 
 
-def quiet_libraries() -> None:
-    """Keep the libraries' notes out of a recipe's output; warnings and errors stay."""
+def limit_library_logs() -> None:
+    """Let the libraries log warnings and errors only."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 def progress_bar(**settings: Any) -> tqdm:
-    """Return a progress bar; into a file it writes now and then only.
+    """Return a progress bar; one that is written to a file is updated less often.
 
     Args:
         settings: of ``tqdm``.
@@ -81,15 +81,15 @@ def progress_bar(**settings: Any) -> tqdm:
 
 
 class ScalarLog:
-    """Writes scalars to ``scalars.csv`` in the run folder, and to a TorchRL logger if asked.
+    """Writes scalars to ``scalars.csv`` in the run folder and, on request, to a TorchRL logger.
 
     The file has the columns step, name and value, one row per scalar, and is complete after each
-    `write`. A run that is resumed goes on in the same file. TorchRL's own CSV logger is not used:
-    it writes a file without a header per scalar and keeps everything in memory.
+    `write`. A resumed run appends to the same file. TorchRL's own CSV logger is not used: it writes
+    one file without a header per scalar and keeps all values in memory.
 
     Args:
         run_dir: folder of the run; made if it does not exist.
-        backend: "csv" for the file alone, or "tensorboard" or "wandb" beside it.
+        backend: "csv" for the file only, or "tensorboard" or "wandb" in addition.
         config: of the run, for the backend.
 
     Raises:
@@ -106,7 +106,7 @@ class ScalarLog:
         run_dir.mkdir(parents=True, exist_ok=True)
         self.path = run_dir / SCALARS_FILE
         self.logger = make_logger(backend, run_dir, run_dir.name, config or {})
-        _drop_torn_row(self.path)
+        _drop_incomplete_row(self.path)
         self._file = self.path.open("a", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file, lineterminator="\n")
         if self._file.tell() == 0:
@@ -137,15 +137,15 @@ class ScalarLog:
 def read_scalars(path: str | Path) -> dict[str, Series]:
     """Read the scalars of a run.
 
-    Steps that a resumed run wrote a second time count once, with their later value. A row that
-    was cut off at the end of the file, because the run was killed, is left out.
+    Of steps that a resumed run wrote twice, the later value is returned. An incomplete last row,
+    which a killed run leaves, is ignored.
 
     Args:
         path: ``scalars.csv`` or the run folder.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is something else.
+        ValueError: the file does not hold scalars.
     """
     path = Path(path)
     if path.is_dir():
@@ -167,8 +167,8 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
     }
 
 
-def _drop_torn_row(path: Path) -> None:
-    """Cut off a last row without an end, which a killed run leaves behind."""
+def _drop_incomplete_row(path: Path) -> None:
+    """Remove a last row without a line end, which a killed run leaves."""
     if path.exists():
         content = path.read_bytes()
         if not content.endswith(b"\n"):
@@ -176,7 +176,7 @@ def _drop_torn_row(path: Path) -> None:
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested settings to what every backend can show: numbers, flags and text."""
+    """Flatten nested settings to the types that every backend shows: numbers, flags and text."""
     flat: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, Mapping):

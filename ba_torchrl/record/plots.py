@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
     Curve = Sequence[ArrayLike]
 
-# Told apart by colour-blind readers too (Okabe and Ito), in an order of decreasing contrast.
+# Distinguishable by colour-blind readers (Okabe and Ito), in the order of decreasing contrast.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")
 _MANY_POINTS = 25
 LEAST_WIDTH_IN = 5.0
-"""Of a picture: the legend needs it, too."""
+"""Least width of a figure, which the legend needs."""
 
 
 def plot_learning_curve(
@@ -65,7 +65,7 @@ def plot_learning_curve(
     for number, (name, curve) in enumerate(curves.items()):
         _draw(axes, number, name, curve)
     axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
-    _dress(axes, ylim)
+    _style_axes(axes, ylim)
     axes.legend(frameon=False, loc="best")
     return _save(figure, path)
 
@@ -80,7 +80,7 @@ def plot_panels(
     ylim: tuple[float, float] | None = (0.0, 1.0),
     columns: int | None = None,
 ) -> Path:
-    """Draw curves into panels side by side, in the manner of the paper's figures 18 to 22.
+    """Draw curves into panels side by side, as in the paper's figures 18 to 22.
 
     Args:
         panels: by title, curves by name as for `plot_learning_curve`.
@@ -89,7 +89,7 @@ def plot_panels(
         xlabel: below the panels.
         ylabel: at their left.
         ylim: least and greatest y; None fits the curves.
-        columns: most panels in a row; None leaves as few places empty as three to five can.
+        columns: most panels in a row; None chooses three to five, with the fewest empty places.
 
     Returns:
         The path.
@@ -114,7 +114,7 @@ def plot_panels(
         for name, curve in curves.items():
             shown[name] = _draw(axes, list(names).index(name), name, curve)
         axes.set_title(title, fontsize=10)
-        _dress(axes, ylim)
+        _style_axes(axes, ylim)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     for column in range(columns):
@@ -134,13 +134,13 @@ def plot_panels(
 
 def _figure(size_in: tuple[float, float]) -> Figure:
     try:
-        from matplotlib.figure import Figure  # no pyplot: it keeps figures in a global list
+        from matplotlib.figure import Figure  # no pyplot: it holds figures in a global list
     except ImportError as error:
         raise ImportError("drawing curves needs pip install 'ba-torchrl[recipes]'") from error
     return Figure(figsize=size_in, dpi=150, layout="constrained")
 
 
-def _dress(axes: Axes, ylim: tuple[float, float] | None) -> None:
+def _style_axes(axes: Axes, ylim: tuple[float, float] | None) -> None:
     if ylim is not None:
         margin = 0.02 * (ylim[1] - ylim[0])  # lines along the edges stay visible
         axes.set_ylim(ylim[0] - margin, ylim[1] + margin)

@@ -1,4 +1,4 @@
-"""Report: what runs came to, as curves (PNG), tables (CSV, Markdown) and a page (HTML).
+"""Report: results of runs as curves (PNG), tables (CSV, Markdown) and a page (HTML).
 
 Made from the ``result.json`` of finished runs (see `ba_torchrl.record.results`).
 """
@@ -17,7 +17,7 @@ from typing import Any
 from jinja2 import Environment
 
 from ba_torchrl.record.plots import plot_panels
-from ba_torchrl.record.results import failure_reason, now
+from ba_torchrl.record.results import now, read_failure
 from ba_torchrl.record.summary import (
     COLUMNS,
     CONFIDENCE,
@@ -45,11 +45,11 @@ _HEADER = (
 def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
     """Write curves (PNG), tables (CSV, Markdown) and a page (HTML) of the runs below some folders.
 
-    The page holds the curves; it refers to videos where they lie.
+    The page contains the curves and links to the videos.
 
     Args:
-        roots: where to look for runs.
-        folder: where to write; made if it does not exist.
+        roots: folders that are searched for runs.
+        folder: of the report; made if it does not exist.
 
     Returns:
         The page.
@@ -68,7 +68,7 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
         writer.writeheader()
         writer.writerows(row for table in tables for row in table)
     left_out = [
-        {"path": _relative(path, folder), "reason": failure_reason(path) or "interrupted"}
+        {"path": _relative(path, folder), "reason": read_failure(path) or "interrupted"}
         for path in unfinished
     ]
     texts = [_markdown(section, table) for section, table in zip(sections, tables, strict=True)]
@@ -118,7 +118,7 @@ def _plot(section: Section, path: Path) -> Path:
 
 
 def _note(section: Section) -> str:
-    """Say what the figures are, and what they cannot be."""
+    """Return a text that defines the figures and their uncertainty."""
     counts = sorted({len(group.runs) for group in section.groups})
     seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     policies = {run.result.final.policy for group in section.groups for run in group.runs}
@@ -130,8 +130,8 @@ def _note(section: Section) -> str:
     )
     if counts[0] == 1:
         text += (
-            " Where there is one seed only, there is neither shading nor interval: "
-            "how far another seed would be off is unknown."
+            " With a single seed there is neither shading nor interval: the spread over seeds is "
+            "unknown."
         )
     return text
 
@@ -166,7 +166,7 @@ def _markdown(section: Section, table: Sequence[dict[str, Any]]) -> str:
 
 
 def _machines(section: Section) -> list[str]:
-    """Return what the runs were computed on and with, each once."""
+    """Return the machines and package versions of the runs, each once."""
     found = set()
     for group in section.groups:
         for run in group.runs:
@@ -182,18 +182,18 @@ def _machines(section: Section) -> list[str]:
 
 
 def _videos(section: Section, folder: Path) -> list[dict[str, Any]]:
-    """Return each group's videos: that of the first seed to be shown, the others to be linked."""
+    """Return each group's videos: the page shows that of the first seed and links the others."""
     found = []
     for group in sorted(section.groups, key=lambda group: (group.task, group.method)):
-        films = [
+        videos = [
             {"seed": run.result.seed, "source": _relative(run.folder / name, folder)}
             for run in group.runs
             for name in [run.result.files.get("video")]
             if name is not None and (run.folder / name).exists()
         ]
-        if films:
+        if videos:
             caption = f"{group.task}, {group.method}"
-            found.append({"caption": caption, "first": films[0], "others": films[1:]})
+            found.append({"caption": caption, "first": videos[0], "others": videos[1:]})
     return found
 
 

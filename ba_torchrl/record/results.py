@@ -1,4 +1,4 @@
-"""Results: what a finished run leaves as data, one ``result.json`` per run folder.
+"""Results: the data of a finished run, one ``result.json`` per run folder.
 
 `RunResult` is the schema. Reports are made from these files alone.
 """
@@ -23,11 +23,12 @@ from ba_torchrl.config import StrictModel
 RESULT_FILE = "result.json"
 CONFIG_FILE = "config.json"
 FAILURE_FILE = "failure.json"
-"""What a benchmark leaves in the folder of a run that failed: ``reason``, ``when`` and ``log``."""
+"""Written by a benchmark into the folder of a run that failed: ``reason``, ``when``, ``log``."""
 PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
 
 NON_LEARNING_FIELDS = frozenset(
     {
+        "plugins",
         "run_dir",
         "resume",
         "label",
@@ -41,8 +42,8 @@ NON_LEARNING_FIELDS = frozenset(
         "video_episodes",
     }
 )
-"""Fields of a run's configuration that say where and how it is computed and shown, not what is
-learnt: a run can be resumed under others, and runs that differ in them are averaged."""
+"""Fields of a run's configuration that do not change what is learnt: a resumed run may have other
+values, and reports average over runs that differ in them."""
 
 
 class CurvePoint(StrictModel):
@@ -53,7 +54,7 @@ class CurvePoint(StrictModel):
     env_steps: int
     """Steps of all environments so far, demonstrations not counted."""
     seconds: float
-    """Since the run began, time between an interruption and its resumption not counted."""
+    """Since the start of the run, without the time between an interruption and its resumption."""
     episodes: int
     success_rate: float
     standard_error: float
@@ -63,11 +64,11 @@ class CurvePoint(StrictModel):
 
 
 class FinalEvaluation(StrictModel):
-    """The evaluation that is reported, on episodes that chose nothing."""
+    """The reported evaluation, on episodes that did not select the checkpoint."""
 
     policy: Literal["last", "best"]
     updates: int
-    """Age of the policy."""
+    """Updates of the evaluated policy."""
     episodes: int
     success_rate: float
     standard_error: float
@@ -75,7 +76,7 @@ class FinalEvaluation(StrictModel):
 
 
 class RunResult(StrictModel):
-    """Everything a report needs to know about a run."""
+    """Results and settings of a run, from which reports are made."""
 
     format: Literal[1] = 1
     task: str
@@ -94,9 +95,9 @@ class RunResult(StrictModel):
     hardware: dict[str, Any]
     """`cpu`, `cores`, `memory_gb`, `gpu` (None on the CPU) and the learner's `threads`."""
     seconds: float
-    """Wall time of the run, time between an interruption and its resumption not counted."""
+    """Wall time of the run, without the time between an interruption and its resumption."""
     resumed_at: list[int] = Field(default_factory=list)
-    """Updates after which the run went on from where it had been interrupted."""
+    """Updates after which the run was resumed."""
     finished: str
     """When, UTC, ISO 8601."""
     files: dict[str, str]
@@ -104,7 +105,7 @@ class RunResult(StrictModel):
 
 
 def write_result(folder: str | Path, result: RunResult) -> Path:
-    """Write ``result.json`` into a run folder, whole or not at all."""
+    """Write ``result.json`` into a run folder; the file appears when it is complete."""
     path = Path(folder) / RESULT_FILE
     scratch = path.with_suffix(".tmp")
     scratch.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -117,13 +118,13 @@ def read_result(folder: str | Path) -> RunResult:
 
     Raises:
         FileNotFoundError: the run is not finished.
-        ValueError: the file is something else.
+        ValueError: the file is not the result of a run.
     """
     path = Path(folder) / RESULT_FILE
     try:
         return RunResult.model_validate_json(path.read_text(encoding="utf-8"))
     except ValidationError as error:
-        raise ValueError(f"{path} is no result of a run: {error}") from None
+        raise ValueError(f"{path} is not the result of a run: {error}") from None
 
 
 def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
@@ -140,8 +141,8 @@ def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
     return sorted(finished), sorted(set().union(*others) - finished)
 
 
-def failure_reason(folder: str | Path) -> str | None:
-    """Return why the run in a folder failed when a benchmark last tried it, None if it did not."""
+def read_failure(folder: str | Path) -> str | None:
+    """Return why a benchmark's last attempt at the run in a folder failed, None if it did not."""
     path = Path(folder) / FAILURE_FILE
     return json.loads(path.read_text(encoding="utf-8"))["reason"] if path.exists() else None
 
@@ -160,17 +161,17 @@ def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def differences(
     first: Mapping[str, Any],
     second: Mapping[str, Any],
-    besides: Collection[str] = NON_LEARNING_FIELDS,
+    ignored: Collection[str] = NON_LEARNING_FIELDS,
 ) -> dict[str, tuple[Any, Any]]:
     """Return the settings in which two runs' configurations differ, and both values.
 
     Args:
         first: a configuration with every default filled in.
         second: another.
-        besides: fields that may differ.
+        ignored: fields that may differ.
     """
     a, b = (
-        flat({key: value for key, value in config.items() if key not in besides})
+        flat({key: value for key, value in config.items() if key not in ignored})
         for config in (first, second)
     )
     return {
@@ -181,7 +182,7 @@ def differences(
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that shape results."""
+    """Return the versions of Python and of the packages that affect results."""
     found = {"python": platform.python_version(), "ba_torchrl": __version__}
     for name in PACKAGES:
         try:
@@ -192,10 +193,10 @@ def versions() -> dict[str, str]:
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
-    """Return what a run is computed on.
+    """Return the hardware that a run is computed on.
 
     Args:
-        device: the learner's.
+        device: of the learner.
     """
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     return {

@@ -1,6 +1,6 @@
-"""Summary: finished runs, gathered by benchmark, task and method, as figures over seeds.
+"""Summary: statistics over seeds of finished runs, by benchmark, task and method.
 
-Runs whose settings differ are never averaged: their methods get names that tell them apart.
+Runs whose settings differ are never averaged: their methods have different names.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from ba_torchrl.record.results import (
 CONFIDENCE = 0.95
 RESAMPLES = 9999
 GOOD_RATE = 0.8
-"""Sample efficiency is how soon the mean curve reaches this success rate."""
+"""Sample efficiency is measured as the updates until the mean curve reaches this success rate."""
 ALL_TASKS = "all tasks"
-LOOSE_RUNS = "runs"
-"""Title of what belongs to no benchmark."""
+OTHER_RUNS = "runs"
+"""Title of the runs that belong to no benchmark."""
 COLUMNS = (
     "benchmark",
     "task",
@@ -47,7 +47,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run and where it lies."""
+    """A finished run and its folder."""
 
     folder: Path
     result: RunResult
@@ -55,7 +55,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in nothing but their seed."""
+    """Runs that differ in their seed only."""
 
     task: str
     method: str
@@ -64,7 +64,7 @@ class Group:
 
     @property
     def updates(self) -> np.ndarray:
-        """Where the curve has points, [n]."""
+        """Updates at the points of the curve, [n]."""
         return np.array([point.updates for point in self.runs[0].result.curve])
 
     @property
@@ -83,9 +83,9 @@ class Group:
         return np.array(list(self.by_seed.values()))
 
     def reaches(self, rate: float) -> tuple[float, float]:
-        """Return after how many updates and environment steps the mean curve reaches a rate.
+        """Return the updates and environment steps at which the mean curve reaches a rate.
 
-        Both are nan if it does not; they are as fine as the evaluations are.
+        Both are nan if it does not. Their resolution is the interval of evaluations.
         """
         reached = np.flatnonzero(self.rates.mean(0) >= rate)
         if not reached.size:
@@ -96,7 +96,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Section:
-    """One benchmark, or all runs that belong to none."""
+    """One benchmark, or all runs that belong to no benchmark."""
 
     title: str
     groups: Sequence[Group]
@@ -119,11 +119,11 @@ def load_sections(roots: Iterable[str | Path]) -> tuple[list[Section], list[Path
         roots: folders.
 
     Returns:
-        Benchmarks by name, what belongs to none last; and the folders of unfinished runs.
+        Benchmarks by name, runs without a benchmark last; and the folders of unfinished runs.
 
     Raises:
         FileNotFoundError: a folder is missing, or none holds a finished run.
-        ValueError: a result cannot be read, or the same run is there twice.
+        ValueError: a result cannot be read, or a run is found twice.
     """
     roots = [Path(root) for root in roots]
     for root in roots:
@@ -138,8 +138,8 @@ def load_sections(roots: Iterable[str | Path]) -> tuple[list[Section], list[Path
     by_title: dict[str, list[Run]] = {}
     for folder in finished:
         run = Run(folder, read_result(folder))
-        by_title.setdefault(run.result.benchmark or LOOSE_RUNS, []).append(run)
-    titles = sorted(by_title, key=lambda title: (title == LOOSE_RUNS, title))
+        by_title.setdefault(run.result.benchmark or OTHER_RUNS, []).append(run)
+    titles = sorted(by_title, key=lambda title: (title == OTHER_RUNS, title))
     return [Section(title, _grouped(by_title[title])) for title in titles], unfinished
 
 
@@ -154,7 +154,7 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     """Return a bootstrap interval of the mean at `CONFIDENCE`; nan for a single value.
 
     Args:
-        values: one per seed. With few seeds such an interval is too narrow, if anything.
+        values: one per seed. With few seeds the interval tends to be too narrow.
     """
     if len(values) < 2:
         return float("nan"), float("nan")
@@ -172,8 +172,8 @@ def interval(values: np.ndarray) -> tuple[float, float]:
 def summarize(section: Section) -> list[dict[str, Any]]:
     """Return the table of a section: rows with the names of `COLUMNS`.
 
-    There is a row per task and method, and then one for each method that was run on every task,
-    where a seed's success is its mean over tasks.
+    There is a row per task and method, and one more for each method that ran on every task, with
+    the mean over tasks as the success of a seed.
     """
     groups = sorted(section.groups, key=lambda group: (group.task, group.method))
     rows = [_row(section.title, group) for group in groups]
@@ -231,7 +231,7 @@ def _row(title: str, group: Group) -> dict[str, Any]:
 
 
 def _grouped(runs: Sequence[Run]) -> list[Group]:
-    """Gather the seeds of each task and method; tell methods apart whose settings differ."""
+    """Group runs by task, method and settings; methods with several settings get distinct names."""
     named: dict[tuple[str, str], list[list[Run]]] = {}
     for run in runs:
         alike = named.setdefault((run.result.task, run.result.label), [])
@@ -248,7 +248,7 @@ def _grouped(runs: Sequence[Run]) -> list[Group]:
             twice = {seed for seed in seeds if seeds.count(seed) > 1}
             if twice:
                 where = ", ".join(str(run.folder) for run in members if run.result.seed in twice)
-                raise ValueError(f"{task}, {label}: the same run is there twice: {where}")
+                raise ValueError(f"{task}, {label}: runs with the same settings and seed: {where}")
             name = label + _distinction(members[0], [other[0] for other in alike])
             groups.append(Group(task, name, sorted(members, key=lambda run: run.result.seed)))
     return groups
@@ -259,7 +259,7 @@ def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
 
 
 def _distinction(run: Run, others: Sequence[Run]) -> str:
-    """Return what sets a run apart from others of its name, such as " (env.obs_size 64)"."""
+    """Return the settings in which a run differs from others, such as " (env.obs_size 64)"."""
     names = sorted({name for other in others for name in _differences(run, other)})
     values = []
     for name in names:

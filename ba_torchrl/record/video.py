@@ -15,8 +15,8 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
 
     Args:
         path: ends in ``.mp4`` (H.264) or ``.gif``; its folder is made if it does not exist.
-        frames: [T, H, W, 3] uint8, or a sequence of T pictures of one size. In a ``.mp4``, an odd
-            height or width gets one more row or column, a copy of the last.
+        frames: [T, H, W, 3] uint8, or a sequence of T pictures of one size. For ``.mp4``, an odd
+            height or width is padded with a copy of the last row or column.
         fps: pictures per second.
 
     Returns:
@@ -24,7 +24,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
 
     Raises:
         ImportError: imageio or its ffmpeg is missing.
-        ValueError: the frames or the suffix are something else.
+        ValueError: the frames or the suffix are not of this kind.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -35,15 +35,15 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
     pictures = _checked(frames)
     try:
         import imageio
-        import imageio_ffmpeg  # noqa: F401  imageio would find out late, and say less
+        import imageio_ffmpeg  # noqa: F401  imageio reports it later and with less detail
     except ImportError as error:
         raise ImportError("writing videos needs pip install 'ba-torchrl[recipes]'") from error
     path.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".gif":
         imageio.mimwrite(path, pictures, duration=1000 / fps, loop=0)
         return path
-    # Players want chroma at half the resolution, hence even sizes; by default imageio would
-    # stretch the picture to multiples of 16 instead.
+    # yuv420p halves the resolution of chroma, hence even sizes; by default imageio resizes to
+    # multiples of 16.
     pictures = [_even(picture) for picture in pictures]
     imageio.mimwrite(
         path, pictures, fps=fps, codec="libx264", pixelformat="yuv420p", macro_block_size=2

@@ -1,35 +1,38 @@
-"""Checkpoints of a run: written whole or not at all, with the configuration that rebuilds them."""
+"""Checkpoints of a run, and the configuration from which they are rebuilt."""
 
 from __future__ import annotations
 
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Algorithm, Problem
-from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.config import ExperimentConfig
+
+Which = Literal["best", "latest"]
+"""Of a run's checkpoints, the one with the highest success rate in evaluation, or the last."""
 
 
 class Checkpoints:
-    """The checkpoints of a run folder: the newest ones and the best.
+    """The checkpoints of a run folder: the latest ones and the best.
 
-    TorchRL publishes each under its final name only when it is complete, so that a crash leaves
-    the previous one whole.
+    TorchRL publishes each under its final name only when it is complete: after a crash the
+    previous one is intact.
 
     Args:
         folder: the run folder.
         algorithm: what to save.
         device: where to load it to.
-        keep_last: how many of the newest to keep.
+        keep_last: how many of the latest to keep.
     """
 
     def __init__(
@@ -37,9 +40,7 @@ class Checkpoints:
     ) -> None:
         self._device = device
         self._checkpoint = Checkpoint(algorithm=algorithm)
-        self._rotation = CheckpointRotation(
-            folder / "checkpoints", keep_last=keep_last, keep_best=("success_rate", "max")
-        )
+        self._rotation = _rotation(folder, keep_last)
 
     def save(self, updates: int, success_rate: float) -> Path:
         """Write a checkpoint and return its folder."""
@@ -58,7 +59,7 @@ class Checkpoints:
         )
 
     def latest(self) -> Path:
-        """Return the folder of the newest checkpoint.
+        """Return the folder of the latest checkpoint.
 
         Raises:
             ConfigError: nothing was saved yet.
@@ -83,7 +84,7 @@ class Checkpoints:
 
 
 def write_config(config: ExperimentConfig) -> None:
-    """Write the run's configuration into its folder, whole or not at all."""
+    """Write the run's configuration into its folder; the file appears when it is complete."""
     config.folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps(config.model_dump(mode="json"), indent=2)
     scratch = config.folder / f"{CONFIG_FILE}.tmp"
@@ -109,18 +110,24 @@ def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
     return ExperimentConfig.parse({**values, **changes}, what=str(file))
 
 
-def find_checkpoint(path: str | Path) -> Path:
-    """Return the checkpoint meant by ``path``: itself, or the newest of a run folder.
+def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
+    """Return the folder of a checkpoint.
+
+    Args:
+        path: a run folder, or one of its checkpoints.
+        which: of the checkpoints of a run folder: "best" in evaluation, or "latest".
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is none, or ``which`` is something else.
     """
+    if which not in get_args(Which):
+        raise ConfigError(f"which: {which!r} is none of {', '.join(get_args(Which))}")
     path = Path(path)
     if (path / "checkpoints").is_dir():
-        rotation = CheckpointRotation(path / "checkpoints", keep_last=1)
-        latest = rotation.latest()
-        if latest is not None:
-            return Path(latest)
+        rotation = _rotation(path)
+        found = rotation.best() if which == "best" else rotation.latest()
+        if found is not None:
+            return Path(found)
     if path.parent.name == "checkpoints" and path.exists():
         return path
     raise ConfigError(
@@ -129,17 +136,21 @@ def find_checkpoint(path: str | Path) -> Path:
     )
 
 
-def load(path: str | Path, **changes: Any) -> tuple[ExperimentConfig, Algorithm]:
+def load(
+    path: str | Path, which: Which = "best", **changes: Any
+) -> tuple[ExperimentConfig, Algorithm]:
     """Rebuild the algorithm of a checkpoint.
 
     Args:
-        path: a run folder (its newest checkpoint is taken) or one of its checkpoints.
-        changes: fields of `ExperimentConfig` to override, such as ``device="cpu"``.
+        path: a run folder, or one of its checkpoints.
+        which: of the checkpoints of a run folder: "best" in evaluation, or "latest".
+        changes: fields of `ExperimentConfig` to override, such as ``device="cpu"`` for a run that
+            was trained on a GPU.
 
     Raises:
         ConfigError: there is no checkpoint, or its configuration does not parse.
     """
-    checkpoint = find_checkpoint(path)
+    checkpoint = find_checkpoint(path, which)
     config = read_config(checkpoint.parent.parent, **changes)
     algorithm = build_algorithm(config)
     Checkpoint(algorithm=algorithm).load(checkpoint, map_location=config.torch_device)
@@ -170,27 +181,21 @@ def problem_of(config: ExperimentConfig) -> Problem:
     """Return what the algorithm of an experiment must know of its environment.
 
     Raises:
-        ConfigError: the environment cannot be made, or its images are not for networks.
+        ConfigError: the environment cannot be made.
     """
     env = make_env(config.task, **config.env)
-    try:
-        pixels = env.observation_spec[keys.PIXELS]
-        if pixels.shape[0] != 1 or float(pixels.space.low.min()) < 0:
-            raise ConfigError(
-                f"env.view_type {config.env_config.view_type!r}: the networks take depth or height "
-                "in one channel, nothing below zero"
-            )
-        in_hand = None
-        if keys.IN_HAND in env.observation_spec:
-            in_hand = tuple(env.observation_spec[keys.IN_HAND].shape[:2])
-        return Problem(
-            image_size=pixels.shape[-1],
-            actions=env.actions,
-            max_depth_m=float(pixels.space.high.max()),
-            in_hand_shape=in_hand,
-            total_updates=config.total_updates,
-            seed=config.seed,
-            device=config.torch_device,
-        )
-    finally:
-        env.close()
+    env.close()
+    return Problem(
+        control=TASKS[config.task].control,
+        images=env.images,
+        actions=env.actions,
+        total_updates=config.total_updates,
+        seed=config.seed,
+        device=config.torch_device,
+    )
+
+
+def _rotation(folder: Path, keep_last: int = 1) -> CheckpointRotation:
+    return CheckpointRotation(
+        folder / "checkpoints", keep_last=keep_last, keep_best=("success_rate", "max")
+    )

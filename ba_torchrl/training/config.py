@@ -13,10 +13,13 @@ from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.config import EnvConfig, StrictModel, parse
-from ba_torchrl.data.demos import Source, check_demonstrations, source_config
+from ba_torchrl.data.demo_files import check_demonstrations
+from ba_torchrl.data.demos import Source, source_config
 from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
+from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
@@ -24,20 +27,26 @@ SET_BY_THE_EXPERIMENT = ("seed", "expert")
 
 
 class SeedUse(IntEnum):
-    """What a seed is derived for; no two uses share episodes, nor do two runs."""
+    """What a seed is derived for. Different uses and different runs have different episodes."""
 
     DEMONSTRATIONS = 0
     COLLECTION = 1
     EVALUATION = 2
     REPORT = 3
+    """The last evaluation of a run, which is reported."""
+    TEST = 4
+    """Evaluations of a checkpoint after the run."""
 
 
 class ExperimentConfig(StrictModel):
     """One training run. Fields that the paper fixes have its values (appendix G.2).
 
-    Parsing it checks all of it, nested parts included, before anything starts.
+    `parse` checks all fields, nested ones included, before anything starts.
     """
 
+    plugins: list[str] = Field(default_factory=list)
+    """Modules outside the package to import first. `parse` adds those that register the run's task,
+    robot, network and algorithm."""
     task: str
     """Id of the task."""
     env: dict[str, Any] = Field(default_factory=dict)
@@ -53,21 +62,21 @@ class ExperimentConfig(StrictModel):
     threads: int | None = Field(default=None, ge=1)
     """torch threads of the learner; None leaves torch's choice."""
     num_envs: int = Field(default=5, ge=1)
-    """Environments that collect side by side."""
+    """Number of environments that step together."""
     parallel: bool = True
     """One process per environment, or all in the learner's process."""
     start_method: Literal["spawn", "fork"] = "spawn"
-    """How those processes start."""
+    """How these processes start."""
     demonstrations: int = Field(default=100, ge=0)
-    """Expert episodes that are played for the replay, before the start."""
+    """Expert episodes in the replay before the first update."""
     demonstrations_source: Source = "expert"
-    """Where they come from: "expert", or "deconstruction" of structures, reversed in time."""
+    """Their source: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
-    """Leave out those that failed; so that there are fewer, where the expert is not perfect."""
+    """Leave out failed episodes; fewer remain where the expert fails."""
     demonstrations_path: str | None = None
     """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
     pretrain_updates: int = Field(default=0, ge=0)
-    """Updates on the demonstrations alone, before the first step."""
+    """Updates on the demonstrations before the first environment step."""
     total_updates: int = Field(default=10_000, ge=1)
     """Gradient updates of the run, pretraining included."""
     updates_per_step: int = Field(default=1, ge=1)
@@ -75,27 +84,27 @@ class ExperimentConfig(StrictModel):
     min_replay: int = Field(default=100, ge=1)
     """Transitions in the replay before the first update."""
     eval_every: int = Field(default=500, ge=1)
-    """Updates between evaluations of the greedy policy; each is followed by a checkpoint, of
-    which the best and the newest are kept."""
+    """Updates between evaluations of the greedy policy; a checkpoint follows each, and the best and
+    the latest ones are kept."""
     eval_episodes: int = Field(default=100, ge=1)
-    """Episodes of each of them."""
+    """Episodes of each of these evaluations."""
     final_eval_episodes: int = Field(default=100, ge=1)
-    """Episodes of the last evaluation, the one that is reported."""
+    """Episodes of the last evaluation, which is reported."""
     report: Literal["last", "best"] = "last"
-    """Which policy the last evaluation is of: the run's last, or that of the checkpoint with the
-    best evaluation. Its episodes are others than those that chose the checkpoint."""
+    """The reported policy: the last one, or that of the checkpoint with the best evaluation. The
+    episodes of its evaluation differ from those that selected the checkpoint."""
     log_every: int = Field(default=50, ge=1)
     """Updates between rows of the losses."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"
-    """Where scalars go, besides the run folder's CSV."""
+    """Logger of scalars in addition to the run folder's CSV file."""
     video_episodes: int = Field(default=3, ge=0)
     """Greedy episodes in the video at the end."""
     label: str = "run"
     """Name of the curve in plots, such as "sacfd equi"."""
     run_dir: str = "runs/run"
-    """Folder of everything the run writes."""
+    """Folder of the run's files."""
     resume: bool = False
-    """Go on with the run in that folder if it was interrupted."""
+    """Continue the run in that folder if it was interrupted."""
     benchmark: str | None = None
     """Name of the benchmark that the run belongs to, for reports."""
 
@@ -118,8 +127,8 @@ class ExperimentConfig(StrictModel):
         """Return the first seed of the environments that serve ``use``.
 
         Args:
-            use: what for.
-            part: another number gives others, as a resumed run needs.
+            use: what the environments serve.
+            part: number of a further set of episodes for the same use, after a resumption.
         """
         return int(np.random.SeedSequence([self.seed, use, part]).generate_state(1)[0])
 
@@ -158,6 +167,7 @@ class ExperimentConfig(StrictModel):
             ConfigError: a name is unknown, a type wrong, or parts do not go together.
         """
         config = parse(cls, values, what)
+        load_plugins(config.plugins)
         control = TASKS[config.task].control  # raises with the known names
         for reserved in SET_BY_THE_EXPERIMENT:
             if reserved in config.env:
@@ -165,12 +175,7 @@ class ExperimentConfig(StrictModel):
         _ = config.env_config
         if config.env_config.obs_type != "pixel":
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
-        config.algorithm_config.check(config.network_config)
-        if config.algorithm_config.control != control:
-            raise ConfigError(
-                f"algorithm {config.algorithm['name']!r} learns "
-                f"{config.algorithm_config.control} tasks, not {config.task}"
-            )
+        config.algorithm_config.check(config.network_config, control)
         if config.pretrain_updates > config.total_updates:
             raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
         if config.pretrain_updates and not config.demonstrations:
@@ -186,7 +191,19 @@ class ExperimentConfig(StrictModel):
         except (RuntimeError, AssertionError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
-        return config
+        return config.model_copy(update={"plugins": config._all_plugins()})
+
+    def _all_plugins(self) -> list[str]:
+        """Return `plugins` and the modules that register what the run uses, each once."""
+        used = (
+            (TASKS, self.task),
+            (ROBOTS, self.env_config.robot),
+            (NETWORKS, self.network["name"]),
+            (ALGORITHMS, self.algorithm["name"]),
+        )
+        modules = (registry.plugin_module(name) for registry, name in used)
+        found = [name for name in modules if name is not None and name not in MAIN]
+        return list(dict.fromkeys([*self.plugins, *found]))
 
     def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)

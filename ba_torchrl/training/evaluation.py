@@ -1,4 +1,4 @@
-"""Evaluation: the greedy policy on episodes of its own."""
+"""Evaluation of the greedy policy."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ba_torchrl.envs import keys
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found."""
+    """Result of an evaluation."""
 
     episodes: int
     success_rate: float
-    """Share of episodes that reached the goal."""
+    """Fraction of episodes that reached the goal."""
     standard_error: float
     """Of the success rate (binomial)."""
     mean_length: float
@@ -59,12 +59,12 @@ def evaluate(
     seed: int,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> Evaluation:
-    """Play greedy episodes, a fixed number per environment, always from the same seeds.
+    """Play greedy episodes from a seed, a fixed number per environment.
 
     Args:
         env: a vector of environments.
         policy: acts greedily under TorchRL's deterministic exploration type.
-        episodes: how many in all.
+        episodes: total number.
         seed: of the first episodes.
         on_episode: called with each episode, for progress bars.
     """
@@ -91,18 +91,18 @@ def record_episodes(
     seed: int,
     hold_frames: int = 4,
 ) -> list[np.ndarray]:
-    """Play episodes, greedy ones of a policy that explores, and photograph every step.
+    """Play greedy episodes and render every step.
 
     Args:
         task: id of the task.
         env_settings: fields of `EnvConfig`.
         policy: acts on an unbatched root TensorDict; None for random actions.
-        episodes: how many.
+        episodes: their number.
         seed: of the first.
-        hold_frames: how often the last picture of an episode is repeated.
+        hold_frames: repetitions of an episode's last image.
 
     Returns:
-        Pictures [H, W, 3] uint8 in a row.
+        Images [H, W, 3] uint8 in the order of time.
     """
     frames: list[np.ndarray] = []
     env = make(task, **{**env_settings, "seed": seed})

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Self
 
 import torch
@@ -14,60 +13,111 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.data.demos import (
-    as_transitions,
-    collect_demonstrations,
-    load_demonstrations,
-    source_config,
-)
+from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.data.demo_files import load_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import ScalarLog, progress_bar
-from ba_torchrl.record.plots import plot_learning_curve
-from ba_torchrl.record.results import (
-    CurvePoint,
-    FinalEvaluation,
-    RunResult,
-    hardware,
-    now,
-    versions,
-    write_result,
-)
-from ba_torchrl.record.video import write_video
+from ba_torchrl.record.results import CurvePoint
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
-from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate, record_episodes
+from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
+from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
 
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a run ended with, and where to find it."""
+def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
+    """Return the environments of a run, ready to be reset.
 
-    evaluation: Evaluation
-    updates: int
-    """Age of the policy that was evaluated."""
-    checkpoint: Path
-    curve: Path
-    video: Path | None
-    record: Path
-    """All of this and the whole curve as JSON; see `ba_torchrl.record.results`."""
-    seconds: float
+    Args:
+        config: of the run.
+        seed: of the first environment.
+        changes: fields of `EnvConfig` that differ from the run's.
+    """
+    return make_vector_env(
+        config.task,
+        config.num_envs,
+        parallel=config.parallel,
+        start_method=config.start_method,
+        register_modules=config.plugins,
+        **{**config.env, "seed": seed, **changes},
+    )
+
+
+def make_collector(env: EnvBase, algorithm: Algorithm, config: ExperimentConfig) -> Collector:
+    """Return a collector of one step of every environment at a time, flattened to [num_envs].
+
+    Args:
+        env: the environments, on the CPU.
+        algorithm: whose policy explores.
+        config: of the run.
+    """
+    return Collector(
+        env,
+        algorithm.policy,
+        frames_per_batch=config.num_envs,
+        total_frames=-1,
+        postproc=lambda data: data.reshape(-1),
+        policy_device=config.torch_device,
+        storing_device="cpu",
+        auto_register_policy_transforms=False,
+    )
+
+
+def gather_demonstrations(config: ExperimentConfig, algorithm: Algorithm) -> list[TensorDict]:
+    """Return the episodes [T] of a run's demonstrations, read from a folder or played now.
+
+    Args:
+        config: of the run.
+        algorithm: whose policy must be able to choose the demonstrated actions.
+
+    Raises:
+        ConfigError: the folder holds fewer than the run asks for.
+        RuntimeError: no episode can be used.
+    """
+    if config.demonstrations_path is not None:
+        episodes = load_demonstrations(config.demonstrations_path, task=config.task, env=config.env)
+        if len(episodes) < config.demonstrations:
+            raise ConfigError(
+                f"{config.demonstrations_path} holds {len(episodes)} episodes, fewer than "
+                f"demonstrations={config.demonstrations}"
+            )
+        return episodes[: config.demonstrations]
+    seed = config.derived_seed(SeedUse.DEMONSTRATIONS)
+    env = make_env(config, seed, **source_config(config.demonstrations_source))
+    try:
+        episodes = collect_demonstrations(
+            env,
+            config.demonstrations,
+            seed=seed,
+            source=config.demonstrations_source,
+            only_successful=config.only_successful_demonstrations,
+            nearest_action=algorithm.nearest_action,
+        )
+    finally:
+        env.close()
+    if not episodes:
+        raise RuntimeError(
+            f"no episode of the source {config.demonstrations_source!r} can be used; see "
+            "demonstrations_source and only_successful_demonstrations"
+        )
+    return episodes
 
 
 class Experiment:
     """A training run, from demonstrations to the last evaluation.
 
     Args:
-        config: the run. With ``resume`` it goes on from its last evaluation if it was interrupted;
-            `ba_torchrl.training.resume` says what is kept.
+        config: the run. With ``resume`` an interrupted run continues from its last evaluation; see
+            `ba_torchrl.training.resume`.
         progress: show a progress bar.
 
     Raises:
-        ConfigError: the run folder holds another run, or one that may not be resumed like this.
+        ConfigError: the run folder holds another run, or this one with other settings.
     """
 
     def __init__(self, config: ExperimentConfig, progress: bool = True) -> None:
@@ -117,7 +167,7 @@ class Experiment:
     # -- stages ------------------------------------------------------------------------------
 
     def _resume(self) -> bool:
-        """Go back to the last evaluation; return whether there was one."""
+        """Restore the state of the last evaluation; return whether there is one."""
         if not self._state.load():
             return False
         updates, progress = self.algorithm.updates, self._progress
@@ -126,44 +176,15 @@ class Experiment:
         self._bar.update(updates)
         if not self.checkpoints.has(updates):  # the interruption came between state and checkpoint
             self.checkpoints.save(updates, progress.curve[-1].success_rate)
-        logger.info("%s goes on after update %d", self.config.folder, updates)
+        logger.info("the run in %s continues after update %d", self.config.folder, updates)
         return True
 
     def _demonstrate(self) -> None:
-        """Fill the replay with the expert's episodes."""
-        config = self.config
-        if not config.demonstrations:
+        """Fill the replay with demonstrations."""
+        if not self.config.demonstrations:
             return
-        if config.demonstrations_path is not None:
-            episodes = load_demonstrations(
-                config.demonstrations_path, task=config.task, env=config.env
-            )
-            if len(episodes) < config.demonstrations:
-                raise ConfigError(
-                    f"{config.demonstrations_path} holds {len(episodes)} episodes, fewer than "
-                    f"demonstrations={config.demonstrations}"
-                )
-            episodes = episodes[: config.demonstrations]
-        else:
-            seed = config.derived_seed(SeedUse.DEMONSTRATIONS)
-            env = self._make_env(seed, **source_config(config.demonstrations_source))
-            try:
-                episodes = collect_demonstrations(
-                    env,
-                    config.demonstrations,
-                    seed=seed,
-                    source=config.demonstrations_source,
-                    only_successful=config.only_successful_demonstrations,
-                )
-            finally:
-                env.close()
-        if not episodes:
-            raise RuntimeError(
-                f"no episode of the source {config.demonstrations_source!r} is of use; see "
-                "demonstrations_source and only_successful_demonstrations"
-            )
-        for episode in episodes:
-            self.algorithm.extend(as_transitions(episode, is_expert=True))
+        episodes = gather_demonstrations(self.config, self.algorithm)
+        self.algorithm.on_demonstrations(episodes)
         self.log.write(
             0,
             {
@@ -173,25 +194,17 @@ class Experiment:
         )
 
     def _learn(self) -> None:
-        """Alternate collecting and updating until the updates are used up."""
+        """Pretrain, then alternate collection and updates until the last update."""
         config, algorithm = self.config, self.algorithm
         while algorithm.updates < config.pretrain_updates:
             self._update()
         if algorithm.updates == config.total_updates:
             return
-        # Other episodes than before an interruption, or the first ones would come twice.
+        # A resumed run plays other episodes than before its interruption.
         part = self._progress.resumed_at[-1] if self._progress.resumed_at else 0
-        self._train_env = self._make_env(config.derived_seed(SeedUse.COLLECTION, part))
-        collector = Collector(
-            self._train_env,
-            algorithm.policy,
-            frames_per_batch=config.num_envs,
-            total_frames=-1,
-            postproc=lambda data: data.reshape(-1),
-            policy_device=config.torch_device,
-            storing_device="cpu",
-            auto_register_policy_transforms=False,
-        )
+        seed = config.derived_seed(SeedUse.COLLECTION, part)
+        self._train_env = make_env(config, seed, expert=algorithm.stores_expert_action)
+        collector = make_collector(self._train_env, algorithm, config)
         try:
             for data in collector:
                 self._store(data)
@@ -205,100 +218,37 @@ class Experiment:
             collector.shutdown(close_env=False)
 
     def _finish(self) -> Result:
-        """Evaluate for the record, on episodes that chose nothing; write curve, video, result."""
-        config = self.config
-        curve = self._progress.curve
-        if not curve or curve[-1].updates < self.algorithm.updates:
+        """Run the evaluation that is reported, on new episodes; write curve, video and record."""
+        config, progress = self.config, self._progress
+        if not progress.curve or progress.curve[-1].updates < self.algorithm.updates:
             self._evaluate_and_save()
         checkpoint = self.checkpoints.latest()
         if config.report == "best":
             checkpoint = self.checkpoints.load_best()
+        updates = self.algorithm.updates
         evaluation = self._evaluate(config.final_eval_episodes, SeedUse.REPORT)
-        self.log.write(self.algorithm.updates, evaluation.scalars("final"))
-        picture = self._plot()
-        video = None
-        if config.video_episodes:
-            video = config.folder / "evaluation.mp4"
-            frames = record_episodes(
-                config.task,
-                config.env,
-                self._greedy,
-                config.video_episodes,
-                config.derived_seed(SeedUse.REPORT),
-            )
-            write_video(video, frames, fps=5)
+        self.log.write(updates, evaluation.scalars("final"))
+        curve = plot_curve(config, progress.curve)
+        video = record_video(config, self._greedy)
         seconds = time.perf_counter() - self._started
-        files = {"curve": picture, "checkpoint": checkpoint, "video": video}
-        record = write_result(
-            config.folder,
-            RunResult(
-                task=config.task,
-                label=config.label,
-                benchmark=config.benchmark,
-                seed=config.seed,
-                curve=curve,
-                final=FinalEvaluation(
-                    policy=config.report, updates=self.algorithm.updates, **asdict(evaluation)
-                ),
-                config=config.resolved(),
-                versions=versions(),
-                hardware=hardware(config.torch_device),
-                seconds=seconds,
-                resumed_at=self._progress.resumed_at,
-                finished=now(),
-                files={
-                    name: path.resolve().relative_to(config.folder.resolve()).as_posix()
-                    for name, path in files.items()
-                    if path is not None
-                },
-            ),
-        )
+        files = {"curve": curve, "checkpoint": checkpoint, "video": video}
+        record = write_record(config, evaluation, updates, progress, seconds, files)
         self._state.remove()
-        return Result(
-            evaluation, self.algorithm.updates, checkpoint, picture, video, record, seconds
-        )
-
-    def _plot(self) -> Path:
-        """Draw the learning curve; return its file."""
-        curve = self._progress.curve
-        return plot_learning_curve(
-            {
-                self.config.label: (
-                    [point.updates for point in curve],
-                    [point.success_rate for point in curve],
-                    [point.success_rate - point.standard_error for point in curve],
-                    [point.success_rate + point.standard_error for point in curve],
-                )
-            },
-            self.config.folder / "learning_curve.png",
-            title=self.config.task,
-            xlabel="updates",
-            ylabel="success rate of the greedy policy",
-        )
+        return Result(evaluation, updates, checkpoint, curve, video, record, seconds)
 
     # -- parts -------------------------------------------------------------------------------
 
-    def _make_env(self, seed: int, **changes: bool) -> EnvBase:
-        config = self.config
-        return make_vector_env(
-            config.task,
-            config.num_envs,
-            parallel=config.parallel,
-            start_method=config.start_method,
-            **{**config.env, "seed": seed, **changes},
-        )
-
     def _store(self, data: TensorDict) -> None:
-        """Add collected transitions to the replay and keep score of the episodes."""
+        """Add collected transitions to the replay and count steps, faults and successes."""
         progress, following = self._progress, data[keys.NEXT]
         progress.env_steps += data.numel()
         progress.faults += int(following[keys.FAULT].sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
-        self.algorithm.extend(as_transitions(data, is_expert=False))
+        self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
 
     def _update(self) -> None:
-        """Take one update, and whatever is due after it."""
+        """Take one update; log and evaluate if they are due."""
         config = self.config
         scalars = self.algorithm.update()
         updates = self.algorithm.updates
@@ -314,7 +264,7 @@ class Experiment:
             self._evaluate_and_save()
 
     def _evaluate_and_save(self) -> None:
-        """Add a point to the learning curve and write a checkpoint that bears its success rate."""
+        """Add a point to the learning curve; save the state and a checkpoint with its rate."""
         updates, progress = self.algorithm.updates, self._progress
         evaluation = self._evaluate(self.config.eval_episodes, SeedUse.EVALUATION)
         progress.seconds = time.perf_counter() - self._started
@@ -334,5 +284,5 @@ class Experiment:
     def _evaluate(self, episodes: int, use: SeedUse) -> Evaluation:
         seed = self.config.derived_seed(use)
         if self._eval_env is None:
-            self._eval_env = self._make_env(seed)
+            self._eval_env = make_env(self.config, seed)
         return evaluate(self._eval_env, self._greedy, episodes, seed)

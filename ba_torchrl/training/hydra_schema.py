@@ -1,22 +1,25 @@
-"""What the recipes' YAML files start from: every field with its default, taken from the code.
+"""Hydra's schemas of the recipes: every field with its default, taken from the code.
 
-So any field can be set on the command line, and none is written down twice.
+Any field can therefore be set on the command line, and no default is written twice.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import load_plugins
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
 from ba_torchrl.training.grid.plan import SET_BY_THE_GRID, BenchmarkConfig
 
@@ -30,12 +33,24 @@ def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
     }
 
 
-def register() -> None:
+GROUPS = {"algorithm": ALGORITHMS, "network": NETWORKS}
+"""Folders of presets in ``configs``, and the registry that each chooses from."""
+
+
+def register(arguments: Sequence[str] = ()) -> None:
     """Make the schemas known to Hydra: environment, experiment, grid, each algorithm and network.
 
-    Under ``algorithm``, ``network`` and ``per_...`` of a grid anything may be set: what there is
-    depends on the presets, and is checked against them.
+    An algorithm or a network from outside the package is also a preset, under its registered name
+    and with its defaults. Under ``algorithm``, ``network`` and ``per_...`` of a grid any field may
+    be set: the presets decide which exist, and `plan` checks them.
+
+    Args:
+        arguments: of the command line; plugins that it names are imported before.
+
+    Raises:
+        ConfigError: a plugin cannot be imported.
     """
+    load_plugins(_plugins_in(arguments))
     store = ConfigStore.instance()
     env = {
         name: value
@@ -56,10 +71,14 @@ def register() -> None:
     for name in ("env", "algorithm", "network", "per_task", "per_algorithm", "per_network"):
         OmegaConf.set_struct(grid[name], False)
     store.store(name="grid", node=grid)
-    for group, registry in (("algorithm", ALGORITHMS), ("network", NETWORKS)):
+    for group, registry in GROUPS.items():
         for name in registry:
             node = {"name": name, **defaults_of(registry[name])}
             store.store(group=f"{group}/schema", name=name, node=node)
+            if registry.plugin_module(name) is not None:
+                *folders, last = name.split("/")
+                where = "/".join([group, *folders])
+                store.store(group=where, name=last, node=node, package=group)
     OmegaConf.register_new_resolver(
         "file_name", lambda text: text.replace("/", "_").replace(" ", "_"), replace=True
     )
@@ -70,15 +89,38 @@ def preset(group: str, name: str) -> dict[str, Any]:
 
     Args:
         group: folder in ``configs``, such as "algorithm".
-        name: of a file in it. Hydra must have been started with that ``configs`` folder.
+        name: of a file in it, or of a plugin's entry. Hydra must have been started with that
+            ``configs`` folder.
 
     Raises:
-        ConfigError: there is no such file; the message lists those there are.
+        ConfigError: there is no such preset; the message lists the known ones.
     """
-    known = GlobalHydra.instance().config_loader().get_group_options(group)
+    known = _presets(group)
     if name not in known:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise ConfigError(f"unknown {group} {name!r}.{hint} Known: {', '.join(known)}")
     settings = compose(overrides=[f"+{group}={name}"])
     return OmegaConf.to_container(settings[group], resolve=True)
+
+
+def _presets(group: str) -> list[str]:
+    """Return the names of a group's presets."""
+    files = GlobalHydra.instance().config_loader().get_group_options(group)
+    registry = GROUPS[group]
+    plugins = [name for name in registry if registry.plugin_module(name) is not None]
+    return sorted({*files, *plugins})
+
+
+def _plugins_in(arguments: Iterable[str]) -> list[str]:
+    """Return the modules that ``plugins=[...]`` of a command line names.
+
+    Hydra composes the configuration from the presets, so the plugins that add some come first.
+    """
+    found: list[str] = []
+    parser = OverridesParser.create()
+    for argument in arguments:
+        if argument.lstrip("+").startswith("plugins="):
+            value = parser.parse_override(argument).value()
+            found += [value] if isinstance(value, str) else [str(name) for name in value]
+    return found

@@ -1,9 +1,9 @@
-"""Resuming: the state of a run at its last evaluation, from which it goes on if it is interrupted.
+"""Resuming: the state of a run at its last evaluation, from which an interrupted run continues.
 
-Kept: the algorithm (networks, optimiser, schedules, generators), its replay with priorities, the
-process's random number generators, the learning curve and all counters. Not kept: the episodes in
-progress, which start anew with other seeds, and what happened since the last evaluation, which is
-done again. A resumed run is therefore another sample of the same run, not the same bits.
+Saved: the algorithm (networks, optimiser, schedules, generators), its replay with priorities, the
+process's random number generators, the learning curve and all counters. Not saved: the episodes in
+progress, which start again with other seeds, and the updates since the last evaluation, which are
+repeated. A resumed run is therefore another sample of the same run, not the same bits.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ _FOLDER = "resume"
 
 @dataclass
 class Progress:
-    """How far a run has come."""
+    """Learning curve and counters of a run."""
 
     curve: list[CurvePoint] = field(default_factory=list)
     recent: deque[bool] = field(default_factory=lambda: deque(maxlen=RECENT_EPISODES))
@@ -51,23 +52,23 @@ class Progress:
         return {**values, "recent": list(self.recent), "curve": curve}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over what `state_dict` returned."""
+        """Restore what `state_dict` returned."""
         vars(self).update(state)
         self.recent = deque(state["recent"], maxlen=RECENT_EPISODES)
         self.curve = [CurvePoint(**point) for point in state["curve"]]
 
 
 class ResumeState:
-    """What a run saves at every evaluation and removes when it has finished; it is large.
+    """The state that a run saves at every evaluation and deletes when it finishes; it is large.
 
-    TorchRL publishes each state under its final name only when it is complete, and the previous
-    one is removed after that: a crash while writing leaves that one whole.
+    TorchRL publishes each state under its final name only when it is complete, and deletes the
+    previous one after that: after a crash while writing, that one is intact.
 
     Args:
         folder: the run folder.
-        algorithm: whose state and replay are kept.
+        algorithm: whose state and replay are saved.
         progress: the run's counters and curve.
-        device: where to load tensors to.
+        device: where to load tensors to; it may differ from the one they were saved on.
     """
 
     def __init__(
@@ -79,7 +80,7 @@ class ResumeState:
             algorithm=algorithm,
             replay=_Replay(algorithm),
             progress=progress,
-            generators=GlobalRNGState(),
+            generators=_Generators(),
         )
         self._rotation = CheckpointRotation(self._folder, keep_last=1)
 
@@ -103,18 +104,18 @@ class ResumeState:
 
 
 def resumable_updates(folder: str | Path) -> int | None:
-    """Return after how many updates the run in a folder would go on, None if it cannot."""
+    """Return the update after which the run in a folder can be resumed, None if it cannot."""
     folder = Path(folder) / _FOLDER
     latest = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
     return None if latest is None else int(latest.name.rsplit("-", 1)[-1])
 
 
 def open_run_folder(config: ExperimentConfig) -> None:
-    """Make the run folder and write the configuration into it, if no other run lies there.
+    """Make the run folder and write the configuration into it.
 
     Raises:
-        ConfigError: there is a run, and it is finished, or ``resume`` is off, or it had other
-            settings; the message names each.
+        ConfigError: it holds a run that is finished, or that has other settings, or that
+            ``resume`` does not ask for; the message names the reason.
     """
     folder = config.folder
     if not (folder / CONFIG_FILE).exists():
@@ -124,8 +125,8 @@ def open_run_folder(config: ExperimentConfig) -> None:
         raise ConfigError(f"{folder} holds a finished run; choose another run_dir")
     elif not config.resume:
         raise ConfigError(
-            f"{folder} holds a run that did not finish: resume=true goes on with it, another "
-            "run_dir starts anew"
+            f"{folder} holds a run that did not finish: resume=true continues it, another run_dir "
+            "starts a new one"
         )
     else:
         check_same_run(config)
@@ -134,17 +135,20 @@ def open_run_folder(config: ExperimentConfig) -> None:
                 raise ConfigError(
                     f"{folder} has checkpoints, but nothing to resume from; choose another run_dir"
                 )
-            logger.warning("the run in %s has not been evaluated yet: starting it anew", folder)
+            logger.warning("the run in %s has no evaluation yet: starting it again", folder)
     write_config(config)
 
 
 def check_same_run(config: ExperimentConfig) -> None:
     """Check that the run in the folder of ``config`` was started with the same settings.
 
+    The device may differ, and that of the folder need not exist on this machine.
+
     Raises:
         ConfigError: it was not; the message names every difference.
     """
-    found = differences(read_config(config.folder).resolved(), config.resolved())
+    started = read_config(config.folder, device=config.device)
+    found = differences(started.resolved(), config.resolved())
     if found:
         lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
         raise ConfigError(
@@ -152,8 +156,22 @@ def check_same_run(config: ExperimentConfig) -> None:
         )
 
 
+class _Generators(GlobalRNGState):
+    """The process's generators; those of a GPU are restored only where there are as many GPUs."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        here = self.state_dict()
+        found = {name: value for name, value in state_dict.items() if name in here}
+        cuda = "torch_cuda"
+        if cuda in found and len(found[cuda]) != len(here[cuda]):
+            del found[cuda]
+        if len(found) < len(state_dict):
+            logger.warning("another device: %s not restored", ", ".join(state_dict.keys() - found))
+        super().load_state_dict(found)
+
+
 class _Replay:
-    """An algorithm's replay as TorchRL's checkpoints want it: with ``dump`` and ``load``."""
+    """An algorithm's replay with the methods ``dump`` and ``load`` of TorchRL's checkpoints."""
 
     def __init__(self, algorithm: Algorithm) -> None:
         self._algorithm = algorithm

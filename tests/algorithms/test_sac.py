@@ -8,7 +8,9 @@ from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.algorithms.base import NETWORKS, Problem
 from ba_torchrl.algorithms.sac import SACConfig
 from ba_torchrl.config import parse
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.transitions import as_transitions
+from tests.specs import close_loop_images
 
 TASK = "close_loop/block_reaching"
 DEPTH_M = 0.39
@@ -18,10 +20,9 @@ def build(network="cnn", **config):
     torch.manual_seed(0)
     sizes = {"cnn": {"width": 0.25}, "equi": {"group_order": 4, "n_hidden": 8}}[network]
     problem = Problem(
-        image_size=64,
+        control="close_loop",
+        images=close_loop_images(64, DEPTH_M),
         actions=CloseLoopActions("pxyzr"),
-        max_depth_m=DEPTH_M,
-        in_hand_shape=None,
         total_updates=10,
         seed=0,
         device=torch.device("cpu"),
@@ -35,7 +36,7 @@ def demonstrations():
     env = ba_torchrl.make_vector_env(TASK, 2, parallel=False, expert=True, obs_size=64, seed=0)
     episodes = collect_demonstrations(env, 6, seed=0)
     env.close()
-    return torch.cat([as_transitions(episode, is_expert=True) for episode in episodes])
+    return torch.cat([as_transitions(episode, ["pixels"], is_expert=True) for episode in episodes])
 
 
 @pytest.mark.parametrize("network", ["cnn", "equi"])
@@ -57,9 +58,10 @@ def test_the_policy_writes_nothing_but_the_action_for_any_batch_shape(network, s
 
 def test_the_policy_sees_depth_as_the_replay_stores_it():
     sac = build()
+    codec = sac.codecs["pixels"]
     codes = torch.randint(0, 256, (4, 1, 64, 64), dtype=torch.uint8)
-    stored = sac.quantizer.decode(codes)
-    nearby = (stored + (torch.rand_like(stored) - 0.5) * 1.9 * sac.quantizer.max_error_m).clamp(0)
+    stored = codec.decode(codes)
+    nearby = (stored + (torch.rand_like(stored) - 0.5) * 1.9 * codec.max_error_m).clamp(0)
     holding = torch.zeros(4, 1, dtype=torch.bool)
     actions = []
     for pixels in (stored, nearby):
@@ -115,7 +117,7 @@ def test_the_learning_rate_falls_linearly_over_the_run(demonstrations):
 
 
 def test_plain_sac_needs_no_demonstrations(demonstrations):
-    sac = build(demonstration_weight=0.0, prioritized=False, augmentation="none")
+    sac = build(demonstration_weight=0.0, replay="uniform", augmentation="none")
     online = demonstrations.clone()
     online["is_expert"] = torch.zeros_like(online["is_expert"])
     sac.extend(online)

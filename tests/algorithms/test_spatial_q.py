@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
@@ -10,9 +11,12 @@ from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
 from ba_torchrl.algorithms.spatial_q import SpatialQConfig
 from ba_torchrl.config import parse
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.errors import ConfigError
+from tests.specs import open_loop_images
 
+IMAGES = ["pixels", "in_hand"]
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
@@ -22,10 +26,9 @@ TINY = {"num_rotations": 4, "width": 0.125, "precision": "float32", "height_scal
 def build(network="asr", sequence="pxyr", *, sizes=None, seed=0, **config):
     torch.manual_seed(seed)
     problem = Problem(
-        image_size=32,
+        control="open_loop",
+        images=open_loop_images(),
         actions=OpenLoopActions(sequence, BOUNDS),
-        max_depth_m=0.24,
-        in_hand_shape=(1, 24),
         total_updates=10,
         seed=seed,
         device=torch.device("cpu"),
@@ -40,7 +43,7 @@ def transitions():
     env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
     episodes = collect_demonstrations(env, 4, seed=0, only_successful=True)
     env.close()
-    return torch.cat([as_transitions(episode, is_expert=True) for episode in episodes])
+    return torch.cat([as_transitions(episode, IMAGES, is_expert=True) for episode in episodes])
 
 
 def online(transitions):
@@ -69,7 +72,7 @@ def test_every_network_learns_the_demonstrations(network, transitions):
 
 
 @pytest.mark.parametrize("demonstrations", ["none", "dqfd", "sdqfd", "adet"])
-@pytest.mark.parametrize("replay", ["split", "prioritized", "uniform"])
+@pytest.mark.parametrize("replay", ["symmetric", "prioritized", "uniform"])
 def test_every_loss_takes_steps_on_every_replay(demonstrations, replay, transitions):
     algorithm = build("fcn", demonstrations=demonstrations, replay=replay)
     algorithm.extend(transitions)
@@ -141,7 +144,7 @@ def test_the_policy_is_greedy_until_epsilon_says_otherwise(transitions):
     explorer.extend(transitions)
     found = []
     for _ in range(6):
-        found.append(float(explorer.acting.epsilon))
+        found.append(float(explorer.explorer.epsilon))
         explorer.update()
     assert found == pytest.approx([1.0, 0.875, 0.75, 0.625, 0.5, 0.5])
 
@@ -173,10 +176,62 @@ def test_an_action_without_yaw_takes_the_networks_that_suit_it(transitions):
         build("fcn", "pxy", augmentation="se2")
 
 
-def test_networks_of_the_other_kind_are_refused():
+def test_networks_and_tasks_of_the_other_kind_are_refused():
     spatial, close = parse(SpatialQConfig, {}, "q"), parse(ALGORITHMS["sac"], {}, "sac")
-    with pytest.raises(ConfigError, match=r"for close_loop tasks; .* asr, equi_asr"):
-        spatial.check(parse(NETWORKS["cnn"], {}, "cnn"))
-    with pytest.raises(ConfigError, match=r"for open_loop tasks; .* cnn, equi"):
-        close.check(parse(NETWORKS["fcn"], {}, "fcn"))
-    spatial.check(parse(NETWORKS["fcn"], {}, "fcn"))
+    cnn, fcn = parse(NETWORKS["cnn"], {}, "cnn"), parse(NETWORKS["fcn"], {}, "fcn")
+    with pytest.raises(ConfigError, match=r"for close_loop tasks; open_loop tasks take .* asr"):
+        spatial.check(cnn, "open_loop")
+    with pytest.raises(ConfigError, match=r"for open_loop tasks; close_loop tasks take .* cnn"):
+        close.check(fcn, "close_loop")
+    with pytest.raises(ConfigError, match="learns open_loop tasks, not close_loop ones"):
+        spatial.check(cnn, "close_loop")
+    spatial.check(fcn, "open_loop")
+
+
+def test_demonstrations_are_executed_as_they_are_learnt():
+    algorithm = build()
+    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
+    episodes = collect_demonstrations(env, 3, seed=0, nearest_action=algorithm.nearest_action)
+    plain = collect_demonstrations(env, 3, seed=0)
+    env.close()
+    for episode in episodes:
+        assert torch.equal(algorithm.nearest_action(episode["action"]), episode["action"])
+    moved = (algorithm.nearest_action(plain[0]["action"]) - plain[0]["action"]).abs()
+    assert moved[:, 3].max() > 0.01  # the expert's own actions are off the grid
+    algorithm.on_demonstrations(episodes)
+    stored = algorithm.replay.expert.storage.column("action")
+    assert torch.equal(stored, torch.cat([episode["action"] for episode in episodes]))
+
+
+@pytest.mark.parametrize("yaw", [3.1, 1.5])
+def test_a_yaw_that_wraps_reverses_the_image_of_what_is_held(yaw):
+    algorithm = build()  # yaws at multiples of pi / 4
+    image = torch.rand(1, 24, 24).half().float()
+    states = TensorDict(
+        {
+            "pixels": torch.zeros(4, 1, 32, 32),
+            "in_hand": torch.stack(
+                [torch.zeros_like(image), image, image, torch.zeros_like(image)]
+            ),
+            "holding": torch.tensor([False, True, True, False])[:, None],
+        },
+        [4],
+    )
+    episode = states[:3].clone()
+    # a pick, a place that does nothing, and one that releases
+    episode["action"] = torch.tensor(
+        [[0, 0.45, 0, yaw], [1, 0.4, 0.1, 0.8], [1, 0.4, 0.1, 0.8]], dtype=torch.float32
+    )
+    episode["next"] = states[1:].clone()
+    episode["next", "reward"] = torch.zeros(3, 1)
+    for key in ("done", "terminated", "truncated", "fault"):
+        episode["next", key] = torch.zeros(3, 1, dtype=torch.bool)
+    algorithm.on_demonstrations([episode])
+    stored = algorithm.replay.expert.storage[:3]
+    wraps = yaw > 3
+    expected = image.flip(-2, -1) if wraps else image
+    assert stored["action"][0, 3] == pytest.approx(0.0 if wraps else math.pi / 2)
+    for shown in (stored["next", "in_hand"][:2], stored["in_hand"][1:]):
+        assert torch.equal(shown, expected.expand(2, -1, -1, -1))
+    assert not stored["in_hand"][0].any()
+    assert not stored["next", "in_hand"][2].any()

@@ -4,12 +4,8 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.data.demos import (
-    collect_demonstrations,
-    load_demonstrations,
-    save_demonstrations,
-    source_config,
-)
+from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.errors import ConfigError
 
 TASK = "open_loop/block_stacking"

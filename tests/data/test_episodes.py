@@ -2,13 +2,10 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.data.demos import (
-    as_transitions,
-    collect_demonstrations,
-    load_demonstrations,
-    save_demonstrations,
-)
+from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.episodes import collect_episodes, mean_length, quotas, success_rate
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.errors import ConfigError
 
 TASK = "close_loop/block_reaching"
@@ -66,7 +63,7 @@ def test_excluded_entries_are_not_kept(expert_env):
 
 def test_transitions_are_flat_and_flagged(expert_env):
     (episode,) = collect_demonstrations(expert_env, 1, seed=0)
-    out = as_transitions(episode, is_expert=True)
+    out = as_transitions(episode, ["pixels"], is_expert=True)
     assert out.batch_size == (len(episode),)
     assert out["is_expert"].all()
     assert set(out.keys()) == {"pixels", "holding", "action", "next", "is_expert"}

@@ -7,9 +7,10 @@ from tensordict import TensorDict
 
 import ba_torchrl
 from ba_torchrl.actions import PICK, PLACE
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.episodes import collect_episodes
 from ba_torchrl.data.time_reversal import is_reversible, replay_scores, reverse_episode
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import Pose
@@ -282,7 +283,7 @@ def test_collected_side_by_side():
     assert [len(episode) for episode in episodes] == [4, 4, 4]
     for episode, original in zip(episodes, played, strict=True):
         assert torch.equal(episode["pixels"][0], original["next", "pixels"][-1])
-    transitions = as_transitions(episodes[0], is_expert=True)
+    transitions = as_transitions(episodes[0], ["pixels", "in_hand"], is_expert=True)
     assert keys.IN_HAND in transitions
     assert (keys.NEXT, keys.IN_HAND) in transitions.keys(include_nested=True)
 

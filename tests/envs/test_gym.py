@@ -1,7 +1,4 @@
-import json
 import logging
-import subprocess
-import sys
 import warnings
 
 import gymnasium
@@ -15,8 +12,9 @@ from torchrl.data import Categorical
 
 import ba_torchrl
 from ba_torchrl.envs import gym
-from ba_torchrl.envs.registration import gym_id, register_tasks
+from ba_torchrl.envs.registration import gym_id
 from ba_torchrl.errors import ConfigError, InvalidActionError
+from ba_torchrl.tasks.base import TASKS as REGISTRY
 
 TASKS = ba_torchrl.list_tasks()
 PICKING = "BulletArm/CloseLoopBlockPicking-v0"
@@ -37,86 +35,11 @@ def make():
         env.close()
 
 
-# -- registration ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("task", "wanted"),
-    [
-        ("close_loop/block_picking", "BulletArm/CloseLoopBlockPicking-v0"),
-        ("open_loop/house_building_3", "BulletArm/OpenLoopHouseBuilding3-v0"),
-        ("ramp/block_stacking", "BulletArm/RampBlockStacking-v0"),
-    ],
-)
-def test_ids(task, wanted):
-    assert gym_id(task) == wanted
-
-
-def test_every_task_has_an_id_of_its_own():
-    specs = {spec.id: spec for spec in gymnasium.registry.values() if spec.namespace == "BulletArm"}
-    assert {name: spec.kwargs["task"] for name, spec in specs.items()} == {
-        gym_id(task): task for task in TASKS
-    }
-    assert len(specs) == len(TASKS)
-    assert all(spec.max_episode_steps is None for spec in specs.values())
-
-
-def test_registering_again_adds_only_what_is_missing(monkeypatch):
-    before = gymnasium.registry[PICKING]
-    missing = gym_id("close_loop/block_reaching")
-    monkeypatch.delitem(gymnasium.registry, missing)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        register_tasks()
-    assert missing in gymnasium.registry
-    assert gymnasium.registry[PICKING] is before
-
-
-def run(code, folder):
-    """Run ``code`` in a fresh interpreter, outside the repository; return what it prints last."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-@pytest.mark.parametrize(
-    "imports",
-    [
-        "import ba_torchrl, gymnasium",
-        "import gymnasium, ba_torchrl",
-        "import ba_torchrl, importlib.util; importlib.util.find_spec('gymnasium')",
-    ],
-)
-def test_ids_are_known_whatever_is_imported_first_and_without_torch(imports, tmp_path):
-    known, loaded = run(
-        f"{imports}\nimport gymnasium, json, sys\n"
-        "known = sorted(name for name in gymnasium.registry if name.startswith('BulletArm/'))\n"
-        "print(json.dumps([known, sorted(sys.modules)]))",
-        tmp_path,
-    )
-    assert known == sorted(map(gym_id, TASKS))
-    assert not {"torch", "torchrl"} & set(loaded)
-
-
-def test_make_needs_no_import_of_the_package(tmp_path):
-    code = (
-        "import gymnasium, json, sys\n"
-        "light = not {'torch', 'pybullet', 'ba_torchrl'} & set(sys.modules)\n"
-        f"env = gymnasium.make('ba_torchrl:{PICKING}', obs_size=16)\n"
-        "observation, info = env.reset(seed=0)\n"
-        "env.close()\n"
-        "print(json.dumps([light, observation['pixels'].shape]))"
-    )
-    assert run(code, tmp_path) == [True, [1, 16, 16]]
-
-
 # -- every task ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_gymnasium_has_nothing_to_say(make, task):
+def test_the_environment_checker_finds_nothing(make, task):
     env = make(gym_id(task), expert=True, render_mode="rgb_array", max_steps=3).unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -127,11 +50,11 @@ def test_gymnasium_has_nothing_to_say(make, task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_stable_baselines_only_warns_that_depth_is_not_a_photograph(make, task):
+def test_stable_baselines_warns_about_nothing_but_the_range_of_depth(make, task):
     from stable_baselines3.common.env_checker import check_env
 
     size = {"obs_size": 36}  # the least that its own image encoder takes
-    if task.startswith("open_loop"):
+    if REGISTRY[task].control == "open_loop":
         size["in_hand_size"] = 36
     env = make(gym_id(task), **size)
     with warnings.catch_warnings(record=True) as caught:
@@ -268,7 +191,7 @@ def test_the_step_limit_truncates(make):
     assert shorter.step(NOTHING)[2:4] == (False, True)
 
 
-def test_a_simulator_fault_truncates_and_is_told(make, monkeypatch, caplog):
+def test_a_simulator_fault_truncates_and_is_in_info(make, monkeypatch, caplog):
     def fail(*_):
         raise RuntimeError("the solver exploded")
 
@@ -314,10 +237,10 @@ def test_actions_of_any_precision_mean_the_same(make):
     assert same(results[0], results[2])
 
 
-# -- pictures, ends --------------------------------------------------------------------------
+# -- rendering, closing --------------------------------------------------------------------------
 
 
-def test_rgb_array_gives_pictures(make):
+def test_rgb_array_returns_images(make):
     env = make(render_mode="rgb_array")
     env.reset(seed=0)
     env_render_passive_checker(env.unwrapped)
@@ -330,7 +253,7 @@ def test_rgb_array_gives_pictures(make):
     assert env.metadata["render_fps"] > 0
 
 
-def test_a_list_of_pictures_can_be_collected(make):
+def test_rgb_array_list_returns_all_images(make):
     env = make(render_mode="rgb_array_list")
     env.reset()
     env.step(NOTHING)
@@ -346,14 +269,14 @@ def test_torchrl_wraps_it(make):
     env.close()
 
 
-def test_without_a_render_mode_render_says_so(make):
+def test_render_without_a_mode_warns(make):
     env = make()
     env.reset()
     with pytest.warns(UserWarning, match="render_mode='rgb_array'"):
         assert env.unwrapped.render() is None
 
 
-def test_human_asks_for_a_window(monkeypatch):
+def test_human_opens_a_window(monkeypatch):
     asked = []
     real = gym.make_env
 

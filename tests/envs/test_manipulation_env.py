@@ -89,7 +89,7 @@ def test_a_simulator_fault_ends_the_episode_truncated(env, monkeypatch, caplog):
 
 def test_faults_without_end_are_an_error(env, monkeypatch):
     monkeypatch.setattr(base, "MAX_CONSECUTIVE_FAULTS", 2)
-    monkeypatch.setattr("ba_torchrl.sim.control.close_loop.CloseLoopMotion.move_to", _fail)
+    monkeypatch.setattr("ba_torchrl.sim.control.close_loop.CloseLoopController.move_to", _fail)
     for _ in range(2):
         assert env.step(env.reset().set("action", torch.zeros(5)))["next", "fault"]
     with pytest.raises(base.SimulationError, match="3 times in a row"):

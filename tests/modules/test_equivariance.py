@@ -7,7 +7,8 @@ import torch
 
 pytest.importorskip("escnn")
 
-from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
+from ba_torchrl.modules.base import NETWORKS
+from tests.specs import actor_critic_spec
 
 SEQUENCES = ["pxyzr", "pxyz"]
 
@@ -15,7 +16,7 @@ SEQUENCES = ["pxyzr", "pxyz"]
 def build(size, sequence="pxyzr", n_hidden=8, group_order=8, seed=0):
     torch.manual_seed(seed)
     config = NETWORKS["equi"](n_hidden=n_hidden, group_order=group_order, precision="float32")
-    return config.build(ActorCriticSpec(size, sequence))
+    return config.build(actor_critic_spec(size, sequence))
 
 
 def turn_action(action, sequence, quarters):
@@ -127,7 +128,7 @@ def test_eighth_turns_of_a_smooth_image_are_close():
     vector, invariant = torch.tensor(deviations).median(dim=0).values
     assert vector < 0.2
     assert invariant < 0.1
-    plain = NETWORKS["cnn"](precision="float32").build(ActorCriticSpec(64, "pxyzr")).actor
+    plain = NETWORKS["cnn"](precision="float32").build(actor_critic_spec(64, "pxyzr")).actor
     assert eighth_turn_deviations(plain)[0] > 0.5  # a network without the symmetry fails
 
 

@@ -10,8 +10,9 @@ import torch
 from pydantic import ValidationError
 from torchrl.objectives import LossModule
 
-from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
+from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.trunk import compute_dtype
+from tests.specs import actor_critic_spec
 
 pytest.importorskip("escnn")
 
@@ -23,7 +24,7 @@ SMALL = {"cnn": {"width": 0.25}, "equi": {"n_hidden": 8, "group_order": 4}}
 def small(name, size=64, sequence="pxyzr", **fields):
     torch.manual_seed(0)
     return NETWORKS[name](**{**SMALL.get(name, {}), **fields}).build(
-        ActorCriticSpec(size, sequence)
+        actor_critic_spec(size, sequence)
     )
 
 
@@ -44,7 +45,7 @@ def test_registry_holds_the_networks():
     ],
 )
 def test_parameter_counts_are_the_papers(name, fields, actor, critic):
-    networks = NETWORKS[name](**fields).build(ActorCriticSpec(128, "pxyzr"))
+    networks = NETWORKS[name](**fields).build(actor_critic_spec(128, "pxyzr"))
     assert count(networks.actor) == actor
     if critic is not None:
         assert count(networks.encoder) + count(networks.critic) == critic
@@ -183,20 +184,20 @@ def test_config_errors():
     with pytest.raises(ValidationError):
         NETWORKS["equi"](group_order=1)
     with pytest.raises(ValueError, match="multiple of 8 at 128 px"):
-        NETWORKS["equi"](n_hidden=12).build(ActorCriticSpec(128, "pxyzr"))
+        NETWORKS["equi"](n_hidden=12).build(actor_critic_spec(128, "pxyzr"))
     with pytest.raises(ValueError, match="multiple of 4 at 64 px"):
-        NETWORKS["equi"](n_hidden=6).build(ActorCriticSpec(64, "pxyzr"))
+        NETWORKS["equi"](n_hidden=6).build(actor_critic_spec(64, "pxyzr"))
     with pytest.raises(ValueError, match="needs x and y"):
-        NETWORKS["equi"](n_hidden=8).build(ActorCriticSpec(64, "pz"))
+        NETWORKS["equi"](n_hidden=8).build(actor_critic_spec(64, "pz"))
     for name in ACTOR_CRITICS:
         with pytest.raises(ValueError, match="image_size"):
-            NETWORKS[name]().build(ActorCriticSpec(90, "pxyzr"))
+            NETWORKS[name]().build(actor_critic_spec(90, "pxyzr"))
 
 
 @pytest.mark.parametrize("sequence", ["", "pxx", "pxyq"])
 def test_bad_action_sequences_are_refused(sequence):
     with pytest.raises(ValueError, match="action_sequence"):
-        ActorCriticSpec(64, sequence)
+        actor_critic_spec(64, sequence)
 
 
 def test_missing_escnn_names_the_fix():
@@ -204,9 +205,9 @@ def test_missing_escnn_names_the_fix():
     code = """
 import sys
 sys.modules["escnn"] = None
-from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
-from ba_torchrl.modules.spatial import SpatialSpec
-actor_critic, spatial = ActorCriticSpec(64, "pxyzr"), SpatialSpec(32, 24, 1, ("x", "y", "rz"))
+from ba_torchrl.modules.base import NETWORKS
+from tests.specs import actor_critic_spec, spatial_spec
+actor_critic, spatial = actor_critic_spec(), spatial_spec()
 NETWORKS["cnn"](width=0.1).build(actor_critic)
 for name in ("fcn", "rot_fcn", "asr"):
     NETWORKS[name](width=0.1).build(spatial)

@@ -6,7 +6,7 @@ import torch
 pytest.importorskip("escnn")
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.spatial import SpatialSpec
+from tests.specs import spatial_spec
 
 SIZE = 32
 XY, XYR = ("x", "y"), ("x", "y", "rz")
@@ -15,7 +15,7 @@ SMALL = {"width": 0.125, "precision": "float32"}
 
 def build(name, components=XYR, half_rotation=True, size=SIZE, in_hand_size=24, **fields):
     torch.manual_seed(0)
-    spec = SpatialSpec(size, in_hand_size, 1, components, half_rotation)
+    spec = spatial_spec(size, in_hand_size, 1, components, half_rotation)
     return NETWORKS[name](**{**SMALL, **fields}).build(spec)
 
 

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from torchrl.objectives import LossModule
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.spatial import SpatialSpec
+from tests.specs import spatial_spec
 
 pytest.importorskip("escnn")
 
@@ -20,7 +20,7 @@ SMALL = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
 
 def build(name, size=32, in_hand_size=24, channels=1, components=XYR, half=True, **fields):
     torch.manual_seed(0)
-    spec = SpatialSpec(size, in_hand_size, channels, components, half)
+    spec = spatial_spec(size, in_hand_size, channels, components, half)
     return NETWORKS[name](**{**SMALL, **fields}).build(spec)
 
 
@@ -196,7 +196,7 @@ def test_a_batch_of_one_primitive_only_learns(name, primitive):
 def test_narrow_networks_are_born_with_values_above_their_bias(seed):
     """Else many pixels tie at the greatest value, and only the bias could ever raise it."""
     torch.manual_seed(seed)
-    spec = SpatialSpec(32, 24, 1, XY)
+    spec = spatial_spec(32, 24, 1, XY)
     network = NETWORKS["equi_fcn"](width=0.125, precision="float32").build(spec)
     pixels, in_hand, _, _ = batch(n=2)
     for holding in (False, True):
@@ -211,7 +211,7 @@ def test_narrow_networks_are_born_with_yaws_that_differ(seed):
     """Else everything is zero before the last layer, and stays so for want of a gradient."""
     torch.manual_seed(seed)
     network = NETWORKS["equi_asr"](width=0.125, num_rotations=4, precision="float32")
-    _, yaws = values_of(network.build(SpatialSpec(32, 24, 1, XYR)), *batch())
+    _, yaws = values_of(network.build(spatial_spec(32, 24, 1, XYR)), *batch())
     assert (yaws.std(dim=1) > 1e-3 * yaws.abs().max()).all()
 
 

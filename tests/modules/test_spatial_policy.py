@@ -130,8 +130,8 @@ def test_levels_are_taken_as_the_action_chose_them():
     assert torch.equal(later[0], torch.stack([network.yaws[1, 2, 3], network.yaws[0, 5, 0]]))
 
 
-def policy(epsilon=0.0, seed=0, rounding=None):
-    made = SpatialPolicy(SpatialValues(Table(), layout()), rounding or nn.Identity(), seed)
+def policy(epsilon=0.0, seed=0):
+    made = SpatialPolicy(SpatialValues(Table(), layout()), seed)
     made.epsilon.fill_(epsilon)
     return made
 
@@ -150,18 +150,6 @@ def test_only_the_action_leaves_the_policy_for_any_batch_shape(shape):
     assert set(out.keys()) == {"pixels", "in_hand", "holding", "action"}
     assert out["action"].shape == (*shape, 4)
     assert (out["action"][..., 0] == 1).all()
-
-
-def test_the_policy_rounds_both_images():
-    seen = []
-
-    class Note(nn.Module):
-        def forward(self, image):
-            seen.append(image.shape)
-            return image
-
-    policy(rounding=Note())(*observation(2))
-    assert seen == [(2, 1, 6, 8), (2, 1, 4, 4)]
 
 
 def test_exploration_goes_to_what_stands_there_and_keeps_the_primitive():

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.modules import QValueActor
 
 from ba_torchrl.objectives.dqn import (
     LevelDQNLoss,
@@ -224,3 +225,75 @@ def test_keys_can_be_renamed():
     data["next"].rename_key_("reward", "gain")
     assert torch.equal(loss(data)["loss_qvalue"].detach(), expected)
     assert "surprise" in data
+
+
+@pytest.mark.parametrize("demonstrations", ["none", "dqfd", "sdqfd", "adet"])
+def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum(demonstrations):
+    data, found = batch(experts="all"), {}
+    for reduction in ("none", "mean", "sum"):
+        loss = make_loss(demonstrations=demonstrations, reduction=reduction)
+        found[reduction] = loss(data.clone())
+    for name in ("loss_qvalue", "loss_demonstration"):
+        losses = found["none"][name]
+        assert losses.shape == (12,)
+        torch.testing.assert_close(found["mean"][name], losses.mean())
+        torch.testing.assert_close(found["sum"][name], losses.sum())
+    for name in ("demonstration_error", "td_error"):
+        assert torch.equal(found["none"][name], found["mean"][name])
+
+
+@pytest.mark.parametrize("function", [large_margin, strict_large_margin])
+def test_other_samples_than_demonstrations_have_no_margin_loss(function):
+    q, chosen = torch.rand(6, 5), torch.arange(6) % 5
+    is_expert = torch.tensor([True, False] * 3)
+    losses = function(q, chosen, is_expert, 2.0, reduction="none")
+    assert (losses[1::2] == 0).all()
+    assert (losses[::2] > 0).all()
+    share = 3 if function is large_margin else 6
+    mean = function(q, chosen, is_expert, 2.0)
+    torch.testing.assert_close(mean, losses.sum() / share)
+
+
+def test_an_unknown_reduction_is_refused():
+    with pytest.raises(ValueError, match="reduction must be none, mean or sum, got 'max'"):
+        make_loss(reduction="max")
+
+
+def test_in_keys_can_be_set_and_follow_renamed_keys():
+    loss = make_loss(demonstrations="none")
+    data = batch()
+    order = [
+        "holding",
+        "pixels",
+        *[key for key in loss.in_keys if key not in ("holding", "pixels")],
+    ]
+    loss.in_keys = order
+    assert loss.in_keys == order
+    by_name = loss(data.clone())["loss_qvalue"]
+    by_position = loss(*(data[key] for key in order))
+    assert torch.equal(by_position[loss.out_keys.index("loss_qvalue")], by_name)
+    loss.set_keys(action="chosen")
+    assert "chosen" in loss.in_keys
+    assert "action" not in loss.in_keys
+
+
+@pytest.mark.parametrize("action_space", ["one_hot", "categorical"])
+def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
+    torch.manual_seed(0)
+    network = nn.Linear(4, 5)
+    actor = QValueActor(network, in_keys=["pixels"], action_space=action_space)
+    data = batch().exclude("holding", ("next", "holding"))
+    index = torch.randint(5, (12,))
+    data["action"] = nn.functional.one_hot(index, 5) if action_space == "one_hot" else index
+    loss = LevelDQNLoss(actor, demonstrations="sdqfd", margin=0.3).make_value_estimator(gamma=GAMMA)
+    found = loss(data)
+    with torch.no_grad():
+        q = network(data["pixels"])
+        best = network(data["next", "pixels"]).max(dim=1, keepdim=True).values
+        target = data["next", "reward"] + GAMMA * ~data["next", "terminated"] * best
+        wanted = nn.functional.huber_loss(q.gather(1, index[:, None]), target)
+        margin = strict_large_margin(q, index, data["is_expert"][:, 0], 0.3)
+    torch.testing.assert_close(found["loss_qvalue"], wanted)
+    torch.testing.assert_close(found["demonstration_error"], margin)
+    (found["loss_qvalue"] + found["loss_demonstration"]).backward()
+    assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in loss.parameters())

@@ -376,10 +376,11 @@ def test_refusals():
 
 def test_with_tanh_normal_actor_and_image_networks():
     """The real thing: TorchRL's actor on the plain network, one joint backward pass."""
-    from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
+    from ba_torchrl.modules.base import NETWORKS
+    from tests.specs import actor_critic_spec
 
     torch.manual_seed(0)
-    networks = NETWORKS["cnn"](width=0.1).build(ActorCriticSpec(64, "pxyz"))
+    networks = NETWORKS["cnn"](width=0.1).build(actor_critic_spec(64, "pxyz"))
     observation = [keys.PIXELS, keys.HOLDING]
     actor = ProbabilisticActor(
         TensorDictModule(networks.actor, observation, ["loc", "scale"]),
@@ -415,3 +416,23 @@ def test_with_tanh_normal_actor_and_image_networks():
     acting = dict(actor.named_parameters())
     assert {p.data_ptr() for p in acting.values()} <= {p.data_ptr() for p in loss.parameters()}
     assert actor(data.select(*observation))[keys.ACTION].abs().max() <= 1
+
+
+def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum():
+    data, found = batch(experts=(True,) * 4), {}
+    for reduction in ("none", "mean", "sum"):
+        found[reduction] = make(reduction=reduction)(data.clone())
+    for name in ("loss_actor", "loss_qvalue", "loss_alpha"):
+        losses = found["none"][name]
+        assert losses.shape == (4,)
+        torch.testing.assert_close(found["mean"][name], losses.mean())
+        torch.testing.assert_close(found["sum"][name], losses.sum())
+    assert found["none"]["demonstration_error"].shape == ()
+
+
+def test_in_keys_can_be_set():
+    loss, data = make(demonstration_weight=0.0), batch(weights=None)
+    loss.in_keys = list(reversed(loss.in_keys))
+    by_position = loss(*(data[key] for key in loss.in_keys))
+    by_name = loss(data)["loss_qvalue"]
+    assert torch.equal(by_position[loss.out_keys.index("loss_qvalue")], by_name)

@@ -46,7 +46,7 @@ def test_a_curve_without_a_band_has_none(tmp_path):
     assert count(path, shaded(BLUE), tolerance=3) < 500
 
 
-def test_limits_are_those_of_a_rate_unless_told_otherwise(tmp_path):
+def test_the_limits_are_those_of_a_rate_by_default(tmp_path):
     flat = {"loss": (X, np.full(len(X), 40.0))}
     rate = plot_learning_curve(flat, tmp_path / "rate.png")
     free = plot_learning_curve(flat, tmp_path / "free.png", ylim=None)
@@ -85,7 +85,7 @@ def test_missing_package_names_the_way_out(tmp_path, monkeypatch):
         plot_learning_curve({"a": curve(600)}, tmp_path / "curve.png")
 
 
-def test_leaves_no_global_state(tmp_path):
+def test_plots_leave_no_global_state(tmp_path):
     code = (
         "import sys; from ba_torchrl.record.plots import plot_learning_curve;"
         "assert 'matplotlib' not in sys.modules;"

@@ -144,10 +144,10 @@ def test_benchmarks_are_reported_apart_and_loose_runs_last(tmp_path):
     assert [section.title for section in sections] == ["close_loop_3d", "close_loop_4d", "runs"]
 
 
-def test_the_same_run_twice_is_refused(tmp_path):
+def test_two_runs_of_one_seed_are_refused(tmp_path):
     for name in ("a", "b"):
         leave_run(tmp_path / name, (0, 0, 1))
-    with pytest.raises(ValueError, match=r"twice: .*/a, .*/b"):
+    with pytest.raises(ValueError, match=r"settings and seed: .*/a, .*/b"):
         load_sections([tmp_path])
 
 
@@ -157,11 +157,11 @@ def test_folders_without_results_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no folder .*nowhere"):
         load_sections([tmp_path / "nowhere"])
     (tmp_path / "result.json").write_text('{"format": 2}')
-    with pytest.raises(ValueError, match=r"result\.json is no result"):
+    with pytest.raises(ValueError, match=r"result\.json is not the result"):
         load_sections([tmp_path])
 
 
-def test_a_result_comes_back_as_it_was_written(tmp_path):
+def test_a_result_is_read_as_it_was_written(tmp_path):
     folder = leave_run(tmp_path / "a", (0.25, 0.5, 1.0), seed=3)
     result = read_result(folder)
     assert [point.success_rate for point in result.curve] == [0.25, 0.5, 1.0]
@@ -169,7 +169,7 @@ def test_a_result_comes_back_as_it_was_written(tmp_path):
     assert [path.name for path in folder.iterdir()] == ["result.json"]
 
 
-def test_differences_are_those_in_what_is_learnt():
+def test_differences_ignore_fields_that_do_not_change_learning():
     first = {"env": {"a": 1, "b": [1, 2]}, "seed": 0, "run_dir": "x", "label": "one"}
     second = {"env": {"a": 2, "b": [1, 2], "c": 3}, "seed": 1, "run_dir": "y", "label": "two"}
     assert differences(first, second) == {"env.a": (1, 2), "env.c": (None, 3), "seed": (0, 1)}
@@ -260,7 +260,7 @@ def test_a_report_is_curves_tables_and_a_page(tmp_path):
         assert (np.abs(image - shade).max(-1) <= 3).sum() > 1000
 
 
-def test_one_seed_has_no_shading_and_the_report_says_so(tmp_path):
+def test_one_seed_has_no_shading_and_the_report_states_it(tmp_path):
     leave_run(tmp_path / "runs/a", (0.2, 0.7, 0.9))
     path = write_report([tmp_path / "runs"], tmp_path / "report")
     image = imageio.imread(path.parent / "close_loop_4d.png")[..., :3].astype(int)

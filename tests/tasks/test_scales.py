@@ -14,7 +14,7 @@ SCALED = [task for task in ba_torchrl.list_tasks() if np.ptp(TASKS[task].scale_l
 
 def steps_to_success(task, episodes, **config):
     """Return the expert's steps in each episode, None where it fails."""
-    size = 16 if task.startswith("close_loop") else 128
+    size = 16 if TASKS[task].control == "close_loop" else 128
     env = ba_torchrl.make(task, seed=0, expert=True, obs_size=size, **config)
     steps = []
     for _ in range(episodes):

@@ -11,7 +11,13 @@ import torch
 
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, find_checkpoint, load
+from ba_torchrl.training.checkpoint import (
+    Checkpoints,
+    build_algorithm,
+    find_checkpoint,
+    load,
+    read_config,
+)
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
@@ -40,7 +46,7 @@ def tiny(tmp_path, **changes):
     return ExperimentConfig.parse({**TINY, "run_dir": str(tmp_path / "run"), **changes})
 
 
-def test_a_run_leaves_everything_behind(tmp_path):
+def test_a_run_writes_its_files(tmp_path):
     result = Experiment(tiny(tmp_path), progress=False).run()
     folder = tmp_path / "run"
     assert result.evaluation.episodes == 4
@@ -100,7 +106,7 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
     assert set(a.keys()) == {"pixels", "holding", "action"}
 
 
-def test_a_crash_while_saving_leaves_the_last_checkpoint_whole(tmp_path, monkeypatch):
+def test_a_crash_while_saving_keeps_the_last_checkpoint(tmp_path, monkeypatch):
     config = tiny(tmp_path)
     algorithm = build_algorithm(config)
     checkpoints = Checkpoints(config.folder, algorithm, config.torch_device)
@@ -144,7 +150,7 @@ def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
     assert seeds[0] == seeds[1] != seeds[2]
 
 
-def test_a_missing_checkpoint_says_what_is_needed(tmp_path):
+def test_a_missing_checkpoint_is_explained(tmp_path):
     with pytest.raises(ConfigError, match=r"config\.json and checkpoints"):
         load(tmp_path)
 
@@ -156,7 +162,7 @@ def test_a_missing_checkpoint_says_what_is_needed(tmp_path):
         ({"env": {"obs_sise": 64}}, "Did you mean 'obs_size'"),
         ({"env": {"seed": 3}}, "set by the experiment"),
         ({"env": {"obs_type": "vec"}}, "obs_type"),
-        ({"task": "open_loop/block_stacking"}, "'sac' learns close_loop tasks"),
+        ({"task": "open_loop/block_stacking"}, "SACConfig learns close_loop tasks"),
         ({"algorithm": {"name": "ppo"}}, "unknown algorithm 'ppo'.*sac"),
         ({"algorithm": {"name": "sac", "gama": 0.9}}, "Did you mean 'gamma'"),
         ({"algorithm": {"batch_size": 3}}, "algorithm.name is missing"),
@@ -212,10 +218,13 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
     assert algorithm.updates == 6
 
 
-@pytest.mark.parametrize("view", ["camera_side_rgbd", "camera_center_xy"])
-def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view):
+@pytest.mark.parametrize(
+    ("view", "reason"),
+    [("camera_side_rgbd", "choose another view_type"), ("camera_center_xy", "values from zero")],
+)
+def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view, reason):
     config = tiny(tmp_path, env={**TINY["env"], "view_type": view})
-    with pytest.raises(ConfigError, match=view):
+    with pytest.raises(ConfigError, match=reason):
         Experiment(config, progress=False)
     assert not (tmp_path / "run").exists()
 
@@ -302,4 +311,7 @@ def test_the_recipes_from_the_command_line(tmp_path):
         "evaluate", f"checkpoint={tmp_path}/run", "episodes=3", f"video={gif}", "video_episodes=1"
     )
     assert "over 3 episodes of close_loop/block_reaching" in out
+    config = read_config(tmp_path / "run")
+    assert f"seed {config.derived_seed(SeedUse.TEST)}, none of which training used" in out
+    assert f"update 3, {find_checkpoint(tmp_path / 'run')}" in out
     assert gif.read_bytes().startswith(b"GIF")

@@ -3,11 +3,13 @@ import shutil
 
 import pytest
 import torch
+from torchrl.checkpoint import GlobalRNGState
 
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
-from ba_torchrl.training.checkpoint import find_checkpoint
+from ba_torchrl.training import experiment as experiments
+from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
 from ba_torchrl.training.config import ExperimentConfig, SeedUse
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.resume import check_same_run, resumable_updates
@@ -29,11 +31,15 @@ TINY = {
     "log_every": 1,
     "video_episodes": 0,
 }
-UNIFORM = {**TINY["algorithm"], "prioritized": False}
+UNIFORM = {**TINY["algorithm"], "replay": "uniform"}
 
 
 class Interrupted(BaseException):
     """Not an error that anything would handle."""
+
+
+def raise_interrupted(*_):
+    raise Interrupted
 
 
 def config_for(tmp_path, **changes):
@@ -108,7 +114,7 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
     assert experiment.algorithm.replay_size == demonstrated + 14
     assert resumable_updates(config.folder) is None
     assert not (config.folder / "resume").exists()
-    assert find_checkpoint(config.folder).name.endswith("9")
+    assert find_checkpoint(config.folder, "latest").name.endswith("9")
 
 
 @pytest.mark.parametrize("algorithm", [TINY["algorithm"], UNIFORM], ids=["prioritized", "uniform"])
@@ -128,7 +134,7 @@ def test_learner_replay_priorities_and_generators_come_back_bit_by_bit(tmp_path,
     for key in ("exp_avg", "exp_avg_sq", "step"):
         for index, moments in old.optimizer.state_dict()["state"].items():
             assert torch.equal(new.optimizer.state_dict()["state"][index][key], moments[key])
-    if config.algorithm_config.prioritized:
+    if config.algorithm_config.replay == "prioritized":
         a, b = (algorithm.replay.sampler.state_dict() for algorithm in (old, new))
         assert torch.equal(a["leaves"], b["leaves"])
         assert len(set(a["leaves"][: old.replay_size].tolist())) > 3  # not all of them alike
@@ -140,18 +146,23 @@ def test_learner_replay_priorities_and_generators_come_back_bit_by_bit(tmp_path,
             assert torch.equal(a[key], b[key]), key
     a, b = old.augmentation(old.replay.sample()), new.augmentation(new.replay.sample())
     assert torch.equal(a["action"], b["action"])
-    # what is added next goes where it would have gone
+    # the next transitions are stored at the same places
     more = old.replay.storage[:2].exclude("index").clone()
     assert new.replay.extend(more).tolist() == old.replay.extend(more).tolist()
 
 
-def test_a_resumed_run_collects_other_episodes(tmp_path):
+def test_a_resumed_run_collects_other_episodes(tmp_path, monkeypatch):
     config = config_for(tmp_path)
     interrupt(config, after=4)
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
     seeds = []
-    make = experiment._make_env
-    experiment._make_env = lambda seed, **kwargs: seeds.append(seed) or make(seed, **kwargs)
+    make_env = experiments.make_env
+
+    def recorded(config, seed, **changes):
+        seeds.append(seed)
+        return make_env(config, seed, **changes)
+
+    monkeypatch.setattr(experiments, "make_env", recorded)
     experiment.run()
     assert config.derived_seed(SeedUse.COLLECTION) not in seeds
     assert config.derived_seed(SeedUse.COLLECTION, 3) in seeds
@@ -159,7 +170,7 @@ def test_a_resumed_run_collects_other_episodes(tmp_path):
     assert config.derived_seed(SeedUse.COLLECTION, 0) == config.derived_seed(SeedUse.COLLECTION)
 
 
-def test_a_crash_while_saving_leaves_the_last_state_whole(tmp_path):
+def test_a_crash_while_saving_keeps_the_last_state(tmp_path):
     config = config_for(tmp_path)
     experiment = Experiment(config, progress=False)
     save = experiment.algorithm.save_replay
@@ -181,7 +192,7 @@ def test_a_crash_while_saving_leaves_the_last_state_whole(tmp_path):
     assert [path.name for path in (config.folder / "resume").iterdir()] == [state.name]
 
 
-def test_a_checkpoint_that_was_not_written_any_more_is_written(tmp_path):
+def test_a_checkpoint_missing_after_an_interruption_is_written(tmp_path):
     config = config_for(tmp_path)
     interrupt_between_state_and_checkpoint(config)
     assert not (config.folder / "checkpoints").exists()
@@ -189,10 +200,10 @@ def test_a_checkpoint_that_was_not_written_any_more_is_written(tmp_path):
     assert find_checkpoint(config.folder).name.endswith("3")
 
 
-def test_an_interruption_of_the_last_evaluation_repeats_no_update(tmp_path, monkeypatch):
+def test_an_interruption_after_the_last_evaluation_repeats_no_update(tmp_path, monkeypatch):
     config = config_for(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(Experiment, "_plot", lambda self: (_ for _ in ()).throw(Interrupted()))
+        patch.setattr(experiments, "plot_curve", raise_interrupted)
         with pytest.raises(Interrupted):
             run(config)
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
@@ -203,15 +214,15 @@ def test_an_interruption_of_the_last_evaluation_repeats_no_update(tmp_path, monk
     assert result.resumed_at == [9]
 
 
-def test_what_was_interrupted_before_its_first_evaluation_starts_anew(tmp_path, caplog):
+def test_a_run_interrupted_before_its_first_evaluation_starts_again(tmp_path, caplog):
     interrupt(config_for(tmp_path), after=2)
     result = run(config_for(tmp_path, resume=True))
-    assert "has not been evaluated yet" in caplog.text
+    assert "has no evaluation yet" in caplog.text
     assert result.updates == 9
     assert read_result(result.record.parent).resumed_at == []
 
 
-def test_nothing_to_resume_starts_a_run_and_says_so(tmp_path, caplog):
+def test_without_a_run_to_resume_a_new_one_starts_with_a_warning(tmp_path, caplog):
     assert run(config_for(tmp_path, resume=True, total_updates=3)).updates == 3
     assert "no run to resume" in caplog.text
 
@@ -262,10 +273,43 @@ def test_how_and_where_it_runs_may_change(tmp_path):
     assert run(other).updates == 9
 
 
-def test_a_folder_with_a_run_is_not_written_over(tmp_path):
+def pretend_cuda(folder):
+    """Let the files of an interrupted run say that its learner was on a GPU."""
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "device": "cuda"}))
+    schemas = list((folder / "resume").rglob("state.json"))
+    text = [schema.read_text() for schema in schemas]
+    assert any('"device":"cpu"' in content for content in text)
+    for schema, content in zip(schemas, text, strict=True):
+        schema.write_text(content.replace('"device":"cpu"', '"device":"cuda:0"'))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a machine without a GPU")
+def test_a_run_begun_on_cuda_resumes_on_a_cpu(tmp_path, monkeypatch, caplog):
+    config = config_for(tmp_path)
+    state_dict = GlobalRNGState.state_dict
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            GlobalRNGState,
+            "state_dict",
+            lambda self: {**state_dict(self), "torch_cuda": [torch.zeros(16, dtype=torch.uint8)]},
+        )
+        interrupt(config, after=5)
+    pretend_cuda(config.folder)
+    with pytest.raises(ConfigError, match="device: use device=cpu"):
+        read_config(config.folder)
+    result = run(config_for(tmp_path, resume=True, device="cpu"))
+    assert result.updates == 9
+    assert read_result(config.folder).resumed_at == [3]
+    assert "torch_cuda not restored" in caplog.text
+    _, algorithm = load(config.folder, "latest")
+    assert {parameter.device.type for parameter in algorithm.loss.parameters()} == {"cpu"}
+
+
+def test_a_folder_with_a_run_is_not_overwritten(tmp_path):
     config = config_for(tmp_path)
     interrupt(config, after=4)
-    with pytest.raises(ConfigError, match="resume=true goes on"):
+    with pytest.raises(ConfigError, match="resume=true continues"):
         Experiment(config, progress=False)
     run(config_for(tmp_path, resume=True))
     before = (config.folder / "result.json").read_bytes()
@@ -275,7 +319,7 @@ def test_a_folder_with_a_run_is_not_written_over(tmp_path):
     assert (config.folder / "result.json").read_bytes() == before
 
 
-def test_checkpoints_without_a_state_are_not_written_over(tmp_path):
+def test_checkpoints_without_a_state_are_not_overwritten(tmp_path):
     config = config_for(tmp_path)
     interrupt(config, after=4)
     shutil.rmtree(config.folder / "resume")
@@ -283,7 +327,7 @@ def test_checkpoints_without_a_state_are_not_written_over(tmp_path):
         Experiment(config_for(tmp_path, resume=True), progress=False)
 
 
-def test_the_result_tells_the_whole_run(tmp_path):
+def test_the_result_holds_the_whole_run(tmp_path):
     config = config_for(tmp_path, video_episodes=1, benchmark="some", label="sac cnn", seed=3)
     result = run(config)
     values = json.loads((config.folder / "result.json").read_text())

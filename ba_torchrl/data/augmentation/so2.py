@@ -1,8 +1,9 @@
-"""Rotation of sampled transitions, for algorithms that learn from turned copies."""
+"""Rotation of sampled transitions about the vertical (appendix G.2)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 
 import torch
 import torch.nn.functional as F
@@ -10,8 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from ba_torchrl.envs import keys
-
-_NEXT_PIXELS = (keys.NEXT, keys.PIXELS)
+from ba_torchrl.envs.images import ImageSpec
 
 
 def quarters_and_rotation(angle_rad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -30,43 +30,43 @@ def quarters_and_rotation(angle_rad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def rotate_images(images: Tensor, angle_rad: Tensor) -> Tensor:
-    """Return images turned about their centres as the world turns about z.
+    """Return images rotated about their centres as the scene rotates about z.
 
-    A quarter turn is ``torch.rot90(k=1)`` and exact; between, bilinear, and what comes in from
-    outside repeats the border.
+    A quarter turn is ``torch.rot90(k=1)`` and exact; other angles are bilinear, and pixels from
+    outside of the image repeat its border.
 
     Args:
         images: [B, C, H, H], rows along +x, columns along +y.
         angle_rad: [B] float64 on the CPU, radians.
     """
     quarters, cos, sin = quarters_and_rotation(angle_rad)
-    # Where an output pixel comes from, in (column, row): the inverse rotation.
+    # Source of an output pixel in (column, row): the inverse rotation.
     zero = torch.zeros_like(cos)
     rows = [torch.stack([cos, -sin, zero], dim=-1), torch.stack([sin, cos, zero], dim=-1)]
     source = torch.stack(rows, dim=1).to(images)
     grid = F.affine_grid(source, list(images.shape), align_corners=False)
-    turned = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
-    exact_quarters(turned, images, quarters)
-    return turned
+    rotated = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    copy_exact_quarters(rotated, images, quarters)
+    return rotated
 
 
-def exact_quarters(turned: Tensor, images: Tensor, quarters: Tensor) -> None:
-    """Overwrite images that were turned by whole quarters with exact copies.
+def copy_exact_quarters(rotated: Tensor, images: Tensor, quarters: Tensor) -> None:
+    """Overwrite images that were rotated by whole quarter turns with exact copies.
 
     Args:
-        turned: [B, C, H, H], changed in place.
-        images: before they were turned.
+        rotated: [B, C, H, H], changed in place.
+        images: before the rotation.
         quarters: int64 [B] on the CPU; -1 leaves an image as it is.
     """
     for k in sorted(set(quarters.tolist()) - {-1}):
         exact = (quarters == k).nonzero().squeeze(-1).to(images.device)
-        turned[exact] = torch.rot90(images[exact], k, (-2, -1))
+        rotated[exact] = torch.rot90(images[exact], k, (-2, -1))
 
 
 def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
-    """Return (dx, dy) turned about z, shortened to the edge of [-1, 1]^2 where it leaves the box.
+    """Return (dx, dy) rotated about z and, outside of [-1, 1]^2, shortened to its edge.
 
-    The direction is kept, which clipping each component would not do.
+    The direction is kept, unlike with clipped components.
 
     Args:
         displacement: [B, 2].
@@ -79,38 +79,82 @@ def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
     return turned / turned.abs().amax(dim=-1, keepdim=True).clamp_min(1)
 
 
-class SO2Augmentation(nn.Module):
-    """Turns image, next image and (dx, dy) of sampled transitions by one random angle each.
-
-    It stands for the turned copies that the reference stores beside each transition (appendix
-    G.2, "augmentation buffer"): four copies and the original are a probability of 0.8. Gripper,
-    z and yaw components are unchanged. Call it again for another view.
+def map_pairs(
+    tensordict: TensorDictBase, key: str, rows: Tensor, transform: Callable[[Tensor], Tensor]
+) -> None:
+    """Transform an image and its successor in some rows of a batch, both by one call.
 
     Args:
-        action_sequence: one letter per action component; x and y are turned.
-        seed: of the module's own draws.
-        probability: of turning a transition.
+        tensordict: batch [B]; gets new tensors under ``key`` and ("next", ``key``).
+        key: of the image.
+        rows: int64 [R], on the batch's device.
+        transform: from [R, 2 C, H, W], both images as channels of one, to the same shape.
+    """
+    image = tensordict[key]
+    images = torch.cat([image, tensordict[keys.NEXT, key]], dim=1)
+    images[rows] = transform(images[rows])
+    first, second = images.split(image.shape[1], dim=1)
+    tensordict.set(key, first.contiguous()).set((keys.NEXT, key), second.contiguous())
+
+
+def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
+    """Refuse images for which no transformation is defined.
 
     Raises:
-        ValueError: the probability is outside [0, 1], or x or y is missing.
+        ValueError: an image has a camera's axes.
+    """
+    unknown = [key for key, image in images.items() if image.frame == "camera"]
+    if unknown:
+        raise ValueError(
+            f"augmentation: {', '.join(unknown)} comes from a camera that does not move with the "
+            "scene and cannot be transformed; use augmentation 'none'"
+        )
+
+
+class SO2Augmentation(nn.Module):
+    """Rotates images, next images and (dx, dy) of sampled transitions, each by a random angle.
+
+    It replaces the rotated copies that the reference stores beside each transition (appendix G.2,
+    "augmentation buffer"): four copies and the original are a probability of 0.8. The gripper, z
+    and yaw components are unchanged, and so are images in the gripper's axes. Another call on the
+    same batch gives another view.
+
+    Args:
+        images: declarations of the images by key.
+        action_sequence: one letter per action component; x and y are rotated.
+        seed: of the module's own draws.
+        probability: of rotating a transition.
+
+    Raises:
+        ValueError: the probability is outside [0, 1], x or y is missing, or an image cannot be
+            rotated.
     """
 
-    def __init__(self, action_sequence: str, *, seed: int, probability: float = 0.8) -> None:
+    def __init__(
+        self,
+        images: Mapping[str, ImageSpec],
+        action_sequence: str,
+        *,
+        seed: int,
+        probability: float = 0.8,
+    ) -> None:
         super().__init__()
         if not 0 <= probability <= 1:
             raise ValueError(f"probability must be in [0, 1], got {probability}")
         if not {"x", "y"} <= set(action_sequence):
-            raise ValueError(f"nothing to turn in the action {action_sequence!r}: no x and y")
+            raise ValueError(f"the action {action_sequence!r} has no x and y to rotate")
+        require_known_frames(images)
         self.probability = probability
+        self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
         self._plane = [action_sequence.index("x"), action_sequence.index("y")]
-        # On the CPU whatever the batch's device: the same seed turns the same way everywhere.
+        # On the CPU for any device of the batch, so that a seed gives the same angles on all.
         self._generator = torch.Generator().manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return a batch of transitions [B] with some turned; the input is not changed.
+        """Return a batch of transitions [B] with some rotated; the input is not changed.
 
         Args:
-            tensordict: holds ``pixels``, ("next", "pixels") and ``action``.
+            tensordict: holds the images, their successors and ``action``.
         """
         (batch,) = tensordict.batch_size
         draws = torch.rand(2, batch, generator=self._generator, dtype=torch.float64)
@@ -119,14 +163,10 @@ class SO2Augmentation(nn.Module):
         out = tensordict.copy()
         if not len(chosen):
             return out
-        pixels, action = tensordict[keys.PIXELS], tensordict[keys.ACTION]
-        index = chosen.to(pixels.device)
-        # Both images as channels of one: they share the grid.
-        images = torch.cat([pixels, tensordict[_NEXT_PIXELS]], dim=1)
-        images[index] = rotate_images(images[index], angle)
-        first, second = images.split(pixels.shape[1], dim=1)
-        out.set(keys.PIXELS, first.contiguous()).set(_NEXT_PIXELS, second.contiguous())
-        action = action.clone()
+        action = tensordict[keys.ACTION].clone()
+        index = chosen.to(action.device)
+        for key in self._scene_images:
+            map_pairs(out, key, index, lambda images: rotate_images(images, angle))
         rows = index[:, None]
         plane = torch.tensor(self._plane, device=action.device)
         action[rows, plane] = rotate_displacement(action[rows, plane], angle)
@@ -137,5 +177,5 @@ class SO2Augmentation(nn.Module):
         return self._generator.get_state()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Take over what ``get_extra_state`` returned."""
+        """Restore the generator's state, from any device."""
         self._generator.set_state(state.cpu())

@@ -16,6 +16,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
 from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.frames import FrameTable
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError
 
@@ -24,30 +25,30 @@ _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))
 
 
 class FrameStorage(LazyTensorStorage):
-    """A TorchRL storage that keeps each image once, whether a step's own or its next one.
+    """A TorchRL storage that keeps each image once, as a step's observation and as its next one.
 
-    Everything else lies in ordinary columns. Images go in and come out as float32 metres, within
-    the codec's error; in between they are its bytes, compressed without loss.
+    All other entries are ordinary columns. Images are stored as their codec's codes, compressed
+    without loss, and come out within the codec's error.
 
     Args:
         max_size: number of transitions.
-        codecs: how each kind of image is stored, by its key, such as ``pixels``; the key nested in
-            "next" goes with it.
+        codecs: codec of each image by its key, such as ``pixels``; also of the image of the same
+            key in "next".
 
     Raises:
-        ValueError: there is no kind of image.
+        ValueError: there is no image.
     """
 
     def __init__(self, max_size: int, codecs: Mapping[str, ImageCodec]) -> None:
         super().__init__(max_size, device="cpu")
         if not codecs:
-            raise ValueError("codecs names no image")
+            raise ValueError("codecs is empty: there is no image to store")
         self.codecs = dict(codecs)
         self.frame_keys: list[NestedKey] = [
             nested for key in codecs for nested in (key, (keys.NEXT, key))
         ]
         self._frames: dict[str, FrameTable] = {}
-        # Slots of (image, next image) of each kind and transition, -1 where none is stored yet.
+        # Slots of (image, next image) by key and transition, -1 where none is stored yet.
         self._slots = torch.full((len(codecs), self.max_size, 2), -1, dtype=torch.int32)
 
     def set(
@@ -60,15 +61,15 @@ class FrameStorage(LazyTensorStorage):
         """Store transitions.
 
         Args:
-            cursor: their places.
+            cursor: their indices.
             data: one transition for an int, else a batch of them.
-            set_cursor: whether this is the writer, which moves the end of the storage.
+            set_cursor: whether the storage's length grows with them, as for a writer.
         """
         if isinstance(cursor, int) or (isinstance(cursor, Tensor) and not cursor.ndim):
             cursor, data = [int(cursor)], data.unsqueeze(0)
         places = torch.arange(self.max_size)[cursor] if isinstance(cursor, slice) else cursor
         places = torch.as_tensor(places, dtype=torch.long)
-        if len(places) > self.max_size:  # each place once, with the latest
+        if len(places) > self.max_size:  # each index once, with the last
             places, data = places[-self.max_size :], data[-self.max_size :]
         super().set(places, data.exclude(*self.frame_keys), set_cursor=set_cursor)
         for number, (key, codec) in enumerate(self.codecs.items()):
@@ -83,10 +84,10 @@ class FrameStorage(LazyTensorStorage):
     ) -> None:
         slots = slots.numpy()
         for row, place in enumerate(places.tolist()):
-            # One by one: a single image is too small for torch to wake its threads, which costs
-            # milliseconds where environments keep the cores busy.
+            # One by one: a single image is too small for torch to start its threads, which costs
+            # milliseconds while environments keep the cores busy.
             codes = [codec.encode(image[row]).flatten().numpy() for image in images]
-            # Acquired before released, so that a frame in both stays.
+            # Acquired before the old ones are released, so that a frame in both stays.
             new = [frames.acquire(code) for code in codes]
             for slot in slots[place].tolist():
                 if slot >= 0:
@@ -94,12 +95,12 @@ class FrameStorage(LazyTensorStorage):
             slots[place] = new
 
     def get(self, index: int | Sequence[int] | slice | Tensor) -> TensorDictBase:
-        """Return transitions with float32 images, metres.
+        """Return transitions, images decoded.
 
-        A slice over the whole storage decodes every image; ``column`` reads an entry without.
+        A slice over the whole storage decodes every image; ``column`` decodes none.
 
         Args:
-            index: places.
+            index: which.
         """
         data = super().get(index).copy()
         for number, (key, codec) in enumerate(self.codecs.items()):
@@ -123,16 +124,17 @@ class FrameStorage(LazyTensorStorage):
         return self._storage[key][: len(self)]
 
     @property
-    def image_shapes(self) -> dict[str, torch.Size]:
-        """Shape of each kind of image, once one is stored."""
-        return {
-            key: self.codecs[key].decode(torch.zeros(table.shape, dtype=torch.uint8)).shape
+    def image_types(self) -> dict[str, tuple[torch.dtype, torch.Size]]:
+        """Type and shape of each image by key, once one is stored."""
+        decoded = {
+            key: self.codecs[key].decode(torch.zeros(table.shape, dtype=torch.uint8))
             for key, table in self._frames.items()
         }
+        return {key: (image.dtype, image.shape) for key, image in decoded.items()}
 
     @property
     def frame_count(self) -> int:
-        """Number of different frames held, of all kinds together."""
+        """Number of different frames held, of all keys together."""
         return sum(len(frames) for frames in self._frames.values())
 
     @property
@@ -153,7 +155,7 @@ class FrameStorage(LazyTensorStorage):
             frames.clear()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return columns, frames and their assignment; views, to be saved and not changed."""
+        """Return columns, frames and their assignment; they are views and must not be changed."""
         if not self.initialized:
             return {"size": 0}
         size = len(self)
@@ -177,13 +179,13 @@ class FrameStorage(LazyTensorStorage):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over what ``state_dict`` returned.
+        """Restore the columns and frames of a ``state_dict``.
 
         Args:
             state_dict: of a storage with at most this one's capacity.
 
         Raises:
-            ValueError: it holds more transitions than fit, or other kinds of images.
+            ValueError: it holds more transitions than fit, or other images.
         """
         size = state_dict["size"]
         if size > self.max_size:
@@ -222,12 +224,13 @@ class FrameStorage(LazyTensorStorage):
 
 
 class FrameReplayBuffer(TensorDictReplayBuffer):
-    """TorchRL's buffer on a :class:`FrameStorage`, with two checks on what enters.
+    """TorchRL's buffer on a `FrameStorage`, which checks transitions and keeps demonstrations.
 
     The first transitions fix the entries, types and shapes; later ones must have the same, since
     TorchRL would keep stale values where one is missing. Transitions whose ``fault`` flag is set
-    are left out and counted in ``faults_dropped``; the flag itself is not stored. What the caller
-    hands in is not changed.
+    are left out and counted in ``faults_dropped``; the flag itself is not stored. Once the buffer
+    is full, new transitions overwrite the oldest ones that are no demonstrations. The input is not
+    changed.
 
     Args:
         storage: the frame storage.
@@ -247,6 +250,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
         super().__init__(
             storage=storage,
             sampler=sampler,
+            writer=ExpertKeepingWriter(),
             batch_size=batch_size,
             generator=generator,
             priority_key=keys.TD_ERROR,
@@ -260,7 +264,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             data: a transition without batch shape.
 
         Returns:
-            Its place [1], or nothing [0] for a fault.
+            Its index [1], or an empty tensor [0] for a fault.
 
         Raises:
             ReplaySchemaError: entries, types or shapes are not those of the stored ones.
@@ -275,10 +279,11 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             update_priority: see TorchRL.
 
         Returns:
-            Their places, int64 [M], M <= N.
+            Indices of those that were stored, int64 [M], M <= N.
 
         Raises:
             ReplaySchemaError: entries, types or shapes are not those of the stored ones.
+            ConfigError: demonstrations leave no room for these transitions.
         """
         if tensordicts.ndim != 1:
             raise ReplaySchemaError(
@@ -294,6 +299,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             data = data[sound]
         if not len(data):
             return torch.zeros(0, dtype=torch.long)
+        data = self.writer.fitting(data)
         return super().extend(data, update_priority=update_priority)
 
     def _check_schema(self, data: TensorDictBase) -> None:
@@ -326,8 +332,8 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             for key, value in storage._storage.items(True, True)
             if key != _INDEX
         }
-        for key, shape in storage.image_shapes.items():
-            schema |= dict.fromkeys((key, (keys.NEXT, key)), (torch.float32, shape))
+        for key, image_type in storage.image_types.items():
+            schema |= dict.fromkeys((key, (keys.NEXT, key)), image_type)
         return schema
 
 
@@ -346,16 +352,16 @@ def make_replay_buffer(
     weight_exponent: float = 0.4,
     expert_bonus: float = 1.0,
 ) -> FrameReplayBuffer:
-    """Return an empty replay whose samples hold float32 images in metres (appendix G.2).
+    """Return an empty replay from which transitions are drawn uniformly or by priority (G.2).
 
     Args:
         capacity: number of transitions.
         batch_size: of a sample; None where every call gives it.
-        codecs: how each kind of image is stored, by key; the acting policy must use the same.
+        codecs: codec of each image by key; the acting policy must use the same.
         seed: of the draws.
-        prioritized: by TD error with the experts' bonus, else uniformly.
+        prioritized: draw by TD error with the bonus of demonstrations, else uniformly.
         priority_exponent: alpha.
-        weight_exponent: beta at the start of the run; ``buffer.sampler.anneal`` moves it.
+        weight_exponent: beta at the start of the run; ``buffer.sampler.anneal`` raises it.
         expert_bonus: added to the priority of demonstrations.
     """
     generator = torch.Generator().manual_seed(seed)

@@ -1,31 +1,90 @@
-"""How the replay stores images, and what the acting policy must therefore see."""
+"""Codecs: how the replay stores images, applied to what the acting policy sees, too."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
+from ba_torchrl.envs.images import ImageSpec
+
 
 class ImageCodec(Protocol):
-    """Between images in metres and the bytes that stand for them; equal images, equal bytes."""
+    """Maps images to uint8 codes and back; equal images have equal codes.
+
+    As a module it encodes and decodes, so that a policy sees what the replay returns.
+    """
 
     def encode(self, image: Tensor) -> Tensor:
         """Return uint8 codes; leading dimensions stay as they are."""
         ...
 
     def decode(self, codes: Tensor) -> Tensor:
-        """Return float32 images of codes."""
+        """Return the images of codes."""
         ...
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Return the image that is stored for this one, in its type."""
+        ...
+
+
+def make_codecs(images: Mapping[str, ImageSpec]) -> dict[str, ImageCodec]:
+    """Return the codec of each image that its declaration asks for, by key.
+
+    Args:
+        images: declarations by key.
+
+    Raises:
+        ValueError: an image has values that its storage cannot hold.
+    """
+    return {key: _make_codec(key, image) for key, image in images.items()}
+
+
+def _make_codec(key: str, image: ImageSpec) -> ImageCodec:
+    if image.storage == "exact":
+        if image.dtype != torch.uint8:
+            raise ValueError(
+                f"image {key!r}: storage 'exact' takes uint8 images, not {image.dtype}"
+            )
+        return Uint8Images()
+    if image.storage == "float16":
+        return HalfPrecision(image.high)
+    if image.low < 0:
+        raise ValueError(
+            f"image {key!r}: storage 'uint8' takes values from zero, not from {image.low:g}"
+        )
+    return DepthQuantizer(image.high)
+
+
+class Uint8Images(nn.Module):
+    """Images that are uint8 already, stored as they are."""
+
+    def encode(self, image: Tensor) -> Tensor:
+        """Return the image.
+
+        Raises:
+            TypeError: the image is not uint8.
+        """
+        if image.dtype != torch.uint8:
+            raise TypeError(f"the image must be uint8, got {image.dtype}")
+        return image.contiguous()
+
+    def decode(self, codes: Tensor) -> Tensor:
+        """Return the codes, which are the image."""
+        return codes
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Return the image."""
+        return image
 
 
 class DepthQuantizer(nn.Module):
     """Depth images as uint8, in 255 equal steps over [0, high_m].
 
-    As a module it quantises and restores: put it before an acting policy, so that it sees what
-    the learner sees. Depth outside the range is clipped; zero, the fingers' value, is exact.
+    Depth outside the range is clipped; zero, the value of the fingers, is exact.
 
     Args:
         high_m: largest depth, metres.
@@ -80,10 +139,7 @@ class DepthQuantizer(nn.Module):
 
 
 class HalfPrecision(nn.Module):
-    """Heights as float16: two bytes each, exact to a 2048th of the height.
-
-    As a module it rounds and restores: put it before an acting policy, so that it sees what the
-    learner sees.
+    """Heights as float16: two bytes each, with an error of at most a 2048th of the height.
 
     Args:
         high_m: largest height, metres.

@@ -1,4 +1,4 @@
-"""A table of compressed images that keeps equal ones once."""
+"""A table of compressed images, in which equal images are stored once."""
 
 from __future__ import annotations
 
@@ -11,18 +11,16 @@ import torch
 from torch import Tensor
 
 _LEVEL = 1
-"""Of zlib. Rendered depth shrinks fifty-fold; higher levels take longer for little more."""
+"""Of zlib. Rendered depth becomes fifty times smaller; higher levels are slower and gain little."""
 _BYTES_PER_FRAME = 100
-"""Of slot, count and index entry in CPython, beside the frame itself."""
+"""Of slot, count and index entry in CPython, without the frame itself."""
 
 
 class FrameTable:
-    """Reference-counted uint8 frames, compressed, found again by their content.
+    """Reference-counted uint8 frames, compressed and indexed by their content.
 
-    A frame is shared whenever an equal one is held: a step's next image with the following step's
-    image, whatever the order in which environments, demonstrations and resets are interleaved.
-    Nothing is assumed about neighbouring transitions, nor about the images: those that do not
-    compress take as much as they would uncompressed.
+    Equal frames share a slot: a step's next image and the following step's image, in any order of
+    environments, demonstrations and resets. Frames that do not compress take their full size.
 
     Args:
         shape: of one frame.
@@ -33,7 +31,7 @@ class FrameTable:
         self.clear()
 
     def clear(self) -> None:
-        """Forget every frame."""
+        """Remove every frame."""
         self._packed: list[bytes] = []  # by slot; empty where free
         self._counts: list[int] = []
         self._free: list[int] = []
@@ -46,11 +44,11 @@ class FrameTable:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory in use, that of Python's objects included."""
+        """Bytes of memory in use, including Python's objects."""
         return self._packed_bytes + _BYTES_PER_FRAME * len(self._packed)
 
     def acquire(self, frame: np.ndarray) -> int:
-        """Return the slot of a frame, stored now if none equal is held, counted once more.
+        """Return the slot of a frame and count one more use; the frame is stored if it is new.
 
         Args:
             frame: uint8 of one frame's size, flat and contiguous.
@@ -72,7 +70,7 @@ class FrameTable:
         return slot
 
     def release(self, slot: int) -> None:
-        """Count a use of a slot less, and free it after the last one."""
+        """Count one use of a slot less; without uses it becomes free."""
         self._counts[slot] -= 1
         if self._counts[slot] == 0:
             packed, self._packed[slot] = self._packed[slot], b""
@@ -89,7 +87,7 @@ class FrameTable:
         return torch.from_numpy(frames).reshape(*slots.shape, *self.shape)
 
     def dump(self) -> tuple[Tensor, Tensor]:
-        """Return the compressed frames of all slots, one after the other, and their sizes.
+        """Return the compressed frames of all slots, concatenated, and their sizes.
 
         Returns:
             uint8 [bytes] and int64 [slots]; a free slot has size 0.
@@ -98,7 +96,7 @@ class FrameTable:
         return torch.from_numpy(packed), torch.tensor([len(p) for p in self._packed])
 
     def load(self, packed: Tensor, sizes: Tensor, uses: Iterable[int]) -> None:
-        """Take over frames that ``dump`` returned.
+        """Restore frames that ``dump`` returned.
 
         Args:
             packed: uint8 [bytes].

@@ -29,10 +29,10 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
     largest.
 
     Args:
-        max_capacity: number of transitions of the storage.
+        max_capacity: number of transitions of the storage, over all its dimensions.
         generator: source of every draw.
         alpha: exponent of the priorities.
-        beta: exponent of the weights at the start of a run; ``anneal`` takes it to one.
+        beta: exponent of the weights at the start of a run; ``anneal`` raises it to one.
         eps: added to every priority.
         expert_bonus: added to the priority of demonstrations.
         expert_key: entry that flags them.
@@ -68,17 +68,22 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         """Set beta between its first value and one.
 
         Args:
-            fraction: how much of the run is over; clipped to [0, 1].
+            fraction: of the run that is over; clipped to [0, 1].
         """
         fraction = min(max(fraction, 0.0), 1.0)
         self.beta = self._initial_beta + (1.0 - self._initial_beta) * fraction
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
+    def sample(
+        self, storage: Storage, batch_size: int
+    ) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Tensor]]:
         """Return ``batch_size`` indices drawn by priority, and their ``priority_weight`` [B].
 
         Args:
-            storage: what is sampled.
+            storage: the storage that is sampled.
             batch_size: number of draws, with replacement.
+
+        Returns:
+            Indices [B], or for a storage of several dimensions a tuple of them; and the weights.
 
         Raises:
             RuntimeError: the storage is empty.
@@ -91,12 +96,13 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass)).long()
         index = index.clamp_max(count - 1)  # rounding of the total
         leaf = torch.as_tensor(self._sum_tree[index])
-        return index, {"priority_weight": (leaf / smallest).pow(-self.beta).float()}
+        weights = {"priority_weight": (leaf / smallest).pow(-self.beta).float()}
+        return (torch.unravel_index(index, storage.shape) if storage.ndim > 1 else index), weights
 
     @torch.no_grad()
     def update_priority(
         self,
-        index: int | Tensor,
+        index: int | Tensor | tuple[Tensor, ...],
         priority: float | Tensor,
         *,
         storage: Storage | None = None,
@@ -104,14 +110,15 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         """Set the priorities of some transitions.
 
         Args:
-            index: their places in the storage.
+            index: of the transitions: [N], or for a storage of several dimensions [N, ndim] or a
+                tuple of tensors [N].
             priority: absolute TD error of each, or one for all; without the bonus.
             storage: holds the expert flags; TorchRL's buffers pass it.
 
         Raises:
             ValueError: a priority is not finite, or the storage is needed and missing.
         """
-        index = torch.as_tensor(index, dtype=torch.long).cpu().reshape(-1)
+        index = _flat_index(index, storage)
         if not index.numel():
             return
         error = torch.as_tensor(priority, dtype=self.dtype).detach().cpu().reshape(-1).abs()
@@ -133,7 +140,8 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         if hasattr(storage, "column"):  # does not decode images
             flags = storage.column(self.expert_key)[index]
         else:
-            flags = storage[index][self.expert_key]
+            place = torch.unravel_index(index, storage.shape) if storage.ndim > 1 else index
+            flags = storage[place][self.expert_key]
         return self.expert_bonus * flags.reshape(-1).to(self.dtype)
 
     def state_dict(self) -> dict[str, Any]:
@@ -147,7 +155,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over what ``state_dict`` returned.
+        """Restore priorities, exponents and the generator, from any device.
 
         Args:
             state_dict: of a sampler of the same capacity.
@@ -178,3 +186,15 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
     def loads(self, path: str | Path) -> None:
         """Read the state from a folder that ``dumps`` wrote."""
         self.load_state_dict(torch.load(Path(path) / _FILE, weights_only=True))
+
+
+def _flat_index(index: int | Tensor | tuple[Tensor, ...], storage: Storage | None) -> Tensor:
+    """Return indices into the flattened storage, int64 [N] on the CPU."""
+    if storage is not None and storage.ndim > 1:
+        if not isinstance(index, tuple):
+            index = torch.as_tensor(index).reshape(-1, storage.ndim).unbind(-1)
+        flat = torch.zeros((), dtype=torch.long)
+        for part, size in zip(index, storage.shape, strict=True):
+            flat = flat * size + torch.as_tensor(part, dtype=torch.long).cpu()
+        return flat.reshape(-1)
+    return torch.as_tensor(index, dtype=torch.long).cpu().reshape(-1)

@@ -1,66 +1,80 @@
-"""A replay of two halves: demonstrations, which stay, and what the policy has met."""
+"""Symmetric sampling: half of every batch from demonstrations, half from online transitions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.data import ReplayBufferEnsemble
 
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer, make_replay_buffer
 from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 
-_SIDES = ("expert", "online")
+_NAMES = ("expert", "online")
 
 
-class SymmetricReplay:
+class SymmetricReplay(ReplayBufferEnsemble):
     """Half of every batch from demonstrations, half from online transitions (appendix G.1).
 
-    Demonstrations are never overwritten. While one side is empty, the other fills the batch; an
-    odd transition comes from the demonstrations. TorchRL's ``OfflineToOnlineReplayBuffer`` splits
-    likewise, but draws the online half from the global generator, so that no seed repeats it.
+    Demonstrations are never overwritten. While one buffer is empty, the other fills the batch; an
+    odd transition comes from the demonstrations. TorchRL's ensemble and its
+    ``OfflineToOnlineReplayBuffer`` draw from a generator that both buffers share, or from the
+    global one, and only even batches; here each buffer has a generator of its own.
 
     Args:
         capacity: number of online transitions, and of demonstrations.
         batch_size: of a sample.
-        codecs: how each kind of image is stored, by key; the acting policy must use the same.
+        codecs: codec of each image by key; the acting policy must use the same.
         seed: of the draws.
     """
 
     def __init__(
         self, capacity: int, batch_size: int, *, codecs: Mapping[str, ImageCodec], seed: int
     ) -> None:
-        self.batch_size = batch_size
         self.expert, self.online = (
             make_replay_buffer(capacity, None, codecs=codecs, seed=2 * seed + i, prioritized=False)
-            for i, _ in enumerate(_SIDES)
+            for i, _ in enumerate(_NAMES)
         )
+        super().__init__(self.expert, self.online, batch_size=batch_size, collate_fn=torch.cat)
+        for buffer in (self.expert, self.online):
+            buffer.set_rng(buffer._rng)  # the ensemble has given its own to the samplers
 
     def __len__(self) -> int:
-        """Number of transitions of both sides."""
+        """Number of transitions in both buffers."""
         return len(self.expert) + len(self.online)
 
-    def extend(self, transitions: TensorDictBase) -> None:
-        """Add transitions [N], each on the side that ``is_expert`` says.
+    def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> None:
+        """Add transitions [N], each to the buffer that its ``is_expert`` flag names.
+
+        Args:
+            data: transitions.
+            update_priority: see TorchRL; the buffers have no priorities.
 
         Raises:
-            ValueError: there is no room for more demonstrations.
+            ConfigError: there is no room for more demonstrations.
             ReplaySchemaError: entries, types or shapes are not those of the stored ones.
         """
-        is_expert = transitions[keys.IS_EXPERT].reshape(-1)
+        is_expert = data[keys.IS_EXPERT].reshape(-1)
         room = self.expert.storage.max_size - len(self.expert)
         if int(is_expert.sum()) > room:
-            raise ValueError(
+            raise ConfigError(
                 f"{int(is_expert.sum())} more demonstrations do not fit: {room} places of "
                 f"{self.expert.storage.max_size} are left; raise buffer_size"
             )
         for buffer, chosen in ((self.expert, is_expert), (self.online, ~is_expert)):
             if chosen.any():
-                buffer.extend(transitions[chosen])
+                buffer.extend(data[chosen])
 
-    def sample(self) -> TensorDictBase:
+    def add(self, data: TensorDictBase) -> None:
+        """Add one transition."""
+        self.extend(data.unsqueeze(0))
+
+    def _sample(self, batch_size: int) -> tuple[TensorDictBase, dict[str, Any]]:
         """Return a batch of transitions [batch_size], demonstrations first.
 
         Raises:
@@ -68,27 +82,29 @@ class SymmetricReplay:
         """
         if not len(self):
             raise RuntimeError("cannot sample from an empty replay")
-        online = self.batch_size // 2 if len(self.expert) else self.batch_size
+        online = batch_size // 2 if len(self.expert) else batch_size
         online = online if len(self.online) else 0
-        parts = [
-            buffer.sample(count)
-            for buffer, count in (
-                (self.expert, self.batch_size - online),
-                (self.online, online),
-            )
-            if count
-        ]
-        return torch.cat(parts)
+        counts = ((self.expert, batch_size - online), (self.online, online))
+        return torch.cat([buffer.sample(count) for buffer, count in counts if count]), {}
 
     def dumps(self, path: str | Path) -> None:
-        """Write both sides into a folder, made if missing."""
-        for side in _SIDES:
-            self._side(side).dumps(Path(path) / side)
+        """Write both buffers into a folder, made if missing."""
+        for name, buffer in self._buffers():
+            buffer.dumps(Path(path) / name)
 
     def loads(self, path: str | Path) -> None:
-        """Read both sides from a folder that ``dumps`` wrote."""
-        for side in _SIDES:
-            self._side(side).loads(Path(path) / side)
+        """Read both buffers from a folder that ``dumps`` wrote."""
+        for name, buffer in self._buffers():
+            buffer.loads(Path(path) / name)
 
-    def _side(self, side: str) -> FrameReplayBuffer:
-        return getattr(self, side)
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of both buffers."""
+        return {name: buffer.state_dict() for name, buffer in self._buffers()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore both buffers."""
+        for name, buffer in self._buffers():
+            buffer.load_state_dict(state_dict[name])
+
+    def _buffers(self) -> zip[tuple[str, FrameReplayBuffer]]:
+        return zip(_NAMES, (self.expert, self.online), strict=True)

@@ -1,4 +1,4 @@
-"""What every vector of environments does alike: seeds, and the check of actions."""
+"""Seeds and checks of actions, common to all vectors of environments."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from ba_torchrl.errors import InvalidActionError
 def check_actions(
     actions: torch.Tensor | None, spec: TensorSpec, stepped: torch.Tensor | None = None
 ) -> None:
-    """Refuse actions that no environment may see.
+    """Refuse actions that are missing, not finite or of the wrong shape or type.
 
     Args:
         actions: [n, A], one row per environment.
-        spec: of ``actions``; values beyond its bounds are allowed, environments clip them.
+        spec: of ``actions``; values out of its bounds are allowed, the environments clip them.
         stepped: [n] or [n, 1] bool, the environments that are about to step; None means all.
 
     Raises:
@@ -53,24 +53,24 @@ def check_actions(
 
 
 def _describe(spec: TensorSpec) -> str:
-    """Say in words which actions ``spec`` allows."""
+    """Return a description of the actions that ``spec`` allows."""
     low, high = getattr(spec.space, "low", None), getattr(spec.space, "high", None)
     bounds = "" if low is None else f", from {low.tolist()} to {high.tolist()}"
     return f"a finite {spec.dtype} tensor of shape {list(spec.shape)}{bounds}"
 
 
 class SeededVector:
-    """Mixed into both kinds of vector: one rule for seeds, one check of actions."""
+    """Mix-in of both kinds of vectors: seeds of the environments and the check of actions."""
 
     _base_seed: int | None = None
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int:
-        """Seed environment i with ``seed + i`` and return the seed for a further vector.
+        """Seed environment i with ``seed + i``; return a seed for the next vector.
 
         Raises:
             ValueError: ``seed`` is not a natural number.
         """
-        self._adopt_seed(seed)
+        self._set_base_seed(seed)
         if self.is_closed:
             self.start()
         for index in range(self.num_workers):
@@ -81,7 +81,7 @@ class SeededVector:
         self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any
     ) -> TensorDictBase:
         if seed is not None:
-            self._adopt_seed(seed)
+            self._set_base_seed(seed)
             each = kwargs.pop("list_of_kwargs", [{}] * self.num_workers)
             each = [{**kwargs, **own, "seed": seed + i} for i, own in enumerate(each)]
             kwargs = {"list_of_kwargs": each}
@@ -92,7 +92,7 @@ class SeededVector:
             tensordict.get(self.action_key, None), self.action_spec, tensordict.get("_step", None)
         )
 
-    def _adopt_seed(self, seed: int | None) -> None:
+    def _set_base_seed(self, seed: int | None) -> None:
         if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
             raise ValueError(f"a seed must be a natural number, got {seed!r}")
         self._base_seed = int(seed)

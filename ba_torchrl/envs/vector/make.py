@@ -1,4 +1,4 @@
-"""Vectors of environments, in this process or in workers that may die without ending the run."""
+"""Vectors of environments, in this process or in worker processes."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ def make_vector_env(
             `functools.partial` of an importable function or class suits every start method.
         num_envs: number of environments.
         seed: environment i is seeded with ``seed + i``, in this process and in workers alike.
-        parallel: whether each environment gets a process of its own.
-        start_method: how processes start. "fork" takes milliseconds, but needs a parent without
-            an open simulator and without CUDA; "spawn" takes seconds and always works.
-        num_threads: torch threads of this process while the environments are open; None leaves
-            them as they are.
-        use_buffers: whether data travel through shared memory (the default, best for steps of
-            a few milliseconds) or through pipes.
+        parallel: whether each environment runs in a separate process.
+        start_method: how processes start. "fork" takes milliseconds and needs a parent without an
+            open simulator and without CUDA; "spawn" takes seconds and has no such condition.
+        num_threads: torch threads of this process while the environments are open; None for no
+            change.
+        use_buffers: whether data pass through shared memory (the default, faster for steps of a
+            few milliseconds) or through pipes.
         timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: how often in a row a worker may be replaced without a step in between.
+        max_restarts: consecutive replacements of a worker without a completed step.
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.

@@ -1,4 +1,4 @@
-"""VectorEnv: TorchRL's ParallelEnv, except that it outlives its workers."""
+"""VectorEnv: TorchRL's ParallelEnv with workers that are replaced when they fail."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ _LOSS = {
 class VectorEnv(SeededVector, ParallelEnv):
     """Environments in worker processes; a worker that raises, dies or hangs is replaced.
 
-    The other workers keep their episodes. The step that lost an episode returns, for that
-    environment, the last valid observation with ``fault``, ``truncated`` and ``done`` set and a
-    reward of zero; TorchRL then resets it like any finished one. Actions are checked in this
-    process, before anything is sent. ``restarts`` counts the replacements.
+    The other workers keep their episodes. For the environment of the failed worker, the step
+    returns the last valid observation with ``fault``, ``truncated`` and ``done`` set and a reward
+    of zero; TorchRL then resets it like any finished one. Actions are checked in this process
+    before they are sent. ``restarts`` counts the replacements.
 
     Args:
         num_workers: number of environments.
         create_env_fn: builds one environment, or one such function per environment.
         timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: how often in a row a worker may be replaced without a step in between.
+        max_restarts: consecutive replacements of a worker without a completed step.
         parallel_options: further options of `torchrl.envs.ParallelEnv`.
 
     Raises:
@@ -95,15 +95,15 @@ class VectorEnv(SeededVector, ParallelEnv):
             return super().step_and_maybe_reset(tensordict)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """End the workers and give the torch threads back."""
+        """End the workers and restore the number of torch threads."""
         was_open, threads = not self.is_closed, torch.get_num_threads()
         super().close(raise_if_closed=raise_if_closed)
         if was_open:
-            # TorchRL sets another number, assuming that it had lowered it.
+            # TorchRL raises the number, on the assumption that it lowered it at the start.
             torch.set_num_threads(threads if self.num_threads is None else self._threads_before)
 
     def __getitem__(self, item: Any) -> EnvBase:
-        raise NotImplementedError("a VectorEnv has no views: a worker in one could not be replaced")
+        raise NotImplementedError("a VectorEnv cannot be indexed: its workers may be replaced")
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check_actions(tensordict)
@@ -201,7 +201,7 @@ class VectorEnv(SeededVector, ParallelEnv):
 
     @contextlib.contextmanager
     def _stepping(self) -> Iterator[None]:
-        """Around a step: workers that died since the last command report a lost episode."""
+        """Context of a step: workers that died since the last command report a lost episode."""
         if self.is_closed:
             self.start()
         self._replace_dead()
@@ -222,7 +222,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 self._lost.add(index)
 
     def _replace(self, index: int, cause: WorkerError, seed: int | None = None) -> None:
-        """Put a new process in the place of worker ``index``; it still has to be reset."""
+        """Start a new process for worker ``index``; it must be reset before it steps."""
         while True:
             self._failures_in_a_row[index] += 1
             if self._failures_in_a_row[index] > self.max_restarts:
@@ -234,7 +234,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 )
             self.restarts += 1
             self._replacements[index] += 1
-            # The text only: a kept log record must not keep the dead worker through its traceback.
+            # The text only: the traceback of a stored log record would hold the dead worker.
             logger.warning(
                 "worker %d is replaced (restart %d): %s", index, self.restarts, str(cause)
             )
@@ -248,7 +248,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 cause = error
 
     def _new_seed(self, index: int) -> int:
-        """Return a seed that no environment has had, the same whenever the run is repeated."""
+        """Return a seed that no environment has used, the same in every repetition of the run."""
         known = self._base_seed is not None
         entropy = [self._base_seed, index, self._replacements[index]] if known else None
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
@@ -266,7 +266,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             self._lost.discard(index)
 
     def _collect(self, indices: list[int]) -> dict[int, WorkerError]:
-        """Wait for the answers of workers; return the failures of those that gave none."""
+        """Wait for the answers of workers; return the errors of those that failed."""
         pending = set(indices)
         failures: dict[int, WorkerError] = {}
         deadline = time.monotonic() + self.timeout_s
@@ -280,14 +280,14 @@ class VectorEnv(SeededVector, ParallelEnv):
                 failures |= failed
                 pending -= failed.keys()
         except BaseException:
-            # An interrupt, say: later answers would be taken for those to the next command.
+            # After an interrupt, late answers would be read as those to the next command.
             for index in pending:
                 self.parent_channels[index].abort()
             raise
         return failures
 
     def _collect_flags(self, pending: set[int]) -> dict[int, WorkerError]:
-        """Take answered workers out of ``pending``; return, after a while, the dead ones."""
+        """Remove workers that answered from ``pending``; return the errors of dead ones."""
         flags = self._shm_done_flags
 
         def all_answered() -> bool:
@@ -309,7 +309,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         return failures
 
     def _collect_messages(self, pending: set[int]) -> dict[int, WorkerError]:
-        """Like `_collect_flags`, for workers that answer through their pipes."""
+        """The same as `_collect_flags`, for workers that answer through their pipes."""
         failures: dict[int, WorkerError] = {}
         workers = {self.parent_channels[index].pipe: index for index in pending}
         for pipe in wait(list(workers), _HEALTH_CHECK_S):
@@ -322,16 +322,16 @@ class VectorEnv(SeededVector, ParallelEnv):
         return failures
 
     def _recover(self, index: int, message: tuple[Any, Any]) -> None:
-        """Give the command in ``message`` the answer of an environment that lost its episode."""
+        """Answer the command in ``message`` for an environment that lost its episode."""
         command = message[0]
         if command != "reset":
             self._write_loss(index)
             message = ("reset", (False, {}))
         self.parent_channels[index].muted = False
-        if command == "step":  # the caller sees that it is done, and resets it
+        if command == "step":  # the environment is done, so the caller resets it
             return
         while True:
-            # A seed that the caller asked for is part of the message and stays.
+            # The message contains the seed, if the caller gave one.
             self.parent_channels[index].send(message)
             failures = self._collect([index])
             if not failures:
@@ -339,7 +339,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             self._replace(index, failures[index])
 
     def _write_loss(self, index: int) -> None:
-        """Make the answer to a step that never happened."""
+        """Write the answer to a step that was not executed."""
         if self._use_buffers:
             root = self.shared_tensordicts[index]
             answer = root.get("next")

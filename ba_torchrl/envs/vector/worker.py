@@ -1,4 +1,4 @@
-"""One worker process of a vector of environments, seen from the process that started it."""
+"""One worker process of a vector of environments, on the side of the parent process."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _NAP_S = 30e-6
 class Worker:
     """A process that runs one of TorchRL's worker loops, and the pipe to it.
 
-    TorchRL uses it as if it were the pipe. It remembers the last command, holds answers that
-    were read ahead, and turns a broken pipe into a `WorkerError` when an answer is awaited.
+    It has the interface of the pipe, which TorchRL uses. It stores the last command and answers
+    that were read early, and a broken pipe raises a `WorkerError` when an answer is read.
 
     Args:
         loop: TorchRL's worker loop.
-        options: keyword arguments of ``loop``, but for the two ends of the pipe and the event.
+        options: keyword arguments of ``loop``, except the two ends of the pipe and the event.
         start_method: "spawn" or "fork"; None means the default of this process.
         timeout_s: seconds to wait for an answer.
     """
@@ -53,7 +53,7 @@ class Worker:
         self.event = context.Event()
         self.inbox: deque[Any] = deque()
         self.message: tuple[Any, Any] = ("start", None)
-        self.muted = False  # it has no episode to go on with: commands go nowhere
+        self.muted = False  # commands are dropped: the episode is lost
         self._timeout_s = timeout_s
         options = {
             **options,
@@ -61,10 +61,10 @@ class Worker:
             "child_pipe": child_pipe,
             "mp_event": self.event,
         }
-        # Daemonic: it must not outlive a parent that forgets to close it.
+        # Daemonic: it ends with the parent, closed or not.
         self.process = context.Process(target=_work, args=(loop, options), daemon=True)
         self.process.start()
-        child_pipe.close()  # else the pipe would not break with the worker
+        child_pipe.close()  # else the pipe stays open when the worker dies
 
     @property
     def command(self) -> str:
@@ -72,21 +72,21 @@ class Worker:
         return self.message[0]
 
     def greet(self) -> None:
-        """Wait until the environment is built.
+        """Wait until the environment is made.
 
         Raises:
-            WorkerError: it could not be built.
+            WorkerError: it could not be made.
         """
         self.read(_START_TIMEOUT_S)
         self.send(("init", None))
 
     def send(self, message: tuple[Any, Any]) -> None:
-        """Send a command and its argument; a dead worker is noticed by who awaits the answer."""
+        """Send a command and its argument; reading the answer raises if the worker is dead."""
         self.message = message
         if self.muted:
             return
         try:
-            # Not `send`: that passes tensors as descriptors, which a dead worker never picks up.
+            # Not `send`: it passes tensors as descriptors, which a dead worker never opens.
             self.pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
         except OSError as error:
             logger.debug("could not send %r: %s", message[0], error)
@@ -95,7 +95,7 @@ class Worker:
         """Return the next answer.
 
         Raises:
-            WorkerError: there will be none.
+            WorkerError: the worker failed.
         """
         return self.inbox.popleft() if self.inbox else self.read(self._timeout_s)
 
@@ -103,7 +103,7 @@ class Worker:
         """Return the next message of the pipe.
 
         Raises:
-            WorkerError: the worker is gone, or sends nothing for ``timeout_s`` seconds.
+            WorkerError: the worker has ended, or sends nothing for ``timeout_s`` seconds.
         """
         try:
             if not self.pipe.poll(timeout_s):
@@ -116,27 +116,27 @@ class Worker:
         return message
 
     def check(self) -> None:
-        """Drop answers that nobody waits for any more.
+        """Drop answers to earlier commands.
 
         Raises:
-            WorkerError: the worker is gone.
+            WorkerError: the worker has ended.
         """
         self.inbox.clear()
         while self.process.exitcode is not None or self.pipe.poll():
             self.read(0.0)
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the process to end by itself, then release what it held."""
+        """Wait until the process ends, kill it after the timeout, and release its resources."""
         self.process.join(max(timeout_s, 0.0))
         self.kill()
 
     def abort(self) -> None:
-        """End the process, whatever it does; the next `check` finds it dead."""
-        self.process.kill()  # a hanging simulator does not listen to anything softer
+        """Kill the process; the next `check` raises."""
+        self.process.kill()  # a hanging simulator handles no other signal
         self.process.join()
 
     def kill(self) -> None:
-        """End the process, whatever it does, and release what it held."""
+        """Kill the process and release its resources."""
         self.abort()
         self.process.close()
         self.pipe.close()
@@ -152,8 +152,8 @@ class Worker:
 
 
 def _work(loop: Callable[..., None], options: dict[str, Any]) -> None:
-    """Body of a worker: run TorchRL's loop and send its exception, if any, to the parent."""
-    # The parent decides what an interrupt means; handlers that it set are not the worker's.
+    """Run TorchRL's loop in a worker; send its exception, if any, to the parent."""
+    # The parent handles interrupts; the worker does not inherit its handlers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torchrl._utils.BATCHED_PIPE_TIMEOUT = _IDLE_TIMEOUT_S
@@ -161,18 +161,18 @@ def _work(loop: Callable[..., None], options: dict[str, Any]) -> None:
     try:
         loop(**options)
     except BaseException:
-        with contextlib.suppress(OSError):  # no parent is left to tell
+        with contextlib.suppress(OSError):  # the parent has ended
             pipe.send((_FAILED, traceback.format_exc()))
-        os._exit(1)  # the environment is broken: run none of its clean-up
+        os._exit(1)  # the environment is broken: skip its clean-up
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Poll ``condition``, at first without a pause; return whether it came true in time."""
+    """Poll ``condition``, at first without a pause; return whether it holds before the timeout."""
     start = time.perf_counter()
     while not condition():
         elapsed = time.perf_counter() - start
         if elapsed > timeout_s:
             return False
         if elapsed > _SPIN_S:
-            time.sleep(_NAP_S)  # the core belongs to the workers
+            time.sleep(_NAP_S)  # leave the core to the workers
     return True

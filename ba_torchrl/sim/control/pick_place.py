@@ -25,6 +25,7 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.robots.gripper import Gripper
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ PEAK_ACCELERATION = 10 / math.sqrt(3)
 """Of `smooth_step`, which covers 1 in a time of 1."""
 
 
+LowestTool = Callable[[Gripper, tuple[float, float], Matrix, float], float]
+"""From a gripper, x and y, the tool's rotation and the opening to the least height of the tool at
+which the fingers close above the support surface."""
+
+
 class HeldState(NamedTuple):
     """What `PickPlace` remembers."""
 
@@ -87,7 +93,7 @@ class PickPlace:
         opening: how far the fingers open, 0 to 1.
         top_down: come from straight above even where the tool is tilted, instead of along its
             axis.
-        surface_height_m: from x and y to the height of the support surface there, metres.
+        lowest_tool_m: least height of the tool at a place; that above the world's floor if None.
         limits: distances and step counts.
     """
 
@@ -98,7 +104,7 @@ class PickPlace:
         teleport: bool = True,
         opening: float = 1.0,
         top_down: bool = False,
-        surface_height_m: Callable[[tuple[float, float]], float] = lambda xy: 0.0,
+        lowest_tool_m: LowestTool | None = None,
         limits: PickPlaceLimits | None = None,
     ) -> None:
         self.robot = robot
@@ -106,7 +112,7 @@ class PickPlace:
         self.teleport = teleport
         self.opening = opening
         self.top_down = top_down
-        self.surface_height_m = surface_height_m
+        self.lowest_tool_m = lowest_tool_m
         self.limits = limits or PickPlaceLimits()
         self.held: Body | None = None
         """What is in the gripper; it is hidden from cameras, as is the arm."""
@@ -226,8 +232,10 @@ class PickPlace:
     def _above_surface(self, position: Vector, rotation: Matrix) -> Vector:
         """Return the point, raised if necessary so that the fingers close above the surface."""
         x, y, z = position
-        lowest = self.robot.gripper.lowest_tool_m(rotation, self.opening)
-        return x, y, max(z, self.surface_height_m((x, y)) + lowest)
+        gripper = self.robot.gripper
+        if self.lowest_tool_m is None:
+            return x, y, max(z, gripper.lowest_tool_m(rotation, self.opening))
+        return x, y, max(z, self.lowest_tool_m(gripper, (x, y), rotation, self.opening))
 
     def _tool_rotation(self) -> Matrix:
         return quaternion_matrix(self.robot.tool_transform().orientation)

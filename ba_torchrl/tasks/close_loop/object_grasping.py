@@ -28,7 +28,7 @@ WALL_PIXELS = 25
 
 
 @TASKS.register("close_loop/object_grasping")
-class ObjectGrasping(CloseLoopControl, ClutterTask):
+class ObjectGrasping(ClutterTask, CloseLoopControl):
     """Random objects in a tray; success when one is held with the tool 15 cm above ground."""
 
     num_objects = 5

@@ -32,7 +32,7 @@ NEAR_COST = 60.0
 
 
 @TASKS.register("open_loop/object_grasping")
-class ObjectGrasping(OpenLoopControl, ClutterTask):
+class ObjectGrasping(ClutterTask, OpenLoopControl):
     """Random objects in a tray, 15 unless told otherwise; success when a pick took one.
 
     An episode is one pick.

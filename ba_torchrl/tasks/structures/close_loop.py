@@ -25,7 +25,6 @@ from ba_torchrl.tasks.motion_primitives import (
 )
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.free_space import PlacementArea
-from ba_torchrl.tasks.structures.parts import ORANGE
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.terrain import Terrain
@@ -34,7 +33,7 @@ from ba_torchrl.tasks.workspace import ActionLimits, Spot
 NO_ROOM_M = 1.0
 """Cost of a piece that no grasp reaches, in metres of detour."""
 
-COLORS: tuple[Color, ...] = (RED, BLUE, ORANGE, GREEN)
+COLORS: tuple[Color, ...] = (RED, BLUE, (0.9, 0.6, 0.2, 1.0), GREEN)
 """Of the cubes, from the bottom up."""
 
 

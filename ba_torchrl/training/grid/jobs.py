@@ -1,7 +1,7 @@
-"""Jobs: the runs of a benchmark, each in a process of its own (POSIX systems only).
+"""Jobs: the runs of a benchmark, each in a separate process (POSIX systems only).
 
-Finished runs are skipped and interrupted ones resumed, so that the same command continues a grid
-wherever it was stopped. A run that fails is recorded and does not stop the others.
+Finished runs are skipped and interrupted ones resumed: the same command continues a grid. The
+failure of a run is recorded and does not stop the others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ba_torchrl.training.grid.plan import status
 
 LOG_FILE = "run.log"
 LOG_LINES = 20
-"""Of a failed run's output that are recorded."""
+"""Last lines of a failed run's output that are recorded."""
 POLL_S = 0.2
 WORKER = (sys.executable, "-m", "ba_torchrl.training.grid.run_one")
 
@@ -39,21 +39,21 @@ def run_all(
     progress: bool = True,
     worker: Sequence[str] = WORKER,
 ) -> dict[Path, str]:
-    """Run what is not done yet.
+    """Run the unfinished runs of a grid.
 
     Args:
-        runs: what `plan` returned.
-        jobs: how many at the same time.
-        max_hours: time limit of each.
+        runs: the runs, from `plan`.
+        jobs: number of runs at the same time.
+        max_hours: time limit of each run.
         progress: show a progress bar over the runs.
         worker: command that reads a run's configuration as JSON from its standard input.
 
     Returns:
-        By run folder, why it failed; empty if all went well.
+        By run folder, the reason of its failure.
 
     Raises:
         ConfigError: a folder holds a run with other settings, in which case nothing was started;
-            or another process is at a run.
+            or another process runs one of them.
     """
     waiting = deque(run for run in runs if status(run).state != "done")
     running: list[_Job] = []
@@ -80,7 +80,7 @@ def run_all(
 
 
 class _Job:
-    """A run in a process of its own."""
+    """A run in a separate process."""
 
     def __init__(
         self, run: ExperimentConfig, worker: Sequence[str], max_hours: float | None
@@ -90,11 +90,11 @@ class _Job:
         self._timed_out = False
         run.folder.mkdir(parents=True, exist_ok=True)
         self._log = (run.folder / LOG_FILE).open("a")
-        try:  # the process inherits the lock, and keeps it even if this one dies
+        try:  # the process inherits the lock and keeps it if this one is killed
             fcntl.flock(self._log, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._log.close()
-            raise ConfigError(f"another process is at the run in {run.folder}") from None
+            raise ConfigError(f"another process runs the experiment in {run.folder}") from None
         (run.folder / FAILURE_FILE).unlink(missing_ok=True)
         self._process = subprocess.Popen(
             worker,
@@ -108,20 +108,20 @@ class _Job:
             with self._process.stdin as stdin:
                 stdin.write(run.model_dump_json())
         except BrokenPipeError:
-            pass  # it ended before it read; its exit status tells
+            pass  # it ended before it read; its exit status is the reason
 
     def __str__(self) -> str:
         return f"{self.run.task} {self.run.label} seed {self.run.seed}"
 
     def has_ended(self) -> bool:
-        """Whether the process is over; one beyond its time limit is ended."""
+        """Whether the process has ended; one that exceeds its time limit is ended here."""
         if self._deadline is not None and time.monotonic() > self._deadline:
             self._timed_out = True
             self.stop()
         return self._process.poll() is not None
 
     def close(self) -> str | None:
-        """Record how the process ended; return why it failed, None if it did not."""
+        """Record how the process ended; return the reason of a failure, None otherwise."""
         self._log.close()
         code = self._process.returncode
         if (self.run.folder / RESULT_FILE).exists():
@@ -140,7 +140,7 @@ class _Job:
         return reason
 
     def stop(self) -> None:
-        """End the process and those that it started, now."""
+        """Kill the process and its child processes."""
         if self._process.poll() is None:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

@@ -1,4 +1,4 @@
-"""Benchmark: a grid of tasks, algorithms, networks and seeds, which `training.jobs` runs."""
+"""Benchmark: a grid of tasks, algorithms, networks and seeds, which `training.grid.jobs` runs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from pydantic import Field
 from ba_torchrl.algorithms.base import Problem
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.results import (
     CONFIG_FILE,
     RESULT_FILE,
     differences,
-    failure_reason,
+    read_failure,
     read_result,
 )
 from ba_torchrl.tasks.base import TASKS
@@ -51,21 +52,21 @@ class BenchmarkConfig(StrictModel):
     networks: list[str] = Field(min_length=1)
     """Names of preset files in ``configs/network``."""
     seeds: int | list[int] = 4
-    """How many, from 0 on, or which."""
+    """A number of seeds, from 0 on, or a list of seeds."""
     skip: list[dict[str, str | list[str]]] = Field(default_factory=list)
-    """What to leave out of the grid: each entry names a ``task``, an ``algorithm``, a ``network``
-    or several of these, one or a list of each; runs that match all it names are left out."""
+    """Runs to leave out: each entry gives a name or a list of names for ``task``, ``algorithm``,
+    ``network`` or several of these; runs that match all of them are left out."""
     per_task: Overrides = Field(default_factory=dict)
-    """By task, what differs from the fields common to all runs."""
+    """By task, fields that override those common to all runs."""
     per_algorithm: Overrides = Field(default_factory=dict)
-    """By algorithm; wins over `per_task`."""
+    """By algorithm; overrides `per_task`."""
     per_network: Overrides = Field(default_factory=dict)
-    """By network; wins over `per_algorithm`."""
+    """By network; overrides `per_algorithm`."""
     jobs: int = Field(default=1, ge=1)
     """Runs at the same time."""
     max_hours: float | None = Field(default=None, gt=0)
-    """Time limit of a run; one that takes longer is stopped, counts as failed, and is resumed by
-    the next call."""
+    """Time limit of a run. A run that exceeds it is stopped and counts as failed; the next call
+    resumes it."""
 
     def seed_list(self) -> list[int]:
         """Return the seeds of the grid."""
@@ -87,7 +88,7 @@ class BenchmarkConfig(StrictModel):
 
 @dataclass(frozen=True)
 class Status:
-    """Where a run of the grid stands."""
+    """State of a run of the grid."""
 
     state: State
     detail: str = ""
@@ -103,8 +104,8 @@ def plan(
 
     Args:
         config: the grid.
-        common: fields of `ExperimentConfig` that all runs share. Those of ``algorithm`` and
-            ``network`` go over the presets, without a name.
+        common: fields of `ExperimentConfig` that all runs share. ``algorithm`` and ``network`` hold
+            fields without a ``name``, which override those of every preset.
         preset: loads the presets.
 
     Returns:
@@ -113,6 +114,7 @@ def plan(
     Raises:
         ConfigError: a name is unknown, a value cannot be used, or parts do not go together.
     """
+    load_plugins(common.get("plugins", ()))
     _check_axes(config, preset)
     presets = {
         (group, name): preset(group, name)
@@ -139,7 +141,8 @@ def plan(
         taken = [name for name in SET_BY_THE_GRID if name in values]
         if taken:
             raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
-        where = Path(config.folder, task.replace("/", "_"), f"{algorithm}_{network}", f"seed{seed}")
+        names = (name.replace("/", "_") for name in (task, f"{algorithm}_{network}"))
+        where = Path(config.folder, *names, f"seed{seed}")
         values |= {
             "task": task,
             "seed": seed,
@@ -159,7 +162,7 @@ def plan(
 
 
 def status(run: ExperimentConfig) -> Status:
-    """Return where a run stands.
+    """Return the state of a run.
 
     Raises:
         ConfigError: its folder holds a run with other settings.
@@ -177,17 +180,17 @@ def status(run: ExperimentConfig) -> Status:
         return Status("done", f"success {result.final.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
         check_same_run(run)
-    reason = failure_reason(folder)
+    reason = read_failure(folder)
     if reason is not None:
         return Status("failed", reason)
     if (folder / CONFIG_FILE).exists():
         updates = resumable_updates(folder) or 0
-        return Status("interrupted", f"goes on after update {updates} of {run.total_updates}")
+        return Status("interrupted", f"continues after update {updates} of {run.total_updates}")
     return Status("missing")
 
 
 def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
-    """Refuse unknown names on every axis and in every override, and names that come twice."""
+    """Refuse unknown and repeated names on every axis, and unknown ones in every override."""
     known: dict[str, Callable[[str], Any]] = {
         "task": TASKS.__getitem__,
         "algorithm": lambda name: preset("algorithm", name),
@@ -205,7 +208,7 @@ def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
 
 
 def _mentioned(config: BenchmarkConfig) -> Iterator[tuple[str, Sequence[str]]]:
-    """Yield (axis, names) of whatever overrides and ``skip`` speak of."""
+    """Yield (axis, names) of the overrides and of ``skip``."""
     yield "task", list(config.per_task)
     yield "algorithm", list(config.per_algorithm)
     yield "network", list(config.per_network)
@@ -215,9 +218,9 @@ def _mentioned(config: BenchmarkConfig) -> Iterator[tuple[str, Sequence[str]]]:
 
 
 def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
-    """Make every environment of the grid once, and every learner that differs from the others.
+    """Make every environment and every learner of the grid once.
 
-    Some parameters are checked by tasks and robots, some sizes and actions by networks.
+    Tasks and robots check some parameters, networks some sizes and actions.
     """
     problems: dict[tuple[str, str], Problem] = {}
     built = set()
@@ -225,9 +228,11 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
         key = (run.task, json.dumps(run.env, sort_keys=True))
         try:
             if key not in problems:
-                # alike but for what no network depends on
-                same = {"seed": 0, "max_depth_m": 1.0, "device": torch.device("cpu")}
-                problems[key] = replace(problem_of(run), **same)
+                problem = problem_of(run)
+                # equal except for what no network depends on
+                images = {name: replace(image, high=1.0) for name, image in problem.images.items()}
+                cpu = torch.device("cpu")
+                problems[key] = replace(problem, images=images, seed=0, device=cpu)
             problem = problems[key]
             learner = repr((problem, run.algorithm_config, run.network_config))
             if learner not in built:

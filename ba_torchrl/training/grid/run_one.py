@@ -15,12 +15,12 @@ def main() -> None:
     import logging
     import sys
 
-    from ba_torchrl.record.logging import quiet_libraries
+    from ba_torchrl.record.logging import limit_library_logs
     from ba_torchrl.training.config import ExperimentConfig
     from ba_torchrl.training.experiment import Experiment
 
     logging.basicConfig(level=logging.INFO)
-    quiet_libraries()
+    limit_library_logs()
     Experiment(ExperimentConfig.parse(json.load(sys.stdin)), progress=False).run()
 
 

@@ -7,12 +7,13 @@ from tensordict import TensorDict
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.rigid import (
-    Motion,
     RigidAugmentation,
-    move_images,
-    reverse_in_hand,
+    RigidTransform,
+    reverse_gripper_axes,
+    transform_images,
 )
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
+from tests.specs import open_loop_images
 
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
 SIZE = 32
@@ -21,6 +22,17 @@ STEP_M = 0.4 / SIZE
 
 def layout(sequence="pxyr", half_rotation=True):
     return OpenLoopActions(sequence, BOUNDS, half_rotation)
+
+
+def augmentation(transforms, actions, channels=1, seed=0, **settings):
+    return RigidAugmentation(
+        transforms, actions, open_loop_images(channels=channels), seed=seed, **settings
+    )
+
+
+def reverse_in_hand(image, axes):
+    axes_of_channels = open_loop_images(channels=image.shape[1])["in_hand"].axes
+    return reverse_gripper_axes(image, axes_of_channels, axes)
 
 
 def spot(x, y):
@@ -60,8 +72,8 @@ def batch(places, yaws=None, sequence="pxyr"):
     )
 
 
-def motion(mirrored=False, angle=0.0, shift=(0.0, 0.0)):
-    return Motion(
+def transform(mirrored=False, angle=0.0, shift=(0.0, 0.0)):
+    return RigidTransform(
         torch.tensor([mirrored]),
         torch.tensor([angle], dtype=torch.float64),
         torch.tensor([shift], dtype=torch.float64),
@@ -73,25 +85,25 @@ def motion(mirrored=False, angle=0.0, shift=(0.0, 0.0)):
 def test_quarter_turns_and_mirror_images_are_exact(k, mirrored):
     image = torch.rand(1, 2, SIZE, SIZE)
     expected = torch.rot90(image.flip(-1) if mirrored else image, k, (-2, -1))
-    assert torch.equal(move_images(image, motion(mirrored, k * math.pi / 2)), expected)
+    assert torch.equal(transform_images(image, transform(mirrored, k * math.pi / 2)), expected)
 
 
 def test_a_shift_by_whole_pixels_moves_rows_along_x():
     image = torch.rand(1, 1, SIZE, SIZE)
-    moved = move_images(image, motion(shift=(3 / SIZE, -2 / SIZE)))
+    moved = transform_images(image, transform(shift=(3 / SIZE, -2 / SIZE)))
     expected = torch.zeros_like(image)
     expected[..., 3:, :-2] = image[..., :-3, 2:]
     torch.testing.assert_close(moved, expected, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(
-    ("motions", "settings"),
+    ("transforms", "settings"),
     [("translation", {}), ("cn", {"order": 12}), ("d4", {}), ("se2", {})],
 )
-def test_the_action_stays_on_what_it_aims_at(motions, settings):
+def test_the_action_stays_on_what_it_aims_at(transforms, settings):
     places = [(0.45 + 0.01 * i, -0.06 + 0.012 * i) for i in range(10)] * 6
     data = batch(places)
-    out = RigidAugmentation(motions, layout(), seed=0, **settings)(data)
+    out = augmentation(transforms, layout(), seed=0, **settings)(data)
     assert not torch.allclose(out["action"], data["action"])
     for image, action in zip(out["pixels"], out["action"], strict=True):
         x, y = centre_of(image)
@@ -119,15 +131,15 @@ def direction_of(image):
     return float(0.5 * torch.atan2(2 * xy, xx - yy)) % math.pi
 
 
-@pytest.mark.parametrize("motions", ["cn", "d4", "se2"])
-def test_the_yaw_turns_with_the_scene(motions):
+@pytest.mark.parametrize("transforms", ["cn", "d4", "se2"])
+def test_the_yaw_turns_with_the_scene(transforms):
     yaws = [0.1 + 0.28 * i for i in range(11)] * 5
     data = batch([(0.45, 0.0)] * len(yaws), yaws)
     data["pixels"] = torch.stack([bar(yaw) for yaw in yaws])
-    out = RigidAugmentation(motions, layout(), seed=1, order=8)(data)
+    out = augmentation(transforms, layout(), seed=1, order=8)(data)
     for image, yaw in zip(out["pixels"], out["action"][:, 3].tolist(), strict=True):
         assert 0 <= yaw <= math.pi + 1e-6
-        if motions != "se2":  # shifted bars are not about the middle
+        if transforms != "se2":  # shifted bars are not about the middle
             off = (direction_of(image) - yaw + math.pi / 2) % math.pi - math.pi / 2
             assert abs(off) < 0.02
     assert len(out["action"][:, 3].unique()) > 20
@@ -135,7 +147,7 @@ def test_the_yaw_turns_with_the_scene(motions):
 
 def test_a_full_turn_is_kept_where_half_turns_differ():
     data = batch([(0.45, 0.0)] * 400, [0.2] * 400)
-    out = RigidAugmentation("cn", layout(half_rotation=False), seed=0, order=4)(data)
+    out = augmentation("cn", layout(half_rotation=False), seed=0, order=4)(data)
     found = sorted({round(float(yaw), 4) for yaw in out["action"][:, 3]})
     assert found == pytest.approx([0.2 + k * math.pi / 2 for k in range(4)], abs=1e-4)
 
@@ -146,7 +158,7 @@ def test_tilts_change_sides_when_a_half_turn_is_taken_back():
     # components: p x y rz ry rx
     extra = torch.tensor([[0.3, 0.2, -0.1]]).expand(200, 3)
     data["action"] = torch.cat([data["action"][:, :3], extra], dim=1)
-    out = RigidAugmentation("cn", actions, seed=0, order=4)(data)["action"]
+    out = augmentation("cn", actions, seed=0, order=4)(data)["action"]
     # 0.3 + pi and 0.3 + 3 pi / 2 come back by half a turn of the gripper about its axis
     expected = {
         (round(yaw, 3), sign * 0.2, -sign * 0.1)
@@ -196,7 +208,7 @@ def test_the_in_hand_image_follows_the_gripper(channels):
     for key in ("in_hand", ("next", "in_hand")):
         data[key] = image.repeat(60, 1, 1, 1)
     over, mirror = reverse_in_hand(image, "xy"), reverse_in_hand(image, "y")
-    turned = RigidAugmentation("cn", layout(), seed=0, order=4)(data)
+    turned = augmentation("cn", layout(), channels, order=4)(data)
     for first, second, action in zip(
         turned["in_hand"], turned["next", "in_hand"], turned["action"], strict=True
     ):
@@ -206,7 +218,7 @@ def test_the_in_hand_image_follows_the_gripper(channels):
         assert 0 <= action[3] <= math.pi
     is_over = [torch.equal(one, over[0]) for one in turned["in_hand"]]
     assert 18 < sum(is_over) < 42
-    mirrored = RigidAugmentation("d4", layout(), seed=0)(data)
+    mirrored = augmentation("d4", layout(), channels)(data)
     kinds = [image, mirror, over, reverse_in_hand(mirror, "xy")]
     counts = [sum(torch.equal(one, kind[0]) for one in mirrored["in_hand"]) for kind in kinds]
     assert sum(counts) == 60
@@ -215,13 +227,13 @@ def test_the_in_hand_image_follows_the_gripper(channels):
 
 def test_the_in_hand_image_stays_where_half_turns_differ():
     data = batch([(0.45, 0.0)] * 20)
-    turned = RigidAugmentation("cn", layout(half_rotation=False), seed=0)(data)
+    turned = augmentation("cn", layout(half_rotation=False), seed=0)(data)
     assert torch.equal(turned["in_hand"], data["in_hand"])
 
 
 def test_actions_stay_within_the_workspace():
     places = [(0.26, -0.19), (0.64, 0.19)] * 100
-    out = RigidAugmentation("se2", layout(), seed=0)(batch(places))
+    out = augmentation("se2", layout(), seed=0)(batch(places))
     assert (out["action"][:, 1] >= 0.25).all()
     assert (out["action"][:, 1] <= 0.65).all()
     assert (out["action"][:, 2].abs() <= 0.2).all()
@@ -230,14 +242,16 @@ def test_actions_stay_within_the_workspace():
 @pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
 def test_the_share_of_moved_transitions(probability):
     data = batch([(0.45, 0.05)] * 600)
-    module = RigidAugmentation("translation", layout(), seed=0, probability=probability)
+    module = RigidAugmentation(
+        "translation", layout(), open_loop_images(), seed=0, probability=probability
+    )
     moved = (module(data)["action"] != data["action"]).any(dim=1).float().mean()
     assert abs(float(moved) - probability) < 0.06
 
 
 def test_the_seed_and_a_saved_state_repeat_the_draws():
     data = batch([(0.45, 0.05)] * 5)
-    first, second = (RigidAugmentation("se2", layout(), seed=3) for _ in range(2))
+    first, second = (augmentation("se2", layout(), seed=3) for _ in range(2))
     assert torch.equal(first(data)["action"], second(data)["action"])
     state = first.state_dict()
     following = first(data)["action"]
@@ -245,11 +259,11 @@ def test_the_seed_and_a_saved_state_repeat_the_draws():
     assert torch.equal(second(data)["action"], following)
 
 
-def test_motions_that_the_action_cannot_follow_are_refused():
-    with pytest.raises(ValueError, match="no yaw to turn with it; use 'translation'"):
-        RigidAugmentation("se2", layout("pxy"), seed=0)
+def test_transforms_that_the_action_cannot_follow_are_refused():
+    with pytest.raises(ValueError, match="no yaw to rotate with it; use 'translation'"):
+        augmentation("se2", layout("pxy"), seed=0)
     with pytest.raises(ValueError, match="tilts do not follow"):
-        RigidAugmentation("d4", layout("pxyzrrr"), seed=0)
+        augmentation("d4", layout("pxyzrrr"), seed=0)
     with pytest.raises(ValueError, match="probability"):
-        RigidAugmentation("cn", layout(), seed=0, probability=2.0)
-    assert RigidAugmentation("translation", layout("pxy"), seed=0) is not None
+        augmentation("cn", layout(), seed=0, probability=2.0)
+    assert augmentation("translation", layout("pxy"), seed=0) is not None

@@ -9,6 +9,9 @@ from tensordict import TensorDict
 
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation, rotate_displacement, rotate_images
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
+
+IMAGES = {"pixels": ImageSpec(1, 32, 0.4)}
 
 
 def angles(*values):
@@ -112,7 +115,7 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
         data[keys.PIXELS][i, 0] = blob(dx, dy, 32)
         data[keys.NEXT, keys.PIXELS][i, 0] = blob(-dx, -dy, 32)
     shown = data.clone()
-    out = SO2Augmentation(sequence, seed=3, probability=1.0)(data)
+    out = SO2Augmentation(IMAGES, sequence, seed=3, probability=1.0)(data)
     assert (data == shown).all()  # the input is not changed
     moved = (out[keys.ACTION] - before[keys.ACTION]).abs()
     others = [i for i in range(len(sequence)) if i not in (x, y)]
@@ -130,7 +133,7 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
 def test_probability():
     data = batch(n=1000, size=4)
     for probability in (0.0, 0.8, 1.0):
-        out = SO2Augmentation("pxyzr", seed=0, probability=probability)(data)
+        out = SO2Augmentation(IMAGES, "pxyzr", seed=0, probability=probability)(data)
         same = (out[keys.ACTION] == data[keys.ACTION]).all(-1)
         same_image = (out[keys.PIXELS] == data[keys.PIXELS]).flatten(1).all(-1)
         assert torch.equal(same, same_image)
@@ -140,7 +143,7 @@ def test_probability():
 def test_angles_are_uniform():
     data = batch(n=4000, size=4)
     data[keys.ACTION] = torch.tensor([0.0, 0.5, 0.0, 0.0, 0.0]).expand(4000, 5).clone()
-    out = SO2Augmentation("pxyzr", seed=0, probability=1.0)(data)
+    out = SO2Augmentation(IMAGES, "pxyzr", seed=0, probability=1.0)(data)
     angle = torch.atan2(out[keys.ACTION][:, 2], out[keys.ACTION][:, 1])
     counts = torch.histc(angle, bins=8, min=-math.pi, max=math.pi)
     chi_square = ((counts - 500) ** 2 / 500).sum()
@@ -149,7 +152,7 @@ def test_angles_are_uniform():
 
 def test_draws_come_from_the_modules_own_generator():
     data = batch()
-    one, two = SO2Augmentation("pxyzr", seed=5), SO2Augmentation("pxyzr", seed=5)
+    one, two = SO2Augmentation(IMAGES, "pxyzr", seed=5), SO2Augmentation(IMAGES, "pxyzr", seed=5)
     torch.manual_seed(0)
     state = torch.get_rng_state()
     first = one(data)
@@ -160,12 +163,12 @@ def test_draws_come_from_the_modules_own_generator():
     assert not torch.equal(second[keys.PIXELS], first[keys.PIXELS])  # another view
     two.load_state_dict(copy.deepcopy(one.state_dict()))
     assert (two(data) == one(data)).all()
-    other = SO2Augmentation("pxyzr", seed=6)(data)
+    other = SO2Augmentation(IMAGES, "pxyzr", seed=6)(data)
     assert not torch.equal(other[keys.PIXELS], first[keys.PIXELS])
 
 
 def test_bad_arguments():
     with pytest.raises(ValueError, match="probability"):
-        SO2Augmentation("pxyz", seed=0, probability=1.5)
+        SO2Augmentation(IMAGES, "pxyz", seed=0, probability=1.5)
     with pytest.raises(ValueError, match="no x and y"):
-        SO2Augmentation("pz", seed=0)
+        SO2Augmentation(IMAGES, "pz", seed=0)

@@ -12,10 +12,11 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
 import ba_torchrl
-from ba_torchrl.data.demos import as_transitions, collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.buffer import make_replay_buffer
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.frames import FrameTable
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError
 
@@ -84,7 +85,7 @@ def test_a_plain_episode_shares_its_frames():
 
 @pytest.mark.parametrize("capacity", [7, 16, 50])
 def test_random_interleavings_and_wrap_around(capacity):
-    """Four environments step side by side, end at their own times, beside demos and single adds."""
+    """Four environments step side by side, end at their own times, between whole episodes."""
     rb, rng = buffer(capacity), np.random.default_rng(1)
     expected = [None] * capacity
     cursor = 0
@@ -101,7 +102,7 @@ def test_random_interleavings_and_wrap_around(capacity):
     for _ in range(40):
         kind = rng.random()
         if kind < 0.15:
-            put(episode(int(rng.integers(1, 6)), rng, expert=True))
+            put(episode(int(rng.integers(1, 6)), rng))
         else:
             steps = []
             for stream in streams:
@@ -205,7 +206,7 @@ def test_memory_of_expert_episodes(task):
     env.close()
     rb = make_replay_buffer(200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
     for data in episodes:
-        rb.extend(as_transitions(data, is_expert=True))
+        rb.extend(as_transitions(data, ["pixels"], is_expert=True))
     assert rb.storage.nbytes / len(rb) <= 5_000
     original = torch.cat(episodes)
     for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):

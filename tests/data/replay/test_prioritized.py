@@ -230,3 +230,37 @@ def test_refusals():
     empty = ExpertPrioritizedSampler(4, generator=torch.Generator())
     with pytest.raises(RuntimeError, match="empty"):
         empty.sample(LazyTensorStorage(4), 2)
+
+
+def test_a_storage_of_two_dimensions():
+    generator = torch.Generator().manual_seed(0)
+    sampler = ExpertPrioritizedSampler(12, generator=generator, alpha=1.0, expert_bonus=0.0)
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(12, ndim=2), sampler=sampler, batch_size=4000, priority_key="td"
+    )
+    data = TensorDict(
+        {
+            "number": torch.arange(12).reshape(4, 3),
+            "is_expert": torch.zeros(4, 3, 1, dtype=torch.bool),
+            "td": torch.ones(4, 3),
+        },
+        batch_size=[4, 3],
+    )
+    rb.extend(data)
+    batch = rb.sample()
+    assert set(batch["number"].tolist()) == set(range(12))
+    batch["td"] = torch.where(batch["number"] == 7, 1e6, 0.0)
+    rb.update_tensordict_priority(batch)
+    assert set(rb.sample()["number"].tolist()) == {7}
+
+
+def test_the_bonus_in_a_storage_of_two_dimensions_is_that_of_the_experts():
+    generator = torch.Generator().manual_seed(0)
+    sampler = ExpertPrioritizedSampler(6, generator=generator, alpha=1.0, expert_bonus=1e6)
+    rb = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(6, ndim=2), sampler=sampler, batch_size=200
+    )
+    is_expert = torch.zeros(2, 3, 1, dtype=torch.bool)
+    is_expert[1, 2] = True
+    rb.extend(TensorDict({"number": torch.arange(6).reshape(2, 3), "is_expert": is_expert}, [2, 3]))
+    assert set(rb.sample()["number"].tolist()) == {5}

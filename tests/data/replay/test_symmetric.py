@@ -1,9 +1,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import ReplayBuffer
 
 from ba_torchrl.data.replay.codecs import HalfPrecision
 from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.errors import ConfigError
 
 CODEC = HalfPrecision(0.25)
 
@@ -64,6 +66,19 @@ def test_every_batch_is_half_and_half():
         assert all(number >= 50 for number in numbers[4:])
         seen |= set(numbers)
     assert seen == {*range(10), *range(50, 90)}  # uniform over both sides
+
+
+def test_it_is_a_replay_buffer_of_torchrl():
+    made = filled()
+    assert isinstance(made, ReplayBuffer)
+    batch, info = made.sample(6, return_info=True)
+    assert batch.batch_size == (6,)
+    assert info == {}
+    made.add(transitions([91], False)[0])
+    assert len(made) == 51
+    other = replay(seed=3)
+    other.load_state_dict(made.state_dict())
+    assert torch.equal(other.sample()["action"], made.sample()["action"])
 
 
 def test_of_an_odd_batch_the_demonstrations_get_one_more():
@@ -128,7 +143,7 @@ def test_an_empty_or_a_full_replay_says_so():
         replay().sample()
     made = replay(capacity=6)
     made.extend(transitions(range(5), True))
-    with pytest.raises(ValueError, match="2 more demonstrations do not fit: 1 places of 6"):
+    with pytest.raises(ConfigError, match="2 more demonstrations do not fit: 1 places of 6"):
         made.extend(transitions(range(2), True))
 
 

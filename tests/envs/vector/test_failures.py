@@ -31,7 +31,7 @@ class TestFailures:
         cause = {"raise": "the simulator exploded", "hang": "within 1 s", "kill": "SIGKILL"}[order]
         assert "worker 1 is replaced" in caplog.text
         assert cause in caplog.text
-        # The episodes of the others go on, the lost one starts anew.
+        # The other episodes continue, the lost one starts again.
         _, state = env.step_and_maybe_reset(
             act(env, env.maybe_reset(env._step_mdp(result)).exclude("action"))
         )

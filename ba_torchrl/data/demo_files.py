@@ -1,0 +1,126 @@
+"""Files of demonstrations: episodes with the task and the parameters that they come from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torchrl
+from tensordict import TensorDict
+
+from ba_torchrl import __version__
+from ba_torchrl.data.demos import Source, source_config
+from ba_torchrl.envs.factory import resolve
+from ba_torchrl.errors import ConfigError
+
+_METADATA_FILE = "demonstrations.json"
+_EPISODE = "episode"
+
+
+def save_demonstrations(
+    path: str | Path,
+    episodes: Sequence[TensorDict],
+    *,
+    task: str,
+    env: dict[str, Any],
+    seed: int,
+    source: Source = "expert",
+) -> None:
+    """Write episodes as one memory-mapped TensorDict, with their task and parameters.
+
+    Args:
+        path: a new folder.
+        episodes: TensorDicts [T].
+        task: id of the task.
+        env: fields of `EnvConfig` that were given.
+        seed: of the first episodes.
+        source: where they come from.
+
+    Raises:
+        ValueError: there are no episodes.
+        FileExistsError: the folder holds demonstrations.
+    """
+    if not episodes:
+        raise ValueError("there are no episodes to save")
+    path = Path(path)
+    if (path / _METADATA_FILE).exists():
+        raise FileExistsError(f"{path} holds demonstrations; choose another folder")
+    numbered = [
+        episode.copy().set(_EPISODE, torch.full((len(episode), 1), number))
+        for number, episode in enumerate(episodes)
+    ]
+    torch.cat(numbered).memmap(path, copy_existing=True)
+    metadata = {
+        "task": task,
+        "env": _env_values(task, env),
+        "seed": seed,
+        "source": source,
+        "episodes": len(episodes),
+        "versions": {
+            "ba_torchrl": __version__,
+            "torch": torch.__version__,
+            "torchrl": torchrl.__version__,
+        },
+    }
+    (path / _METADATA_FILE).write_text(json.dumps(metadata, indent=2) + "\n")
+
+
+def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> list[TensorDict]:
+    """Read episodes back, if they were collected from the same task and parameters.
+
+    Args:
+        path: folder that `save_demonstrations` wrote.
+        task: id of the task they are for.
+        env: fields of `EnvConfig` of the environments they are for.
+
+    Raises:
+        ConfigError: there are none at ``path``, or they come from other environments; the message
+            names every difference.
+    """
+    path = Path(path)
+    check_demonstrations(path, task=task, env=env)
+    data = TensorDict.load_memmap(path)
+    numbers = data[_EPISODE].squeeze(-1)
+    return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
+
+
+def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> None:
+    """Check that there are demonstrations of the same task and parameters at ``path``.
+
+    Args:
+        path: folder that `save_demonstrations` wrote.
+        task: id of the task they are for.
+        env: fields of `EnvConfig` of the environments they are for.
+
+    Raises:
+        ConfigError: there are none, or they come from other environments; the message names every
+            difference.
+    """
+    path = Path(path)
+    try:
+        metadata = json.loads((path / _METADATA_FILE).read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise ConfigError(f"no demonstrations at {path}: {error}") from None
+    if not {"task", "env"} <= metadata.keys():
+        raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
+    # A field that was added later had its default value.
+    found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
+    wanted = {"task": task, **_env_values(task, env)}
+    differences = [
+        f"{name}: collected with {found.get(name)!r}, needed {wanted.get(name)!r}"
+        for name in sorted(found.keys() | wanted.keys())
+        if found.get(name) != wanted.get(name)
+    ]
+    if differences:
+        raise ConfigError(
+            f"the demonstrations at {path} do not fit:\n  " + "\n  ".join(differences)
+        )
+
+
+def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
+    """Return every environment parameter that shapes the data, defaults filled in, as JSON."""
+    other = {"seed", "render", *source_config("deconstruction")}
+    return json.loads(resolve(task, **env).model_dump_json(exclude=other))

@@ -1,0 +1,39 @@
+"""Transitions: what the replay stores of a rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from ba_torchrl.envs import keys
+
+
+def as_transitions(
+    tensordict: TensorDictBase,
+    images: Iterable[str],
+    *,
+    is_expert: bool,
+    expert_action: bool = False,
+) -> TensorDict:
+    """Return what the replay stores of a rollout, flattened to [N].
+
+    Args:
+        tensordict: transitions of any batch shape.
+        images: keys of the images to store.
+        is_expert: whether the transitions are demonstrations.
+        expert_action: also store ``expert_action``; of demonstrations that lack it, the action.
+
+    Raises:
+        KeyError: an entry is missing.
+    """
+    flat = tensordict.reshape(-1)
+    state = [*images, keys.HOLDING]
+    ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
+    out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))
+    out[keys.IS_EXPERT] = torch.full((len(flat), 1), is_expert)
+    if expert_action:
+        is_missing = is_expert and keys.EXPERT_ACTION not in flat
+        out[keys.EXPERT_ACTION] = flat[keys.ACTION if is_missing else keys.EXPERT_ACTION].clone()
+    return out

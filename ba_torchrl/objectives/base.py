@@ -1,0 +1,131 @@
+"""The base of the losses on batches of single transitions."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Literal, Self
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator
+
+from ba_torchrl.envs import keys
+
+Reduction = Literal["none", "mean", "sum"]
+"""What becomes of the losses of a batch's samples, as in TorchRL."""
+
+
+class TransitionLoss(LossModule):
+    """A loss with one-step targets, whose samples may have importance weights.
+
+    Args:
+        reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
+    """
+
+    default_value_estimator = ValueEstimators.TD0
+
+    def __init__(self, reduction: Reduction | None = None) -> None:
+        super().__init__()
+        self.reduction: Reduction = "mean" if reduction is None else reduction
+        if self.reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be none, mean or sum, got {reduction!r}")
+        self._in_keys: list[NestedKey] | None = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` needs, also the order of its arguments without a TensorDict."""
+        if self._in_keys is None:
+            self._in_keys = self._required_keys()
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: Sequence[NestedKey]) -> None:
+        self._in_keys = list(values)
+
+    @abstractmethod
+    def _required_keys(self) -> list[NestedKey]:
+        """Return the entries that ``forward`` needs, for `in_keys`."""
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: object
+    ) -> Self:
+        """Choose how targets are computed; by default TD(0) with gamma 0.99.
+
+        Args:
+            value_type: TD0, the only estimator for a batch of single transitions, or one of
+                TorchRL's estimator objects.
+            hyperparams: its parameters, such as ``gamma``.
+
+        Raises:
+            NotImplementedError: another of TorchRL's named estimators.
+        """
+        value_type, settings = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=(ValueEstimators.TD0,),
+                tensor_keys=self._value_estimator_keys(),
+                value_network=None,
+                **settings,
+            )
+        return self
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        """Pass renamed keys to the value estimator; `in_keys` follows them."""
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._value_estimator_keys())
+        self._in_keys = None
+
+    def _value_estimator_keys(self) -> dict[str, NestedKey]:
+        return {
+            name: getattr(self.tensor_keys, name)
+            for name in ("value", "reward", "done", "terminated")
+        }
+
+    def _transition_keys(self, observation: list[NestedKey]) -> list[NestedKey]:
+        """Return the entries of a transition with this observation, action and ends included."""
+        ends = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
+        names = [self.tensor_keys.action, *observation, *map(_next, (*observation, *ends))]
+        return list(dict.fromkeys(names))
+
+    def _importance_weights(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return the batch's importance weights [...] divided by their largest, None if absent."""
+        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        if weights is None:
+            return None
+        weights = weights.reshape(tensordict.batch_size)
+        return weights / weights.amax()
+
+
+def reduce_loss(losses: Tensor, reduction: Reduction) -> Tensor:
+    """Return the losses of samples, their mean or their sum.
+
+    Args:
+        losses: of the samples, of any shape.
+        reduction: which of these.
+    """
+    if reduction == "none":
+        return losses
+    return losses.sum() if reduction == "sum" else losses.mean()
+
+
+def reduce_over(losses: Tensor, chosen: Tensor, reduction: Reduction) -> Tensor:
+    """Return the losses of the chosen samples, their mean or their sum; zero if there are none.
+
+    Args:
+        losses: of the samples, [...].
+        chosen: bool [...]; other samples count as zero, and not in the mean.
+        reduction: which of these; "none" returns zeros for the other samples.
+    """
+    share = chosen.to(losses.dtype)
+    if reduction == "mean":
+        return (losses * share).sum() / share.sum().clamp_min(1)
+    return reduce_loss(losses * share, reduction)
+
+
+def _next(key: NestedKey) -> tuple[str, ...]:
+    return (keys.NEXT, key) if isinstance(key, str) else (keys.NEXT, *key)

@@ -1,0 +1,117 @@
+"""Plugins: modules outside the package that register tasks, robots, networks or algorithms.
+
+A plugin is an importable module; importing it runs the decorators. Three ways lead to that import:
+the user's own ``import``, a list of names (``register_modules`` of worker processes, ``plugins`` of
+recipes and run configurations), and entry points of installed packages in the group
+``ba_torchrl.plugins``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import warnings
+from collections.abc import Iterable
+from importlib.metadata import entry_points
+from types import ModuleType
+
+from ba_torchrl.errors import ConfigError
+
+GROUP = "ba_torchrl.plugins"
+"""Group of entry points; the value of each is the dotted name of a module."""
+
+MAIN = ("__main__", "__mp_main__")
+"""Names of the module that a process starts with, in itself and in its spawned children."""
+
+_loaded_groups: set[str] = set()
+
+
+class PluginWarning(UserWarning):
+    """An installed plugin that cannot be imported."""
+
+
+def load_entry_points() -> None:
+    """Import the plugins that installed packages declare, once per process.
+
+    A plugin that cannot be imported gives a `PluginWarning` that names it; the others are loaded.
+    """
+    if GROUP in _loaded_groups:
+        return
+    _loaded_groups.add(GROUP)
+    for point in entry_points(group=GROUP):
+        try:
+            point.load()
+        except Exception as error:
+            package = f" of {point.dist.name}" if point.dist is not None else ""
+            warnings.warn(
+                f"the plugin {point.name!r} ({point.value}){package} is not loaded: "
+                f"{type(error).__name__}: {error}",
+                PluginWarning,
+                stacklevel=2,
+            )
+
+
+def module_names(modules: Iterable[str | ModuleType]) -> tuple[str, ...]:
+    """Return the dotted names of modules that are given by name or as they are."""
+    return tuple(
+        module.__name__ if isinstance(module, ModuleType) else module for module in modules
+    )
+
+
+def import_modules(names: Iterable[str]) -> None:
+    """Import plugins by name.
+
+    Args:
+        names: dotted names of modules.
+
+    Raises:
+        ConfigError: a module does not exist; the message says what to do.
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+                raise  # the plugin exists, and imports something that does not
+            raise ConfigError(
+                f"cannot import the plugin {name!r}: there is no module {error.name!r}. Run from "
+                "the folder that holds it, put that folder on PYTHONPATH, or install the package"
+            ) from None
+
+
+def load_plugins(names: Iterable[str]) -> None:
+    """Import the plugins of a recipe or a run; the current directory counts, as with ``python -m``.
+
+    Args:
+        names: dotted names of modules.
+
+    Raises:
+        ConfigError: a module does not exist.
+    """
+    names = list(names)
+    if names and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    import_modules(names)
+
+
+def check_spawned_process_knows(kind: str, name: str) -> None:
+    """Check that a spawned process has what the main module of this one registers.
+
+    It imports the main module of a script and of ``python -m``. There is nothing to import for a
+    notebook, an interactive session and ``python -c``.
+
+    Args:
+        kind: of the entry, "task".
+        name: of the entry, which the main module registered.
+
+    Raises:
+        ConfigError: the main module cannot be imported.
+    """
+    main = sys.modules["__main__"]
+    if getattr(main, "__spec__", None) is None and not hasattr(main, "__file__"):
+        raise ConfigError(
+            f"the {kind} {name!r} is defined in a notebook or an interactive session, which worker "
+            "processes cannot import: move it to a module and import that, or make the "
+            'environments with parallel=False or start_method="fork"'
+        )

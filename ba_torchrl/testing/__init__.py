@@ -1,0 +1,5 @@
+"""Checks that every task passes, for tests of tasks inside and outside the package."""
+
+from ba_torchrl.testing.tasks import check_task
+
+__all__ = ["check_task"]

@@ -1,0 +1,393 @@
+"""The contract of a task, one check per promise; each raises `AssertionError` with the reason.
+
+`check_task` runs all of them on the id of a task. The checks ask the task for its control, so the
+id may be anything.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import pickle
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.utils import check_env_specs
+
+from ba_torchrl import make, make_vector_env
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.tasks.base import TASKS, Task
+
+IMAGE_SIZES = {"close_loop": 32, "open_loop": 128}
+"""Pixels by control. Open-loop experts read heights off the image: with fewer pixels a block falls
+between them."""
+
+MAX_EPISODE_STEPS = 60
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
+
+def check_task(
+    task: str,
+    *,
+    robot: str = "kuka",
+    episodes: int = 10,
+    min_success_rate: float = 0.9,
+    min_recovery_rate: float = 0.85,
+    max_typical_steps: float | None = None,
+) -> None:
+    """Check that a task keeps the promises of this package's tasks; it takes about a minute.
+
+    Args:
+        task: id of a registered task.
+        robot: the arm, in the checks that need no particular one.
+        episodes: episodes that the expert plays, from the start and after random actions.
+        min_success_rate: least share of these that the expert solves from the start.
+        min_recovery_rate: the same after random actions.
+        max_typical_steps: most steps that the expert needs: the mean in close loop, the median in
+            open loop; None for no limit.
+
+    Raises:
+        AssertionError: a promise is broken; the message says which.
+        ConfigError: the task is unknown.
+    """
+    check_specs(task, robot=robot)
+    check_vector_specs(task, robot=robot)
+    check_resets(task, robot=robot)
+    check_seeds(task, robot=robot)
+    check_successive_episodes(task, robot=robot)
+    check_observations_are_copies(task, robot=robot)
+    check_random_actions(task, robot=robot)
+    check_extreme_actions(task, robot=robot)
+    check_pickling(task, robot=robot)
+    check_step_limit(task, robot=robot)
+    check_expert_is_passive(task, robot=robot)
+    check_partial_resets(task, robot=robot)
+    check_expert(
+        task,
+        episodes=episodes,
+        min_success_rate=min_success_rate,
+        max_typical_steps=max_typical_steps,
+        robot=robot,
+    )
+    check_recovery(task, episodes=episodes, min_success_rate=min_recovery_rate, robot=robot)
+
+
+def check_specs(task: str, **config: Any) -> None:
+    """Check that observations, actions and ends are those of the environment's specs."""
+    env = make_small(task, expert=True, max_steps=2, **config)
+    try:
+        check_env_specs(env, break_when_any_done="both", seed=0)
+    finally:
+        env.close()
+
+
+def check_vector_specs(task: str, *, parallel: bool = False, **config: Any) -> None:
+    """Check the specs of two environments that step together."""
+    env = make_vector_env(
+        task,
+        2,
+        parallel=parallel,
+        start_method="fork",
+        **{"obs_size": 32, "seed": 0, "expert": True, "max_steps": 2, **config},
+    )
+    try:
+        check_env_specs(env, break_when_any_done="both", seed=0)
+    finally:
+        env.close()
+
+
+def check_resets(task: str, *, episodes: int = 10, **config: Any) -> None:
+    """Check that an episode starts in a valid scene whose goal does not hold."""
+    env = make_small(task, **config)
+    try:
+        for episode in range(episodes):
+            state = env.reset()
+            where = f"{task}, episode {episode}"
+            assert not env.scene.task.is_success(), f"{where}: the goal holds at the start"
+            assert env.scene.task.is_valid(), f"{where}: the scene is invalid at the start"
+            assert not state[keys.DONE], f"{where}: done at the start"
+            assert not state[keys.SUCCESS], f"{where}: success at the start"
+            assert state[keys.STEP_COUNT] == 0, f"{where}: the step count does not start at 0"
+    finally:
+        env.close()
+
+
+def check_seeds(task: str, **config: Any) -> None:
+    """Check that a seed fixes the images bit for bit, and that another seed gives others."""
+    first, second = make_small(task, **config), make_small(task, **config)
+    policy = _constant_policy(first, 0.65, 0.25, 0.85, 0.0, 0.6)
+    try:
+        a, b = (env.rollout(4, policy)[keys.NEXT, keys.PIXELS] for env in (first, second))
+        assert torch.equal(a, b), f"{task}: two environments with the same seed differ"
+        first.set_seed(0)
+        again = first.rollout(4, policy)
+        assert torch.equal(again[keys.NEXT, keys.PIXELS], a), (
+            f"{task}: the same seed gives another episode the second time"
+        )
+        other = first.reset(seed=1)[keys.PIXELS]
+        assert not torch.equal(other, again[keys.PIXELS][0]), f"{task}: the seed changes nothing"
+    finally:
+        first.close()
+        second.close()
+
+
+def check_successive_episodes(task: str, **config: Any) -> None:
+    """Check that the next episode starts from another scene; tasks that continue are exempt."""
+    if continues(task):
+        return
+    env = make_small(task, **config)
+    try:
+        a, b = (env.reset()[keys.PIXELS] for _ in range(2))
+        assert not torch.equal(a, b), f"{task}: two episodes start from the same scene"
+    finally:
+        env.close()
+
+
+def check_observations_are_copies(task: str, **config: Any) -> None:
+    """Check that a step does not write into images that were returned before."""
+    env = make_small(task, expert=True, **config)
+    try:
+        state = env.reset()
+        while True:
+            kept, copy = state[keys.PIXELS], state[keys.PIXELS].clone()
+            following = env.step(expert_policy(state))[keys.NEXT]
+            assert torch.equal(kept, copy), f"{task}: a step changed an image returned before it"
+            if following[keys.DONE]:
+                break
+            state = following
+        assert not torch.equal(copy, following[keys.PIXELS]), f"{task}: the image never changes"
+    finally:
+        env.close()
+
+
+def check_random_actions(task: str, **config: Any) -> None:
+    """Check that random actions neither fail nor lead out of the specs."""
+    env = make_small(task, **config)
+    torch.manual_seed(0)
+    try:
+        for _ in range(2):
+            last = env.rollout(50)[keys.NEXT].select(*env.observation_spec.keys())[-1]
+            assert env.observation_spec.is_in(last), f"{task}: an observation is out of its spec"
+        assert env.faults == 0, f"{task}: {env.faults} simulator faults under random actions"
+    finally:
+        env.close()
+
+
+def check_extreme_actions(task: str, **config: Any) -> None:
+    """Check that actions at the ends of their ranges do not fail."""
+    env = make_small(task, **config)
+    rng = np.random.default_rng(0)
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        fractions = rng.integers(0, 2, 7).astype(np.float32).tolist()
+        return tensordict.set(keys.ACTION, action_at(env, fractions))
+
+    try:
+        for _ in range(3):
+            env.rollout(50, policy)
+        assert env.faults == 0, f"{task}: {env.faults} simulator faults under extreme actions"
+    finally:
+        env.close()
+
+
+def check_pickling(task: str, **config: Any) -> None:
+    """Check that a function that makes the environment can be sent to another process."""
+    factory = functools.partial(make, task, obs_size=16, **config)
+    env = pickle.loads(pickle.dumps(factory))()
+    try:
+        env.reset()
+    finally:
+        env.close()
+
+
+def check_step_limit(task: str, **config: Any) -> None:
+    """Check that the step limit truncates, unless the limit is the task."""
+    if TASKS[task].terminates_at_limit:
+        return
+    env = make_small(task, max_steps=3, **config)
+    # close loop: stay, gripper open; open loop: place nothing
+    action = action_at(env, [0.5])
+    action[0] = 1.0
+    try:
+        rollout = env.rollout(10, lambda td: td.set(keys.ACTION, action.clone()))
+    finally:
+        env.close()
+    assert len(rollout) == 3, f"{task}: {len(rollout)} steps with max_steps=3"
+    last = rollout[keys.NEXT][-1]
+    assert last[keys.TRUNCATED], f"{task}: the step limit does not truncate"
+    assert last[keys.DONE], f"{task}: truncated, but not done"
+    assert not last[keys.TERMINATED], f"{task}: the step limit terminates"
+    counts = rollout[keys.NEXT, keys.STEP_COUNT].flatten().tolist()
+    assert counts == [1, 2, 3], f"{task}: the step counts are {counts}"
+
+
+def check_expert(
+    task: str,
+    *,
+    episodes: int,
+    min_success_rate: float,
+    max_typical_steps: float | None = None,
+    **config: Any,
+) -> None:
+    """Check that the expert reaches the goal, and that reward and ends agree with it.
+
+    Args:
+        task: id of the task.
+        episodes: how many to play.
+        min_success_rate: least share of them that the expert solves.
+        max_typical_steps: most steps of solved episodes: their mean in close loop, their median in
+            open loop; None for no limit.
+        config: fields of `EnvConfig`.
+    """
+    env = make_small(task, expert=True, **config)
+    try:
+        played = play_expert(env, episodes)
+    finally:
+        env.close()
+    lengths = [len(episode) for episode in played if episode[keys.NEXT, keys.SUCCESS][-1]]
+    assert len(lengths) >= min_success_rate * episodes, (
+        f"{task}: the expert solves {len(lengths)} of {episodes} episodes, "
+        f"fewer than a share of {min_success_rate:g}"
+    )
+    if max_typical_steps is not None:
+        typical = np.mean if TASKS[task].control == "close_loop" else np.median
+        steps = typical(lengths)
+        assert steps <= max_typical_steps, (
+            f"{task}: the expert needs {steps:.1f} steps ({typical.__name__}), "
+            f"more than {max_typical_steps:g}"
+        )
+    for episode in played:
+        following = episode[keys.NEXT]
+        assert torch.equal(following[keys.REWARD], following[keys.SUCCESS].float()), (
+            f"{task}: the reward is not 1 on success and 0 otherwise"
+        )
+        assert not following[keys.DONE][:-1].any(), f"{task}: steps follow one that is done"
+        assert following[keys.TERMINATED][-1] or following[keys.TRUNCATED][-1], (
+            f"{task}: an episode has not ended after {MAX_EPISODE_STEPS} steps"
+        )
+
+
+def check_recovery(task: str, *, episodes: int, min_success_rate: float, **config: Any) -> None:
+    """Check that the expert reaches the goal after random actions; one-step tasks are exempt.
+
+    Args:
+        task: id of the task.
+        episodes: how many to play; those that random actions end do not count.
+        min_success_rate: least share that the expert solves.
+        config: fields of `EnvConfig`.
+    """
+    if TASKS[task].terminates_at_limit:
+        return
+    random_steps = {"close_loop": 8, "open_loop": 2}[TASKS[task].control]
+    env = make_small(task, expert=True, **config)
+    outcomes: list[bool] = []
+    try:
+        for seed in range(2 * episodes):
+            success = _recover(env, seed, random_steps)
+            if success is not None:
+                outcomes.append(success)
+            if len(outcomes) == episodes:
+                break
+    finally:
+        env.close()
+    assert len(outcomes) >= episodes / 2, f"{task}: random actions end most episodes"
+    assert np.mean(outcomes) >= min_success_rate, (
+        f"{task}: after {random_steps} random actions the expert solves {sum(outcomes)} of "
+        f"{len(outcomes)} episodes, fewer than a share of {min_success_rate:g}"
+    )
+
+
+def check_expert_is_passive(task: str, **config: Any) -> None:
+    """Check that computing the expert's action does not change the episode."""
+    computed, plain = make_small(task, expert=True, **config), make_small(task, **config)
+    policy = _constant_policy(plain, 0.0, 0.7, 0.7, 0.05, 0.55)
+    try:
+        a, b = (env.rollout(6, policy)[keys.NEXT, keys.PIXELS] for env in (computed, plain))
+        assert torch.equal(a, b), f"{task}: computing the expert's action changes the episode"
+        for _ in range(5):
+            computed.scene.task.expert_command()
+        position = computed.scene.robot.tool_pose()[0]
+        assert all(map(math.isfinite, position)), f"{task}: the expert moved the robot"
+    finally:
+        computed.close()
+        plain.close()
+
+
+def check_partial_resets(task: str, **config: Any) -> None:
+    """Check that one environment of a vector can be reset and the other keeps its episode."""
+    env = make_vector_env(task, 2, parallel=False, **{"obs_size": 32, "seed": 0, **config})
+    try:
+        state = env.reset()
+        space = env.action_spec.space
+        state = env.step(state.set(keys.ACTION, (space.low + space.high) / 2))[keys.NEXT]
+        before = state[keys.PIXELS].clone()
+        state["_reset"] = torch.tensor([[True], [False]])
+        after = env.reset(state)
+    finally:
+        env.close()
+    counts = after[keys.STEP_COUNT].flatten().tolist()
+    assert counts == [0, 1], f"{task}: step counts {counts} after a reset of the first environment"
+    assert torch.equal(after[keys.PIXELS][1], before[1]), (
+        f"{task}: the reset of one environment changed the image of another"
+    )
+    if TASKS[task].control == "close_loop" and not continues(task):
+        assert not torch.equal(after[keys.PIXELS][0], before[0]), (
+            f"{task}: the environment that was reset shows the same scene"
+        )
+
+
+# -- parts -----------------------------------------------------------------------------------
+
+
+def make_small(task: str, **config: Any) -> ManipulationEnv:
+    """Make an environment with the smallest image on which the task can be solved, seed 0."""
+    size = IMAGE_SIZES[TASKS[task].control]
+    return make(task, **{"obs_size": size, "seed": 0, **config})
+
+
+def continues(task: str) -> bool:
+    """Whether the next episode of a task starts from the scene in which the last one ended."""
+    return TASKS[task].continues is not Task.continues
+
+
+def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
+    """Act as the expert does; TorchRL asks for the argument's name."""
+    return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION])
+
+
+def play_expert(env: ManipulationEnv, episodes: int) -> list[TensorDict]:
+    """Return episodes [T] of the expert."""
+    return [
+        env.rollout(MAX_EPISODE_STEPS, expert_policy, auto_cast_to_device=False)
+        for _ in range(episodes)
+    ]
+
+
+def action_at(env: ManipulationEnv, fractions: Sequence[float]) -> torch.Tensor:
+    """Return the action at fractions, 0 to 1, of each component's range, repeated to its length."""
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    place = torch.tensor([fractions[i % len(fractions)] for i in range(len(low))])
+    return low + place * (high - low)
+
+
+def _constant_policy(env: ManipulationEnv, *fractions: float) -> Policy:
+    return lambda td: td.set(keys.ACTION, action_at(env, fractions))
+
+
+def _recover(env: ManipulationEnv, seed: int, random_steps: int) -> bool | None:
+    """Return whether the expert succeeds after random actions; None if these end the episode."""
+    state = env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    for _ in range(random_steps):
+        action = action_at(env, rng.uniform(0, 1, 7).astype(np.float32).tolist())
+        state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
+        if state[keys.DONE]:
+            return None
+    while not state[keys.DONE]:
+        state = env.step(expert_policy(state))[keys.NEXT]
+    return bool(state[keys.SUCCESS])

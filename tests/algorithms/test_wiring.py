@@ -1,0 +1,311 @@
+"""Every hyper-parameter reaches the part that it is for: algorithms built with unusual values."""
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+
+from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
+from ba_torchrl.config import parse
+from ba_torchrl.data.augmentation.rigid import RigidAugmentation
+from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.envs import keys
+from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.experiment import Experiment
+from tests.specs import close_loop_images, open_loop_images
+
+BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
+SAC = {
+    "learning_rate": 0.003,
+    "weight_decay": 0.02,
+    "gradient_clamp": 1e-4,
+    "gamma": 0.7,
+    "tau": 0.3,
+    "alpha_init": 0.25,
+    "target_entropy": -2.5,
+    "demonstration_weight": 3.0,
+    "batch_size": 6,
+    "buffer_size": 77,
+    "replay": "prioritized",
+    "priority_exponent": 0.9,
+    "importance_exponent": 0.2,
+    "expert_bonus": 2.5,
+    "augmentation": "so2",
+    "augmentation_probability": 0.35,
+}
+SPATIAL_Q = {
+    "learning_rate": 0.002,
+    "weight_decay": 0.03,
+    "gradient_clamp": 1e-4,
+    "gamma": 0.6,
+    "demonstrations": "adet",
+    "demonstration_weight": 0.7,
+    "margin": 0.4,
+    "first_beta": 7.0,
+    "later_beta": 3.0,
+    "target_interval": 3,
+    "batch_size": 6,
+    "buffer_size": 55,
+    "replay": "symmetric",
+    "augmentation": "cn",
+    "augmentation_probability": 0.45,
+    "augmentation_order": 6,
+    "epsilon_init": 1.0,
+    "epsilon_end": 0.2,
+    "epsilon_updates": 4,
+}
+KINDS = {"sac": SAC, "spatial_q": SPATIAL_Q}
+
+
+def build(name, **changes):
+    torch.manual_seed(0)
+    is_close = name == "sac"
+    problem = Problem(
+        control="close_loop" if is_close else "open_loop",
+        images=close_loop_images(64) if is_close else open_loop_images(32),
+        actions=CloseLoopActions("pxyzr") if is_close else OpenLoopActions("pxyr", BOUNDS),
+        total_updates=10,
+        seed=0,
+        device=torch.device("cpu"),
+    )
+    network = (
+        parse(NETWORKS["cnn"], {"width": 0.25}, "cnn")
+        if is_close
+        else parse(NETWORKS["asr"], {"num_rotations": 4, "width": 0.125}, "asr")
+    )
+    settings = parse(ALGORITHMS[name], {**KINDS[name], **changes}, name)
+    return settings.build(network, problem)
+
+
+def transitions(algorithm, count=24):
+    """Random transitions, every second one a demonstration."""
+    generator = torch.Generator().manual_seed(1)
+
+    def state():
+        images = {
+            key: torch.rand(count, *image.shape, generator=generator) * image.high
+            for key, image in algorithm.images.items()
+        }
+        return {**images, keys.HOLDING: torch.rand(count, 1, generator=generator) < 0.5}
+
+    low, high = (0.26, 0.6) if "in_hand" in algorithm.images else (-0.9, 0.9)
+    size = algorithm.problem.actions.size
+    action = low + (high - low) * torch.rand(count, size, generator=generator)
+    if "in_hand" in algorithm.images:
+        action[:, 2] -= 0.45
+    ended = torch.zeros(count, 1, dtype=torch.bool)
+    following = {
+        **state(),
+        keys.REWARD: torch.rand(count, 1, generator=generator),
+        **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
+    }
+    is_expert = torch.arange(count)[:, None] % 2 == 0
+    return TensorDict(
+        {**state(), keys.ACTION: action, keys.IS_EXPERT: is_expert, keys.NEXT: following}, [count]
+    )
+
+
+@pytest.fixture(params=["sac", "spatial_q"])
+def algorithm(request):
+    made = build(request.param)
+    made.extend(transitions(made))
+    return made
+
+
+@pytest.mark.parametrize("name", ["sac", "spatial_q"])
+def test_the_discount_is_that_of_the_value_estimator(name):
+    gamma = build(name).loss.value_estimator.gamma
+    assert float(gamma) == pytest.approx(KINDS[name]["gamma"])
+
+
+def test_a_target_is_the_reward_plus_the_discounted_value():
+    sac = build("sac", alpha_init=1e-8)
+    batch = transitions(sac)
+    torch.manual_seed(3)
+    with torch.no_grad():
+        target = sac.loss._target(batch)
+        batch[keys.NEXT, keys.TERMINATED] |= True
+        torch.manual_seed(3)
+        reward = sac.loss._target(batch)
+        batch[keys.NEXT, keys.TERMINATED] &= False
+        torch.manual_seed(3)
+        sac.loss.make_value_estimator(gamma=1.0)
+        undiscounted = sac.loss._target(batch)
+    assert torch.equal(reward, batch[keys.NEXT, keys.REWARD])
+    torch.testing.assert_close(target - reward, 0.7 * (undiscounted - reward))
+
+
+def test_the_terms_of_sac_have_their_values():
+    loss = build("sac").loss
+    assert float(loss.alpha) == pytest.approx(0.25)
+    assert float(loss.target_entropy) == -2.5
+    assert float(loss.demonstration_weight) == 3.0
+
+
+def test_the_terms_of_spatial_q_have_their_values():
+    loss = build("spatial_q").loss
+    assert loss.demonstrations == "adet"
+    values = (loss.demonstration_weight, loss.margin, loss.first_beta, loss.later_beta)
+    assert values == (0.7, 0.4, 7.0, 3.0)
+
+
+def flat(params):
+    return torch.cat([value.detach().flatten() for value in params.values(True, True)])
+
+
+@pytest.mark.parametrize("name", ["qvalue_network", "encoder_network"])
+def test_the_target_of_sac_follows_by_tau_at_every_update(name):
+    sac = build("sac", learning_rate=0.1)
+    sac.extend(transitions(sac))
+    online = getattr(sac.loss, f"{name}_params")
+    target = getattr(sac.loss, f"target_{name}_params")
+    assert torch.equal(flat(online), flat(target))
+    expected = flat(target)
+    for _ in range(2):
+        sac.update()
+        expected = 0.7 * expected + 0.3 * flat(online)
+        torch.testing.assert_close(flat(target), expected)
+    assert not torch.equal(flat(online), flat(target))
+
+
+def test_the_target_of_spatial_q_is_copied_at_its_interval():
+    spatial = build("spatial_q")
+    spatial.extend(transitions(spatial))
+    loss, equal = spatial.loss, []
+    for _ in range(6):
+        spatial.update()
+        equal.append(
+            torch.equal(flat(loss.value_network_params), flat(loss.target_value_network_params))
+        )
+    assert equal == [False, False, True, False, False, True]
+
+
+@pytest.mark.parametrize(("name", "probability"), [("sac", 0.35), ("spatial_q", 0.45)])
+def test_batches_are_augmented_with_the_configured_probability(name, probability):
+    made = build(name, batch_size=400, replay="uniform")
+    made.extend(transitions(made))
+    kind = SO2Augmentation if name == "sac" else RigidAugmentation
+    assert isinstance(made.augmentation, kind)
+    assert made.augmentation.probability == probability
+    twin = copy.deepcopy(made.replay._rng)
+    original = made.replay.sample()
+    made.replay.set_rng(twin)
+    is_moved = (made.sample()[keys.ACTION] != original[keys.ACTION]).any(dim=1).float().mean()
+    assert 0.4 * probability < float(is_moved) < 1.3 * probability
+    # an update learns from the augmented batch
+    seen = []
+    made.augmentation.register_forward_hook(lambda _, __, out: seen.append(out))
+    made.loss.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    made.update()
+    assert seen[0] is seen[1]
+
+
+def test_the_order_and_kind_of_rigid_transforms_are_the_configured_ones():
+    augmentation = build("spatial_q").augmentation
+    assert (augmentation.transforms, augmentation.order) == ("cn", 6)
+    assert isinstance(build("sac", augmentation="none").augmentation, nn.Identity)
+
+
+def test_the_optimiser_decays_the_networks_and_leaves_the_temperature_alone(algorithm):
+    config, optimizer = algorithm.config, algorithm.optimizer
+    decay = {
+        id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]
+    }
+    for name, parameter in algorithm.loss.named_parameters():
+        wanted = 0.0 if name == "log_alpha" else config.weight_decay
+        assert decay[id(parameter)] == wanted, name
+    assert all(group["lr"] == config.learning_rate for group in optimizer.param_groups)
+
+
+def test_the_gradient_is_clamped_on_the_networks_and_not_on_the_temperature(algorithm):
+    algorithm.update()
+    for name, parameter in algorithm.loss.named_parameters():
+        largest = float(parameter.grad.abs().max())
+        if name == "log_alpha":
+            assert largest > 1e-2
+        else:
+            assert largest <= 1.0001e-4, name
+
+
+def test_the_replay_has_the_configured_size_batch_and_priorities():
+    sac = build("sac")
+    sampler = sac.replay.sampler
+    assert isinstance(sampler, ExpertPrioritizedSampler)
+    assert (sampler.alpha, sampler.beta, sampler.expert_bonus) == (0.9, 0.2, 2.5)
+    assert (sac.replay.storage.max_size, sac.replay.batch_size) == (77, 6)
+    spatial = build("spatial_q")
+    assert isinstance(spatial.replay, SymmetricReplay)
+    assert (spatial.replay.expert.storage.max_size, spatial.replay.batch_size) == (55, 6)
+
+
+@pytest.mark.parametrize("name", ["sac", "spatial_q"])
+@pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
+def test_every_algorithm_learns_from_every_replay(name, replay):
+    made = build(name, replay=replay)
+    made.extend(transitions(made))
+    before = flat(dict_of(made))
+    made.update()
+    assert not torch.equal(before, flat(dict_of(made)))
+
+
+def dict_of(algorithm):
+    return TensorDict({str(i): p.detach() for i, p in enumerate(algorithm.loss.parameters())})
+
+
+def test_the_policy_explores_under_random_and_is_greedy_under_deterministic(algorithm):
+    state = transitions(algorithm).select(*algorithm.observation_keys)
+
+    def actions(kind):
+        with set_exploration_type(kind):
+            return [algorithm.policy(state.clone())[keys.ACTION] for _ in range(2)]
+
+    assert not torch.equal(*actions(ExplorationType.RANDOM))
+    first, second = actions(ExplorationType.DETERMINISTIC)
+    assert torch.equal(first, second)
+
+
+def test_the_share_of_random_actions_falls_over_its_updates():
+    spatial = build("spatial_q")
+    spatial.extend(transitions(spatial))
+    shares = []
+    for _ in range(6):
+        shares.append(float(spatial.explorer.epsilon))
+        spatial.update()
+    assert shares == pytest.approx([1.0, 0.8, 0.6, 0.4, 0.2, 0.2])
+
+
+def test_collection_explores_and_evaluation_is_greedy(tmp_path):
+    config = ExperimentConfig.parse(
+        {
+            "task": "close_loop/block_reaching",
+            "env": {"obs_size": 64, "max_steps": 4},
+            "algorithm": {"name": "sac", "batch_size": 4},
+            "network": {"name": "cnn", "width": 0.25},
+            "num_envs": 2,
+            "parallel": False,
+            "demonstrations": 0,
+            "total_updates": 3,
+            "min_replay": 4,
+            "eval_every": 2,
+            "eval_episodes": 2,
+            "final_eval_episodes": 2,
+            "video_episodes": 1,
+            "log_every": 1,
+            "run_dir": str(tmp_path / "run"),
+        }
+    )
+    experiment = Experiment(config, progress=False)
+    found = []
+    experiment.algorithm.policy.register_forward_hook(lambda *_: found.append(exploration_type()))
+    experiment.run()
+    steps = int(read_scalars(tmp_path / "run")["train/env_steps"].values[-1]) // config.num_envs
+    assert found.count(ExplorationType.RANDOM) == steps == 4
+    # three evaluations and the video, of episodes with one to four steps
+    assert found.count(ExplorationType.DETERMINISTIC) >= 4

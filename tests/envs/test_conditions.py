@@ -1,0 +1,59 @@
+"""The named conditions of success: their conjunction is success, and Gymnasium's info has them."""
+
+import gymnasium
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.envs import keys
+
+
+@pytest.mark.parametrize("task", ba_torchrl.list_tasks())
+def test_success_is_their_conjunction(task):
+    env = ba_torchrl.make(task, seed=3, obs_size=32, expert=True)
+    state = env.reset()
+    assert not all(env.conditions.values())
+    seen = []
+    for _ in range(env.max_steps):
+        state = env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION].clone()))[keys.NEXT]
+        conditions = env.conditions
+        assert all(
+            name.startswith("is_") and type(holds) is bool for name, holds in conditions.items()
+        )
+        assert bool(state[keys.SUCCESS]) == (env.scene.task.is_valid() and all(conditions.values()))
+        seen.append(tuple(conditions.values()))
+        if state[keys.DONE]:
+            break
+    assert bool(state[keys.SUCCESS])
+    assert all(seen[-1])
+    env.close()
+
+
+def test_grasping_and_lifting_are_told_apart():
+    env = ba_torchrl.make("close_loop/block_picking", seed=0, obs_size=32, expert=True)
+    state, seen = env.reset(), []
+    while not state[keys.DONE]:
+        state = env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION].clone()))[keys.NEXT]
+        seen.append(env.conditions)
+    assert {"is_grasped": True, "is_lifted": False} in seen
+    assert seen[-1] == {"is_grasped": True, "is_lifted": True}
+    env.close()
+
+
+def test_they_are_those_of_a_restored_state():
+    env = ba_torchrl.make("close_loop/block_picking", seed=0, obs_size=32)
+    env.reset()
+    before, state = env.conditions, env.get_state()
+    env.step(env.reset().set(keys.ACTION, torch.zeros(5)))
+    env.set_state(state)
+    assert env.conditions == before
+    env.close()
+
+
+def test_the_info_of_gymnasium_has_them():
+    env = gymnasium.make("BulletArm/CloseLoopBlockPicking-v0", obs_size=32, seed=0)
+    _, info = env.reset()
+    assert {"is_grasped": False, "is_lifted": True}.items() <= info.items()
+    *_, info = env.step(env.action_space.sample())
+    assert {"is_grasped", "is_lifted"} <= info.keys()
+    env.close()

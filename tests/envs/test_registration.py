@@ -1,0 +1,88 @@
+"""Gymnasium knows every task, whatever is imported first."""
+
+import json
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import pytest
+
+import ba_torchrl
+from ba_torchrl.envs.registration import gym_id, register_tasks
+from ba_torchrl.tasks.base import TASKS
+
+BUILT_IN = [task for task in TASKS if TASKS.plugin_module(task) is None]
+PICKING = "BulletArm/CloseLoopBlockPicking-v0"
+
+
+@pytest.mark.parametrize(
+    ("task", "wanted"),
+    [
+        ("close_loop/block_picking", "BulletArm/CloseLoopBlockPicking-v0"),
+        ("open_loop/house_building_3", "BulletArm/OpenLoopHouseBuilding3-v0"),
+        ("ramp/block_stacking", "BulletArm/RampBlockStacking-v0"),
+    ],
+)
+def test_ids(task, wanted):
+    assert gym_id(task) == wanted
+
+
+def test_every_task_has_an_id_of_its_own():
+    specs = {spec.id: spec for spec in gymnasium.registry.values() if spec.namespace == "BulletArm"}
+    assert {name: spec.kwargs["task"] for name, spec in specs.items()} == {
+        gym_id(task): task for task in ba_torchrl.list_tasks()
+    }
+    assert len(specs) == len(ba_torchrl.list_tasks())
+    assert all(spec.max_episode_steps is None for spec in specs.values())
+
+
+def test_registering_again_adds_only_what_is_missing(monkeypatch):
+    before = gymnasium.registry[PICKING]
+    missing = gym_id("close_loop/block_reaching")
+    monkeypatch.delitem(gymnasium.registry, missing)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register_tasks()
+    assert missing in gymnasium.registry
+    assert gymnasium.registry[PICKING] is before
+
+
+def run(code, folder):
+    """Run ``code`` in a fresh interpreter, outside the repository; return what it prints last."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import ba_torchrl, gymnasium",
+        "import gymnasium, ba_torchrl",
+        "import ba_torchrl, importlib.util; importlib.util.find_spec('gymnasium')",
+    ],
+)
+def test_ids_are_known_whatever_is_imported_first_and_without_torch(imports, tmp_path):
+    known, loaded = run(
+        f"{imports}\nimport gymnasium, json, sys\n"
+        "known = sorted(name for name in gymnasium.registry if name.startswith('BulletArm/'))\n"
+        "print(json.dumps([known, sorted(sys.modules)]))",
+        tmp_path,
+    )
+    assert known == sorted(map(gym_id, BUILT_IN))
+    assert not {"torch", "torchrl"} & set(loaded)
+
+
+def test_make_needs_no_import_of_the_package(tmp_path):
+    code = (
+        "import gymnasium, json, sys\n"
+        "light = not {'torch', 'pybullet', 'ba_torchrl'} & set(sys.modules)\n"
+        f"env = gymnasium.make('ba_torchrl:{PICKING}', obs_size=16)\n"
+        "observation, info = env.reset(seed=0)\n"
+        "env.close()\n"
+        "print(json.dumps([light, observation['pixels'].shape]))"
+    )
+    assert run(code, tmp_path) == [True, [1, 16, 16]]

@@ -1,0 +1,141 @@
+"""The exercises of docs/architecture.md, "How to add", done outside the package and played.
+
+Each file of ``mine/`` is one addition. None of them edits a file of the package.
+"""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl import testing
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.sim.geometry import downward
+from ba_torchrl.training.checkpoint import build_algorithm
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.experiment import Experiment
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+import mine.bridge  # noqa: E402
+import mine.plateau  # noqa: E402
+import mine.tall_block  # noqa: E402
+import mine.two_views  # noqa: E402
+import mine.wrist_camera  # noqa: E402
+
+TASKS = ("mine/bridge", "mine/stack_on_plateau", "mine/tall_block")
+MOST_LINES = {"bridge": 35, "plateau": 60, "tall_block": 70, "wrist_camera": 40}
+
+
+def play(env, episodes):
+    """Let the expert play; return the number of successes and the steps."""
+    successes = steps = 0
+    for _ in range(episodes):
+        state = env.reset()
+        while not state[keys.DONE]:
+            state = env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION].clone()))[keys.NEXT]
+            steps += 1
+        successes += int(state[keys.SUCCESS])
+    return successes, steps
+
+
+@pytest.mark.parametrize(("name", "most"), MOST_LINES.items())
+def test_additions_are_short(name, most):
+    assert len((HERE / "mine" / f"{name}.py").read_text().splitlines()) <= most
+
+
+@pytest.mark.parametrize(("task", "episodes"), [(task, 5) for task in TASKS])
+def test_experts_solve_new_tasks(task, episodes):
+    env = ba_torchrl.make(task, seed=0, expert=True, obs_size=32)
+    successes, _ = play(env, episodes)
+    assert successes == episodes
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_new_tasks_keep_the_contract(task):
+    testing.check_task(task)
+
+
+def test_a_structure_has_its_fewest_steps_and_its_deconstruction():
+    env = ba_torchrl.make("mine/bridge", seed=0, expert=True)
+    assert env.reset() is not None
+    assert env.scene.task.planner.blueprint.optimal_steps == 4
+    assert play(env, 3) == (3, 12)
+    env.close()
+    apart = ba_torchrl.make("mine/bridge", seed=0, expert=True, deconstruct=True)
+    assert play(apart, 1)[0] == 1
+    apart.close()
+
+
+def test_a_terrain_raises_what_stands_on_it():
+    env = ba_torchrl.make("mine/stack_on_plateau", seed=1, expert=True)
+    state = env.reset()
+    height_m = mine.plateau.HEIGHT_M
+    bodies = env.scene.task.objects
+    assert [body.position[2] for body in bodies] == pytest.approx([height_m + 0.015] * 3, abs=1e-3)
+    middle = state[keys.PIXELS][0]
+    assert float(middle.min()) == pytest.approx(height_m, abs=1e-6)
+    # a pick below the slab is raised until the fingers close above it
+    x, y, _ = bodies[0].position
+    body = env.scene.controller.pick((x, y, 0.0), downward(0.0))
+    assert body is bodies[0]
+    env.close()
+
+
+def test_a_parameter_of_the_task_alone():
+    env = ba_torchrl.make("mine/tall_block", seed=0, tolerance_m=0.5, expert=True)
+    env.reset()
+    assert env.scene.task.settings.parameters.tolerance_m == 0.5
+    assert env.scene.task.evaluate()["is_over_corner"]
+    env.close()
+
+
+def test_a_wrist_camera_is_observed_stored_and_learnt_from(tmp_path):
+    env = ba_torchrl.make(
+        "close_loop/block_picking", seed=0, obs_size=64, observations=["mine/wrist_camera"]
+    )
+    image = env.reset()["wrist"]
+    assert image.shape == (1, 32, 32)
+    assert 0.2 < float(image.max()) <= mine.wrist_camera.FARTHEST_M
+    env.close()
+    config = ExperimentConfig.parse(
+        {
+            "task": "close_loop/block_picking",
+            "env": {"obs_size": 64, "max_steps": 10, "observations": ["mine/wrist_camera"]},
+            "algorithm": {"name": "sac", "batch_size": 8, "augmentation": "none"},
+            "network": {"name": "mine/two_views"},
+            "num_envs": 2,
+            "parallel": False,
+            "demonstrations": 2,
+            "min_replay": 1,
+            "total_updates": 6,
+            "eval_every": 6,
+            "eval_episodes": 1,
+            "final_eval_episodes": 1,
+            "video_episodes": 0,
+            "run_dir": str(tmp_path / "run"),
+        }
+    )
+    experiment = Experiment(config, progress=False)
+    assert experiment.run().updates == 6
+    sample = experiment.algorithm.replay.sample()
+    assert sample["wrist"].shape[1:] == sample["next", "wrist"].shape[1:] == (1, 32, 32)
+    assert not torch.equal(sample["wrist"], sample["next", "wrist"])
+
+
+def test_a_network_that_sees_what_is_not_observed_is_refused():
+    config = ExperimentConfig.parse(
+        {
+            "task": "close_loop/block_picking",
+            "env": {"obs_size": 64},
+            "algorithm": {"name": "sac", "augmentation": "none"},
+            "network": {"name": "mine/two_views"},
+        }
+    )
+    with pytest.raises(ConfigError, match="wrist"):
+        build_algorithm(config)

@@ -1,0 +1,64 @@
+"""A network and an algorithm as a user writes them."""
+
+from typing import ClassVar
+
+import torch
+from torch import nn
+
+from ba_torchrl.algorithms.base import ALGORITHMS
+from ba_torchrl.algorithms.sac import SACConfig
+from ba_torchrl.config import StrictModel
+from ba_torchrl.modules.base import NETWORKS, ActorCritic
+
+
+class FlatActor(nn.Module):
+    """One linear layer on the image."""
+
+    def __init__(self, image_size: int, action_size: int) -> None:
+        super().__init__()
+        self.layer = nn.Linear(image_size**2 + 1, 2 * action_size)
+
+    def forward(self, pixels, holding):
+        loc, log_std = self.layer(flat(pixels, holding)).chunk(2, dim=-1)
+        return loc, log_std.clamp(-5, 2).exp()
+
+
+class FlatEncoder(nn.Module):
+    def forward(self, pixels, holding):
+        return flat(pixels, holding)
+
+
+class FlatCritic(nn.Module):
+    def __init__(self, image_size: int, action_size: int, hidden: int) -> None:
+        super().__init__()
+        size = image_size**2 + 1 + action_size
+        self.layers = nn.Sequential(nn.Linear(size, hidden), nn.ReLU(), nn.Linear(hidden, 2))
+
+    def forward(self, features, action):
+        return self.layers(torch.cat([features, action], dim=-1))
+
+
+def flat(pixels, holding):
+    return torch.cat([pixels.flatten(-3), holding.float()], dim=-1)
+
+
+@NETWORKS.register("mine/flat")
+class FlatConfig(StrictModel):
+    """Hyper-parameters of the linear actor-critic."""
+
+    control: ClassVar[str] = "close_loop"
+    hidden: int = 8
+
+    def build(self, spec):
+        return ActorCritic(
+            FlatActor(spec.image_size, spec.action_size),
+            FlatEncoder(),
+            FlatCritic(spec.image_size, spec.action_size, self.hidden),
+        )
+
+
+@ALGORITHMS.register("mine/sac")
+class MySACConfig(SACConfig):
+    """SAC with another discount factor."""
+
+    gamma: float = 0.9

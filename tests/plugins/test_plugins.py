@@ -1,0 +1,320 @@
+"""Tasks, robots, networks and algorithms from a user's own module, as a user tries them.
+
+Everything runs in processes of its own: a registered task stays registered.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PLUGINS = ("my_tasks", "my_learning")
+PLUGIN = "plugins=[my_tasks,my_learning]"
+GYM_ID = "BulletArm/MineReachNear-v0"
+SMALL = "obs_size=16, seed=0, max_steps=3"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder outside the repository that holds the plugins."""
+    for name in PLUGINS:
+        shutil.copy(Path(__file__).parent / f"{name}.py", tmp_path)
+    return tmp_path
+
+
+def run(folder, *command, paths=(), check=True):
+    """Run Python in a folder, where the package itself is installed; return the process."""
+    path = os.pathsep.join(map(str, [ROOT, *paths]))
+    done = subprocess.run(
+        [sys.executable, *map(str, command)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    if check:
+        assert done.returncode == 0, done.stderr[-3000:]
+    return done
+
+
+def last_line(done):
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_make_knows_a_task_and_a_robot_after_the_import(folder):
+    code = f"""
+import json, ba_torchrl, my_tasks
+env = ba_torchrl.make("mine/reach_near", robot="mine/kuka", expert=True, {SMALL})
+robot = type(env.scene.robot).__name__ if env.reset() is not None else None
+print(json.dumps([robot, env.task_class.__name__, "mine/reach_near" in ba_torchrl.list_tasks()]))
+"""
+    assert last_line(run(folder, "-c", code)) == ["MyKuka", "ReachNear", True]
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import my_tasks, gymnasium",
+        "import gymnasium, my_tasks",
+        "import ba_torchrl, gymnasium, my_tasks",
+        "import gymnasium, ba_torchrl; ba_torchrl.list_tasks(); import my_tasks",
+    ],
+)
+def test_gymnasium_knows_a_task_in_any_order_of_imports(folder, imports):
+    code = f"{imports}\nimport json; print(json.dumps(gymnasium.spec({GYM_ID!r}).kwargs))"
+    kwargs = last_line(run(folder, "-c", code))
+    assert kwargs == {"task": "mine/reach_near", "register_modules": ["my_tasks"]}
+
+
+def test_workers_of_gymnasium_import_the_module_of_the_task(folder):
+    code = f"""
+import json, gymnasium, my_tasks
+env = gymnasium.make_vec(
+    {GYM_ID!r}, 2, vectorization_mode="async", vector_kwargs={{"context": "spawn"}}, {SMALL}
+)
+observation, info = env.reset(seed=[0, 1])
+env.close()
+print(json.dumps(observation["pixels"].shape))
+"""
+    assert last_line(run(folder, "-c", code)) == [2, 1, 16, 16]
+
+
+@pytest.mark.parametrize("options", ["", "register_modules=['extra'],"])
+def test_spawned_workers_import_the_modules_of_task_and_robot(folder, options):
+    (folder / "extra.py").write_text("import os\nopen(f'seen-{os.getpid()}', 'w').close()\n")
+    code = f"""
+import json, ba_torchrl, my_tasks
+env = ba_torchrl.make_vector_env("mine/reach_near", 1, robot="mine/kuka", {options} {SMALL})
+rollout = env.rollout(3)
+env.close()
+print(json.dumps(list(rollout["pixels"].shape)))
+"""
+    assert last_line(run(folder, "-c", code)) == [1, 3, 1, 16, 16]
+    processes = len(list(folder.glob("seen-*")))
+    assert processes == (2 if options else 0)
+
+
+IN_MAIN = f"""
+import json, ba_torchrl
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
+
+
+@TASKS.register("mine/here")
+class Here(BlockReaching):
+    goal_distance_m = 0.02
+
+
+@TASKS.register("mine/here")
+class Here(BlockReaching):  # the cell of a notebook, run a second time
+    goal_distance_m = 0.01
+
+
+def play(**options):
+    env = ba_torchrl.make_vector_env("mine/here", 1, {SMALL}, **options)
+    shape = list(env.rollout(2)["pixels"].shape)
+    env.close()
+    return shape
+"""
+
+
+def test_a_task_of_a_notebook_is_refused_in_spawned_workers(folder):
+    code = f"""{IN_MAIN}
+from ba_torchrl.errors import ConfigError
+message = ""
+try:
+    play()
+except ConfigError as error:
+    message = str(error)
+print(json.dumps([message, play(parallel=False), play(start_method="fork")]))
+"""
+    message, *shapes = last_line(run(folder, "-c", code))
+    assert "'mine/here' is defined in a notebook" in message
+    assert "move it to a module" in message
+    assert shapes == [[1, 2, 1, 16, 16]] * 2
+
+
+def test_a_task_of_a_script_reaches_its_workers(folder):
+    script = folder / "script.py"
+    script.write_text(f'{IN_MAIN}\nif __name__ == "__main__":\n    print(json.dumps(play()))\n')
+    assert last_line(run(folder, script)) == [1, 2, 1, 16, 16]
+
+
+def test_a_module_that_workers_cannot_import_is_named(folder):
+    code = f"""
+import importlib.util, sys, ba_torchrl
+spec = importlib.util.spec_from_file_location("hidden_name", "my_tasks.py")
+module = importlib.util.module_from_spec(spec)
+sys.modules["hidden_name"] = module
+spec.loader.exec_module(module)
+ba_torchrl.make_vector_env("mine/reach_near", 1, {SMALL})
+"""
+    done = run(folder, "-c", code, check=False)
+    assert done.returncode != 0
+    assert "cannot import the plugin 'hidden_name'" in done.stderr
+    assert "PYTHONPATH" in done.stderr
+
+
+def install(folder, name, module):
+    """Write what an installed package leaves that declares a plugin."""
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[ba_torchrl.plugins]\n{name} = {module}\n")
+
+
+def test_installed_plugins_are_found_and_a_broken_one_does_not_stop_the_others(tmp_path):
+    packages = tmp_path / "site-packages"
+    packages.mkdir()
+    shutil.copy(Path(__file__).parent / "my_tasks.py", packages)
+    (packages / "broken_plugin.py").write_text("raise RuntimeError('no licence')\n")
+    install(packages, "broken", "broken_plugin")
+    install(packages, "good", "my_tasks")
+    code = "import json, ba_torchrl; print(json.dumps(ba_torchrl.list_tasks()))"
+    done = run(tmp_path, "-c", code, paths=[packages])
+    assert "mine/reach_near" in last_line(done)
+    assert done.stderr.count("PluginWarning") == 1
+    assert "plugin 'broken' (broken_plugin) of broken is not loaded" in done.stderr
+    assert "RuntimeError: no licence" in done.stderr
+
+
+def test_two_tasks_with_one_gymnasium_id_are_refused(folder):
+    code = """
+import gymnasium, my_tasks
+from ba_torchrl.tasks.base import TASKS
+TASKS.register("mine_reach/near")(my_tasks.ReachNear)
+"""
+    done = run(folder, "-c", code, check=False)
+    assert "'mine/reach_near' and 'mine_reach/near' have the same Gymnasium id" in done.stderr
+
+
+def test_a_users_task_passes_or_fails_the_contract(folder):
+    (folder / "my_broken_task.py").write_text(
+        """
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
+
+
+@TASKS.register("mine/always_here")
+class AlwaysHere(BlockReaching):
+    def randomise(self, rng):
+        self.stand(self.block, self.settings.workspace.center, 0.0)
+"""
+    )
+    code = """
+import json, my_tasks, my_broken_task
+from ba_torchrl.testing import check_task
+check_task("mine/reach_near", robot="mine/kuka", episodes=3)
+try:
+    check_task("mine/always_here", episodes=1)
+except AssertionError as error:
+    print(json.dumps(str(error)))
+"""
+    assert "mine/always_here: the seed changes nothing" in last_line(run(folder, "-c", code))
+
+
+TRAINING = (
+    "task=mine/reach_near",
+    "algorithm=mine/sac",
+    "network=mine/flat",
+    "network.hidden=4",
+    "env.robot=mine/kuka",
+    "env.obs_size=16",
+    "env.max_steps=5",
+    "algorithm.augmentation=none",
+    "algorithm.batch_size=4",
+    "demonstrations=2",
+    "total_updates=4",
+    "eval_every=2",
+    "eval_episodes=2",
+    "final_eval_episodes=2",
+    "num_envs=2",
+    "video_episodes=0",
+)
+
+
+def test_the_recipes_take_a_plugin(folder):
+    recipes = ROOT / "recipes"
+    out = run(folder, recipes / "train.py", PLUGIN, *TRAINING, "run_dir=runs/one").stdout
+    assert "over 2 episodes" in out
+    config = json.loads((folder / "runs/one/config.json").read_text())
+    assert config["plugins"] == list(PLUGINS)
+    result = json.loads((folder / "runs/one/result.json").read_text())
+    assert result["label"] == "mine/sac mine/flat"
+    assert result["config"]["network"] == {"name": "mine/flat", "hidden": 4}
+    assert result["config"]["algorithm"]["gamma"] == 0.9
+
+    out = run(folder, recipes / "evaluate.py", "checkpoint=runs/one", "episodes=2").stdout
+    assert "over 2 episodes of mine/reach_near" in out
+
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir()
+    again = (recipes / "evaluate.py", f"checkpoint={folder}/runs/one", "episodes=1")
+    done = run(elsewhere, *again, check=False)
+    assert "cannot import the plugin 'my_tasks'" in done.stderr
+
+
+def test_a_run_from_a_script_records_its_plugins(folder):
+    code = """
+import json, my_tasks, my_learning
+from ba_torchrl.training.config import ExperimentConfig
+config = ExperimentConfig.parse(
+    {
+        "task": "mine/reach_near",
+        "env": {"obs_size": 16},
+        "algorithm": {"name": "sac"},
+        "network": {"name": "mine/flat"},
+    }
+)
+print(json.dumps(config.plugins))
+"""
+    assert last_line(run(folder, "-c", code)) == list(PLUGINS)
+
+
+def test_a_benchmark_with_a_plugin_runs_its_jobs(folder):
+    arguments = [
+        PLUGIN,
+        "tasks=[mine/reach_near]",
+        "algorithms=[mine/sac]",
+        "networks=[mine/flat]",
+        "seeds=1",
+        "folder=grid",
+        *(text for text in TRAINING if not text.startswith(("task=", "algorithm=", "network="))),
+    ]
+    out = run(folder, ROOT / "recipes" / "benchmark.py", *arguments).stdout
+    assert "1 of 1 runs done in grid" in out
+    assert (folder / "grid/mine_reach_near/mine_sac_mine_flat/seed0/result.json").exists()
+
+
+@pytest.mark.slow
+def test_the_other_recipes_take_a_plugin(folder):
+    recipes = ROOT / "recipes"
+    demos = ("task=mine/reach_near", "episodes=2", "num_envs=1", "env.obs_size=16", "path=demos")
+    out = run(folder, recipes / "collect_demos.py", PLUGIN, *demos).stdout
+    assert "episodes of mine/reach_near" in out
+    out = run(
+        folder, recipes / "play.py", PLUGIN, "task=mine/reach_near", "video=null", "env.obs_size=16"
+    ).stdout
+    assert "1 episodes of mine/reach_near" in out
+    tasks = "tasks=[mine/reach_near]"
+    out = run(
+        folder, recipes / "experts.py", PLUGIN, tasks, "robots=[mine/kuka]", "episodes=2"
+    ).stdout
+    assert "| `mine/reach_near` | mine/kuka |" in out
+    run(folder, recipes / "gallery.py", PLUGIN, tasks, "deconstructions=[]", "overview=null")
+    assert (folder / "docs/gallery/mine_reach_near.png").exists()
+
+
+def test_an_unknown_task_names_the_way_to_plugins(folder):
+    done = run(
+        folder, ROOT / "recipes" / "train.py", *TRAINING[:1], "run_dir=runs/two", check=False
+    )
+    assert "unknown task 'mine/reach_near'" in done.stderr
+    assert "plugins=[module]" in done.stderr

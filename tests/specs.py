@@ -1,0 +1,27 @@
+"""What networks are built for in the tests."""
+
+from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.modules.base import ActorCriticSpec
+from ba_torchrl.modules.spatial import SpatialSpec
+
+
+def close_loop_images(size=64, high_m=0.39):
+    return {"pixels": ImageSpec(1, size, high_m, storage="uint8")}
+
+
+def open_loop_images(size=32, in_hand_size=24, channels=1, high_m=0.24):
+    axes = ("yz", "xz", "xy") if channels == 3 else ()
+    return {
+        "pixels": ImageSpec(1, size, high_m),
+        "in_hand": ImageSpec(channels, in_hand_size, high_m, frame="gripper", channel_axes=axes),
+    }
+
+
+def actor_critic_spec(size=64, sequence="pxyzr"):
+    return ActorCriticSpec(close_loop_images(size), sequence)
+
+
+def spatial_spec(
+    size=32, in_hand_size=24, channels=1, components=("x", "y", "rz"), half_rotation=True
+):
+    return SpatialSpec(open_loop_images(size, in_hand_size, channels), components, half_rotation)

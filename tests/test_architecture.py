@@ -1,0 +1,37 @@
+"""docs/architecture.md: its picture is that of the present imports, and it names every folder."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+
+spec = importlib.util.spec_from_file_location("architecture", ROOT / "docs" / "architecture.py")
+architecture = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(architecture)
+
+
+def test_the_picture_is_drawn_from_the_imports():
+    assert architecture.page_with_picture(PAGE) == PAGE, "run `python docs/architecture.py`"
+
+
+def test_imports_that_follow_from_others_are_left_out():
+    graph = {"a": {"b", "c"}, "b": {"c"}, "c": set()}
+    assert architecture.reduced(graph) == {"a": {"b"}, "b": {"c"}, "c": set()}
+
+
+def test_every_folder_has_a_line():
+    folders = {path.parent.name for path in (ROOT / "ba_torchrl").glob("*/__init__.py")}
+    named = set(re.findall(r"^\| `(\w+)/`", PAGE, flags=re.MULTILINE))
+    assert named == folders
+
+
+def test_examples_and_files_exist():
+    paths = re.findall(r"`((?:tests|docs|ba_torchrl)/[\w/.]+)`", PAGE)
+    paths += [
+        f"ba_torchrl/{path}"
+        for path in re.findall(r"`((?:envs|sim|tasks|data|training)/\w+\.py)`", PAGE)
+    ]
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+    assert len(paths) > 8

@@ -1,0 +1,131 @@
+"""The benchmarks in ``configs`` have the paper's values."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from ba_torchrl.config import parse
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.grid.plan import BenchmarkConfig, plan
+from tests.training.grid.grids import PICK, PLACE, REACH
+
+ROOT = Path(__file__).parents[3]
+
+
+def tasks_of(control):
+    """Return the built-in tasks of a control."""
+    built_in = (task for task in TASKS if TASKS.plugin_module(task) is None)
+    return [task for task in built_in if TASKS[task].control == control]
+
+
+def shipped(name, *overrides):
+    hydra_schema.register()
+    with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
+        settings = compose(
+            "benchmark", overrides=[f"benchmark={name}", *overrides], return_hydra_config=True
+        )
+        HydraConfig.instance().set_config(settings)
+        own = OmegaConf.masked_copy(settings, [key for key in settings if key != "hydra"])
+        values = OmegaConf.to_container(own, resolve=True)
+        assert values.pop("dry_run") is False
+        known = [name for name in BenchmarkConfig.model_fields if name in values]
+        config = parse(BenchmarkConfig, {name: values.pop(name) for name in known}, "benchmark")
+        return config, values, plan(config, values, hydra_schema.preset)
+
+
+@pytest.mark.parametrize(
+    ("name", "actions", "turned"),
+    [("close_loop_3d", "pxyz", False), ("close_loop_4d", "pxyzr", True)],
+)
+def test_close_loop_benchmarks_have_the_values_of_the_paper(name, actions, turned):
+    config, _, runs = shipped(name)
+    assert sorted(config.tasks) == tasks_of("close_loop")
+    assert len(runs) == 10 * 2 * 2 * 4
+    assert {run.benchmark for run in runs} == {name}
+    assert {run.run_dir.split("/")[1] for run in runs} == {name}
+    for run in runs:
+        env, algorithm = run.env_config, run.algorithm_config
+        assert (env.action_sequence, env.random_orientation) == (actions, turned)
+        assert (env.robot, env.obs_size, run.num_envs) == ("kuka", 128, 5)
+        assert (run.demonstrations, run.total_updates) == (100, 10_000)
+        assert (run.eval_every, run.eval_episodes) == (500, 100)
+        assert (algorithm.learning_rate, algorithm.gamma) == (1e-3, 0.99)
+        assert (algorithm.batch_size, algorithm.buffer_size) == (64, 100_000)
+        assert (algorithm.alpha_init, algorithm.target_entropy) == (0.01, -5.0)
+        assert (algorithm.replay == "prioritized") is run.label.startswith("sacfd")
+    first = next(run for run in runs if run.label == "sacfd equi").algorithm_config
+    assert (first.priority_exponent, first.importance_exponent, first.expert_bonus) == (
+        0.6,
+        0.4,
+        1.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("networks=[fcn,asr]", "sdqfd asr: .*no rz"),
+        ("env.obs_size=90", "multiple of 16"),
+        ("algorithm.augmentation=d4", "no yaw to rotate"),
+    ],
+)
+def test_networks_for_other_actions_or_images_are_refused(override, message):
+    with pytest.raises(ConfigError, match=f"(?s){PLACE} with .*{message}"):
+        shipped("open_loop_2d", f"tasks=[{PLACE}]", "network.width=0.1", override)
+
+
+def test_overrides_make_a_small_budget():
+    _, _, runs = shipped(
+        "close_loop_4d",
+        f"tasks=[{REACH}]",
+        "algorithms=[sacfd]",
+        "networks=[cnn,equi]",
+        "seeds=1",
+        "total_updates=600",
+        "env.obs_size=64",
+        "network.depth_scale_m=0.1",
+        "algorithm.tau=0.05",
+        "per_network.cnn.network.width=0.5",
+        "folder=somewhere",
+    )
+    cnn, equi = runs
+    assert (cnn.total_updates, cnn.env_config.obs_size) == (600, 64)
+    assert cnn.network_config.width == 0.5
+    assert {run.network_config.depth_scale_m for run in runs} == {0.1}
+    assert {run.algorithm_config.tau for run in runs} == {0.05}
+    assert equi.network["name"] == "equi"
+    assert cnn.run_dir.startswith("somewhere/")
+
+
+def test_an_unknown_preset_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match=r"unknown network 'resnet'.* Known: .*cnn.*equi"):
+        shipped("close_loop_4d", "networks=[resnet]")
+    with pytest.raises(ConfigError, match=r"unknown algorithm 'sacdf'\. Did you mean 'sacfd'"):
+        shipped("close_loop_4d", "algorithms=[sacdf]")
+
+
+@pytest.mark.parametrize("name", ["open_loop_2d", "open_loop_3d"])
+def test_open_loop_benchmarks_have_the_values_of_the_paper(name):
+    config, common, runs = shipped(name, "network.width=0.1")  # planning builds each network
+    known = set(tasks_of("open_loop"))
+    left_out = {"open_loop/box_palletizing"} if name == "open_loop_2d" else set()
+    assert set(config.tasks) == known - left_out
+    assert config.seed_list() == [0, 1, 2, 3]
+    assert common["env"]["action_sequence"] == {"2": "pxy", "3": "pxyr"}[name[-2]]
+    assert common["env"]["random_orientation"] is (name == "open_loop_3d")
+    assert (common["env"]["obs_size"], common["env"]["in_hand_size"]) == (128, 24)
+    assert (common["demonstrations"], common["num_envs"]) == (200, 5)
+    assert (common["total_updates"], common["eval_every"]) == (20_000, 500)
+    assert {run.algorithm_config.gamma for run in runs} == {0.95}
+    if name == "open_loop_3d":
+        assert len(runs) == 12 * (5 + 3) * 4
+        assert {run.env_config.obs_size for run in runs if "rot_fcn" in run.label} == {90}
+        assert config.per_network["rot_fcn"] == {"env": {"obs_size": 90}}
+        assert config.skips(task=PICK, algorithm="dqn", network="fcn")
+        assert not config.skips(task=PICK, algorithm="dqn", network="equi_asr")
+        assert not config.skips(task=PICK, algorithm="sdqfd", network="fcn")

@@ -1,0 +1,252 @@
+"""Runs of a grid in processes of their own: failures, interruptions, resumption."""
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.report import write_report
+from ba_torchrl.record.results import RunResult, read_result
+from ba_torchrl.training.grid import jobs
+from ba_torchrl.training.grid.jobs import run_all
+from ba_torchrl.training.grid.plan import status
+from tests.training.grid.grids import COMMON, REACH, planned
+
+ROOT = Path(__file__).parents[3]
+
+FAKE_WORKER = """
+import json, os, pathlib, signal, sys, time
+config = json.load(sys.stdin)
+folder = pathlib.Path(config["run_dir"])
+(folder / "calls").open("a").write("x")
+print("seed", config["seed"], "runs", flush=True)
+orders = folder.parents[2] / f"orders-{config['seed']}"
+order = orders.read_text() if orders.exists() else "finish"
+if order == "fail":
+    sys.exit("it broke")
+if order == "die":
+    os.kill(os.getpid(), signal.SIGSEGV)
+if order == "hang":
+    time.sleep(100)
+if order == "meet":  # needs another one at the same time
+    for _ in range(200):
+        if len(list(folder.parent.glob("*/calls"))) == 2:
+            break
+        time.sleep(0.05)
+    else:
+        sys.exit("the other run did not start")
+results = json.loads((folder.parents[2] / "results.json").read_text())
+(folder / "result.json").write_text(results[config["run_dir"]])
+"""
+
+
+def result_of(run):
+    return RunResult(
+        task=run.task,
+        label=run.label,
+        benchmark=run.benchmark,
+        seed=run.seed,
+        curve=[],
+        final={
+            "policy": "last",
+            "updates": 6,
+            "episodes": 2,
+            "success_rate": 0.5,
+            "standard_error": 0.35,
+            "mean_length": 3.0,
+        },
+        config=run.resolved(),
+        versions={},
+        hardware={},
+        seconds=1.0,
+        finished="2000-01-01T00:00:00+00:00",
+        files={},
+    )
+
+
+@pytest.fixture
+def fake(tmp_path, monkeypatch):
+    """Return a function that runs a grid with a worker that follows orders from a file."""
+    script = tmp_path / "worker.py"
+    script.write_text(FAKE_WORKER)
+    monkeypatch.setattr(jobs, "POLL_S", 0.02)
+
+    def run(runs, orders=(), **options):
+        grid = Path(runs[0].run_dir).parents[2]
+        grid.mkdir(exist_ok=True)
+        for path in grid.glob("orders-*"):
+            path.unlink()
+        for seed, order in dict(orders).items():
+            (grid / f"orders-{seed}").write_text(order)
+        results = {run.run_dir: result_of(run).model_dump_json() for run in runs}
+        (grid / "results.json").write_text(json.dumps(results))
+        return run_all(runs, progress=False, worker=[sys.executable, str(script)], **options)
+
+    return run
+
+
+def calls(run):
+    path = run.folder / "calls"
+    return len(path.read_text()) if path.exists() else 0
+
+
+def test_a_failed_run_is_recorded_and_repeated_by_the_next_call(tmp_path, fake):
+    runs = planned(tmp_path, seeds=4)
+    assert {str(status(run)) for run in runs} == {"missing"}
+    failures = fake(runs, {1: "fail", 2: "die"})
+    assert failures == {
+        runs[1].folder: "exit status 1: it broke",
+        runs[2].folder: "killed by SIGSEGV",
+    }
+    assert [status(run).state for run in runs] == ["done", "failed", "failed", "done"]
+    assert str(status(runs[0])) == "done: success 0.50"
+    assert str(status(runs[1])) == "failed: exit status 1: it broke"
+    record = json.loads((runs[1].folder / "failure.json").read_text())
+    assert record["log"] == ["seed 1 runs", "it broke"]
+    assert fake(runs) == {}
+    assert [calls(run) for run in runs] == [1, 2, 2, 1]
+    assert {status(run).state for run in runs} == {"done"}
+    assert not (runs[1].folder / "failure.json").exists()
+
+
+def test_a_run_that_exceeds_its_time_limit_is_stopped(tmp_path, fake):
+    runs = planned(tmp_path)
+    started = time.monotonic()
+    failures = fake(runs, {0: "hang"}, max_hours=1 / 3600)
+    assert time.monotonic() - started < 20
+    assert failures == {runs[0].folder: "took longer than max_hours"}
+    assert status(runs[1]).state == "done"
+
+
+def test_jobs_run_at_the_same_time(tmp_path, fake):
+    runs = planned(tmp_path)
+    assert fake(runs, {0: "meet", 1: "meet"}, jobs=2) == {}
+
+
+def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
+    runs = planned(tmp_path)
+    processes = []
+    start = subprocess.Popen
+
+    def remember(*args, **kwargs):
+        processes.append(start(*args, **kwargs))
+        return processes[-1]
+
+    def interrupt(seconds):
+        if calls(runs[0]):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs.subprocess, "Popen", remember)
+    monkeypatch.setattr(jobs.time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        fake(runs, {0: "hang"})
+    assert [process.returncode for process in processes] == [-signal.SIGKILL]
+    assert status(runs[0]).state == "missing"
+
+
+def test_a_folder_with_other_settings_is_refused_before_anything_starts(tmp_path, fake):
+    fake(planned(tmp_path, seeds=1))
+    changed = planned(tmp_path, seeds=2, common={"total_updates": 8})
+    with pytest.raises(ConfigError, match="total_updates: 6 there, 8 now"):
+        fake(changed)
+    assert calls(changed[1]) == 0
+
+
+def test_a_run_of_another_process_is_refused(tmp_path, fake):
+    runs = planned(tmp_path)
+    runs[1].folder.mkdir(parents=True)
+    with (runs[1].folder / "run.log").open("a") as log:
+        fcntl.flock(log, fcntl.LOCK_EX)
+        with pytest.raises(ConfigError, match=r"another process runs .*seed1"):
+            fake(runs)
+    assert calls(runs[1]) == 0
+    assert fake(runs) == {}
+    assert (calls(runs[0]), calls(runs[1])) == (1, 1)
+
+
+def test_a_killed_run_is_resumed_in_a_new_process(tmp_path):
+    (run,) = planned(tmp_path, seeds=[5], common={"total_updates": 90, "eval_every": 15})
+    state = run.folder / "resume"
+    pids = []
+
+    def kill_after_an_evaluation():
+        for _ in range(6000):
+            if any(not path.name.startswith(".") for path in state.glob("*")):
+                pids.extend(children_of(os.getpid()))
+                for pid in pids:
+                    os.kill(pid, signal.SIGKILL)
+                return
+            time.sleep(0.005)
+
+    killer = threading.Thread(target=kill_after_an_evaluation)
+    killer.start()
+    failures = run_all([run], progress=False)
+    killer.join()
+    assert len(pids) == 1
+    assert failures == {run.folder: "killed by SIGKILL"}
+    assert status(run).state == "failed"
+    (run.folder / "failure.json").unlink()
+    found = status(run)
+    assert found.state == "interrupted"
+    updates = int(found.detail.split()[3])
+    assert run_all([run], progress=False) == {}
+    result = read_result(run.folder)
+    assert result.resumed_at == [updates]
+    assert [point.updates for point in result.curve] == list(range(15, 91, 15))
+    assert not state.exists()
+
+
+def children_of(pid):
+    """Return the processes that this one started to run benchmarks."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/status"):
+        try:
+            parent = path.read_text().split("PPid:\t")[1].split("\n")[0]
+            command = (path.parent / "cmdline").read_text()
+        except OSError:  # the process has ended
+            continue
+        if int(parent) == pid and "ba_torchrl.training.grid.run_one" in command:
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_the_recipe_from_the_command_line(tmp_path):
+    def recipe(*arguments, code=0):
+        command = [sys.executable, "recipes/benchmark.py", *arguments]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
+        assert done.returncode == code, done.stderr[-3000:]
+        return done.stdout + done.stderr
+
+    small = [f"{name}={value}" for name, value in COMMON.items() if not isinstance(value, dict)]
+    arguments = (
+        *small,
+        f"tasks=[{REACH}]",
+        "algorithms=[sacfd]",
+        "networks=[cnn]",
+        "seeds=2",
+        "env.obs_size=64",
+        "env.max_steps=8",
+        "algorithm.batch_size=8",
+        "network.width=0.25",
+        f"folder={tmp_path}/grid",
+    )
+    # a run that cannot start, since its folder is taken by a file
+    (tmp_path / "grid/close_loop_block_reaching/sacfd_cnn/seed0").mkdir(parents=True)
+    blocked = tmp_path / "grid/close_loop_block_reaching/sacfd_cnn/seed0/checkpoints"
+    blocked.write_text("a file")
+    out = recipe(*arguments, code=1)
+    assert "1 of 2 runs done" in out
+    assert "failed  " in out
+    out = recipe(*arguments, "dry_run=true")
+    assert "2 runs: 1 failed, 1 done" in out
+    page = write_report([tmp_path / "grid"], tmp_path / "report").read_text()
+    assert "close_loop_4d" in page
+    assert "sacfd cnn" in page

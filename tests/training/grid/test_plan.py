@@ -1,0 +1,99 @@
+"""Which runs a grid consists of."""
+
+import pytest
+
+from ba_torchrl.errors import ConfigError
+from tests.training.grid.grids import PICK, PLACE, PRESETS, REACH, planned
+
+
+def test_a_grid_is_the_product_of_its_axes_ordered_by_seed(tmp_path):
+    runs = planned(
+        tmp_path, tasks=[REACH, PICK], algorithms=["sac", "sacfd"], networks=["cnn", "small"]
+    )
+    assert len(runs) == len({run.run_dir for run in runs}) == 16
+    assert [run.seed for run in runs] == [0] * 8 + [1] * 8
+    assert {run.task for run in runs[:8]} == {REACH, PICK}
+    assert {run.label for run in runs[:8]} == {"sac cnn", "sac small", "sacfd cnn", "sacfd small"}
+    first = runs[0]
+    assert (first.task, first.label, first.seed) == (REACH, "sac cnn", 0)
+    assert (first.benchmark, first.resume, first.total_updates) == ("little", True, 6)
+    assert first.algorithm_config.replay == "uniform"
+    assert first.algorithm_config.batch_size == 8
+    assert first.run_dir.endswith("grid/close_loop_block_reaching/sac_cnn/seed0")
+    assert [run.seed for run in planned(tmp_path, seeds=[7, 3])] == [7, 3]
+
+
+def test_the_more_specific_override_wins(tmp_path):
+    runs = planned(
+        tmp_path,
+        tasks=[REACH, PICK],
+        algorithms=["sac", "sacfd"],
+        networks=["cnn", "small"],
+        seeds=1,
+        per_task={PICK: {"demonstrations": 3, "env": {"max_steps": 9}, "min_replay": 11}},
+        per_algorithm={"sacfd": {"algorithm": {"gamma": 0.9}, "demonstrations": 4}},
+        per_network={"small": {"network": {"width": 0.5}, "demonstrations": 5}},
+        common={"network": {"depth_scale_m": 0.1}},
+    )
+    by = {(run.task, run.label): run for run in runs}
+    demonstrations = {key: run.demonstrations for key, run in by.items()}
+    assert demonstrations[REACH, "sac cnn"] == 2
+    assert demonstrations[PICK, "sac cnn"] == 3
+    assert demonstrations[PICK, "sacfd cnn"] == 4
+    assert demonstrations[PICK, "sacfd small"] == 5
+    pick = by[PICK, "sacfd small"]
+    assert pick.env == {"obs_size": 64, "max_steps": 9}
+    assert by[REACH, "sacfd small"].env == {"obs_size": 64, "max_steps": 8}
+    assert (pick.algorithm_config.gamma, pick.algorithm_config.batch_size) == (0.9, 8)
+    assert by[PICK, "sac small"].algorithm_config.gamma == 0.99
+    assert (pick.network_config.width, pick.network_config.depth_scale_m) == (0.5, 0.1)
+    assert by[PICK, "sac cnn"].network_config.width == 1.0
+    assert PRESETS["network", "small"] == {"name": "cnn", "width": 0.25}
+
+
+def test_skip_leaves_out_matching_runs(tmp_path):
+    runs = planned(
+        tmp_path,
+        tasks=[REACH, PICK],
+        algorithms=["sac", "sacfd"],
+        networks=["cnn", "small"],
+        seeds=1,
+        skip=[{"algorithm": "sac", "network": ["cnn"]}, {"task": PICK, "algorithm": "sacfd"}],
+    )
+    assert {(run.task, run.label) for run in runs} == {
+        (REACH, "sac small"),
+        (REACH, "sacfd cnn"),
+        (REACH, "sacfd small"),
+        (PICK, "sac small"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tasks": [REACH, "close_loop/flying"]}, "Known: .*block_picking"),
+        ({"algorithms": ["sac", "ppo"]}, "unknown algorithm 'ppo'.*sacfd"),
+        ({"networks": ["mlp"]}, "unknown network 'mlp'.*small"),
+        ({"per_task": {"close_loop/flying": {}}}, "Known: .*block_picking"),
+        ({"per_network": {"smal": {}}}, "unknown network 'smal'"),
+        ({"skip": [{"algorithm": ["sac", "ddpg"]}]}, "unknown algorithm 'ddpg'"),
+        ({"skip": [{"robot": "kuka"}]}, "unknown axis 'robot'.*task, algorithm, network"),
+        ({"skip": [{"task": REACH}]}, "grid is empty"),
+        ({"tasks": []}, "tasks"),
+        ({"seeds": 0}, "seeds"),
+        ({"seeds": [1, 1]}, "names one twice"),
+        ({"networks": ["cnn", "cnn"]}, "names one twice"),
+        ({"sedes": 3}, "Did you mean 'seeds'"),
+        ({"common": {"total_update": 5}}, "Did you mean 'total_updates'"),
+        ({"common": {"seed": 5}}, "seed: set by the benchmark"),
+        ({"common": {"network": {"widht": 1.0}}}, "with sac small: .*Did you mean 'width'"),
+        ({"common": {"env": {"in_hand_size": 30}}}, f"{REACH}.*: 'in_hand_size' is for open-loop"),
+        ({"common": {"env": {"robot": "sawyer"}}}, "kuka"),
+        ({"tasks": [PLACE]}, "an algorithm for close_loop tasks, not"),
+        ({"per_task": {REACH: {"env": {"obs_sise": 64}}}}, "Did you mean 'obs_size'"),
+    ],
+)
+def test_wrong_grids_are_refused(tmp_path, changes, message):
+    with pytest.raises(ConfigError, match=f"(?s){message}"):
+        planned(tmp_path, **changes)
+    assert not (tmp_path / "grid").exists()
