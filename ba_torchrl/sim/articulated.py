@@ -34,7 +34,7 @@ class Rail:
             raise ValueError(f"friction_n must not be negative, it is {self.friction_n}")
 
 
-class Part(Body):
+class ArticulatedLink(Body):
     """One of the rigid bodies that an articulated body consists of.
 
     Args:
@@ -183,9 +183,11 @@ class Articulated:
             physicsClientId=client,
         )
         links = range(1, len(pieces))
-        self.base = Part(client, self.id, [-1, *links[: len(fixed)]], base, name)
+        self.base = ArticulatedLink(client, self.id, [-1, *links[: len(fixed)]], base, name)
         """The fixed part."""
-        self.slider = Part(client, self.id, [0, *links[len(fixed) :]], slider, f"{name}'s slider")
+        self.slider = ArticulatedLink(
+            client, self.id, [0, *links[len(fixed) :]], slider, f"{name}'s slider"
+        )
         """The part that moves."""
         low, high = rail.range_m
         # in a call of their own: next to other settings, PyBullet ignores the limits
@@ -210,7 +212,7 @@ class Articulated:
         return f"Articulated({self.name!r})"
 
     @property
-    def parts(self) -> tuple[Part, Part]:
+    def parts(self) -> tuple[ArticulatedLink, ArticulatedLink]:
         """The fixed part and the sliding one."""
         return self.base, self.slider
 

@@ -14,7 +14,7 @@ import pybullet
 import pybullet_data
 
 from ba_torchrl.errors import SimulationError
-from ba_torchrl.sim.articulated import Articulated, Part, Rail
+from ba_torchrl.sim.articulated import Articulated, ArticulatedLink, Rail
 from ba_torchrl.sim.bodies import Body, Color, Shape
 
 
@@ -254,14 +254,14 @@ class World:
         """
         pybullet.setCollisionFilterGroupMask(self.floor, -1, 0, 0, physicsClientId=self.client)
         for body in self.bodies:
-            for link in body.links if isinstance(body, Part) else (-1,):
+            for link in body.links if isinstance(body, ArticulatedLink) else (-1,):
                 pybullet.setCollisionFilterGroupMask(
                     body.id, link, 0, 0, physicsClientId=self.client
                 )
         self.detect_collisions()
         _renew_pairs(self.client, self.floor, is_static=True)
         for body in self.bodies:
-            if isinstance(body, Part):
+            if isinstance(body, ArticulatedLink):
                 body.forget_pairs()
             else:
                 _renew_pairs(self.client, body.id, body.is_static)

@@ -130,7 +130,7 @@ class CornerPicking(CloseLoopTask):
             for k in (0, 1)
         ]
         needed = DRAG_ROOM_M if is_pressing else ROOM_M
-        yaws = [wanted for wanted in yaws if self.room_m(wanted) >= needed]
+        yaws = [wanted for wanted in yaws if self.clearance_m(wanted) >= needed]
         if not yaws:
             return self._pull() if is_pressing else self._press()
         if is_pressing:  # no turn yet, and steeply up: else the fingers would take the block along
@@ -141,7 +141,7 @@ class CornerPicking(CloseLoopTask):
         ceiling = self.settings.workspace.z[1]
         return pick_up(robot, block, limits, yaws_rad=yaws, ceiling_m=ceiling)
 
-    def room_m(self, yaw_rad: float) -> float:
+    def clearance_m(self, yaw_rad: float) -> float:
         """Return the gap between open fingers around the block and the walls.
 
         Args:

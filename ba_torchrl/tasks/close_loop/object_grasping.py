@@ -12,8 +12,8 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopControl
 from ba_torchrl.tasks.clutter.base import ClutterTask
-from ba_torchrl.tasks.clutter.grasp_planner import Grasp
 from ba_torchrl.tasks.clutter.push_planner import NEAR_M, Push, PushPlanner
+from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
@@ -71,7 +71,7 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
         """Return the actions [N] that it is worth to have an object turn less in the fingers."""
         return grasps[:, 5]
 
-    def _grasp(self, grasp: Grasp, over_z: float) -> GripperCommand:
+    def _grasp(self, grasp: TopDownGrasp, over_z: float) -> GripperCommand:
         """Go above the object with open fingers, down, and close them on arrival."""
         robot, limits = self.robot, self.action_limits
         (x, y, z), yaw = robot.tool_pose()

@@ -12,9 +12,10 @@ import numpy as np
 from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.assets.hulls import surface_samples
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Vector, YawPose
+from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.vision.depth import HeightCamera
+from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.motion_primitives import nearest_equivalent_yaw
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
@@ -47,18 +48,6 @@ SAMPLES = 256
 PIXEL_M = 0.003
 BORDER_M = 0.06
 """The height image reaches this far beyond the workspace."""
-
-
-class Grasp(NamedTuple):
-    """A tool pose around an object."""
-
-    body: Body
-    position: Vector
-    yaw_rad: float
-    risk: float
-    """0 for parallel sides in easy reach; beyond 1, rather not."""
-    cost: float
-    """Actions it takes, failures counted in."""
 
 
 class GraspPlanner:
@@ -112,7 +101,7 @@ class GraspPlanner:
         limits: ActionLimits,
         heights: np.ndarray,
         penalty: Callable[[np.ndarray], np.ndarray] | None = None,
-    ) -> Grasp | None:
+    ) -> TopDownGrasp | None:
         """Return the cheapest grasp of any of the bodies, or None if there is none.
 
         Args:
@@ -156,7 +145,9 @@ class GraspPlanner:
                     travel += max(0.1 - z, 0.0) / limits.step_m  # up first
                 cost = travel + 12 * risk + more
                 if best is None or cost < best.cost:
-                    best = Grasp(body, (gx, gy, gz), target_yaw, float(risk), float(cost))
+                    best = TopDownGrasp(
+                        body, (gx, gy, gz), target_yaw, risk=float(risk), cost=float(cost)
+                    )
         return best
 
     def risk_alone(self, samples: np.ndarray, tool: YawPose) -> float:

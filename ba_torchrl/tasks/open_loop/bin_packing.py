@@ -19,7 +19,7 @@ from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.footprints import Rectangle, narrowest, outline
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.pick_place_commands import no_op
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 
 BIN_M = (0.176, 0.144, 0.08)
 WALL_M = 0.004
@@ -30,7 +30,6 @@ INSIDE_M = 1e-3
 """An object may lean out of the bin's inside by this much."""
 PICK_BELOW_M = 0.011
 """Objects are held this far below their top: the fingers stay out of what a flat one lies on."""
-LOWEST_PICK_M = 0.012
 EAVES_M = 0.026
 FREE_HALF_M = (0.06, 0.016)
 """Half the extents of the area around an object that is free at the start, for the pick."""
@@ -144,8 +143,7 @@ class BinPacking(PackingTask):
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which an object is held: just below its top."""
-        lowest_m = self.terrain.height_m(xy) + LOWEST_PICK_M * self.unit
-        return max(top_m - PICK_BELOW_M * self.unit, lowest_m)
+        return max(top_m - PICK_BELOW_M * self.unit, self.lowest_tool_m(xy))
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height at which to let go: over the bin's rim, or gently on the ground."""
@@ -174,12 +172,12 @@ class BinPacking(PackingTask):
         grasps = {body: self.grasp(body) for body in outside}
 
         def order(body: Body) -> tuple[bool, float, float]:
-            room = grasps[body].room_m
+            room = grasps[body].clearance_m
             size = float(np.ptp(body.shape.vertices, axis=0).prod()) if room > 0 else 0.0
             return room > 0, round(size, 7), room
 
         body = max(outside, key=order)
-        return self.pick(body, grasps[body])
+        return pick_command(grasps[body].tool)
 
     # ----------------------------------------------------------------------------------------
 

@@ -16,9 +16,10 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clearance import half_gap_m, outline_clearance_m
 from ba_torchrl.tasks.footprints import Rectangle
-from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, Grasp, PackingTask, open_box
+from ba_torchrl.tasks.grasps import TopDownGrasp
+from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.pick_place_commands import no_op
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)
@@ -179,21 +180,22 @@ class BottleArrangement(PackingTask):
         if self._clearance(place, None) < CLEARANCE_M:
             # bottles stand where there is no room left: one of them goes to a better place
             grasps = {body: self.grasp(body) for body in self.objects if body not in grasps}
-            body = max(grasps, key=lambda body: (grasps[body].room_m > 0, self._offset(body)))
-            return self.pick(body, grasps[body])
-        body = max(outside, key=lambda body: round(grasps[body].room_m, 4))
-        return self.pick(body, grasps[body])
+            body = max(grasps, key=lambda body: (grasps[body].clearance_m > 0, self._offset(body)))
+            return pick_command(grasps[body].tool)
+        body = max(outside, key=lambda body: round(grasps[body].clearance_m, 4))
+        return pick_command(grasps[body].tool)
 
-    def grasp(self, body: Body) -> Grasp:
+    def grasp(self, body: Body) -> TopDownGrasp:
         """Return where to grasp a bottle: by its neck, from the side with most room."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         others = self.obstacles(body, height + self.tips_m)
         x, y, _ = body.position
         half = half_gap_m(self.robot.gripper, self.finger_opening)
         choices = [
-            Grasp(x, y, yaw, self._finger_gap_m((x, y), yaw, half, others)) for yaw in self._yaws()
+            TopDownGrasp(body, (x, y, height), yaw, self._finger_gap_m((x, y), yaw, half, others))
+            for yaw in self._yaws()
         ]
-        return max(choices, key=lambda choice: round(choice.room_m, 4))
+        return max(choices, key=lambda choice: round(choice.clearance_m, 4))
 
     # ----------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
 from ba_torchrl.tasks.packing.base import ENOUGH_M, RELEASE_GAP_M, PackingTask
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.pick_place_commands import no_op
+from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 from ba_torchrl.tasks.structures.blueprint import CUBOID, UPRIGHT_RAD
 
 PALLET_M = (0.232, 0.192, 0.03)
@@ -156,10 +156,10 @@ class BoxPalletizing(PackingTask):
 
         def urgency(body: Body) -> tuple[float, bool, float]:
             level = round(vertical_extent(body)[1] / (BOX_M[2] * self.unit / 2))
-            return level, grasps[body].room_m > 0, grasps[body].room_m
+            return level, grasps[body].clearance_m > 0, grasps[body].clearance_m
 
         body = max(astray, key=urgency)
-        return self.pick(body, grasps[body])
+        return pick_command(grasps[body].tool)
 
     # ----------------------------------------------------------------------------------------
 

@@ -33,9 +33,8 @@ SUNK_M = 0.05
 """Boxes reach down below the ground: what falls fast passes through a thin sheet."""
 HALF_LAYOUT_M = 0.15
 """The three areas together fill a square of twice this."""
-GRASP_M = 0.0145
-"""Height of the tool above what an object lies on. The tips of closed fingers reach down to 13.6 mm
-below the tool: they just clear the floor, and close on the lower part of a swab."""
+TIPS_GAP_M = 9e-4
+"""Gap between what an object lies on and the tips of the fingers as they close."""
 COLUMN_M = 0.05
 """Distance of neighbours in the box of new tubes; the fingers pass between them."""
 WINDOW_M = 0.01
@@ -228,11 +227,11 @@ class CovidTest(OpenLoopTask):
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool at which the fingers close on what lies highest there."""
-        return max(top_m - self._tube_m[1] / 2, self._sheet_z_m(xy) + GRASP_M)
+        return max(top_m - self._tube_m[1] / 2, self._sheet_z_m(xy) + self._grasp_m)
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool at which what was picked like this is let go."""
-        return top_m + GRASP_M + RELEASE_GAP_M
+        return top_m + self._grasp_m + RELEASE_GAP_M
 
     def window_m(self, held: Body | None) -> float:
         """Return half the width of the square that is searched for the highest point.
@@ -285,7 +284,7 @@ class CovidTest(OpenLoopTask):
             return no_op(self.settings.workspace, is_holding=False)
         body = max(wanted, key=self._room)
         x, y, _ = body.position
-        z = vertical_extent(body)[0] + GRASP_M
+        z = vertical_extent(body)[0] + self._grasp_m
         return pick_command(downward_pose((x, y, z), self._grasp_yaw(body)))
 
     def _wanted(self) -> list[Body]:
@@ -341,7 +340,12 @@ class CovidTest(OpenLoopTask):
             turn = wrap_angle(area.yaw_rad + along_rad - held.yaw_rad, math.pi)
         z = self._sheet_z_m((x, y)) + RELEASE_GAP_M + held.position[2] - vertical_extent(held)[0]
         command = place_command(tool, held.pose, held.pose.moved_to((x, y, z), turn))
-        return command._replace(z_m=max(command.z_m, rim_m + GRASP_M + RELEASE_GAP_M))
+        return command._replace(z_m=max(command.z_m, rim_m + self._grasp_m + RELEASE_GAP_M))
+
+    @property
+    def _grasp_m(self) -> float:
+        """Height of the tool above what an object lies on, for the lower part of a swab."""
+        return TIPS_GAP_M - self.robot.gripper.lowest_m
 
     def _grasp_yaw(self, body: Body) -> float:
         return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0

@@ -85,7 +85,7 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
             return self._squeeze()
         near = [grasp for grasp in found if grasp.cost < found[0].cost + NEAR_COST]
         grasp = near[self.clutter.failures % len(near)]
-        return pick_command(downward_pose(grasp.position, grasp.yaw_rad))
+        return pick_command(grasp.tool)
 
     def _penalty(self, highest: np.ndarray, grasps: np.ndarray) -> np.ndarray:
         """Return what speaks against grasps [N, 6] as the planner lists them, [N].

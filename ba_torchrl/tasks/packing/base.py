@@ -5,20 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import pybullet
 
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
-from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose, downward_pose
+from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, joined, moved
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clearance import half_gap_m, hand_rectangle, outline_clearance_m
 from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
+from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
-from ba_torchrl.tasks.pick_place_commands import pick_command, place_command
+from ba_torchrl.tasks.pick_place_commands import place_command
 
 SCALE = 0.8
 """At this scale, objects have the sizes of appendix A.1."""
@@ -66,16 +67,6 @@ def open_box(size_m: Vector, wall_m: float, floor_m: float, color: Color) -> Blo
     depth = floor_m + UNDERGROUND_M
     slab = moved(box_mesh((*inside, depth)), (0.0, 0.0, floor_m - (z + depth) / 2))
     return Blocks(parts=(*walls, slab), surface=joined([*walls, sheet]), mass_kg=0.0, color=color)
-
-
-class Grasp(NamedTuple):
-    """Where to close the fingers."""
-
-    x: float
-    y: float
-    yaw_rad: float
-    room_m: float
-    """Gap between the open fingers and what stands beside them."""
 
 
 class PackingTask(OpenLoopControl, Task):
@@ -144,7 +135,7 @@ class PackingTask(OpenLoopControl, Task):
             if other is not body and other is not held and vertical_extent(other)[1] > above_m
         ]
 
-    def grasp(self, body: Body) -> Grasp:
+    def grasp(self, body: Body) -> TopDownGrasp:
         """Return where to grasp an object: in its middle, or where the fingers have more room."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         gripper = self.robot.gripper
@@ -161,13 +152,8 @@ class PackingTask(OpenLoopControl, Task):
                 room = outline_clearance_m(gripper, tool, half_open, others)
                 hand = hand_rectangle(self.robot, tool)
                 room = min([room, *(gap_m(hand, other) for other in tall)])
-                choices.append(Grasp(*xy, side.yaw_rad, room))
-        return max(choices, key=lambda choice: min(choice.room_m, ENOUGH_M))
-
-    def pick(self, body: Body, grasp: Grasp) -> PickPlaceCommand:
-        """Return the pick of an object."""
-        height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
-        return pick_command(downward_pose((grasp.x, grasp.y, height), grasp.yaw_rad))
+                choices.append(TopDownGrasp(body, (*xy, height), side.yaw_rad, room))
+        return max(choices, key=lambda choice: min(choice.clearance_m, ENOUGH_M))
 
     def place(self, held: Body, position: Vector, turn_rad: float) -> PickPlaceCommand:
         """Return the place that brings what is held somewhere, up to half turns.

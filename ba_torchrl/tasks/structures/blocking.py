@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +17,35 @@ from ba_torchrl.tasks.structures.free_space import extent_along_m
 SPARE_M = 2e-3
 """Room between a piece and a finger that comes down close by it."""
 
-BlocksGrasp = Callable[[Body, Body, Vector | None], Sequence[bool]]
-"""From a piece, another, and where that one will be if not where it is now, to whether it is in
-the hand's way, for each of the ways to grasp the first."""
+
+class GraspQueries:
+    """What the planner asks about the gripper; here, that of a gripper that needs no room."""
+
+    clears_blocked_pieces: bool = False
+    """Whether pieces that block the grasp of another are removed."""
+
+    def pick_effort_m(self, body: Body) -> float:
+        """Return what to add to the way of a piece for picking it, to choose among equals."""
+        return 0.0
+
+    def site_deficit_m(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
+        """Return how much clearance is missing at sites to pick the other pieces later, [S].
+
+        Args:
+            sites: [S, P, 2] points on the ground that a structure will stand on.
+            rest: pieces that will still have to be picked.
+        """
+        return np.zeros(len(sites))
+
+    def blocks_grasp(self, body: Body, other: Body, place: Vector | None) -> Sequence[bool]:
+        """Return whether a piece is in the hand's way, for each of the ways to grasp another.
+
+        Args:
+            body: to be grasped.
+            other: the piece.
+            place: its position then; None where it is now.
+        """
+        return (False,)
 
 
 class Move(NamedTuple):
@@ -89,7 +115,7 @@ class GraspBlocking:
         pieces: what each body is.
         bodies_above: all that lies on each, right on it or on what does.
         held: what the gripper holds: it is in no one's way.
-        blocks_grasp: what keeps the hand from pieces; nothing if not given.
+        queries: about the gripper.
     """
 
     def __init__(
@@ -97,21 +123,21 @@ class GraspBlocking:
         pieces: Mapping[Body, Piece],
         bodies_above: Mapping[Body, frozenset[Body]],
         held: Body | None,
-        blocks_grasp: BlocksGrasp | None,
+        queries: GraspQueries,
     ) -> None:
         self.pieces = pieces
         self.bodies_above = bodies_above
         self.held = held
-        self.blocks_grasp = blocks_grasp
+        self.queries = queries
         self._obstacles: dict[Body, list[frozenset[Body]]] = {}
 
     def obstacles(self, body: Body) -> list[frozenset[Body]]:
         """Return what is in the hand's way, for each of the ways to grasp a body."""
-        if self.blocks_grasp is None:
+        if not self.queries.clears_blocked_pieces:
             return [frozenset()]
         if body not in self._obstacles:
             others = [other for other in self.pieces if other is not body]
-            rows = [self.blocks_grasp(body, other, None) for other in others]
+            rows = [self.queries.blocks_grasp(body, other, None) for other in others]
             self._obstacles[body] = [
                 frozenset(
                     other
@@ -149,7 +175,7 @@ class GraspBlocking:
             move: to judge.
             assignment: the body in each slot.
         """
-        if self.blocks_grasp is None:
+        if not self.queries.clears_blocked_pieces:
             return 0
         after, most = self._after(move), 0
         for other in self.pieces:
@@ -183,12 +209,12 @@ class GraspBlocking:
             if other in move.onto or not pile.isdisjoint(move.onto):
                 bodies_above[other] = pile | {body}
         held = None if self.held is body else self.held
-        after = GraspBlocking(self.pieces, bodies_above, held, self.blocks_grasp)
+        after = GraspBlocking(self.pieces, bodies_above, held, self.queries)
         for other in self.pieces:
             if other is body:
                 after._obstacles[other] = [frozenset()]
                 continue
-            blocks = self.blocks_grasp(other, body, move.position)
+            blocks = self.queries.blocks_grasp(other, body, move.position)
             after._obstacles[other] = [
                 way | {body} if is_there else way - {body}
                 for way, is_there in zip(self.obstacles(other), blocks, strict=True)

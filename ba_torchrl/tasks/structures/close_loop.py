@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -23,6 +22,7 @@ from ba_torchrl.tasks.motion_primitives import (
     nearest_equivalent_yaw,
     pick_up,
 )
+from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.planner import StructurePlanner
@@ -122,18 +122,22 @@ def assemble(
     def yaws(body: Body) -> list[float]:
         return planner.pieces[body].grasp_yaws(body) if limits.turn_rad else [yaw]
 
-    @cache
-    def effort(body: Body) -> float:
-        others = [other for other in pieces if other is not body]
-        room = max(grasp_clearance_m(robot.gripper, body, option, others) for option in yaws(body))
-        return math.dist((x, y), body.position[:2]) + (0.0 if room > 0 else NO_ROOM_M)
+    class Queries(GraspQueries):
+        """The nearest piece first, those that no grasp reaches last."""
+
+        def pick_effort_m(self, body: Body) -> float:
+            others = [other for other in pieces if other is not body]
+            room = max(
+                grasp_clearance_m(robot.gripper, body, option, others) for option in yaws(body)
+            )
+            return math.dist((x, y), body.position[:2]) + (0.0 if room > 0 else NO_ROOM_M)
 
     area = PlacementArea(
         *terrain.build_area.shrunk(1.2 * planner.block_m),
         gap_m=planner.block_m,
         height_m=terrain.height_m,
     )
-    move = planner.next_move(area, held, effort)
+    move = planner.next_move(area, held, Queries())
     if move is None:
         return lift(limits.step_m, OPEN)
     ceiling_m = terrain.workspace.z[1]

@@ -16,7 +16,7 @@ from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.clearance import grasp_clearance_m, hand_clearance_m, path_clearance_m
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
-from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps
+from ba_torchrl.tasks.structures.blocking import GraspCandidate, GraspQueries, edge_grasps
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 from ba_torchrl.tasks.structures.free_space import PlacementArea
@@ -35,7 +35,7 @@ AMPLE_M = 0.02
 """More room than this is no better."""
 
 
-class StructureTask(OpenLoopControl, Task):
+class StructureTask(OpenLoopControl, GraspQueries, Task):
     """Pieces scattered on the ground; success when they stand as the blueprint says."""
 
     can_be_deconstructed = True
@@ -106,10 +106,7 @@ class StructureTask(OpenLoopControl, Task):
     def expert_command(self) -> PickPlaceCommand:
         """Move the piece that comes next, from any state."""
         held = self.robot.held_body()
-        blocks_grasp = self._blocks_grasp if self.clears_blocked_pieces else None
-        move = self.planner.next_move(
-            self._placement_area(), held, self._effort, self._crowding, blocks_grasp
-        )
+        move = self.planner.next_move(self._placement_area(), held, self)
         if move is None:
             return no_op(self.settings.workspace, held is not None)
         if move.body is held:
@@ -218,7 +215,7 @@ class StructureTask(OpenLoopControl, Task):
             fingers = grasp_clearance_m(gripper, body, yaw, others, self.finger_opening, at)
         return min(fingers, hand_clearance_m(self.robot, PlanarFrame(x, y, yaw), z, others))
 
-    def _crowding(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
+    def site_deficit_m(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
         """Return how much room is wanting at sites for the hand to fetch the rest, load and all.
 
         Args:
@@ -244,7 +241,7 @@ class StructureTask(OpenLoopControl, Task):
         gaps = np.minimum(gaps[:, :, :2].max(axis=2), gaps[:, :, 2])
         return np.maximum(SITE_GAP_M + self.block_m / 2 - gaps, 0.0).sum(axis=1)
 
-    def _blocks_grasp(self, body: Body, other: Body, place: Vector | None) -> list[bool]:
+    def blocks_grasp(self, body: Body, other: Body, place: Vector | None) -> list[bool]:
         """Return whether another piece is in the hand's way, for each way to grasp a body."""
         at = body.position
         if place is not None:  # as seen from there
@@ -255,7 +252,7 @@ class StructureTask(OpenLoopControl, Task):
             for candidate in self._grasp_candidates(body)
         ]
 
-    def _effort(self, body: Body) -> float:
+    def pick_effort_m(self, body: Body) -> float:
         """Prefer pieces that stand free, and of the others those that a wedge drives inwards."""
         candidate = self._best_grasp(body)
         lack_m, _, room_m = self._ease(body, candidate)

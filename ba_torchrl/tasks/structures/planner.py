@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -21,7 +21,7 @@ from ba_torchrl.tasks.structures.assignment import (
     middle,
     read_piece_states,
 )
-from ba_torchrl.tasks.structures.blocking import BlocksGrasp, GraspBlocking, Move
+from ba_torchrl.tasks.structures.blocking import GraspBlocking, GraspQueries, Move
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece, Slot
 from ba_torchrl.tasks.structures.free_space import (
     PlacementArea,
@@ -38,10 +38,6 @@ CROWDED = 10.0
 """What a metre too near is worth in metres of way."""
 STUCK = 100
 """What it is worth in detours that the hand can reach what it is to pick."""
-
-Crowding = Callable[[np.ndarray, Sequence[Body]], np.ndarray]
-"""From sites [S, P, 2], each so many points on the ground that a structure will stand on, and the
-pieces that are still to be fetched then, to how many metres each site is too near them, [S]."""
 
 
 class StructurePlanner:
@@ -106,9 +102,7 @@ class StructurePlanner:
         self,
         area: PlacementArea,
         held: Body | None = None,
-        effort: Callable[[Body], float] = lambda body: 0.0,
-        crowding: Crowding | None = None,
-        blocks_grasp: BlocksGrasp | None = None,
+        queries: GraspQueries | None = None,
     ) -> Move | None:
         """Return the move that brings the structure on, or None if it stands.
 
@@ -118,10 +112,10 @@ class StructurePlanner:
         Args:
             area: where on the ground there is room.
             held: what the gripper holds: it is placed before anything else is picked.
-            effort: metres to add to the way of a piece for picking it, to choose among equals.
-            crowding: how much a site is too near to pieces; only free room counts if not given.
-            blocks_grasp: what keeps the hand from pieces; nothing if not given.
+            queries: about the gripper; one that needs no room if not given.
         """
+        queries = queries or GraspQueries()
+        effort = cache(queries.pick_effort_m)
         assigner = self._assigner(held)
         assignments, most = assigner.largest_assignments()
         if most == len(self.blueprint.slots):
@@ -129,9 +123,8 @@ class StructurePlanner:
                 return self._to_ground(held, area)
             misplaced = min(map(assigner.misplaced, assignments), key=len)
             return self._to_ground(min(misplaced, key=effort), area) if misplaced else None
-        effort = cache(effort)
         bodies_above = assigner.bodies_above()
-        blocking = GraspBlocking(self.pieces, bodies_above, held, blocks_grasp)
+        blocking = GraspBlocking(self.pieces, bodies_above, held, queries)
         holds_piece = held in self.pieces
         best: tuple[tuple[int, float], Move | Body] | None = None
         for assignment in assignments:
@@ -150,8 +143,8 @@ class StructurePlanner:
                 if best is not None and detour > best[0][0]:
                     continue
                 move, way = body, 0.0
-                if number is not None and not (first and blocks_grasp is None):
-                    move, crowd_m = self._into_slot(body, number, assignment, area, crowding)
+                if number is not None and not (first and not queries.clears_blocked_pieces):
+                    move, crowd_m = self._into_slot(body, number, assignment, area, queries)
                     detour += blocking.added_removals(move, assignment)
                     way = math.dist(assigner.states[body].position[:2], move.position[:2])
                     way += CROWDED * crowd_m
@@ -211,7 +204,7 @@ class StructurePlanner:
         number: int,
         assignment: Assignment,
         area: PlacementArea,
-        crowding: Crowding | None,
+        queries: GraspQueries,
     ) -> tuple[Move, float]:
         """Return the move that fills a slot, and by how much its place is too near to others."""
         slots, slot, piece = self.blueprint.slots, self.blueprint.slots[number], self.pieces[body]
@@ -223,7 +216,7 @@ class StructurePlanner:
         if not supports:
             if beside is None:
                 return self._to_ground(body, area), 0.0
-            return self._beside(body, beside, bridge, area, rest, crowding)
+            return self._beside(body, beside, bridge, area, rest, queries)
         x, y, _ = middle(assignment[i].position for i in self._over(number))
         z = max(vertical_extent(support)[1] for support in supports)
         z += body.position[2] - vertical_extent(body)[0]
@@ -240,8 +233,8 @@ class StructurePlanner:
         if not slot.inherits_yaw:
             yaw = None
         crowd_m = 0.0
-        if crowding is not None and sum(other is not None for other in assignment) == 1:
-            crowd_m = float(crowding(np.array([[(x, y)]]), rest)[0])
+        if sum(other is not None for other in assignment) == 1:
+            crowd_m = float(queries.site_deficit_m(np.array([[(x, y)]]), rest)[0])
         return Move(body, piece, (x, y, z), yaw, period, tuple(supports)), crowd_m
 
     def _over(self, number: int) -> tuple[int, ...]:
@@ -279,7 +272,7 @@ class StructurePlanner:
         bridge: Slot,
         area: PlacementArea,
         rest: Sequence[Body],
-        crowding: Crowding | None,
+        queries: GraspQueries,
     ) -> tuple[Move, float]:
         """Return the move to the ground beside a piece, and by how much that is too near others.
 
@@ -289,7 +282,7 @@ class StructurePlanner:
             bridge: the slot of what will lie on both.
             area: where there is room.
             rest: the pieces that are still to be fetched then.
-            crowding: as for `next_move`.
+            queries: as for `next_move`.
         """
         piece = self.pieces[body]
         x, y, z = body.position
@@ -313,17 +306,16 @@ class StructurePlanner:
         spots = center + radii[:, None] * ways
         others = [other for other in self.pieces if other is not body and other is not anchor]
         cost = placement_deficit_m(spots, body, others, area)
-        if crowding is not None:
-            length = max(
-                (
-                    np.ptp(b.shape.vertices[:, 1])
-                    for b, p in self.pieces.items()
-                    if p.kind == bridge.piece.kind
-                ),
-                default=0.0,
-            )
-            along = radii[:, None] / 2 + length / 2 * np.linspace(-1.0, 1.0, SITE_POINTS)
-            cost = cost + crowding(center + along[:, :, None] * ways[:, None], rest)
+        length = max(
+            (
+                np.ptp(b.shape.vertices[:, 1])
+                for b, p in self.pieces.items()
+                if p.kind == bridge.piece.kind
+            ),
+            default=0.0,
+        )
+        along = radii[:, None] / 2 + length / 2 * np.linspace(-1.0, 1.0, SITE_POINTS)
+        cost = cost + queries.site_deficit_m(center + along[:, :, None] * ways[:, None], rest)
         aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
         best = int(np.lexsort((radii + aways, cost.round(6)))[0])
         spot = tuple(spots[best].tolist())

@@ -88,7 +88,7 @@ def test_all_headings_occur_and_fixed_ones_are_zero(env):
 def test_the_block_cannot_be_grasped_in_the_corner(env, turn):
     scene, task = env.scene, env.scene.task
     task.put_corner((0.45, 0.0), 0.0)
-    assert task.room_m(turn) < 0
+    assert task.clearance_m(turn) < 0
     x, y, z = task.block.position
     scene.controller.reset(((x, y, 0.2), turn))
     for height in (0.15, 0.1, z, z):
@@ -102,7 +102,7 @@ def test_the_goal_needs_the_grasp_and_fifteen_centimetres(env):
     scene, task = env.scene, env.scene.task
     task.put_corner((0.45, 0.0), 0.0)
     task.block.place((0.45, 0.0, 0.027))
-    assert task.room_m(0.0) > 0
+    assert task.clearance_m(0.0) > 0
     scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
     assert not task.is_success()  # high, but empty
     scene.controller.move_to((0.45, 0.0, 0.027), 0.0)
@@ -118,8 +118,8 @@ def test_room_beside_the_fingers_against_arithmetic(env):
     task.put_corner((0.45, 0.0), 0.7)
     task.block.place((*task.corner.to_world(0.01, -0.02), 0.027), 0.7)
     along = task.robot.gripper.finger_reach_m + 0.0075
-    assert task.room_m(0.7) == pytest.approx(min(0.1 - along, 0.07 - 0.0095), abs=1e-6)
-    assert task.room_m(0.7 + math.pi / 2) == pytest.approx(0.07 - along, abs=1e-6)
+    assert task.clearance_m(0.7) == pytest.approx(min(0.1 - along, 0.07 - 0.0095), abs=1e-6)
+    assert task.clearance_m(0.7 + math.pi / 2) == pytest.approx(0.07 - along, abs=1e-6)
 
 
 def test_the_block_is_dragged_by_friction_alone(env):
@@ -128,8 +128,8 @@ def test_the_block_is_dragged_by_friction_alone(env):
         state = env.reset()
         scene, task = env.scene, env.scene.task
         while (
-            task.room_m(task.block.yaw_rad) < 0
-            and task.room_m(task.block.yaw_rad + math.pi / 2) < 0
+            task.clearance_m(task.block.yaw_rad) < 0
+            and task.clearance_m(task.block.yaw_rad + math.pi / 2) < 0
         ):
             state = env.step(state.set("action", state["expert_action"]))["next"]
             assert not state["done"]

@@ -9,6 +9,7 @@ import pytest
 from ba_torchrl.sim.bodies import Box, Solid, vertical_extent
 from ba_torchrl.sim.meshes import gable_mesh
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import (
     CUBE,
     CUBOID,
@@ -456,8 +457,10 @@ def test_pieces_are_put_down_inside_and_clear_of_others(scene):
 
 def test_effort_decides_among_equals(scene):
     s = scene(tower(CUBE, CUBE, CUBE))
+    queries = GraspQueries()
     for favourite in s.cubes:
-        move = s.planner.next_move(AREA, effort=lambda body, f=favourite: float(body is not f))
+        queries.pick_effort_m = lambda body, f=favourite: float(body is not f)
+        move = s.planner.next_move(AREA, queries=queries)
         assert move.body is favourite
 
 
@@ -470,21 +473,24 @@ def test_what_keeps_the_hand_from_a_piece_goes_to_the_ground(scene):
     s.put(loose, 0.45, 1.1 * B, 0)
     s.world.settle()
 
-    def blocks_grasp(body, other, place):
-        x, y, z = other.position if place is None else place
-        near = math.dist((x, y), body.position[:2]) < 2 * B
-        return [near and z - body.position[2] > B / 2]
+    class Queries(GraspQueries):
+        clears_blocked_pieces = True
+
+        def blocks_grasp(self, body, other, place):
+            x, y, z = other.position if place is None else place
+            near = math.dist((x, y), body.position[:2]) < 2 * B
+            return [near and z - body.position[2] > B / 2]
 
     assert s.planner.next_move(AREA).body is loose
     for top in (s.cubes[2], s.cubes[1]):
-        move = s.planner.next_move(AREA, blocks_grasp=blocks_grasp)
+        move = s.planner.next_move(AREA, queries=Queries())
         assert move.body is top
         assert move.onto == ()
         top.place(move.position)
         s.world.settle()
-    assert s.planner.next_move(AREA, blocks_grasp=blocks_grasp).onto != ()
+    assert s.planner.next_move(AREA, queries=Queries()).onto != ()
     # nor is anything put where it would be in the way
-    move = s.planner.next_move(AREA, held=s.cubes[2], blocks_grasp=blocks_grasp)
+    move = s.planner.next_move(AREA, held=s.cubes[2], queries=Queries())
     assert move.body is s.cubes[2]
     assert move.onto == (s.cubes[1],)
 
