@@ -12,11 +12,11 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
+from ba_torchrl.algorithms.seeds import SeedUse  # noqa: E402
 from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
 from ba_torchrl.record.video import write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
-from ba_torchrl.training.config import SeedUse  # noqa: E402
 from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes  # noqa: E402
 
 

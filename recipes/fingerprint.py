@@ -145,9 +145,9 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
         CLOSE_LOOP_TASK,
         "sac",
         "cnn",
-        {"algorithm__prioritized": False, "algorithm__augmentation": "none"},
+        {"algorithm__replay": "uniform", "algorithm__augmentation": "none"},
     ),
-    "prioritized sac": (CLOSE_LOOP_TASK, "sac", "cnn", {"algorithm__prioritized": True}),
+    "prioritized sac": (CLOSE_LOOP_TASK, "sac", "cnn", {"algorithm__replay": "prioritized"}),
     "without yaw": (
         CLOSE_LOOP_TASK,
         "sacfd",
@@ -196,7 +196,7 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
         OPEN_LOOP_TASK,
         "adet",
         "fcn",
-        {"algorithm__replay": "split", "algorithm__augmentation": "cn"},
+        {"algorithm__replay": "symmetric", "algorithm__augmentation": "cn"},
     ),
     "random actions": (
         OPEN_LOOP_TASK,

@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import StrictModel
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.errors import ConfigError
@@ -47,6 +48,10 @@ class Problem:
     """Length of the run, over which schedules extend."""
     seed: int
     device: torch.device
+
+    def derived_seed(self, use: SeedUse) -> int:
+        """Return the run's seed for one use of randomness."""
+        return derive_seed(self.seed, use)
 
 
 class Algorithm(ABC):

@@ -18,6 +18,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.base import Algorithm, AlgorithmConfig, NetworkConfig, Problem
+from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import ReplayKind, make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
@@ -117,7 +118,7 @@ class Learner(Algorithm):
             config.buffer_size,
             config.batch_size,
             codecs=self.codecs,
-            seed=self.problem.seed,
+            seed=self.problem.derived_seed(SeedUse.REPLAY),
             priority_exponent=config.priority_exponent,
             weight_exponent=config.importance_exponent,
             expert_bonus=config.expert_bonus,

@@ -12,6 +12,7 @@ from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.envs import keys
@@ -109,7 +110,7 @@ class SAC(Learner):
             self.images,
             self.problem.actions.sequence,
             probability=self.config.augmentation_probability,
-            seed=self.problem.seed,
+            seed=self.problem.derived_seed(SeedUse.AUGMENTATION),
         )
 
     def network_parameters(self) -> list[nn.Parameter]:

@@ -16,6 +16,7 @@ from torchrl.objectives import HardUpdate
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.augmentation.rigid import (
     RigidAugmentation,
     RigidTransforms,
@@ -119,7 +120,7 @@ class SpatialQ(Learner):
 
     def make_policy(self, networks: SpatialValues) -> TensorDictModule:
         """Return the greedy policy with a share of random actions."""
-        self.explorer = SpatialPolicy(networks, seed=self.problem.seed)
+        self.explorer = SpatialPolicy(networks, seed=self.problem.derived_seed(SeedUse.EXPLORATION))
         return spatial_policy(self.explorer)
 
     def make_loss(self, networks: SpatialValues) -> LevelDQNLoss:
@@ -147,7 +148,7 @@ class SpatialQ(Learner):
             config.augmentation,
             self.problem.actions,
             self.images,
-            seed=self.problem.seed,
+            seed=self.problem.derived_seed(SeedUse.AUGMENTATION),
             probability=config.augmentation_probability,
             order=config.augmentation_order,
         )

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
+from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import EnvConfig, StrictModel, parse
 from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import Source, source_config
@@ -24,18 +23,6 @@ from ba_torchrl.tasks.base import TASKS
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
 """Fields of `EnvConfig` that are not for the user to set."""
-
-
-class SeedUse(IntEnum):
-    """What a seed is derived for. Different uses and different runs have different episodes."""
-
-    DEMONSTRATIONS = 0
-    COLLECTION = 1
-    EVALUATION = 2
-    REPORT = 3
-    """The last evaluation of a run, which is reported."""
-    TEST = 4
-    """Evaluations of a checkpoint after the run."""
 
 
 class ExperimentConfig(StrictModel):
@@ -130,7 +117,7 @@ class ExperimentConfig(StrictModel):
             use: what the environments serve.
             part: number of a further set of episodes for the same use, after a resumption.
         """
-        return int(np.random.SeedSequence([self.seed, use, part]).generate_state(1)[0])
+        return derive_seed(self.seed, use, part)
 
     def resolved(self) -> dict[str, Any]:
         """Return the configuration as JSON, every default filled in."""

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.demo_files import load_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
@@ -22,7 +23,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import ScalarLog, progress_bar
 from ba_torchrl.record.results import CurvePoint
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
-from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder

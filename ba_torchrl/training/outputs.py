@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.episodes import Policy
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
@@ -17,7 +18,7 @@ from ba_torchrl.record.results import (
     write_result,
 )
 from ba_torchrl.record.video import write_video
-from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation, record_episodes
 from ba_torchrl.training.resume import Progress
 

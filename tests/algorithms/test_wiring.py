@@ -309,3 +309,18 @@ def test_collection_explores_and_evaluation_is_greedy(tmp_path):
     assert found.count(ExplorationType.RANDOM) == steps == 4
     # three evaluations and the video, of episodes with one to four steps
     assert found.count(ExplorationType.DETERMINISTIC) >= 4
+
+
+@pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
+def test_no_two_uses_of_randomness_draw_the_same_numbers(replay):
+    spatial = build("spatial_q", replay=replay)
+    buffers = [spatial.replay]
+    if replay == "symmetric":
+        buffers = [spatial.replay.expert, spatial.replay.online]
+    generators = {f"replay {i}": buffer._rng for i, buffer in enumerate(buffers)}
+    generators["augmentation"] = spatial.augmentation._generator
+    generators["exploration"] = spatial.explorer._generator
+    torch.manual_seed(spatial.problem.seed)
+    draws = {name: tuple(torch.rand(4, generator=g).tolist()) for name, g in generators.items()}
+    draws["weights"] = tuple(torch.rand(4).tolist())
+    assert len(set(draws.values())) == len(draws), draws

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.checkpoint import (
@@ -18,7 +19,7 @@ from ba_torchrl.training.checkpoint import (
     load,
     read_config,
 )
-from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
 
@@ -234,7 +235,7 @@ def test_another_view_can_be_learnt_from(tmp_path):
     assert Experiment(config, progress=False).run().updates == 6
 
 
-def test_seeds_of_different_uses_and_runs_do_not_meet(tmp_path):
+def test_seeds_of_different_uses_and_runs_differ(tmp_path):
     seeds = [tiny(tmp_path, seed=s).derived_seed(use) for s in range(4) for use in SeedUse]
     spread = sorted(seeds)
     assert all(b - a > 1000 for a, b in itertools.pairwise(spread))

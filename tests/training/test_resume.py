@@ -5,12 +5,13 @@ import pytest
 import torch
 from torchrl.checkpoint import GlobalRNGState
 
+from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.training import experiment as experiments
 from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
-from ba_torchrl.training.config import ExperimentConfig, SeedUse
+from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.resume import check_same_run, resumable_updates
 

@@ -1,0 +1,36 @@
+"""Seeds of a run: one for each use of randomness, so that no two uses draw the same numbers."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class SeedUse(IntEnum):
+    """Uses of randomness in a run.
+
+    Initial weights, and what SAC samples from its policy, come from torch's global generator, which
+    starts from the run's own seed.
+    """
+
+    DEMONSTRATIONS = 0
+    COLLECTION = 1
+    EVALUATION = 2
+    REPORT = 3
+    TEST = 4
+    """Of `recipes/evaluate.py`; no checkpoint was chosen by these episodes."""
+    REPLAY = 5
+    AUGMENTATION = 6
+    EXPLORATION = 7
+
+
+def derive_seed(seed: int, use: SeedUse, part: int = 0) -> int:
+    """Return the seed of one use of randomness in a run.
+
+    Args:
+        seed: of the run.
+        use: the use.
+        part: number of a further seed for the same use.
+    """
+    return int(np.random.SeedSequence([seed, use, part]).generate_state(1)[0])
