@@ -1,0 +1,63 @@
+"""The page of tasks, written from the registry."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+
+from ba_torchrl import make
+from ba_torchrl.tasks.base import TASKS
+
+CONTROLS = {"close_loop": "Close loop", "open_loop": "Open loop"}
+
+
+def task_page(tasks: Sequence[str] | None = None) -> str:
+    """Return a Markdown page with a section for each task.
+
+    Args:
+        tasks: ids; all tasks of the package if None.
+    """
+    if tasks is None:
+        tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
+    lines = [
+        "# Tasks",
+        "",
+        "Written by `recipes/tasks.py` from the sources. Success is the conjunction of the",
+        "conditions, measured once the scene is at rest. `env.conditions` and Gymnasium's `info`",
+        "hold them after every step.",
+    ]
+    for control, title in CONTROLS.items():
+        ids = [task for task in tasks if TASKS[task].control == control]
+        if ids:
+            lines += ["", f"## {title}"]
+        for task in ids:
+            lines += ["", *_section(task)]
+    return "\n".join(lines) + "\n"
+
+
+def _section(task: str) -> list[str]:
+    """Return the lines of one task."""
+    cls = TASKS[task]
+    env = make(task, seed=0, obs_size=16)
+    env.reset()
+    conditions, steps, actions = list(env.conditions), env.max_steps, env.action_sequence
+    env.close()
+    least, most = cls.num_objects_range
+    numbers = range(least, most + 1, cls.num_objects_step)
+    rows = [
+        ("success", ", ".join(f"`{name}`" for name in conditions)),
+        ("steps", f"{steps}"),
+        ("action", f"`{actions}` by default"),
+        ("objects", f"{cls.num_objects} ({', '.join(map(str, numbers))})"),
+        ("scale", "{:g} to {:g} (limits {:g} to {:g})".format(*cls.scale_range, *cls.scale_limits)),
+    ]
+    rows += [
+        (f"`{name}`", f"{field.default!r}") for name, field in cls.Parameters.model_fields.items()
+    ]
+    return [
+        f"### `{task}`",
+        "",
+        inspect.cleandoc(cls.__doc__),
+        "",
+        *(f"- {name}: {value}" for name, value in rows),
+    ]

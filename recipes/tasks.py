@@ -1,0 +1,25 @@
+"""Write the page of tasks: description, conditions of success and parameters of each.
+
+python recipes/tasks.py path=docs/tasks.md
+"""
+
+from pathlib import Path
+
+import hydra
+from omegaconf import DictConfig
+
+from ba_torchrl.plugins import load_plugins
+from ba_torchrl.record.task_page import task_page
+
+
+@hydra.main(config_path="../configs", config_name="tasks", version_base="1.3")
+def main(settings: DictConfig) -> None:
+    """Write the page."""
+    load_plugins(settings.plugins)
+    path = Path(settings.path)
+    path.write_text(task_page(list(settings.tasks) if settings.tasks else None), encoding="utf-8")
+    print(path)
+
+
+if __name__ == "__main__":
+    main()

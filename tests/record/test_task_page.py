@@ -1,0 +1,27 @@
+"""docs/tasks.md is what `recipes/tasks.py` writes, and names the conditions of success."""
+
+from pathlib import Path
+
+import ba_torchrl
+from ba_torchrl.record.task_page import task_page
+
+PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
+
+
+def test_the_page_is_written_from_the_sources():
+    assert PAGE.read_text(encoding="utf-8") == task_page(), "run `python recipes/tasks.py`"
+
+
+def test_a_section_has_description_conditions_and_parameters():
+    page = task_page(["close_loop/object_grasping"])
+    assert "### `close_loop/object_grasping`" in page
+    assert "- success: `is_grasped`, `is_lifted`" in page
+    assert "- `object_set`: 'random'" in page
+    assert "- objects: 5 (1, 2, 3," in page
+    assert "block_picking" not in page
+
+
+def test_every_task_is_there():
+    page = PAGE.read_text(encoding="utf-8")
+    ours = [task for task in ba_torchrl.list_tasks() if not task.startswith("mine/")]
+    assert [task for task in ours if f"### `{task}`" not in page] == []
