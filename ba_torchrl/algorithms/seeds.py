@@ -18,8 +18,9 @@ class SeedUse(IntEnum):
     COLLECTION = 1
     EVALUATION = 2
     REPORT = 3
+    """The last evaluation of a run, which is reported."""
     TEST = 4
-    """Of `recipes/evaluate.py`; no checkpoint was chosen by these episodes."""
+    """Evaluations of a checkpoint after the run."""
     REPLAY = 5
     AUGMENTATION = 6
     EXPLORATION = 7
