@@ -233,7 +233,7 @@ def test_an_object_outside_ends_the_heap(make):
 
 
 @pytest.mark.parametrize(
-    ("present", "failures", "takes", "lasts"),
+    ("present", "failures", "takes", "should_continue"),
     [
         (2, 0, True, True),
         (1, 0, True, False),
