@@ -1,0 +1,74 @@
+"""The cache of convex parts on disk."""
+
+import logging
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+
+from ba_torchrl.sim.assets import cache
+from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
+from ba_torchrl.sim.meshes import Mesh, box_mesh, moved
+
+
+def test_parts_are_computed_once(own_cache):
+    made = []
+
+    def make():
+        made.append(1)
+        return [box_mesh((1.0, 2.0, 3.0)), moved(box_mesh((1.0, 1.0, 1.0)), (5.0, 0.0, 0.0))]
+
+    first, second = (cached_parts(b"content", "recipe", make) for _ in range(2))
+    assert len(made) == 1
+    assert len(second) == 2
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.vertices, b.vertices)
+        np.testing.assert_array_equal(a.faces, b.faces)
+    cached_parts(b"other content", "recipe", make)
+    cached_parts(b"content", "other recipe", make)
+    assert len(made) == 3
+    assert not list(own_cache.rglob("*.tmp"))
+
+
+def test_a_damaged_entry_is_computed_again(own_cache, caplog):
+    make = lambda: [box_mesh((1.0, 1.0, 1.0))]  # noqa: E731
+    cached_parts(b"content", "recipe", make)
+    (path,) = own_cache.rglob("*.npz")
+    whole = path.read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"not an archive"):
+        path.write_bytes(damaged)
+        with caplog.at_level(logging.WARNING):
+            (part,) = cached_parts(b"content", "recipe", make)
+        np.testing.assert_array_equal(part.vertices, box_mesh((1.0, 1.0, 1.0)).vertices)
+        assert path.read_bytes() == whole
+    assert "made anew" in caplog.text
+
+
+def test_a_cache_that_cannot_be_written_is_reported_and_not_used(monkeypatch, tmp_path, caplog):
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file"))
+    with caplog.at_level(logging.WARNING):
+        (part,) = cached_parts(b"content", "recipe", lambda: [box_mesh((1.0, 1.0, 1.0))])
+    assert isinstance(part, Mesh)
+    assert CACHE_VARIABLE in caplog.text
+
+
+def test_the_default_cache_folder_is_the_users(monkeypatch):
+    monkeypatch.delenv(CACHE_VARIABLE)
+    monkeypatch.setattr(cache, "user_cache_path", lambda name: Path("/users/cache") / name)
+    assert cache.cache_folder() == Path("/users/cache/ba_torchrl/parts")
+
+
+def _write_shared_entries(seed):
+    vertices = np.random.default_rng(seed % 3).random((2000, 3))
+    parts = cached_parts(
+        bytes([seed % 3]), "recipe", lambda: [Mesh(vertices, np.array([[0, 1, 2]]))]
+    )
+    return float(np.abs(parts[0].vertices - vertices).max())
+
+
+def test_concurrent_writes_leave_valid_entries(own_cache):
+    with multiprocessing.get_context("fork").Pool(6) as pool:
+        assert set(pool.map(_write_shared_entries, range(60), chunksize=1)) == {0.0}
+    assert len(list(own_cache.rglob("*.npz"))) == 3
+    assert not list(own_cache.rglob("*.tmp"))

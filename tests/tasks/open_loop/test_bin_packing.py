@@ -1,0 +1,96 @@
+"""Bin packing: when an object is packed, release heights, kinds of objects."""
+
+import pytest
+
+from ba_torchrl.sim.geometry import yaw_quaternion
+from ba_torchrl.tasks.footprints import Rectangle
+from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, pieces
+from tests.tasks.packing.scenes import BIN, QUARTER_TURN, follow
+
+
+def filled_bin(make_env, count=4):
+    """Return an environment with all objects side by side on the bin's floor."""
+    env = make_env(BIN, num_objects=count)
+    env.reset()
+    task = env.scene.task
+    bin_yaw = task.container.yaw_rad
+    inside = Rectangle(*task.container.position[:2], bin_yaw, 0.0, 0.0)
+    cells = [(x, y) for x in (-0.06, 0.0, 0.06) for y in (-0.025, 0.025)]
+    for body, cell in zip(task.objects, cells, strict=False):
+        low = body.shape.bounds_m[0][2]
+        body.place((*inside.frame.to_world(*cell), 0.004 - low), bin_yaw)
+    for body, cell in zip(task.objects, cells, strict=False):
+        if body.shape.bounds_m[1][1] > 0.03:  # long ones would overlap: they stand on an end
+            turn = yaw_quaternion(bin_yaw)
+            x, y, _, w = QUARTER_TURN
+            sz, cz = turn[2], turn[3]
+            body.move_to(
+                (*inside.frame.to_world(*cell), 0.044),
+                (cz * x - sz * y, cz * y + sz * x, sz * w, cz * w),
+            )
+    env.scene.world.settle()
+    return env, task, inside
+
+
+def test_objects_in_the_bin_are_packed(make_env):
+    _, task, _ = filled_bin(make_env)
+    assert task.is_success()
+    assert task.is_valid()
+
+
+@pytest.mark.parametrize(
+    "along",
+    [
+        BIN_M[0] / 2 + 0.022,  # beside the bin, against its wall
+        BIN_M[0] / 2 - 0.01,  # over the wall
+    ],
+)
+def test_an_object_that_is_not_within_the_walls_is_not_packed(make_env, along):
+    _, task, inside = filled_bin(make_env)
+    body = task.objects[0]
+    for z in (-body.shape.bounds_m[0][2], BIN_M[2] - body.shape.bounds_m[0][2]):
+        body.place((*inside.frame.to_world(along, 0.0), z), inside.yaw_rad)
+        assert not task.is_packed(body)
+        assert not task.is_success()
+
+
+def test_an_object_on_the_rim_is_not_packed(make_env):
+    _, task, inside = filled_bin(make_env, count=1)
+    (body,) = task.objects
+    assert task.is_success()
+    low = body.shape.bounds_m[0][2]
+    # its centre is inside the bin, its end rests on the rim
+    body.place((*inside.frame.to_world(BIN_M[0] / 2 - 0.015, 0.0), BIN_M[2] - low), inside.yaw_rad)
+    assert not task.is_packed(body)
+    # entirely above the rim
+    body.place((*inside.frame.to_world(0.0, 0.0), BIN_M[2] - low + 0.001), inside.yaw_rad)
+    assert not task.is_packed(body)
+
+
+def test_a_held_object_is_not_packed(make_env):
+    env = make_env(BIN, num_objects=1)
+    state = env.reset()
+    (picked,) = follow(env, state, 1)
+    assert picked["holding"]
+    assert not env.scene.task.is_success()
+
+
+def test_objects_are_released_above_the_rim_or_on_the_surface(make_env):
+    env = make_env(BIN, num_objects=2)
+    follow(env, env.reset(), 1)
+    task = env.scene.task
+    depth = task.depth_m(env.scene.controller.held)
+    assert task.place_height_m(0.0, (0.4, 0.0)) == pytest.approx(depth, abs=2e-3)
+    assert task.place_height_m(0.004, (0.4, 0.0)) > BIN_M[2] + 0.009  # the fingertips
+    assert task.place_height_m(0.12, (0.4, 0.0)) == pytest.approx(0.12 + depth, abs=2e-3)
+
+
+def test_kinds_are_drawn_with_replacement(make_env):
+    env = make_env(BIN)
+    seen = []
+    for _ in range(12):
+        env.reset()
+        seen.append([body.name.split()[0] for body in env.scene.task.objects])
+    assert all(len(kinds) == 8 for kinds in seen)
+    assert {kind for kinds in seen for kind in kinds} == set(pieces(1.0))
+    assert any(kinds.count(kind) >= 3 for kinds in seen for kind in kinds)
