@@ -1,4 +1,4 @@
-"""Action layouts: what the components of an action vector mean, in the environment's units."""
+"""Action vectors of both controls, and the commands in physical units that they encode."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class GripperCommand(NamedTuple):
     """One close-loop action in physical units."""
 
     opening: float
-    """Wanted opening of the gripper: 0 closed, 1 open."""
+    """Target opening of the gripper: 0 closed, 1 open."""
     dx_m: float
     dy_m: float
     dz_m: float
@@ -26,11 +26,11 @@ class PickPlaceCommand(NamedTuple):
     """One open-loop action in physical units; the tool's rotation is Rz(rz) Ry(ry) Rx(rx)."""
 
     primitive: int | None
-    """`PICK` or `PLACE`; None leaves it to whether something is held."""
+    """`PICK` or `PLACE`; None: place if an object is held, else pick."""
     x_m: float
     y_m: float
     z_m: float | None
-    """None leaves it to the heightmap."""
+    """None: computed from the heightmap."""
     rz_rad: float = 0.0
     ry_rad: float = 0.0
     rx_rad: float = 0.0
@@ -71,7 +71,7 @@ class CloseLoopActions:
     def __post_init__(self) -> None:
         if sorted(self.sequence) not in (sorted("pxyz"), sorted("pxyzr")):
             raise ConfigError(
-                f"action_sequence {self.sequence!r} does not suit a close-loop task: it takes the "
+                f"action_sequence {self.sequence!r} does not fit a close-loop task: it needs the "
                 "letters p, x, y, z once each and r at most once, as in 'pxyzr' or 'pxyz'"
             )
 
@@ -115,7 +115,7 @@ class CloseLoopActions:
 
 
 ANGLES = {0: (), 1: ("rz",), 2: ("rz", "rx"), 3: ("rz", "ry", "rx")}
-"""What the letters r of an open-loop sequence stand for, by their number."""
+"""The angles that the letters r of an open-loop sequence denote, by their number."""
 
 MAX_TILT_RAD = math.pi / 2
 
@@ -127,7 +127,7 @@ class GridAxis(NamedTuple):
     step: float
     count: int
     period: float | None = None
-    """Values this far apart are the same; None where they are not."""
+    """Period of an angle; None for other components."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ class OpenLoopActions:
         sequence: one letter per component, in any order: p the primitive (0 pick, 1 place), x y z
             the position, and up to three r: rz, then rx, or rz, ry, rx. Only x and y are required.
         bounds_m: ranges of x, y and z, to which positions are clipped.
-        half_rotation: wrap yaws into [0, pi], with the tilts that leave the fingers where they
-            are, instead of into [0, 2 pi].
+        half_rotation: wrap yaws into [0, pi] instead of [0, 2 pi]; the tilts change so that the
+            fingers keep their pose.
 
     Raises:
         ConfigError: a letter is missing, unknown or repeated.
@@ -157,7 +157,7 @@ class OpenLoopActions:
             or self.sequence.count("r") > 3
         ):
             raise ConfigError(
-                f"action_sequence {self.sequence!r} does not suit an open-loop task: it takes x "
+                f"action_sequence {self.sequence!r} does not fit an open-loop task: it needs x "
                 "and y once each, p and z at most once, and up to three r, as in 'pxyr'"
             )
 
@@ -204,10 +204,10 @@ class OpenLoopActions:
         return PickPlaceCommand(primitive, x, y, z, rz, ry, rx)
 
     def encode(self, command: PickPlaceCommand) -> np.ndarray:
-        """Return the action [size] float32 of a command; what the sequence lacks is dropped.
+        """Return the action [size] float32 of a command, without components outside the sequence.
 
         Raises:
-            ValueError: the sequence asks for what the command leaves open.
+            ValueError: the command leaves a component of the sequence undefined.
         """
         rz, ry, rx = self.wrap(command.rz_rad, command.ry_rad, command.rx_rad)
         value = {
@@ -221,7 +221,7 @@ class OpenLoopActions:
         }
         missing = [name for name in self.components if value[name] is None]
         if missing:
-            raise ValueError(f"the command leaves {', '.join(missing)} open")
+            raise ValueError(f"the command leaves {', '.join(missing)} undefined")
         action = [
             min(max(value[name], low), high)
             for name, (low, high) in zip(self.components, self.ranges, strict=True)
@@ -229,7 +229,7 @@ class OpenLoopActions:
         return np.array(action, dtype=np.float32)
 
     def axis(self, name: str, count: int) -> GridAxis:
-        """Return the values that a component is divided into.
+        """Return the grid of a component.
 
         Args:
             name: of the component. x and y take the centres of pixels, so that an image of the
@@ -249,10 +249,10 @@ class OpenLoopActions:
         raise ValueError(f"no grid for the component {name!r}")
 
     def wrap(self, rz: float, ry: float, rx: float) -> tuple[float, float, float]:
-        """Return the equivalent angles within the ranges; tilts beyond theirs are clipped.
+        """Return the equivalent angles within the ranges; tilts are clipped to theirs.
 
-        A half turn of the tool about its own axis swaps its fingers, which is the yaw plus pi with
-        both tilts negated.
+        A half turn of the tool about its own axis swaps its fingers: it adds pi to the yaw and
+        negates both tilts.
         """
         rz %= 2 * math.pi
         ry, rx = (min(max(wrap_angle(tilt), -MAX_TILT_RAD), MAX_TILT_RAD) for tilt in (ry, rx))

@@ -1,4 +1,4 @@
-"""EnvConfig: what `ba_torchrl.make` accepts, typed and validated."""
+"""EnvConfig: the keywords of `ba_torchrl.make`, typed and validated."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Interval = tuple[float, float]
 
 
 def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigError:
-    """Turn pydantic's report into a `ConfigError` that names the way out."""
+    """Return pydantic's errors as one `ConfigError` that says what is allowed."""
     known = sorted(known)
     lines = []
     for item in error.errors():
@@ -90,30 +90,30 @@ class EnvConfig(StrictModel):
     max_steps: int | None = Field(default=None, ge=1)
     """Steps until the episode is truncated."""
     num_objects: int | None = Field(default=None, ge=1)
-    """Number of objects, where the task leaves it open."""
+    """Number of objects, for tasks that allow several numbers."""
     obs_size: int = Field(default=128, ge=16, le=1024)
     """Pixels along each side of the image."""
     in_hand_size: int = Field(default=24, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
-    """Open loop: pixels along each side of the image of what is held."""
+    """Open loop: pixels along each side of the in-hand image."""
     in_hand_mode: str = Field(default="raw", json_schema_extra=_OPEN_LOOP)
-    """Open loop: what that image shows: "raw", "sub" or "proj"; `ba_torchrl.sim.vision.in_hand`."""
+    """Open loop: content of the in-hand image: "raw", "sub" or "proj"; see
+    `ba_torchrl.sim.vision.in_hand`."""
     top_down_approach: bool = Field(default=False, json_schema_extra=_OPEN_LOOP)
-    """Open loop: come from straight above even where the gripper is tilted."""
+    """Open loop: approach vertically also with a tilted gripper."""
     fast_mode: bool = True
-    """Teleport the arm where it touches nothing; off, every centimetre is simulated."""
+    """Teleport the arm along collision-free paths; if False, all motion is simulated."""
     render: bool = False
     """Show the simulation in PyBullet's window."""
     random_orientation: bool = True
     """Objects start with random yaw."""
     half_rotation: bool | None = None
-    """Keep the gripper's yaw within a half turn, which is all a two-finger gripper needs. Open
-    loop: 0 to pi, on by default. Close loop: -pi/2 to pi/2 about the start, off by default."""
+    """Keep the gripper's yaw within a half turn, which covers every two-finger grasp. Open loop: 0 to pi, on by default. Close loop: -pi/2 to pi/2 about the start, off by default."""
     workspace_check: Literal["point", "bounding_box"] = "point"
-    """What of an object must stay inside the workspace: its origin, or its whole outline."""
+    """Part of an object that must stay inside the workspace: its origin or its bounding box."""
     close_loop_tray: bool = Field(default=False, json_schema_extra=_CLOSE_LOOP)
     """Close loop: the objects lie in a tray as in Object Grasping."""
     view_type: str = Field(default="camera_center_xyz", json_schema_extra=_CLOSE_LOOP)
-    """Close loop: from where the depth image is taken; see `ba_torchrl.sim.vision.views`."""
+    """Close loop: view of the depth image; see `ba_torchrl.sim.vision.views`."""
     view_scale: float = Field(default=1.5, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
     """Close loop: width of the image as a multiple of the workspace's width."""
     dpos: float = Field(default=0.05, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
@@ -125,22 +125,22 @@ class EnvConfig(StrictModel):
     obs_type: Literal["pixel", "vec"] = "pixel"
     """Observe an image, or the poses of gripper and objects as a vector."""
     rgb: bool = False
-    """Add a colour picture of the scene, arm included, and its depth to every observation."""
+    """Add an RGB image of the scene, arm included, and its depth to every observation."""
     point_cloud: int = Field(default=0, ge=0, le=1_000_000)
-    """Add this many points of the scene's surfaces to every observation."""
+    """Number of points of the scene's surfaces that are added to every observation."""
     deconstruct: bool = False
     """Structures: start with the structure standing and take it apart; every observation contains
     the action that reverses the last one. See `ba_torchrl.data.time_reversal`."""
     observations: tuple[str, ...] = ()
     """Further observations by their registered names; see `ba_torchrl.envs.observations`."""
     floor_color: Rgb | None = None
-    """Colour of the floor in pictures, each component from 0 to 1; light by default, and in
-    PyBullet's window and `rgb` a chequered blue."""
+    """Colour of the floor in RGB images, components from 0 to 1; by default light, and a blue
+    chequer in PyBullet's window and in `rgb`."""
     workspace_color: Rgb | None = None
-    """Colour of the workspace's floor area in pictures; None leaves it unmarked."""
+    """Colour of the workspace's floor area in RGB images; None leaves it unmarked."""
     physics_mode: Literal["fast", "slow", "custom"] = "fast"
-    """Settings of the physics engine: the cheapest that hold a grasp firmly, finer ones, or those
-    given by `time_step_s`, `solver_iterations` and `solver_residual`."""
+    """Settings of the physics engine: the fastest that hold grasps reliably, finer ones, or those
+    of `time_step_s`, `solver_iterations` and `solver_residual`."""
     time_step_s: float | None = Field(default=None, gt=0, le=1 / 60)
     """Custom physics: length of a physics step."""
     solver_iterations: int | None = Field(default=None, ge=1)
@@ -149,14 +149,14 @@ class EnvConfig(StrictModel):
     """Custom physics: residual at which the solver stops early; 0, the default, keeps episodes and
     restored states exact to the last bit."""
     expert: bool = False
-    """Add what the expert would do to every observation."""
+    """Add the expert's action to every observation."""
     seed: int | None = Field(default=None, ge=0)
-    """Seed of the first episode and all that follow it; drawn at random if None."""
+    """Seed of all episodes; drawn at random if None."""
 
     @model_validator(mode="before")
     @classmethod
     def _without_numpy(cls, values: Any) -> Any:
-        """Take NumPy's numbers and arrays for what they hold."""
+        """Convert NumPy scalars and arrays to Python values."""
         if not isinstance(values, dict):
             return values
         return {

@@ -1,4 +1,4 @@
-"""One generic registry: tasks, robots, networks and algorithms enter it by decorator."""
+"""Registry: tasks, robots, observations, networks and algorithms register by decorator."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Registry(Generic[T]):
         self._is_scanned = False
 
     def register(self, name: str) -> Callable[[T], T]:
-        """Return a decorator that files its argument under ``name``.
+        """Return a decorator that registers its argument under ``name``.
 
         A class may be defined again by its own module, as in a notebook whose cell runs twice; the
         new definition replaces the old one.

@@ -1,4 +1,4 @@
-"""Close-loop control: the gripper moves by small steps, watched by a camera above it."""
+"""Close-loop control: small displacements of the gripper, observed by a camera above it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ba_torchrl.tasks.workspace import ActionLimits
 
 START_HEIGHT_M = 0.2
 HALF_TURN = (-math.pi / 2, math.pi / 2)
-"""What `half_rotation` keeps the yaw within; episodes start in its middle."""
+"""Range of the yaw with `half_rotation`; episodes start in its middle."""
 
 
 @CONTROLS.register("close_loop")
@@ -52,7 +52,7 @@ class CloseLoopEnv(ManipulationEnv):
 
     @property
     def action_limits(self) -> ActionLimits:
-        """What one action covers."""
+        """Displacement and rotation of one action."""
         turn = self.config.drot if self.actions.has_yaw else 0.0
         return ActionLimits(self.config.dpos, turn, HALF_TURN if self.half_rotation else None)
 
