@@ -107,7 +107,8 @@ class EnvConfig(StrictModel):
     random_orientation: bool = True
     """Objects start with random yaw."""
     half_rotation: bool | None = None
-    """Keep the gripper's yaw within a half turn, which covers every two-finger grasp. Open loop: 0 to pi, on by default. Close loop: -pi/2 to pi/2 about the start, off by default."""
+    """Keep the gripper's yaw within a half turn, which covers every two-finger grasp. Open loop:
+    0 to pi, on by default. Close loop: -pi/2 to pi/2 about the start, off by default."""
     workspace_check: Literal["point", "bounding_box"] = "point"
     """Part of an object that must stay inside the workspace: its origin or its bounding box."""
     close_loop_tray: bool = Field(default=False, json_schema_extra=_CLOSE_LOOP)
