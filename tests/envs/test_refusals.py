@@ -5,7 +5,9 @@ import math
 import pytest
 
 import ba_torchrl
+from ba_torchrl.envs.factory import resolve
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
 
 PICKING = "close_loop/block_picking"
 
@@ -52,4 +54,20 @@ def test_a_parameter_of_other_tasks_names_them_and_passes_at_its_default():
         ba_torchrl.make(PICKING, object_type="cylinder")
     env = ba_torchrl.make(PICKING, object_type="cube", object_set="random", obs_size=16)
     assert not hasattr(env.config, "object_type")
+    env.close()
+
+
+def test_a_task_may_need_components_of_the_action(monkeypatch):
+    monkeypatch.setattr(TASKS[PICKING], "required_action_components", frozenset({"rz"}))
+    with pytest.raises(ConfigError, match="cannot be solved without the components rz"):
+        ba_torchrl.make(PICKING, action_sequence="pxyz")
+    ba_torchrl.make(PICKING, obs_size=16).close()
+
+
+def test_a_task_may_have_a_default_action_sequence(monkeypatch):
+    monkeypatch.setattr(TASKS[PICKING], "default_action_sequence", "pxyz")
+    env = ba_torchrl.make(PICKING, obs_size=16)
+    assert env.action_spec.shape == (4,)
+    assert resolve(PICKING).action_sequence == "pxyz"
+    assert resolve(PICKING, action_sequence="pxyzr").action_sequence == "pxyzr"
     env.close()
