@@ -74,7 +74,7 @@ def mermaid() -> str:
     graph = imports()
     # `make` builds environments, which import nothing of it: the functions import when called
     graph["make"] = graph.get("make", set()) | {"envs"}
-    lines = ["```mermaid", "flowchart BT"]
+    lines = ["```mermaid", "flowchart TB"]
     labels = {
         "base": "errors, config, registry,\\nplugins, actions",
         "make": "ba_torchrl.make",
