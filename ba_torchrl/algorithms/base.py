@@ -112,6 +112,13 @@ class Algorithm(ABC):
             FloatingPointError: a loss is not finite.
         """
 
+    def pretrain_update(self) -> TensorDict:
+        """Take one update on the demonstrations, before the first collection; by default `update`.
+
+        Counts in `updates`, returns and raises as `update` does.
+        """
+        return self.update()
+
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
         """Return networks, optimiser, counters and generators."""

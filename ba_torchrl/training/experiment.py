@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Self
 
@@ -198,7 +199,7 @@ class Experiment:
         """Pretrain, then alternate collection and updates until the last update."""
         config, algorithm = self.config, self.algorithm
         while algorithm.updates < config.pretrain_updates:
-            self._update()
+            self._update(algorithm.pretrain_update)
         if algorithm.updates == config.total_updates:
             return
         # A resumed run plays other episodes than before its interruption.
@@ -212,7 +213,7 @@ class Experiment:
                 if algorithm.replay_size < config.min_replay:
                     continue
                 for _ in range(config.updates_per_step):
-                    self._update()
+                    self._update(algorithm.update)
                     if algorithm.updates == config.total_updates:
                         return
         finally:
@@ -248,10 +249,10 @@ class Experiment:
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
         self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
 
-    def _update(self) -> None:
+    def _update(self, take_update: Callable[[], TensorDict]) -> None:
         """Take one update; log and evaluate if they are due."""
         config = self.config
-        scalars = self.algorithm.update()
+        scalars = take_update()
         updates = self.algorithm.updates
         self._bar.update()
         if updates % config.log_every == 0:

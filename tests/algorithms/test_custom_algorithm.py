@@ -118,3 +118,17 @@ def test_one_method_changes_one_part():
     learner = Augmented(config.algorithm_config, config.network_config, problem_of(config))
     assert isinstance(learner.augmentation, SO2Augmentation)
     assert learner.target_updater is None
+
+
+def test_pretraining_has_an_update_of_its_own(tmp_path, monkeypatch):
+    taken = []
+
+    def pretrain_update(self):
+        taken.append(self.updates)
+        return self.update()
+
+    monkeypatch.setattr(BehaviourCloning, "pretrain_update", pretrain_update)
+    values = {**RUN, "pretrain_updates": 3, "total_updates": 5, "eval_every": 5}
+    config = ExperimentConfig.parse({**values, "run_dir": str(tmp_path / "run")})
+    assert Experiment(config, progress=False).run().updates == 5
+    assert taken == [0, 1, 2]
