@@ -1,4 +1,4 @@
-"""Augmented state representation: a pixel first, then a yaw that knows it (appendix D.2, G.1)."""
+"""Augmented state representation: a pixel, then a yaw given that pixel (appendix D.2, G.1)."""
 
 from __future__ import annotations
 
