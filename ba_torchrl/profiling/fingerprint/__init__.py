@@ -1,0 +1,1 @@
+"""Records of what environments and training compute, to compare before and after a change."""

@@ -1,0 +1,83 @@
+"""Compare two records, with the place and the size of every difference."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Return what differs between two records of a case, as lines of text; [] if nothing does."""
+    lines = _fact_lines("", old["facts"], new["facts"])
+    for name in [*old["traces"], *(name for name in new["traces"] if name not in old["traces"])]:
+        before, after = old["traces"].get(name), new["traces"].get(name)
+        if before is None or after is None:
+            lines.append(f"{name}: only in the {'old' if after is None else 'new'} record")
+            continue
+        lines += _step_lines(name, before["steps"], after["steps"])
+        lines += _fact_lines(f"{name}: ", before["facts"], after["facts"])
+    return lines
+
+
+def _fact_lines(prefix: str, old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    return [
+        f"{prefix}{name}: {old.get(name, 'missing')} -> {new.get(name, 'missing')}"
+        for name in [*old, *(name for name in new if name not in old)]
+        if repr(old.get(name)) != repr(new.get(name))
+    ]
+
+
+def _step_lines(name: str, old: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[str]:
+    """Return for every key the first step that differs and the greatest difference."""
+    lines = []
+    if len(old) != len(new):
+        lines.append(f"{name}: {len(old)} -> {len(new)} recorded steps")
+    first: dict[str, tuple[int, str]] = {}
+    count: dict[str, int] = {}
+    greatest: dict[str, float] = {}
+    for i, (before, after) in enumerate(zip(old, new, strict=False)):
+        for key in [*before, *(key for key in after if key not in before)]:
+            if key not in before or key not in after:
+                text, size = f"only in the {'old' if key in before else 'new'} record", math.nan
+            elif before[key][0] == after[key][0]:
+                continue
+            else:
+                text, size = _size(before[key][1], after[key][1])
+            first.setdefault(key, (i, text))
+            count[key] = count.get(key, 0) + 1
+            greatest[key] = max(greatest.get(key, -math.inf), size)
+    for key, (i, text) in sorted(first.items(), key=lambda item: item[1][0]):
+        line = f"{name}: step {i}: {key}: {text}"
+        if count[key] > 1:
+            line += f"; {count[key]} steps differ, by at most {greatest[key]:.3g}"
+        lines.append(line)
+    return lines
+
+
+def _size(old: Any, new: Any) -> tuple[str, float]:
+    """Return the difference of two recorded values, as text and as a number."""
+    if isinstance(old, list) and isinstance(new, list):
+        if len(old) != len(new):
+            return f"{len(old)} -> {len(new)} numbers", math.nan
+        gaps = [0.0 if repr(a) == repr(b) else abs(a - b) for a, b in zip(old, new, strict=True)]
+        size = max(gaps, default=0.0)
+        return f"difference {size:.3g}, {_short(old)} -> {_short(new)}", size
+    if isinstance(old, list) or isinstance(new, list):
+        return "of another size", math.nan
+    size = abs(old - new)
+    return f"sum differs by {size:.3g} ({old:.9g} -> {new:.9g})", size
+
+
+def _short(values: list[float]) -> str:
+    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
+
+
+def compare(old: dict[str, dict[str, Any]], new: dict[str, dict[str, Any]]) -> dict[str, list[str]]:
+    """Return the differences of all cases that differ, by name of the case."""
+    found = {}
+    for name in [*old, *(name for name in new if name not in old)]:
+        if name not in old or name not in new:
+            found[name] = [f"only in the {'old' if name in old else 'new'} record"]
+        elif lines := differences(old[name], new[name]):
+            found[name] = lines
+    return found

@@ -1,0 +1,88 @@
+"""The record of what environments compute: equal for equal code, different for any change."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ba_torchrl.profiling.fingerprint.cases import PARTS, Case, cases
+from ba_torchrl.profiling.fingerprint.compare import compare, differences
+from ba_torchrl.profiling.fingerprint.record import run_case
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "fingerprint.py"
+
+
+@pytest.fixture(scope="module")
+def case():
+    return Case(
+        name="small",
+        part="envs",
+        task="close_loop/block_reaching",
+        kind="env",
+        config={"obs_size": 16},
+        plan={"expert": 1, "random": 3},
+    )
+
+
+def test_two_runs_are_equal(case):
+    first = json.loads(json.dumps(run_case(case)))
+    assert first["traces"]["expert 0"]["facts"]["success"]
+    assert differences(first, run_case(case)) == []
+
+
+def test_another_seed_is_a_difference_with_its_place_and_size(case):
+    old = run_case(case)
+    new = run_case(dataclasses.replace(case, seed=case.seed + 1))
+    lines = compare({"small": old}, {"small": new})["small"]
+    assert any(line.startswith("expert 0: step 0: pixels: sum differs by ") for line in lines)
+    assert any(line.startswith("random: step 1: action: difference ") for line in lines)
+
+
+def test_a_changed_number_is_found(case):
+    old = run_case(case)
+    new = json.loads(json.dumps(old))
+    new["traces"]["random"]["steps"][2]["reward"] = ["0" * 16, [0.5]]
+    (line,) = differences(old, new)
+    assert line == "random: step 2: reward: difference 0.5, [0] -> [0.5]"
+
+
+def test_a_refusal_of_the_configuration_is_recorded(case):
+    refused = dataclasses.replace(case, config={"deconstruct": True})
+    record = run_case(refused)
+    assert record["facts"]["refused"].startswith("'deconstruct' has no meaning")
+
+
+def test_every_task_has_cases_and_names_are_unique():
+    names = [case.name for case in cases(PARTS)]
+    assert len(set(names)) == len(names)
+    (task,) = {case.task for case in cases(["envs"], ["open_loop/covid_test"])}
+    assert task == "open_loop/covid_test"
+
+
+def test_the_recipe_records_and_compares(tmp_path):
+    """The recipe runs cases in spawned processes; a changed record gives exit code 1."""
+    path = tmp_path / "record.json"
+
+    def run(*arguments):
+        return subprocess.run(
+            [sys.executable, RECIPE, *arguments, "--workers", "1"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    recorded = run("--tasks=close_loop/block_reaching", "--match=without expert", f"--out={path}")
+    assert recorded.returncode == 0, recorded.stderr
+    record = json.loads(path.read_text())
+    (name,) = record["cases"]
+    assert name == "envs close_loop/block_reaching without expert"
+    reward = record["cases"][name]["traces"]["random"]["steps"][1]["reward"]
+    reward[:] = ["0" * 16, [0.5]]
+    path.write_text(json.dumps(record))
+    compared = run(f"--compare={path}", "--match=without expert")
+    assert compared.returncode == 1, compared.stderr
+    assert "random: step 1: reward: difference 0.5, [0.5] -> [0]" in compared.stdout
+    assert compared.stdout.endswith("different: 1 of 1 cases\n")
