@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import pybullet
 
-from ba_torchrl.sim.bodies import Body, Shape, Solid
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import IDENTITY, ORIGIN, Pose, Quaternion, Vector, yaw_quaternion
+from ba_torchrl.sim.shapes import Shape, Solid
 
 
 @dataclass(frozen=True, kw_only=True)

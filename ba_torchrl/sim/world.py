@@ -15,7 +15,8 @@ import pybullet_data
 
 from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.articulated import Articulated, ArticulatedLink, Rail
-from ba_torchrl.sim.bodies import Body, Color, Shape
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.shapes import Color, Shape
 
 
 @dataclass(frozen=True)

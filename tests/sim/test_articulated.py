@@ -6,9 +6,9 @@ import pytest
 
 from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.articulated import Rail
-from ba_torchrl.sim.bodies import Box, Solid
 from ba_torchrl.sim.meshes import box_mesh, moved, rod_mesh
 from ba_torchrl.sim.robots.kuka import Kuka
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 

@@ -17,8 +17,8 @@ from ba_torchrl.sim.assets.base import OBJECT_SETS, load_object_set
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
 from ba_torchrl.sim.assets.graspnet import graspable_scale
 from ba_torchrl.sim.assets.household import ITEMS
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, moved, write_obj
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.clutter.tray import profile

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 import ba_torchrl
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.contacts import (
     bearing_force_n,
     contacts,
@@ -17,6 +16,7 @@ from ba_torchrl.sim.contacts import (
     nearest_points,
     outer_contacts,
 )
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 EDGE_M, MASS_KG, GRAVITY_M_S2 = 0.05, 0.1, 10.0

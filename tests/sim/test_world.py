@@ -7,7 +7,7 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.errors import SimulationError
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 

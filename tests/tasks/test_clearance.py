@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.clearance import (
     ASIDE_M,

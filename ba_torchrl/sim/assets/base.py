@@ -11,8 +11,8 @@ import numpy as np
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.assets.hulls import volume_and_center
-from ba_torchrl.sim.bodies import Color, Solid
 from ba_torchrl.sim.meshes import Mesh, moved
+from ba_torchrl.sim.shapes import Color, Solid
 
 OBJECT_SETS: Registry[type[ObjectSet]] = Registry("object set", "ba_torchrl.sim.assets")
 

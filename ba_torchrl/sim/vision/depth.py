@@ -19,9 +19,9 @@ from typing import Protocol
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Decal, Shape
 from ba_torchrl.sim.geometry import Quaternion, Vector, quaternion_yaw
 from ba_torchrl.sim.meshes import Mesh
+from ba_torchrl.sim.shapes import Decal, Shape
 from ba_torchrl.sim.vision.kernels import (
     floor_depth,
     lower_depth,

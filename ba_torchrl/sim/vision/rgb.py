@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 import pybullet
 
-from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.lens import Lens
 from ba_torchrl.sim.world import World
 

@@ -29,8 +29,8 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import YawPose, yaw_quaternion
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
     Placed,

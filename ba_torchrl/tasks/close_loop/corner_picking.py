@@ -9,10 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Box, Color, Solid, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.contacts import bearing_force_n, contacts, gap_m
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, moved
+from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.clearance import reach_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask

@@ -11,9 +11,10 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.articulated import Rail
-from ba_torchrl.sim.bodies import Body, Color, Solid
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
+from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.clearance import passing_height_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask

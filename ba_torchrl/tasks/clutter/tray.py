@@ -7,10 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, Color, Solid
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector, yaw_quaternion
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain import Terrain
 from ba_torchrl.tasks.workspace import Workspace

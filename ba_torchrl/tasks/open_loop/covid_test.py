@@ -10,9 +10,10 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Body, Box, Color, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
+from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
 from ba_torchrl.tasks.clearance import grasp_clearance_m

@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 import pybullet
 
 from ba_torchrl.actions import PickPlaceCommand
-from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, joined, moved
+from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clearance import half_gap_m, hand_rectangle, outline_clearance_m

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from ba_torchrl.sim.bodies import Box, Color, Solid
 from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, moved
+from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.tasks.structures.blueprint import (
     CUBE,
     CUBOID,

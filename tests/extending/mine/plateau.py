@@ -1,7 +1,7 @@
 """A terrain: a level plateau above the floor, and a stack that is built on it."""
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import yaw_quaternion
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
 from ba_torchrl.tasks.structures.open_loop import StructureTask

@@ -6,7 +6,6 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.control.pick_place import (
     PEAK_ACCELERATION,
     PickPlace,
@@ -15,6 +14,7 @@ from ba_torchrl.sim.control.pick_place import (
 )
 from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import Physics, World
 
 B = 0.03

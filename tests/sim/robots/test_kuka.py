@@ -4,10 +4,10 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.kuka import Kuka
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 

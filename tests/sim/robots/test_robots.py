@@ -7,10 +7,10 @@ import pybullet
 import pytest
 
 import ba_torchrl
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 CLOSE_LOOP = ((0.3, -0.15, 0.01), (0.6, 0.15, 0.25))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import ba_torchrl
-from ba_torchrl.sim.bodies import Box, Decal
 from ba_torchrl.sim.geometry import yaw_quaternion
+from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
     Placed,

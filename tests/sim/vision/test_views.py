@@ -7,8 +7,8 @@ import pytest
 import ba_torchrl
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import UnknownNameError
-from ba_torchrl.sim.bodies import Box, Decal
 from ba_torchrl.sim.geometry import yaw_quaternion
+from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera, Placed
 from ba_torchrl.sim.vision.kernels import paint_square
 from ba_torchrl.sim.vision.lens import oblique_lens

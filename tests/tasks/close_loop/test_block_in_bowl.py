@@ -7,8 +7,8 @@ import pybullet
 import pytest
 
 import ba_torchrl
-from ba_torchrl.sim.bodies import Box, Solid
 from ba_torchrl.sim.meshes import bowl_parts, box_mesh, centroid, moved, prism_mesh, ring_parts
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 
 TASK = "close_loop/block_in_bowl"

@@ -7,7 +7,7 @@ import torch
 
 import ba_torchrl
 from ba_torchrl.envs.episodes import evaluate_at_rest
-from ba_torchrl.sim.bodies import Box, Solid
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.close_loop.drawer_opening import cabinet_parts, drawer_parts
 

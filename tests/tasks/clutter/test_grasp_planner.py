@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.clutter import grasp_planner
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M, DEEPEST_M, PIXEL_M, GraspPlanner
 from ba_torchrl.tasks.clutter.push_planner import PushPlanner

@@ -7,7 +7,7 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, RIM_Z_M, Tray, profile

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.sim.bodies import Box, Solid
 from ba_torchrl.sim.meshes import box_mesh, moved
 from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.clearance import path_clearance_m
 from ba_torchrl.tasks.structures.blocking import edge_grasps

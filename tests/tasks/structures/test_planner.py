@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.sim.bodies import Box, Solid, vertical_extent
+from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.meshes import gable_mesh
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import (
