@@ -1,4 +1,4 @@
-"""Body: a rigid body of a world, and measurements of its surface as it lies."""
+"""Body: a rigid body of a world, and measurements of its surface at its current pose."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Body:
 
     Args:
         client: PyBullet's client id.
-        shape: geometry and material.
-        name: for messages.
+        shape: geometry, mass and material.
+        name: used in error messages.
     """
 
     def __init__(self, client: int, shape: Shape, name: str) -> None:
@@ -33,8 +33,8 @@ class Body:
         self.shape = shape
         self.name = name
         self.is_hidden = False
-        """Put aside for now: cameras and settling leave it out."""
-        # PyBullet's poses are of the centre of mass
+        """Whether cameras and `World.is_still` ignore the body."""
+        # PyBullet reports and sets the pose of the centre of mass
         self._center = Pose(shape.center_of_mass_m) if any(shape.center_of_mass_m) else None
         self._from_center = None if self._center is None else self._center.inverse()
         self.id = pybullet.createMultiBody(
@@ -49,7 +49,7 @@ class Body:
             self.id,
             -1,
             lateralFriction=shape.friction,
-            frictionAnchor=1,  # a held or stacked body must not creep
+            frictionAnchor=1,  # prevents slow sliding of held and stacked bodies
             physicsClientId=client,
         )
         if shape.collision_margin_m is not None:
@@ -67,23 +67,23 @@ class Body:
 
     @property
     def is_free(self) -> bool:
-        """Whether a gripper can carry the body away."""
+        """Whether the body moves freely in six dimensions, so that a gripper can lift it."""
         return not self.is_static
 
     @property
     def pose(self) -> Pose:
-        """Pose of the geometry's frame."""
+        """Pose of the frame of the geometry in the world."""
         pose = Pose(*pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client))
         return pose if self._from_center is None else bullet_compose(pose, self._from_center)
 
     @property
     def position(self) -> Vector:
-        """Position of the origin in metres."""
-        return self.pose[0]
+        """Position of the frame of the geometry, metres."""
+        return self.pose.position
 
     @property
     def yaw_rad(self) -> float:
-        """Heading of the body's x axis in the plane."""
+        """Heading of the body's x axis in the horizontal plane."""
         return self.pose.yaw_rad
 
     @property
@@ -92,11 +92,21 @@ class Body:
         return quaternion_tilt(self.pose.orientation)
 
     def place(self, position: Vector, yaw_rad: float = 0.0) -> None:
-        """Put the body at rest, upright, at a pose."""
-        self.move_to(position, yaw_quaternion(yaw_rad))
+        """Teleport the body to an upright pose and set its velocity to zero.
 
-    def move_to(self, position: Vector, orientation: Quaternion) -> None:
-        """Put the body at rest at any pose."""
+        Args:
+            position: of the frame of the geometry, metres.
+            yaw_rad: heading of the body's x axis.
+        """
+        self.set_pose(position, yaw_quaternion(yaw_rad))
+
+    def set_pose(self, position: Vector, orientation: Quaternion) -> None:
+        """Teleport the body to a pose and set its velocity to zero.
+
+        Args:
+            position: of the frame of the geometry, metres.
+            orientation: unit quaternion (x, y, z, w).
+        """
         if self._center is not None:
             position, orientation = bullet_compose(Pose(position, orientation), self._center)
         pybullet.resetBasePositionAndOrientation(
@@ -107,7 +117,12 @@ class Body:
         )
 
     def is_still(self, speed_m_s: float, spin_rad_s: float) -> bool:
-        """Whether neither velocity exceeds its limit (sums of absolute components)."""
+        """Whether the velocities are within limits.
+
+        Args:
+            speed_m_s: limit of the L1 norm of the linear velocity.
+            spin_rad_s: limit of the L1 norm of the angular velocity.
+        """
         v, w = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
         return (
             abs(v[0]) + abs(v[1]) + abs(v[2]) <= speed_m_s
@@ -115,26 +130,26 @@ class Body:
         )
 
     def touches(self, other: Body) -> bool:
-        """Whether the two bodies are in contact, as of the last step."""
+        """Whether the two bodies were in contact in the last physics step."""
         return is_any_within(contacts(self.client, self.id, other.id))
 
     def bounding_box(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the axis-aligned bounding box."""
+        """Return the lower and upper corner of the axis-aligned bounding box, metres."""
         return pybullet.getAABB(self.id, physicsClientId=self.client)
 
 
 def world_vertices(body: Body) -> np.ndarray:
-    """Return the vertices of a body's surface as it lies, [V, 3] in metres."""
+    """Return the vertices of a body's visual surface in the world frame, [V, 3] metres."""
     return body.pose.apply(body.shape.vertices)
 
 
 def vertical_extent(body: Body) -> tuple[float, float]:
-    """Return the heights of a body's lowest and highest point, as it lies, in metres."""
+    """Return the heights of a body's lowest and highest vertex in the world frame, metres."""
     heights = world_vertices(body)[:, 2]
     return float(heights.min()), float(heights.max())
 
 
-def radius_m(body: Body) -> float:
-    """Return the distance of the farthest point of an upright body from its axis."""
+def footprint_radius_m(body: Body) -> float:
+    """Return the largest horizontal distance of an upright body's bounding box from its origin."""
     low, high = body.shape.bounds_m
     return math.hypot(*(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True)))

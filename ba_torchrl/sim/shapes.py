@@ -13,20 +13,20 @@ import numpy as np
 import pybullet
 
 from ba_torchrl.sim.geometry import Vector
-from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, write_obj
+from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, write_obj
 
 Color = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape(ABC):
-    """Geometry and material of a body.
+    """Geometry, mass and material of a body.
 
     Args:
         mass_kg: 0 for a static body.
         friction: lateral friction coefficient.
         color: red, green, blue, alpha in [0, 1].
-        center_of_mass_m: in the frame of the geometry.
+        center_of_mass_m: in the frame of the geometry, metres.
     """
 
     mass_kg: float = 0.1
@@ -35,56 +35,60 @@ class Shape(ABC):
     center_of_mass_m: Vector = (0.0, 0.0, 0.0)
 
     collision_margin_m: ClassVar[float | None] = None
-    """Gap that PyBullet keeps around the geometry; None leaves its own choice."""
+    """PyBullet's collision margin around the geometry; None keeps PyBullet's default."""
 
     @abstractmethod
     def mesh(self) -> Mesh:
-        """Return the surface that the depth camera sees."""
+        """Return the visual surface, in the frame of the geometry."""
 
     @abstractmethod
     def create_collision(self, client: int) -> int:
-        """Create PyBullet's collision shape and return its id."""
+        """Create a PyBullet collision shape and return its id."""
 
     @abstractmethod
     def create_visual(self, client: int) -> int:
-        """Create PyBullet's visual shape and return its id."""
+        """Create a PyBullet visual shape and return its id."""
 
     @cached_property
     def vertices(self) -> np.ndarray:
-        """Vertices of the surface that the depth camera sees, [V, 3] in metres."""
+        """Vertices of the visual surface, [V, 3] metres."""
         return self.mesh().vertices
 
     @cached_property
     def bounds_m(self) -> tuple[Vector, Vector]:
-        """Lower and upper corner of the geometry in its own frame."""
+        """Lower and upper corner of the bounding box in the frame of the geometry."""
         vertices = self.vertices
         return tuple(map(float, vertices.min(axis=0))), tuple(map(float, vertices.max(axis=0)))
 
     @property
     def height_m(self) -> float:
-        """Height of the body in its upright pose."""
+        """Height of the bounding box."""
         low, high = self.bounds_m
         return high[2] - low[2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Box(Shape):
-    """A box of the given edge lengths."""
+    """A box with its centre at the origin.
+
+    Args:
+        size_m: edge lengths along x, y and z.
+    """
 
     size_m: Vector
 
     def mesh(self) -> Mesh:
-        """Return the box's surface."""
+        """Return the surface of the box."""
         return box_mesh(self.size_m)
 
     def create_collision(self, client: int) -> int:
-        """Create the collision box."""
+        """Create a collision box."""
         return pybullet.createCollisionShape(
             pybullet.GEOM_BOX, halfExtents=[s / 2 for s in self.size_m], physicsClientId=client
         )
 
     def create_visual(self, client: int) -> int:
-        """Create the visible box."""
+        """Create a visual box."""
         return pybullet.createVisualShape(
             pybullet.GEOM_BOX,
             halfExtents=[s / 2 for s in self.size_m],
@@ -95,50 +99,50 @@ class Box(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Decal(Box):
-    """A thin coloured sheet without collision, such as a goal area on the floor.
+    """A thin coloured sheet without collision geometry, such as a goal area on the floor.
 
     Args:
-        depth_m: how much lower than the floor the depth camera shows it.
+        recess_depth_m: depth images show a recess of this depth in the floor in its place.
     """
 
-    depth_m: float = 0.0
+    recess_depth_m: float = 0.0
     mass_kg: float = 0.0
 
     def create_collision(self, client: int) -> int:
-        """A decal collides with nothing."""
+        """Return PyBullet's id for no collision shape."""
         return -1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid(Shape):
-    """A body of convex parts, hollow where they leave a gap.
+    """A body that consists of convex parts, so that it can be concave or hollow.
 
-    Collisions see the convex hull of each part.
+    The collision geometry is the convex hull of each part.
 
     Args:
-        parts: their surfaces, in the common frame.
-        surface: what cameras see; the parts unless given.
+        parts: surfaces of the parts, in a common frame.
+        surface: visual surface; None uses the parts.
     """
 
     parts: tuple[Mesh, ...]
     surface: Mesh | None = None
 
-    # PyBullet's millimetre stands outside a hull: stacks would float
+    # PyBullet's default margin of 1 mm lies outside a hull: stacked bodies would have visible gaps
     collision_margin_m: ClassVar[float | None] = 2e-4
 
     def mesh(self) -> Mesh:
-        """Return what cameras see."""
-        return joined(self.parts) if self.surface is None else self.surface
+        """Return the visual surface."""
+        return merge_meshes(self.parts) if self.surface is None else self.surface
 
     def create_collision(self, client: int) -> int:
-        """Create one hull for each part."""
+        """Create one convex hull for each part."""
         if len(self.parts) == 1:
             return pybullet.createCollisionShape(
                 pybullet.GEOM_MESH,
                 vertices=self.parts[0].vertices.tolist(),
                 physicsClientId=client,
             )
-        # PyBullet takes several hulls from a file only
+        # PyBullet creates several hulls only from a file
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "parts.obj"
             write_obj(path, self.parts)
@@ -147,7 +151,7 @@ class Solid(Shape):
             )
 
     def create_visual(self, client: int) -> int:
-        """Create the visible surface."""
+        """Create the visual surface."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "surface.obj"
             write_obj(path, [self.mesh()])

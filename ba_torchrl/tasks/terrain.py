@@ -99,7 +99,7 @@ class Terrain(ABC):
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put a body at rest on the surface, upright with respect to it."""
         offset = Pose((0.0, 0.0, -body.shape.bounds_m[0][2]))
-        body.move_to(*self.surface_pose(xy, yaw_rad).compose(offset))
+        body.set_pose(*self.surface_pose(xy, yaw_rad).compose(offset))
 
     # -- heights -----------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from ba_torchrl.sim.assets.base import OBJECT_SETS, load_object_set
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
 from ba_torchrl.sim.assets.graspnet import graspable_scale
 from ba_torchrl.sim.assets.household import ITEMS
-from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, moved, write_obj
+from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, transform_mesh, write_obj
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
@@ -39,10 +39,10 @@ def write_objects(root, **meshes):
 
 def angle_iron(size=0.08):
     """An L of two slabs: its hull is half air."""
-    return joined(
+    return merge_meshes(
         [
-            moved(box_mesh((size, 0.03, 0.02)), (size / 2, 0, 0.01)),
-            moved(box_mesh((0.02, 0.03, size)), (0.01, 0, size / 2)),
+            transform_mesh(box_mesh((size, 0.03, 0.02)), (size / 2, 0, 0.01)),
+            transform_mesh(box_mesh((0.02, 0.03, size)), (0.01, 0, size / 2)),
         ]
     )
 
@@ -74,12 +74,12 @@ def test_points_without_volume_have_no_hull(points):
 
 def test_rests_of_a_box_are_its_six_faces():
     size = (0.03, 0.05, 0.07)
-    found = hulls.rests(hulls.convex_hull(box_mesh(size).vertices))
+    found = hulls.stable_poses(hulls.convex_hull(box_mesh(size).vertices))
     assert sorted(round(rest.height_m, 6) for rest in found) == sorted(size * 2)
     for rest in found:
         least = min(set(size) - {round(rest.height_m, 6)})
         assert rest.width_m == pytest.approx(least, abs=1e-6)
-        assert rest.squareness > 0.9
+        assert rest.antipodal_score > 0.9
         # in this pose the fingers' line is along x, the height along z
         extents = np.ptp(box_mesh(size).vertices @ rest.turn.T, axis=0)
         assert extents[2] == pytest.approx(rest.height_m)
@@ -89,15 +89,15 @@ def test_rests_of_a_box_are_its_six_faces():
 
 def test_a_wedge_is_less_square_than_a_box():
     wedge = np.array([(x, y, z) for x, y in ((0, -0.03), (0, 0.03), (0.04, 0)) for z in (0, 0.03)])
-    flat = [rest for rest in hulls.rests(hulls.convex_hull(wedge)) if rest.height_m < 0.031]
+    flat = [rest for rest in hulls.stable_poses(hulls.convex_hull(wedge)) if rest.height_m < 0.031]
     assert flat
-    assert all(rest.squareness < 0.8 for rest in flat)
+    assert all(rest.antipodal_score < 0.8 for rest in flat)
 
 
 def test_a_body_does_not_rest_on_an_end_it_would_topple_from():
     leaning = box_mesh((0.02, 0.02, 0.1)).vertices.copy()
     leaning[leaning[:, 2] > 0, 0] += 0.06
-    heights = [rest.height_m for rest in hulls.rests(hulls.convex_hull(leaning))]
+    heights = [rest.height_m for rest in hulls.stable_poses(hulls.convex_hull(leaning))]
     assert heights
     assert max(heights) < 0.05
 
@@ -143,24 +143,24 @@ def test_shapes_are_made_when_asked_for(monkeypatch):
 
 
 def test_random_shapes_suit_as_they_say():
-    for number, scale in random_shapes.CHOICE[::8]:
-        found = random_shapes.examine(number)
+    for number, scale in random_shapes.SELECTION[::8]:
+        found = random_shapes.scaled_candidate(number)
         assert found is not None
         assert found.scale == scale
 
 
 def test_unsuitable_random_shapes_are_refused(monkeypatch):
-    assert random_shapes.examine(168) is None  # its file holds numbers that are none
-    number, _ = random_shapes.CHOICE[0]
-    for limit, value in (("LONGEST_M", 0.01), ("FLATTEST_M", 0.2), ("LEAST_FILL", 1.01)):
+    assert random_shapes.scaled_candidate(168) is None  # its file holds numbers that are none
+    number, _ = random_shapes.SELECTION[0]
+    for limit, value in (("MAX_LENGTH_M", 0.01), ("MIN_HEIGHT_M", 0.2), ("MIN_FILL", 1.01)):
         with monkeypatch.context() as patch:
             patch.setattr(random_shapes, limit, value)
-            assert random_shapes.examine(number) is None
+            assert random_shapes.scaled_candidate(number) is None
 
 
 @pytest.mark.slow
 def test_the_choice_of_random_shapes_follows_from_the_criterion():
-    assert random_shapes.choose() == random_shapes.CHOICE
+    assert random_shapes.select_shapes() == random_shapes.SELECTION
 
 
 def test_random_shapes_stand_so_that_fingers_at_yaw_zero_fit():
@@ -169,7 +169,7 @@ def test_random_shapes_stand_so_that_fingers_at_yaw_zero_fit():
         vertices = shape.mesh().vertices
         across = vertices[np.abs(vertices[:, 1]) < hulls.FINGER_HALF_M]
         assert len(across) == 0 or np.ptp(across[:, 0]) <= hulls.GAP_M + 1e-3
-        assert high[2] - low[2] >= random_shapes.FLATTEST_M - 1e-6
+        assert high[2] - low[2] >= random_shapes.MIN_HEIGHT_M - 1e-6
 
 
 def test_what_is_hollow_takes_something_in():
@@ -409,7 +409,7 @@ def test_what_fits_is_taken(tmp_path, size):
 def test_the_longest_object_lies_across_the_smaller_tray():
     inner = 2 * profile(CloseLoopTask.workspace.width)[0][0]
     assert inner == pytest.approx(0.25)
-    assert 0.98 < graspnet.LONGEST_M / math.hypot(inner, inner) <= 1
+    assert 0.98 < graspnet.MAX_LENGTH_M / math.hypot(inner, inner) <= 1
 
 
 def stepwise_scale(extents):
@@ -440,7 +440,10 @@ def test_parts_are_worked_out_once(own_cache):
 
     def make():
         made.append(1)
-        return [box_mesh((1.0, 2.0, 3.0)), moved(box_mesh((1.0, 1.0, 1.0)), (5.0, 0.0, 0.0))]
+        return [
+            box_mesh((1.0, 2.0, 3.0)),
+            transform_mesh(box_mesh((1.0, 1.0, 1.0)), (5.0, 0.0, 0.0)),
+        ]
 
     first, second = (cached_parts(b"content", "recipe", make) for _ in range(2))
     assert len(made) == 1
@@ -499,6 +502,11 @@ def test_processes_that_write_at_once_do_no_harm(own_cache):
 
 
 def test_the_recipe_names_what_the_parts_depend_on():
-    for value in (graspnet.CONVEX_FILL, graspnet.LENGTHS_M, graspnet.LONGEST_M, graspnet.FLATTEST):
+    for value in (
+        graspnet.CONVEX_FILL,
+        graspnet.MESH_LENGTHS_M,
+        graspnet.MAX_LENGTH_M,
+        graspnet.MIN_FLATNESS,
+    ):
         assert str(value) in graspnet.RECIPE
     assert all(str(value) in graspnet.RECIPE for value in graspnet.VHACD.values())

@@ -330,7 +330,7 @@ class CovidTest(OpenLoopTask):
             along_rad: how it is to lie in that frame; a gripper that cannot turn leaves it.
             rim_m: height that the fingertips stay above.
         """
-        tool = self.robot.tool_transform()
+        tool = self.robot.tool_frame()
         others = [other.position for other in self.objects if other is not held]
         x, y = max(
             (self._to_world(area, spot) for spot in spots),
@@ -346,7 +346,7 @@ class CovidTest(OpenLoopTask):
     @property
     def _grasp_m(self) -> float:
         """Height of the tool above what an object lies on, for the lower part of a swab."""
-        return TIPS_GAP_M - self.robot.gripper.lowest_m
+        return TIPS_GAP_M - self.robot.gripper.lowest_tip_m
 
     def _grasp_yaw(self, body: Body) -> float:
         return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0

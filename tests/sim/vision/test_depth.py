@@ -8,8 +8,8 @@ from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
-    Placed,
-    Surface,
+    PosedShape,
+    SceneMesh,
     depth_image,
     paint_square,
     point_cloud,
@@ -75,7 +75,7 @@ def test_a_tilted_box_shows_its_slope():
 def test_decals_dip_only_where_the_floor_is_visible():
     with World() as world:
         box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
-        goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02), "goal")
+        goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), "goal")
         box.place((0.02, 0.0, 0.025))
         goal.place((0.0, 0.0, 0.0))
         image = HeightCamera([box, goal]).heightmap((0.0, 0.0), 0.2, 100)
@@ -180,7 +180,7 @@ def test_render_is_a_picture():
 
 
 def placed(size, position, turn=(0.0, 0.0, 0.0, 1.0)):
-    return Placed(Box(size_m=size), (position, turn))
+    return PosedShape(Box(size_m=size), (position, turn))
 
 
 def random_boxes(rng, count, span=0.15):
@@ -257,10 +257,10 @@ def test_a_turned_camera_sees_the_world_turned_the_other_way():
             shape = (
                 Box(size_m=(0.1, 0.04, 0.05))
                 if number
-                else Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02)
+                else Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02)
             )
             z = 0.025 if number else 0.0
-            bodies.append(Placed(shape, ((cx + dx, cy + dy, z), yaw_quaternion(heading))))
+            bodies.append(PosedShape(shape, ((cx + dx, cy + dy, z), yaw_quaternion(heading))))
         camera = HeightCamera(bodies)
         images.append(camera.heightmap((cx, cy), 0.3, 96, yaw if turned else 0.0))
     np.testing.assert_allclose(images[0], images[1], atol=1e-12)
@@ -280,7 +280,7 @@ def test_a_turned_camera_equals_analytic_boxes():
 def test_hidden_bodies_are_left_out_until_they_return():
     with World() as world:
         boxes = [world.add(Box(size_m=(0.05, 0.05, 0.05)), str(n)) for n in range(3)]
-        goal = world.add(Decal(size_m=(0.05, 0.05, 1e-3), depth_m=0.02), "goal")
+        goal = world.add(Decal(size_m=(0.05, 0.05, 1e-3), recess_depth_m=0.02), "goal")
         for n, body in enumerate((*boxes, goal)):
             body.place((0.1 * n, 0.0, 0.025))
         camera = HeightCamera(world.bodies)
@@ -321,7 +321,7 @@ def test_perspective_equals_rays_that_meet_boxes(lens):
     rng = np.random.default_rng(1)
     for _ in range(3):
         boxes = random_boxes(rng, 5)
-        image = depth_image([Surface(boxes[:2]), Surface(boxes[2:])], lens, 80)
+        image = depth_image([SceneMesh(boxes[:2]), SceneMesh(boxes[2:])], lens, 80)
         expected = ray_depths(boxes, lens, 80)
         assert (expected < ray_depths([], lens, 80)).sum() > 100
         np.testing.assert_allclose(image, expected, atol=1e-9)
@@ -334,19 +334,20 @@ def test_what_reaches_behind_the_camera_is_cut_off_there():
         placed((0.05, 0.05, 0.1), (0.45, 0.0, 0.5)),  # all of it behind
         placed((0.2, 0.1, 0.3), (0.3, 0.3, 0.35), yaw_quaternion(0.4)),
     ]
-    image = depth_image([Surface(boxes)], lens, 64)
+    image = depth_image([SceneMesh(boxes)], lens, 64)
     expected = ray_depths(boxes, lens, 64)
     assert (expected < 0.299).sum() > 100
     np.testing.assert_allclose(image, expected, atol=1e-9)
 
 
 def test_through_a_dip_one_looks_on_to_a_lower_floor():
-    goal = Placed(
-        Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02), ((0.5, 0.04, 0.0), yaw_quaternion(0.3))
+    goal = PosedShape(
+        Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02),
+        ((0.5, 0.04, 0.0), yaw_quaternion(0.3)),
     )
     block = placed((0.05, 0.05, 0.05), (0.5, 0.09, 0.025))
     lens = oblique_lens(CENTER)
-    image = depth_image([Surface([goal, block])], lens, 80)
+    image = depth_image([SceneMesh([goal, block])], lens, 80)
     rays = rays_of(lens, 80)
     floor = np.array(lens.eye_m) + rays * (-lens.eye_m[2] / rays[..., 2])[..., None]
     dx, dy = floor[..., 0] - 0.5, floor[..., 1] - 0.04
@@ -362,16 +363,16 @@ def test_through_a_dip_one_looks_on_to_a_lower_floor():
 def test_a_lens_tells_heights_and_the_reach_of_planes():
     lens = oblique_lens(CENTER)
     box = placed((0.2, 0.2, 0.06), (0.45, 0.0, 0.03))
-    depth = depth_image([Surface([box])], lens, 100)
+    depth = depth_image([SceneMesh([box])], lens, 100)
     heights = lens.heights_m(depth)
     assert heights[50, 50] == pytest.approx(0.06, abs=1e-9)
     np.testing.assert_allclose(heights[:5], 0.0, atol=1e-9)
     floor = ray_depths([], lens, 1000)
-    low, high = lens.plane_depth_m(0.0)
+    low, high = lens.plane_depth_range_m(0.0)
     assert low == pytest.approx(floor.min(), rel=2e-3)
     assert high == pytest.approx(floor.max(), rel=2e-3)
     upward = Lens((0.0, 0.0, 0.3), (1.0, 0.0, 0.3), 1.0)
-    assert upward.plane_depth_m(0.0)[1] == FAR_M
+    assert upward.plane_depth_range_m(0.0)[1] == FAR_M
 
 
 @pytest.mark.parametrize("width", [0.3, 0.45, 0.75, 1.2])
@@ -390,7 +391,7 @@ def test_side_cameras_show_all_of_the_square(width):
 def test_points_of_a_cloud_lie_on_the_surfaces_inside_the_bounds():
     boxes = random_boxes(np.random.default_rng(2), 4, span=0.1)
     lenses = side_lenses(CENTER, 0.3)
-    cloud = point_cloud([Surface(boxes)], lenses, 3000, WORKSPACE)
+    cloud = point_cloud([SceneMesh(boxes)], lenses, 3000, WORKSPACE)
     assert cloud.shape == (3000, 3)
     assert cloud.dtype == np.float32
     distances = np.stack([distance_to_box(cloud, box) for box in boxes] + [np.abs(cloud[:, 2])])
@@ -402,7 +403,7 @@ def test_points_of_a_cloud_lie_on_the_surfaces_inside_the_bounds():
 
 
 def test_a_cloud_follows_from_the_scene_and_the_generator_alone():
-    surfaces = [Surface(random_boxes(np.random.default_rng(3), 3))]
+    surfaces = [SceneMesh(random_boxes(np.random.default_rng(3), 3))]
     lenses = side_lenses(CENTER, 0.3)
     clouds = [
         point_cloud(surfaces, lenses, 500, WORKSPACE, rng)
@@ -417,8 +418,8 @@ def test_a_cloud_follows_from_the_scene_and_the_generator_alone():
 def test_a_cloud_of_more_points_than_are_seen_repeats_all_of_them():
     narrow = ((0.44, 0.46), (-0.01, 0.01), (0.0, 0.2))
     lenses = side_lenses(CENTER, 0.3)
-    seen = visible_points([Surface([])], lenses, 200, (*narrow[:2], (-1.0, 1.0)))
-    cloud = point_cloud([Surface([])], lenses, 20_000, narrow)
+    seen = visible_points([SceneMesh([])], lenses, 200, (*narrow[:2], (-1.0, 1.0)))
+    cloud = point_cloud([SceneMesh([])], lenses, 20_000, narrow)
     assert 0 < len(seen) < 5000
     unique, counts = np.unique(cloud, axis=0, return_counts=True)
     assert len(cloud) == 20_000
@@ -428,13 +429,15 @@ def test_a_cloud_of_more_points_than_are_seen_repeats_all_of_them():
 
 def test_a_cloud_of_nothing_is_an_error():
     with pytest.raises(ValueError, match="see nothing"):
-        point_cloud([Surface([])], side_lenses(CENTER, 0.3), 10, ((5, 6), (5, 6), (0, 1)))
+        point_cloud([SceneMesh([])], side_lenses(CENTER, 0.3), 10, ((5, 6), (5, 6), (0, 1)))
 
 
 def test_points_of_the_floor_sink_where_a_decal_dips():
-    goal = Placed(Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02), ((0.5, 0.04, 0), (0, 0, 0, 1)))
+    goal = PosedShape(
+        Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), ((0.5, 0.04, 0), (0, 0, 0, 1))
+    )
     points = visible_points(
-        [Surface([goal])], side_lenses(CENTER, 0.3), 100, (*WORKSPACE[:2], (-1.0, 1.0))
+        [SceneMesh([goal])], side_lenses(CENTER, 0.3), 100, (*WORKSPACE[:2], (-1.0, 1.0))
     )
     inside = (np.abs(points[:, 0] - 0.5) < 0.045) & (np.abs(points[:, 1] - 0.04) < 0.045)
     assert 100 < inside.sum() < len(points)
@@ -470,8 +473,8 @@ def test_the_depth_of_colour_pictures_is_that_of_the_depth_camera():
         boxes[1].place((0.5, -0.06, 0.025), 0.9)
         lens = oblique_lens(CENTER)
         rgb, depth = render_rgbd(world, lens, 96)
-        expected = depth_image([Surface(boxes)], lens, 96)
-        owner = depth_image([Surface(boxes[:1])], lens, 96) < ray_depths([], lens, 96) - 1e-6
+        expected = depth_image([SceneMesh(boxes)], lens, 96)
+        owner = depth_image([SceneMesh(boxes[:1])], lens, 96) < ray_depths([], lens, 96) - 1e-6
     assert rgb.shape == (96, 96, 3)
     assert rgb.dtype == np.uint8
     off = np.abs(depth - expected)

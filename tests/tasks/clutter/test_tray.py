@@ -87,7 +87,7 @@ def test_nothing_falls_through(world):
     rng = np.random.default_rng(0)
     for block in blocks:
         x, y = (c + rng.uniform(-0.1, 0.1) for c in CENTER)
-        block.move_to((x, y, 0.4), (0.3, 0.1, 0.0, 0.9487))
+        block.set_pose((x, y, 0.4), (0.3, 0.1, 0.0, 0.9487))
         world.step(30)
     world.settle(600)
     for block in blocks:

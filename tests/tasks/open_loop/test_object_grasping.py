@@ -141,12 +141,12 @@ def test_what_was_let_go_of_is_no_success(make):
 
 def test_without_a_height_the_tool_goes_below_what_is_highest_between_the_fingers(make):
     task = with_brick(make)[0].scene.task
-    palm_m = task.robot.gripper.palm_m
+    palm_height_m = task.robot.gripper.palm_height_m
     assert (
-        0.005 < 0.1 - task.pick_height_m(0.1, (0.45, 0.0)) < palm_m
+        0.005 < 0.1 - task.pick_height_m(0.1, (0.45, 0.0)) < palm_height_m
     )  # around it, and the palm above it
     # never into the tray's floor, nor do the fingertips swing into it
-    assert task.pick_height_m(0.0, (0.45, 0.0)) + task.robot.gripper.tip_m(0.02) > FLOOR_Z_M
+    assert task.pick_height_m(0.0, (0.45, 0.0)) + task.robot.gripper.tip_height_m(0.02) > FLOOR_Z_M
     assert task.window_m(None) == pytest.approx(task.robot.gripper.half_width_m, abs=4e-3)
 
 

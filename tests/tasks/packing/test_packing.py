@@ -194,7 +194,7 @@ def filled_bin(make, count=4):
             turn = yaw_quaternion(bin_yaw)
             x, y, _, w = TURNED
             sz, cz = turn[2], turn[3]
-            body.move_to(
+            body.set_pose(
                 (*inside.frame.to_world(*cell), 0.044),
                 (cz * x - sz * y, cz * y + sz * x, sz * w, cz * w),
             )
@@ -291,7 +291,7 @@ def test_a_bottle_lying_in_the_tray_ends_the_episode(make):
     _, task, tray = stand_bottles(make)
     body = task.objects[1]
     lying = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
-    body.move_to((*tray.frame.to_world(0.0, 0.0), 0.2), lying)
+    body.set_pose((*tray.frame.to_world(0.0, 0.0), 0.2), lying)
     assert not task.is_success()
     assert not task.is_valid()
 
@@ -326,7 +326,7 @@ def test_bottles_right_themselves(make):
         x, y, _ = body.position
         lean = math.radians(15)
         base = 0.026 * math.sin(lean)  # the lower edge stays above ground
-        body.move_to((x, y, base), (math.sin(lean / 2), 0.0, 0.0, math.cos(lean / 2)))
+        body.set_pose((x, y, base), (math.sin(lean / 2), 0.0, 0.0, math.cos(lean / 2)))
     env.scene.world.settle(600)
     assert all(body.tilt_rad < 0.02 for body in task.objects)
 
@@ -434,7 +434,7 @@ def test_a_box_may_lie_on_any_long_side_but_not_stand(make):
     rolled = [(0.0, half), (half, 0.0)]  # about its length (y), about its width (x)
     for (x, y), counts in zip(rolled, (True, False), strict=True):
         # the yaw after the quarter turn
-        body.move_to(position, (w * x - z * y, w * y + z * x, z * half, w * half))
+        body.set_pose(position, (w * x - z * y, w * y + z * x, z * half, w * half))
         assert (body in pallet.task.filled().values()) is counts
 
 
@@ -509,7 +509,7 @@ def test_the_expert_tips_over_a_box_that_stands_on_its_end(make):
     state = env.step(env.reset().set("action", nothing))["next"]
     body = env.scene.task.objects[0]
     x, y, _ = body.position
-    body.move_to((x, y, BOX_M[1] / 2), TURNED)
+    body.set_pose((x, y, BOX_M[1] / 2), TURNED)
     state = env.step(state.set("action", nothing))["next"]
     assert body.tilt_rad > 1.5
     seen = follow(env, state)

@@ -166,7 +166,7 @@ def turned(body, axis, angle_rad, yaw_rad):
     (x, y, z), w = (a * math.sin(half) for a in axis), math.cos(half)
     c, s = math.cos(yaw), math.sin(yaw)
     # the product of the two quaternions, the yaw first
-    body.move_to((0.4, 0.0, 0.1), (x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s))
+    body.set_pose((0.4, 0.0, 0.1), (x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s))
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
@@ -264,7 +264,7 @@ def test_the_triangle_belongs_on_top_and_upright(scene):
     slope = math.pi - math.atan2(B, B / 2)
     turned(triangle, (0.0, 1.0, 0.0), slope, 0.0)
     depth = triangle.position[2] - vertical_extent(triangle)[0]
-    triangle.move_to((0.4, 0.0, 2 * B + depth), triangle.pose[1])
+    triangle.set_pose((0.4, 0.0, 2 * B + depth), triangle.pose[1])
     s.settle()
     assert triangle.touches(second)
     assert not s.planner.is_built()
