@@ -29,7 +29,7 @@ from ba_torchrl.envs.settings import check_action_components, check_task_paramet
 from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
-from ba_torchrl.sim.vision.rgb import LIGHT_FLOOR, render_rgb
+from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import Physics
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
@@ -186,7 +186,7 @@ class ManipulationEnv(EnvBase):
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return an RGB image of the scene, [height, width, 3] uint8."""
         x, y = self.workspace.center
-        floor = self.config.floor_color or LIGHT_FLOOR
+        floor = self.config.floor_color or DEFAULT_FLOOR_RGB
         aside, z, distance = self.camera_pose
         return render_rgb(
             self.scene.world,

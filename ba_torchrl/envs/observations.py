@@ -24,7 +24,7 @@ from ba_torchrl.registry import Registry
 from ba_torchrl.sim.vision.depth import point_cloud
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_rgbd
-from ba_torchrl.sim.vision.views import finger_posts
+from ba_torchrl.sim.vision.views import finger_boxes
 from ba_torchrl.tasks.workspace import Workspace
 
 OBSERVATIONS: Registry[type[Observation]] = Registry("observation", "ba_torchrl.envs")
@@ -157,7 +157,7 @@ class PointCloud(Observation):
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the points, metres."""
         robot, workspace = scene.robot, self.workspace
-        fingers = finger_posts(robot.tool_pose(), robot.finger_span_m * robot.opening() / 2)
+        fingers = finger_boxes(robot.tool_pose(), robot.finger_span_m * robot.opening() / 2)
         points = point_cloud(
             [scene.camera.surface, fingers],
             side_lenses(workspace.center, workspace.width),

@@ -85,7 +85,7 @@ class OpenLoopEnv(ManipulationEnv):
     @property
     def _heights_to_reach(self) -> tuple[float, ...]:
         floor = self.workspace.z[0]
-        return floor + 0.01, floor + PickPlaceLimits().approach_m + 0.01
+        return floor + 0.01, floor + PickPlaceLimits().approach_distance_m + 0.01
 
     def _make_action_spec(self) -> Bounded:
         low, high = zip(*self.actions.ranges, strict=True)
@@ -142,7 +142,7 @@ class OpenLoopEnv(ManipulationEnv):
             position = self._position(scene, command, self._heightmap(scene), primitive)
             controller.place(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
-        controller.check_grasp()
+        controller.update_grasp()
         if controller.held is None:
             self._memory = {}
         if watched is not None:

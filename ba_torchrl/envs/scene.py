@@ -10,9 +10,9 @@ from typing import Any, Protocol
 from ba_torchrl.config import CUSTOM_PHYSICS, EnvConfig
 from ba_torchrl.envs.settings import task_parameters
 from ba_torchrl.errors import ConfigError, SimulationError
-from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SavedState, Snapshot, World
 from ba_torchrl.tasks.base import TASKS, Task, TaskSettings

@@ -12,9 +12,9 @@ from ba_torchrl import list_tasks, make
 from ba_torchrl.envs import keys
 from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
 from ba_torchrl.profiling.table import Bench, Budget, Row, measurement, seconds, timed_row
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS

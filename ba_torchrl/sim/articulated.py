@@ -1,4 +1,4 @@
-"""Articulated: a fixed body with a part that slides out of it along a rail."""
+"""ArticulatedBody: a fixed link and a sliding link, connected by a prismatic joint."""
 
 from __future__ import annotations
 
@@ -7,48 +7,53 @@ from dataclasses import dataclass, replace
 
 import pybullet
 
-from ba_torchrl.sim.bodies import Body, Shape, Solid
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import IDENTITY, ORIGIN, Pose, Quaternion, Vector, yaw_quaternion
+from ba_torchrl.sim.shapes import Shape, Solid
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rail:
-    """Where a part slides, and how hard it is to move.
+class PrismaticJoint:
+    """A sliding joint with limits and dry friction.
 
     Args:
         axis: unit vector of the motion, in the frame of the body.
-        range_m: least and greatest travel.
-        friction_n: force that the part withstands; it also stops the part when let go.
+        limits_m: lower and upper joint limit, a range that contains the initial position 0.
+        friction_n: greatest force of the dry friction.
+
+    Raises:
+        ValueError: the limits exclude 0, or the friction is negative.
     """
 
     axis: Vector = (1.0, 0.0, 0.0)
-    range_m: tuple[float, float]
+    limits_m: tuple[float, float]
     friction_n: float
 
     def __post_init__(self) -> None:
-        low, high = self.range_m
+        low, high = self.limits_m
         if not low <= 0 <= high:
-            raise ValueError(f"the range {self.range_m} must contain 0, where the part is put")
+            raise ValueError(f"limits_m {self.limits_m} must contain 0, the initial position")
         if self.friction_n < 0:
-            raise ValueError(f"friction_n must not be negative, it is {self.friction_n}")
+            raise ValueError(f"friction_n must not be negative, got {self.friction_n}")
 
 
 class ArticulatedLink(Body):
-    """One of the rigid bodies that an articulated body consists of.
+    """One of the two rigid links of an articulated body.
 
     Args:
         client: PyBullet's client id.
-        body_id: of the articulated body.
-        links: PyBullet's indices of the part, its frame's first; -1 is the fixed base.
-        shape: its geometry and material; both parts share the frame of the fixed one at travel 0.
-        name: for messages.
+        body_id: PyBullet's id of the articulated body.
+        links: PyBullet's link indices of the convex parts, where the first defines the frame; -1
+            is the fixed base.
+        shape: geometry, mass and material, in the frame of the fixed link at joint position 0.
+        name: used in error messages.
     """
 
     def __init__(
         self, client: int, body_id: int, links: Sequence[int], shape: Shape, name: str
     ) -> None:
-        # not Body's: that would load a body of its own
+        # Body.__init__ is not called: it would load another PyBullet body
         self.client, self.id, self.links = client, body_id, tuple(links)
         self.shape, self.name = shape, name
         self.is_hidden = False
@@ -67,17 +72,17 @@ class ArticulatedLink(Body):
 
     @property
     def is_static(self) -> bool:
-        """Whether the part never moves."""
+        """Whether this is the fixed link."""
         return self.links[0] < 0
 
     @property
     def is_free(self) -> bool:
-        """A part stays on its rail: no gripper can carry it away."""
+        """Return False: a gripper cannot lift a link."""
         return False
 
     @property
     def pose(self) -> Pose:
-        """Pose of the geometry's frame."""
+        """Pose of the frame of the geometry in the world."""
         if self.is_static:
             return Pose(
                 *pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)
@@ -87,33 +92,42 @@ class ArticulatedLink(Body):
         )
         return Pose(state[4], state[5])
 
-    def move_to(self, position: Vector, orientation: Quaternion) -> None:
-        """Put the whole articulated body at a pose; only its fixed part can be asked to.
+    def set_pose(self, position: Vector, orientation: Quaternion) -> None:
+        """Teleport the articulated body; possible only through its fixed link.
+
+        Args:
+            position: of the fixed link, metres.
+            orientation: unit quaternion (x, y, z, w).
 
         Raises:
-            ValueError: the part moves along its rail only.
+            ValueError: this is the sliding link.
         """
         if not self.is_static:
-            raise ValueError(f"{self.name} moves along its rail only: place the whole body")
+            raise ValueError(f"{self.name} moves only along its joint: place the whole body")
         pybullet.resetBasePositionAndOrientation(
             self.id, position, orientation, physicsClientId=self.client
         )
 
     def is_still(self, speed_m_s: float, spin_rad_s: float) -> bool:
-        """Whether the part moves along its rail no faster than the limit."""
+        """Whether the joint velocity is within the limit.
+
+        Args:
+            speed_m_s: limit of the joint velocity.
+            spin_rad_s: unused; the link does not rotate.
+        """
         if self.is_static:
             return True
         state = pybullet.getJointState(self.id, self.links[0], physicsClientId=self.client)
         return abs(state[1]) <= speed_m_s
 
     def touches(self, other: Body) -> bool:
-        """Whether the part, and not its sibling, is in contact with a body as of the last step."""
+        """Whether this link was in contact with a body in the last physics step."""
         points = contacts(self.client, self.id, other.id)
         return is_any_within(point for point in points if point.link in self.links)
 
-    def forget_pairs(self) -> None:
-        """Let the engine look afresh at what is near the part."""
-        # PyBullet's own groups: what is static meets all but its like
+    def rebuild_collision_pairs(self) -> None:
+        """Enable collisions of the link, whose pairs `World` has removed."""
+        # PyBullet's default collision groups: static bodies do not collide with each other
         group, mask = (2, ~2) if self.is_static else (1, -1)
         for link in self.links:
             pybullet.setCollisionFilterGroupMask(
@@ -121,7 +135,7 @@ class ArticulatedLink(Body):
             )
 
     def bounding_box(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the axis-aligned bounding box."""
+        """Return the lower and upper corner of the axis-aligned bounding box, metres."""
         boxes = [
             pybullet.getAABB(self.id, link, physicsClientId=self.client) for link in self.links
         ]
@@ -131,66 +145,68 @@ class ArticulatedLink(Body):
         )
 
 
-class Articulated:
-    """A fixed body and a part that slides along a rail: one PyBullet body with one joint.
+class ArticulatedBody:
+    """A fixed link and a sliding link: one PyBullet body with one prismatic joint.
 
-    The two parts do not collide with each other; the rail alone guides the sliding one. Every
-    convex piece is a link of its own: PyBullet's snapshots mix up the contacts of pieces that
-    share one, and the same state would not have the same future.
+    The two links do not collide with each other. Each convex part is a separate PyBullet link:
+    PyBullet's snapshots confuse the contacts of several convex parts in one link, so that restored
+    states would not repeat exactly.
 
     Args:
         client: PyBullet's client id.
-        base: shape of the fixed part.
-        slider: shape of the part that slides, in the frame of the fixed one at travel 0. Where its
-            centre of mass lies makes no difference on a rail.
-        rail: where it slides.
-        name: for messages.
+        base: shape of the fixed link.
+        slider: shape of the sliding link, in the frame of the fixed link at joint position 0. Its
+            centre of mass has no effect.
+        joint: axis, limits and friction.
+        name: used in error messages.
 
     Raises:
         ValueError: the base has a mass, or the slider has none.
     """
 
-    def __init__(self, client: int, base: Shape, slider: Shape, rail: Rail, name: str) -> None:
+    def __init__(
+        self, client: int, base: Shape, slider: Shape, joint: PrismaticJoint, name: str
+    ) -> None:
         if base.mass_kg != 0 or slider.mass_kg <= 0:
-            raise ValueError(f"{name}: its base takes no mass, its slider needs one")
+            raise ValueError(f"{name}: the base must have zero mass, the slider a positive mass")
         self.client = client
-        self.rail = rail
+        self.joint = joint
         self.name = name
-        bottom, *fixed = _pieces(base)
-        moving = _pieces(slider)
-        # links are numbered from 1 where PyBullet asks for parents: 0 is the base
+        base_part, *fixed = _convex_parts(base)
+        moving = _convex_parts(slider)
+        # in linkParentIndices, 0 is the base and links count from 1
         parents = [0, *[0] * len(fixed), *[1] * (len(moving) - 1)]
-        pieces = [moving[0], *fixed, *moving[1:]]
+        parts = [moving[0], *fixed, *moving[1:]]
         share = slider.mass_kg / len(moving)
         self.id = pybullet.createMultiBody(
             baseMass=0.0,
-            baseCollisionShapeIndex=bottom.create_collision(client),
+            baseCollisionShapeIndex=base_part.create_collision(client),
             baseVisualShapeIndex=base.create_visual(client),
             basePosition=(0.0, 0.0, -base.bounds_m[0][2]),
             linkMasses=[share, *[0.0] * len(fixed), *[share] * (len(moving) - 1)],
-            linkCollisionShapeIndices=[piece.create_collision(client) for piece in pieces],
-            linkVisualShapeIndices=[slider.create_visual(client), *[-1] * (len(pieces) - 1)],
-            linkPositions=[ORIGIN] * len(pieces),
-            linkOrientations=[IDENTITY] * len(pieces),
-            linkInertialFramePositions=[ORIGIN] * len(pieces),
-            linkInertialFrameOrientations=[IDENTITY] * len(pieces),
+            linkCollisionShapeIndices=[part.create_collision(client) for part in parts],
+            linkVisualShapeIndices=[slider.create_visual(client), *[-1] * (len(parts) - 1)],
+            linkPositions=[ORIGIN] * len(parts),
+            linkOrientations=[IDENTITY] * len(parts),
+            linkInertialFramePositions=[ORIGIN] * len(parts),
+            linkInertialFrameOrientations=[IDENTITY] * len(parts),
             linkParentIndices=parents,
             linkJointTypes=[
                 pybullet.JOINT_PRISMATIC,
-                *[pybullet.JOINT_FIXED] * (len(pieces) - 1),
+                *[pybullet.JOINT_FIXED] * (len(parts) - 1),
             ],
-            linkJointAxis=[rail.axis] * len(pieces),
+            linkJointAxis=[joint.axis] * len(parts),
             physicsClientId=client,
         )
-        links = range(1, len(pieces))
+        links = range(1, len(parts))
         self.base = ArticulatedLink(client, self.id, [-1, *links[: len(fixed)]], base, name)
-        """The fixed part."""
+        """The fixed link."""
         self.slider = ArticulatedLink(
             client, self.id, [0, *links[len(fixed) :]], slider, f"{name}'s slider"
         )
-        """The part that moves."""
-        low, high = rail.range_m
-        # in a call of their own: next to other settings, PyBullet ignores the limits
+        """The sliding link."""
+        low, high = joint.limits_m
+        # a separate call: PyBullet ignores joint limits in a call with other settings
         pybullet.changeDynamics(
             self.id,
             0,
@@ -198,44 +214,49 @@ class Articulated:
             jointUpperLimit=high,
             physicsClientId=client,
         )
-        # a motor that wants standstill and has little force is dry friction
+        # a velocity motor with target zero and limited force acts as dry friction
         pybullet.setJointMotorControl2(
             self.id,
             0,
             pybullet.VELOCITY_CONTROL,
             targetVelocity=0.0,
-            force=rail.friction_n,
+            force=joint.friction_n,
             physicsClientId=client,
         )
 
     def __repr__(self) -> str:
-        return f"Articulated({self.name!r})"
+        return f"ArticulatedBody({self.name!r})"
 
     @property
     def parts(self) -> tuple[ArticulatedLink, ArticulatedLink]:
-        """The fixed part and the sliding one."""
+        """The fixed link and the sliding link."""
         return self.base, self.slider
 
     @property
     def travel_m(self) -> float:
-        """How far the slider is along its rail."""
+        """Position of the joint."""
         return pybullet.getJointState(self.id, 0, physicsClientId=self.client)[0]
 
     def place(self, position: Vector, yaw_rad: float = 0.0, travel_m: float = 0.0) -> None:
-        """Put everything at rest, upright, at a pose and a travel of the slider.
+        """Teleport the body to an upright pose and a joint position, with zero velocities.
+
+        Args:
+            position: of the fixed link, metres.
+            yaw_rad: heading of the fixed link's x axis.
+            travel_m: joint position.
 
         Raises:
-            ValueError: the travel is out of the rail's range.
+            ValueError: the joint position is outside of the joint limits.
         """
-        low, high = self.rail.range_m
+        low, high = self.joint.limits_m
         if not low <= travel_m <= high:
-            raise ValueError(f"{self.name}: travel {travel_m} m is outside of {low} to {high} m")
-        self.base.move_to(position, yaw_quaternion(yaw_rad))
+            raise ValueError(f"{self.name}: travel_m {travel_m} is outside of [{low}, {high}]")
+        self.base.set_pose(position, yaw_quaternion(yaw_rad))
         pybullet.resetJointState(self.id, 0, travel_m, 0.0, physicsClientId=self.client)
 
 
-def _pieces(shape: Shape) -> list[Shape]:
-    """Return a shape's convex pieces."""
+def _convex_parts(shape: Shape) -> list[Shape]:
+    """Return the convex parts of a shape, each as a shape."""
     if not isinstance(shape, Solid):
         return [shape]
     return [replace(shape, parts=(part,), surface=None) for part in shape.parts]

@@ -1,14 +1,8 @@
-"""Body: a rigid body of a world; and the shapes that the tasks are made of."""
+"""Body: a rigid body of a world, and measurements of its surface at its current pose."""
 
 from __future__ import annotations
 
 import math
-import tempfile
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pybullet
@@ -22,150 +16,7 @@ from ba_torchrl.sim.geometry import (
     quaternion_tilt,
     yaw_quaternion,
 )
-from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, write_obj
-
-Color = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shape(ABC):
-    """Geometry and material of a body.
-
-    Args:
-        mass_kg: 0 for a static body.
-        friction: lateral friction coefficient.
-        color: red, green, blue, alpha in [0, 1].
-        center_of_mass_m: in the frame of the geometry.
-    """
-
-    mass_kg: float = 0.1
-    friction: float = 1.0
-    color: Color = (0.8, 0.2, 0.2, 1.0)
-    center_of_mass_m: Vector = (0.0, 0.0, 0.0)
-
-    collision_margin_m: ClassVar[float | None] = None
-    """Gap that PyBullet keeps around the geometry; None leaves its own choice."""
-
-    @abstractmethod
-    def mesh(self) -> Mesh:
-        """Return the surface that the depth camera sees."""
-
-    @abstractmethod
-    def create_collision(self, client: int) -> int:
-        """Create PyBullet's collision shape and return its id."""
-
-    @abstractmethod
-    def create_visual(self, client: int) -> int:
-        """Create PyBullet's visual shape and return its id."""
-
-    @cached_property
-    def vertices(self) -> np.ndarray:
-        """Vertices of the surface that the depth camera sees, [V, 3] in metres."""
-        return self.mesh().vertices
-
-    @cached_property
-    def bounds_m(self) -> tuple[Vector, Vector]:
-        """Lower and upper corner of the geometry in its own frame."""
-        vertices = self.vertices
-        return tuple(map(float, vertices.min(axis=0))), tuple(map(float, vertices.max(axis=0)))
-
-    @property
-    def height_m(self) -> float:
-        """Height of the body in its upright pose."""
-        low, high = self.bounds_m
-        return high[2] - low[2]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Box(Shape):
-    """A box of the given edge lengths."""
-
-    size_m: Vector
-
-    def mesh(self) -> Mesh:
-        """Return the box's surface."""
-        return box_mesh(self.size_m)
-
-    def create_collision(self, client: int) -> int:
-        """Create the collision box."""
-        return pybullet.createCollisionShape(
-            pybullet.GEOM_BOX, halfExtents=[s / 2 for s in self.size_m], physicsClientId=client
-        )
-
-    def create_visual(self, client: int) -> int:
-        """Create the visible box."""
-        return pybullet.createVisualShape(
-            pybullet.GEOM_BOX,
-            halfExtents=[s / 2 for s in self.size_m],
-            rgbaColor=self.color,
-            physicsClientId=client,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Decal(Box):
-    """A thin coloured sheet without collision, such as a goal area on the floor.
-
-    Args:
-        depth_m: how much lower than the floor the depth camera shows it.
-    """
-
-    depth_m: float = 0.0
-    mass_kg: float = 0.0
-
-    def create_collision(self, client: int) -> int:
-        """A decal collides with nothing."""
-        return -1
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Solid(Shape):
-    """A body of convex parts, hollow where they leave a gap.
-
-    Collisions see the convex hull of each part.
-
-    Args:
-        parts: their surfaces, in the common frame.
-        surface: what cameras see; the parts unless given.
-    """
-
-    parts: tuple[Mesh, ...]
-    surface: Mesh | None = None
-
-    # PyBullet's millimetre stands outside a hull: stacks would float
-    collision_margin_m: ClassVar[float | None] = 2e-4
-
-    def mesh(self) -> Mesh:
-        """Return what cameras see."""
-        return joined(self.parts) if self.surface is None else self.surface
-
-    def create_collision(self, client: int) -> int:
-        """Create one hull for each part."""
-        if len(self.parts) == 1:
-            return pybullet.createCollisionShape(
-                pybullet.GEOM_MESH,
-                vertices=self.parts[0].vertices.tolist(),
-                physicsClientId=client,
-            )
-        # PyBullet takes several hulls from a file only
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "parts.obj"
-            write_obj(path, self.parts)
-            return pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client
-            )
-
-    def create_visual(self, client: int) -> int:
-        """Create the visible surface."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "surface.obj"
-            write_obj(path, [self.mesh()])
-            return pybullet.createVisualShape(
-                pybullet.GEOM_MESH,
-                fileName=str(path),
-                rgbaColor=self.color,
-                physicsClientId=client,
-            )
+from ba_torchrl.sim.shapes import Shape
 
 
 class Body:
@@ -173,8 +24,8 @@ class Body:
 
     Args:
         client: PyBullet's client id.
-        shape: geometry and material.
-        name: for messages.
+        shape: geometry, mass and material.
+        name: used in error messages.
     """
 
     def __init__(self, client: int, shape: Shape, name: str) -> None:
@@ -182,8 +33,8 @@ class Body:
         self.shape = shape
         self.name = name
         self.is_hidden = False
-        """Put aside for now: cameras and settling leave it out."""
-        # PyBullet's poses are of the centre of mass
+        """Whether cameras and `World.is_still` ignore the body."""
+        # PyBullet reports and sets the pose of the centre of mass
         self._center = Pose(shape.center_of_mass_m) if any(shape.center_of_mass_m) else None
         self._from_center = None if self._center is None else self._center.inverse()
         self.id = pybullet.createMultiBody(
@@ -198,7 +49,7 @@ class Body:
             self.id,
             -1,
             lateralFriction=shape.friction,
-            frictionAnchor=1,  # a held or stacked body must not creep
+            frictionAnchor=1,  # prevents slow sliding of held and stacked bodies
             physicsClientId=client,
         )
         if shape.collision_margin_m is not None:
@@ -216,23 +67,23 @@ class Body:
 
     @property
     def is_free(self) -> bool:
-        """Whether a gripper can carry the body away."""
+        """Whether the body moves freely in six dimensions, so that a gripper can lift it."""
         return not self.is_static
 
     @property
     def pose(self) -> Pose:
-        """Pose of the geometry's frame."""
+        """Pose of the frame of the geometry in the world."""
         pose = Pose(*pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client))
         return pose if self._from_center is None else bullet_compose(pose, self._from_center)
 
     @property
     def position(self) -> Vector:
-        """Position of the origin in metres."""
-        return self.pose[0]
+        """Position of the frame of the geometry, metres."""
+        return self.pose.position
 
     @property
     def yaw_rad(self) -> float:
-        """Heading of the body's x axis in the plane."""
+        """Heading of the body's x axis in the horizontal plane."""
         return self.pose.yaw_rad
 
     @property
@@ -241,11 +92,21 @@ class Body:
         return quaternion_tilt(self.pose.orientation)
 
     def place(self, position: Vector, yaw_rad: float = 0.0) -> None:
-        """Put the body at rest, upright, at a pose."""
-        self.move_to(position, yaw_quaternion(yaw_rad))
+        """Teleport the body to an upright pose and set its velocity to zero.
 
-    def move_to(self, position: Vector, orientation: Quaternion) -> None:
-        """Put the body at rest at any pose."""
+        Args:
+            position: of the frame of the geometry, metres.
+            yaw_rad: heading of the body's x axis.
+        """
+        self.set_pose(position, yaw_quaternion(yaw_rad))
+
+    def set_pose(self, position: Vector, orientation: Quaternion) -> None:
+        """Teleport the body to a pose and set its velocity to zero.
+
+        Args:
+            position: of the frame of the geometry, metres.
+            orientation: unit quaternion (x, y, z, w).
+        """
         if self._center is not None:
             position, orientation = bullet_compose(Pose(position, orientation), self._center)
         pybullet.resetBasePositionAndOrientation(
@@ -256,7 +117,12 @@ class Body:
         )
 
     def is_still(self, speed_m_s: float, spin_rad_s: float) -> bool:
-        """Whether neither velocity exceeds its limit (sums of absolute components)."""
+        """Whether the velocities are within limits.
+
+        Args:
+            speed_m_s: limit of the L1 norm of the linear velocity.
+            spin_rad_s: limit of the L1 norm of the angular velocity.
+        """
         v, w = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
         return (
             abs(v[0]) + abs(v[1]) + abs(v[2]) <= speed_m_s
@@ -264,26 +130,26 @@ class Body:
         )
 
     def touches(self, other: Body) -> bool:
-        """Whether the two bodies are in contact, as of the last step."""
+        """Whether the two bodies were in contact in the last physics step."""
         return is_any_within(contacts(self.client, self.id, other.id))
 
     def bounding_box(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the axis-aligned bounding box."""
+        """Return the lower and upper corner of the axis-aligned bounding box, metres."""
         return pybullet.getAABB(self.id, physicsClientId=self.client)
 
 
 def world_vertices(body: Body) -> np.ndarray:
-    """Return the vertices of a body's surface as it lies, [V, 3] in metres."""
+    """Return the vertices of a body's visual surface in the world frame, [V, 3] metres."""
     return body.pose.apply(body.shape.vertices)
 
 
 def vertical_extent(body: Body) -> tuple[float, float]:
-    """Return the heights of a body's lowest and highest point, as it lies, in metres."""
+    """Return the heights of a body's lowest and highest vertex in the world frame, metres."""
     heights = world_vertices(body)[:, 2]
     return float(heights.min()), float(heights.max())
 
 
-def radius_m(body: Body) -> float:
-    """Return the distance of the farthest point of an upright body from its axis."""
+def footprint_radius_m(body: Body) -> float:
+    """Return the largest horizontal distance of an upright body's bounding box from its origin."""
     low, high = body.shape.bounds_m
     return math.hypot(*(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True)))

@@ -1,6 +1,7 @@
 """Contacts and distances between bodies, read from PyBullet.
 
-Contacts are those of the last physics step or collision detection; distances are as of now.
+Contact points are those of the last physics step or collision detection. Distances are computed
+for the current poses.
 """
 
 from __future__ import annotations
@@ -13,34 +14,34 @@ import pybullet
 
 from ba_torchrl.sim.geometry import Vector
 
-CONTACT_M = 5e-4
-"""Bodies closer than this touch; PyBullet already lists pairs that are millimetres apart."""
+CONTACT_DISTANCE_M = 5e-4
+"""Bodies closer than this are in contact; PyBullet also lists pairs that are millimetres apart."""
 VERTICAL_COSINE = 0.6
-"""A contact bears from above or below if its normal is within 53 degrees of the vertical."""
+"""A contact is vertical if its normal is within 53 degrees of the vertical."""
 
 
 class Contact(NamedTuple):
-    """A point at which a body touches another, or is about to.
+    """A contact point, or a pair of closest points, of two bodies.
 
-    The fields are those of PyBullet's contact points, in their order.
+    The fields are those of PyBullet's contact points, in the same order.
     """
 
     flag: int
     body_id: int
     other_id: int
     link: int
-    """Of the body; -1 is its base."""
+    """Link of the body; -1 is the base."""
     other_link: int
     position: Vector
-    """On the body, metres."""
+    """Point on the body, metres."""
     other_position: Vector
-    """On the other body."""
+    """Point on the other body, metres."""
     normal: Vector
-    """Unit vector on the other body, towards the body."""
+    """Unit contact normal, from the other body towards the body."""
     distance_m: float
-    """Negative where they overlap."""
+    """Negative where the bodies penetrate each other."""
     force_n: float
-    """Normal force in the last step; 0 for distances."""
+    """Normal force in the last step; 0 for closest points."""
     friction_1_n: float
     friction_direction_1: Vector
     friction_2_n: float
@@ -48,30 +49,30 @@ class Contact(NamedTuple):
 
     @property
     def is_vertical(self) -> bool:
-        """Whether it bears from above or below."""
+        """Whether the contact normal is close to the vertical."""
         return abs(self.normal[2]) > VERTICAL_COSINE
 
 
 def contacts(client: int, body_id: int, other_id: int = -1) -> list[Contact]:
-    """Return the contacts of a body.
+    """Return the contact points of a body.
 
     Args:
         client: PyBullet's client id.
         body_id: PyBullet's id of the body.
-        other_id: of the other body; contacts with all bodies if not given.
+        other_id: PyBullet's id of the other body; -1 stands for all bodies.
     """
     points = pybullet.getContactPoints(body_id, other_id, physicsClientId=client)
     return [Contact._make(point) for point in points]
 
 
 def outer_contacts(client: int, *body_ids: int) -> list[Contact]:
-    """Return the contacts of a group of bodies, without those between two of them.
+    """Return the contact points of a group of bodies, except those between two bodies of the group.
 
-    A body's contacts with itself, such as those of two fingers, count.
+    Contacts of a body with itself, such as those between two fingers, are included.
 
     Args:
         client: PyBullet's client id.
-        body_ids: PyBullet's ids of the bodies, such as a robot and what it holds.
+        body_ids: PyBullet's ids of the bodies, such as a robot and the body that it holds.
     """
     return [
         contact
@@ -84,14 +85,14 @@ def outer_contacts(client: int, *body_ids: int) -> list[Contact]:
 def nearest_points(
     client: int, body_id: int, other_id: int, up_to_m: float, link: int | None = None
 ) -> list[Contact]:
-    """Return the points at which two bodies are nearest to each other, as of now.
+    """Return the closest points of two bodies at their current poses.
 
     Args:
         client: PyBullet's client id.
-        body_id: PyBullet's id of a body or robot.
-        other_id: of another.
-        up_to_m: pairs of links that are farther apart are left out.
-        link: of the first body; all of them if not given.
+        body_id: PyBullet's id of the first body or robot.
+        other_id: PyBullet's id of the second body or robot.
+        up_to_m: pairs of links that are farther apart than this are omitted.
+        link: link of the first body; None stands for all links.
     """
     links = {} if link is None else {"linkIndexA": link}
     points = pybullet.getClosestPoints(body_id, other_id, up_to_m, physicsClientId=client, **links)
@@ -99,28 +100,31 @@ def nearest_points(
 
 
 def gap_m(client: int, body_id: int, other_id: int, up_to_m: float = 0.1) -> float:
-    """Return the distance between two bodies, as of now.
+    """Return the distance between two bodies at their current poses.
 
     Args:
         client: PyBullet's client id.
-        body_id: PyBullet's id of a body or robot.
-        other_id: of another.
-        up_to_m: farther is reported as infinite; negative distances are depths of penetration.
+        body_id: PyBullet's id of the first body or robot.
+        other_id: PyBullet's id of the second body or robot.
+        up_to_m: limit of the search.
+
+    Returns:
+        Metres; infinity beyond the limit, negative if the bodies penetrate each other.
     """
     points = nearest_points(client, body_id, other_id, up_to_m)
     return min((point.distance_m for point in points), default=math.inf)
 
 
-def is_any_within(contacts: Iterable[Contact], margin_m: float = CONTACT_M) -> bool:
-    """Whether any of some contacts is closer than a margin."""
+def is_any_within(contacts: Iterable[Contact], margin_m: float = CONTACT_DISTANCE_M) -> bool:
+    """Whether the distance of any of the contacts is less than a margin."""
     return any(contact.distance_m < margin_m for contact in contacts)
 
 
-def bearing_force_n(contacts: Iterable[Contact]) -> float:
-    """Return the sum of the normal forces from above and below."""
+def vertical_force_n(contacts: Iterable[Contact]) -> float:
+    """Return the sum of the normal forces of the vertical contacts."""
     return sum(contact.force_n for contact in contacts if contact.is_vertical)
 
 
 def lateral_force_n(contacts: Iterable[Contact]) -> float:
-    """Return the sum of the other normal forces."""
+    """Return the sum of the normal forces of the contacts that are not vertical."""
     return sum(contact.force_n for contact in contacts if not contact.is_vertical)

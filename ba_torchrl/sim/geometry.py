@@ -1,6 +1,7 @@
-"""Positions, orientations and poses: SE(3), and its counterpart in the horizontal plane.
+"""Rotations, poses (SE(3)) and planar frames (SE(2)).
 
-Frames are right-handed with z up, lengths are metres, angles radians, quaternions (x, y, z, w).
+Frames are right-handed with z up. Lengths are in metres, angles in radians, quaternions in the
+order (x, y, z, w).
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import pybullet
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
-"""Rows of a rotation matrix."""
+"""The rows of a rotation matrix."""
 YawPose = tuple[Vector, float]
-"""Position and yaw of an upright body, or of a tool that points down."""
+"""Position and yaw of an upright body or of a tool that points straight down."""
 
 Coordinate = TypeVar("Coordinate", float, np.ndarray)
 
@@ -29,7 +30,7 @@ IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 def yaw_quaternion(yaw_rad: float) -> Quaternion:
-    """Return the rotation by an angle about z."""
+    """Return the rotation by an angle about the z axis."""
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
 
@@ -46,18 +47,18 @@ def quaternion_tilt(orientation: Quaternion) -> float:
 
 
 def quaternion_matrix(orientation: Quaternion) -> Matrix:
-    """Return the rotation matrix of a unit quaternion, as rows."""
+    """Return the rows of a unit quaternion's rotation matrix."""
     m = pybullet.getMatrixFromQuaternion(orientation)
     return m[:3], m[3:6], m[6:]
 
 
 def rotation_array(orientation: Quaternion) -> np.ndarray:
-    """Return the rotation matrix of a unit quaternion, [3, 3] float64."""
+    """Return the rotation matrix of a unit quaternion, [3, 3] float64 array."""
     return np.reshape(pybullet.getMatrixFromQuaternion(orientation), (3, 3))
 
 
 def euler_matrix(rz_rad: float, ry_rad: float, rx_rad: float) -> Matrix:
-    """Return the rotation matrix Rz(rz) Ry(ry) Rx(rx), as rows."""
+    """Return the rows of the rotation matrix Rz(rz) Ry(ry) Rx(rx)."""
     cz, sz = math.cos(rz_rad), math.sin(rz_rad)
     cy, sy = math.cos(ry_rad), math.sin(ry_rad)
     cx, sx = math.cos(rx_rad), math.sin(rx_rad)
@@ -80,30 +81,34 @@ def quaternion_product(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-# -- tools: z is the direction of approach, the fingers open along x ----------------------------
+# -- tool frames: z is the approach direction, the fingers open along x -------------------------
 
 
 def downward(yaw_rad: float) -> Matrix:
-    """Return the rotation of a tool that points straight down, its fingers along x at yaw 0."""
+    """Return the rotation of a tool that points straight down.
+
+    Args:
+        yaw_rad: heading of the line along which the fingers open; 0 is the world's x axis.
+    """
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return ((cos, sin, 0.0), (sin, -cos, 0.0), (0.0, 0.0, -1.0))
 
 
 def downward_quaternion(yaw_rad: float) -> Quaternion:
-    """Return the rotation of a tool that points straight down, as a quaternion."""
+    """Return the quaternion of `downward`."""
     return (math.cos(yaw_rad / 2), math.sin(yaw_rad / 2), 0.0, 0.0)
 
 
 def tool_rotation(rz_rad: float, ry_rad: float = 0.0, rx_rad: float = 0.0) -> Matrix:
-    """Return Rz(rz) Ry(ry) Rx(rx) of a tool that points straight down at zero angles."""
+    """Return the rotation Rz(rz) Ry(ry) Rx(rx) `downward(0)`: straight down at zero angles."""
     return tuple((x, -y, -z) for x, y, z in euler_matrix(rz_rad, ry_rad, rx_rad))
 
 
 def tool_angles(orientation: Quaternion) -> Vector:
-    """Return rz, ry and rx of a tool: the inverse of `tool_rotation`.
+    """Return the angles rz, ry and rx of `tool_rotation` for an orientation of the tool.
 
     Args:
-        orientation: of the tool.
+        orientation: unit quaternion of the tool frame.
 
     Returns:
         rz and rx in [-pi, pi], ry in [-pi/2, pi/2].
@@ -116,13 +121,20 @@ def tool_angles(orientation: Quaternion) -> Vector:
 
 
 class Pose(NamedTuple):
-    """A pose of one frame in another: an element of SE(3)."""
+    """The pose of a frame relative to an outer frame, an element of SE(3)."""
 
     position: Vector
     orientation: Quaternion = IDENTITY
 
     def compose(self, inner: Pose) -> Pose:
-        """Return the pose, in the outer frame, of what has a pose in this one."""
+        """Return this pose times ``inner``.
+
+        Args:
+            inner: pose relative to this frame.
+
+        Returns:
+            The same pose relative to the outer frame.
+        """
         rows = quaternion_matrix(self.orientation)
         position = tuple(
             p + dot(row, inner.position) for p, row in zip(self.position, rows, strict=True)
@@ -130,25 +142,25 @@ class Pose(NamedTuple):
         return Pose(position, quaternion_product(self.orientation, inner.orientation))
 
     def inverse(self) -> Pose:
-        """Return the pose of the outer frame in this one."""
+        """Return the pose of the outer frame relative to this frame."""
         columns = zip(*quaternion_matrix(self.orientation), strict=True)
         x, y, z, w = self.orientation
         return Pose(tuple(-dot(column, self.position) for column in columns), (-x, -y, -z, w))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Return points of this frame, [..., 3], in the outer frame."""
+        """Transform points [..., 3] from this frame to the outer frame."""
         return points @ rotation_array(self.orientation).T + self.position
 
     def rotate(self, vectors: np.ndarray) -> np.ndarray:
-        """Return directions of this frame, [..., 3], in the outer frame."""
+        """Rotate direction vectors [..., 3] from this frame to the outer frame."""
         return vectors @ rotation_array(self.orientation).T
 
     def moved_to(self, position: Vector, turn_rad: float = 0.0) -> Pose:
-        """Return the pose at another position, turned about the vertical.
+        """Return the pose with another position, rotated about the vertical.
 
         Args:
-            position: in the outer frame.
-            turn_rad: about the outer frame's z axis.
+            position: in the outer frame, metres.
+            turn_rad: rotation about the outer frame's z axis.
         """
         return Pose(position, quaternion_product(yaw_quaternion(turn_rad), self.orientation))
 
@@ -164,29 +176,29 @@ def downward_pose(position: Vector, yaw_rad: float) -> Pose:
 
 
 def bullet_compose(outer: Pose, inner: Pose) -> Pose:
-    """Return `outer.compose(inner)` as PyBullet computes it: in single precision."""
+    """Return `outer.compose(inner)`, computed by PyBullet in single precision."""
     return Pose(*pybullet.multiplyTransforms(*outer, *inner))
 
 
 def bullet_inverse(pose: Pose) -> Pose:
-    """Return `pose.inverse()` as PyBullet computes it: in single precision."""
+    """Return `pose.inverse()`, computed by PyBullet in single precision."""
     return Pose(*pybullet.invertTransform(*pose))
 
 
 class PlanarFrame(NamedTuple):
-    """A frame in the horizontal plane: an element of SE(2)."""
+    """The pose of a frame in the horizontal plane, an element of SE(2)."""
 
     x: float
     y: float
     yaw_rad: float
 
     def to_world(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-        """Return the world's coordinates of a point of this frame; arrays stand for many."""
+        """Transform coordinates (floats or arrays) from this frame to the world frame."""
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return self.x + cos * x - sin * y, self.y + sin * x + cos * y
 
     def to_local(self, x: Coordinate, y: Coordinate) -> tuple[Coordinate, Coordinate]:
-        """Return this frame's coordinates of a point of the world; arrays stand for many."""
+        """Transform coordinates (floats or arrays) from the world frame to this frame."""
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         dx, dy = x - self.x, y - self.y
         return cos * dx + sin * dy, cos * dy - sin * dx
@@ -198,14 +210,19 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
-    """Return the vector product."""
+    """Return the cross product of two vectors of three components."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def perpendicular(vector: Vector, axis: Vector) -> Vector:
-    """Return the direction of the part of a vector that is perpendicular to a unit axis.
+    """Return the normalised component of a vector that is perpendicular to an axis.
 
-    It is zero for a vector along the axis.
+    Args:
+        vector: any vector.
+        axis: unit vector.
+
+    Returns:
+        A unit vector; zero if the vector is parallel to the axis.
     """
     along = dot(vector, axis)
     rest = tuple(v - along * a for v, a in zip(vector, axis, strict=True))

@@ -1,4 +1,4 @@
-"""Procedural triangle meshes; every face is counter-clockwise seen from outside."""
+"""Procedural triangle meshes, whose faces are counter-clockwise seen from outside."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh in its body's frame."""
+    """A triangle mesh in the frame of its body."""
 
     vertices: np.ndarray
     """[V, 3] float64, metres."""
@@ -20,7 +20,11 @@ class Mesh(NamedTuple):
 
 
 def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
-    """Return a box centred on the origin."""
+    """Return a box centred at the origin.
+
+    Args:
+        size_m: edge lengths along x, y and z.
+    """
     corners = np.array(
         [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
     ) * np.asarray(size_m)
@@ -29,15 +33,21 @@ def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
     return Mesh(corners, np.array(faces, dtype=np.int64))
 
 
-def moved(mesh: Mesh, offset_m: tuple[float, float, float], yaw_rad: float = 0.0) -> Mesh:
-    """Return the mesh turned about z, then shifted."""
+def transform_mesh(mesh: Mesh, offset_m: tuple[float, float, float], yaw_rad: float = 0.0) -> Mesh:
+    """Return the mesh, rotated about the z axis and then translated.
+
+    Args:
+        mesh: the mesh.
+        offset_m: translation.
+        yaw_rad: angle of the rotation.
+    """
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    return Mesh(mesh.vertices @ turn.T + np.asarray(offset_m), mesh.faces)
+    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return Mesh(mesh.vertices @ rotation.T + np.asarray(offset_m), mesh.faces)
 
 
-def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Return several meshes as one."""
+def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
+    """Return one mesh with the vertices and faces of several."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -46,11 +56,11 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def write_obj(path: Path, parts: Sequence[Mesh]) -> None:
-    """Write meshes into one Wavefront OBJ file, an object each.
+    """Write a Wavefront OBJ file with one object for each mesh.
 
     Args:
-        path: the file.
-        parts: metres become the file's units.
+        path: of the file.
+        parts: the meshes; the unit of the file is the metre.
     """
     lines, start = [], 1
     for number, (vertices, faces) in enumerate(parts):
@@ -62,49 +72,49 @@ def write_obj(path: Path, parts: Sequence[Mesh]) -> None:
 
 
 def gable_mesh(size_m: tuple[float, float, float], eaves_m: float = 0.0) -> Mesh:
-    """Return a prism with a triangular end, its ridge along y; its bounding box is centred.
+    """Return a gable roof with its ridge along y, its bounding box centred at the origin.
 
     Args:
-        size_m: extents along x (across the ridge), y (along it) and z.
-        eaves_m: height of upright sides below the slopes, for fingers to close on.
+        size_m: extents along x (perpendicular to the ridge), y (along the ridge) and z.
+        eaves_m: height of the vertical sides below the slopes, which fingers can grasp.
     """
     x, y, z = (extent / 2 for extent in size_m)
     end = [(-x, -z), (x, -z), (0.0, z)]
     if eaves_m > 0:
         end = [(-x, -z), (x, -z), (x, eaves_m - z), (0.0, z), (-x, eaves_m - z)]
-    lying = prism_mesh(end, -y, y)  # its axis along z: turn that to -y
-    corners = lying.vertices
-    return Mesh(np.stack([corners[:, 0], -corners[:, 2], corners[:, 1]], axis=1), lying.faces)
+    prism = prism_mesh(end, -y, y)  # along z, which is rotated to -y
+    corners = prism.vertices
+    return Mesh(np.stack([corners[:, 0], -corners[:, 2], corners[:, 1]], axis=1), prism.faces)
 
 
 def rod_mesh(length_m: float, diameter_m: float, sides: int = 16) -> Mesh:
-    """Return a round rod along y, centred on the origin.
+    """Return a cylinder along y, centred at the origin, with a regular polygon as cross-section.
 
     Args:
-        length_m: from end to end.
-        diameter_m: across the corners of the polygon that stands for the circle.
-        sides: of that polygon.
+        length_m: length along y.
+        diameter_m: diameter of the polygon's circumscribed circle.
+        sides: number of sides of the polygon.
     """
     angles = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([np.sin(angles), np.zeros(sides), np.cos(angles)], axis=1) * diameter_m / 2
     half = np.array([0.0, length_m / 2, 0.0])
-    here, there = np.arange(sides), np.roll(np.arange(sides), -1)
+    corner, following = np.arange(sides), np.roll(np.arange(sides), -1)
     faces = [
-        *np.stack([here, there + sides, here + sides], axis=1),
-        *np.stack([here, there, there + sides], axis=1),
-        *np.stack([np.zeros(sides - 2, int), here[2:], here[1:-1]], axis=1),
-        *np.stack([np.zeros(sides - 2, int), here[1:-1], here[2:]], axis=1) + sides,
+        *np.stack([corner, following + sides, corner + sides], axis=1),
+        *np.stack([corner, following, following + sides], axis=1),
+        *np.stack([np.zeros(sides - 2, int), corner[2:], corner[1:-1]], axis=1),
+        *np.stack([np.zeros(sides - 2, int), corner[1:-1], corner[2:]], axis=1) + sides,
     ]
     return Mesh(np.concatenate([ring - half, ring + half]), np.array(faces, dtype=np.int64))
 
 
 def prism_mesh(corners_m: Sequence[tuple[float, float]], low_m: float, high_m: float) -> Mesh:
-    """Return an upright prism.
+    """Return a prism along z.
 
     Args:
-        corners_m: x and y of its convex base, counter-clockwise.
-        low_m: height of its lower face.
-        high_m: height of its upper face.
+        corners_m: x and y of the corners of the convex base, counter-clockwise.
+        low_m: height of the lower face.
+        high_m: height of the upper face.
     """
     count = len(corners_m)
     vertices = [(x, y, z) for z in (low_m, high_m) for x, y in corners_m]
@@ -112,19 +122,20 @@ def prism_mesh(corners_m: Sequence[tuple[float, float]], low_m: float, high_m: f
 
 
 def ring_parts(section_m: Sequence[tuple[float, float]], segments: int) -> list[Mesh]:
-    """Return a ring about z as convex wedges.
+    """Return a ring about the z axis as convex segments.
 
     Args:
-        section_m: distance from the axis and height of the corners of its convex cross-section,
-            counter-clockwise with the distance to the right and the height upwards.
-        segments: how many wedges.
+        section_m: radius and height of the corners of the convex cross-section, counter-clockwise
+            in the plane of radius (first axis) and height (second axis).
+        segments: number of segments.
     """
     angles = np.arange(segments + 1) * (2 * np.pi / segments)
     ends = [
         np.array([(r * np.cos(angle), r * np.sin(angle), z) for r, z in section_m])
         for angle in angles
     ]
-    faces = _prism_faces(len(section_m))[:, ::-1]  # sweeping the section goes into the page
+    # a positive rotation sweeps the section along its negative normal
+    faces = _prism_faces(len(section_m))[:, ::-1]
     return [Mesh(np.concatenate(pair), faces) for pair in pairwise(ends)]
 
 
@@ -137,18 +148,18 @@ def bowl_parts(
     wall_m: float,
     segments: int = 16,
 ) -> list[Mesh]:
-    """Return an open bowl as convex parts, its bounding box centred on the origin.
+    """Return an open bowl as convex parts, its bounding box centred at the origin.
 
-    A wall that flares out stands on a round foot, whose upper face is the bowl's floor: only one
-    part touches the ground, instead of one for each segment, which keeps physics steps cheap.
+    The bowl has a round foot and a conical wall above it. Only the foot touches the support
+    surface: contacts of every wall segment would slow down the simulation.
 
     Args:
-        radius_m: of the rim, outside.
-        height_m: of the rim.
-        foot_radius_m: of the foot.
-        floor_m: height of the foot.
-        wall_m: thickness of the wall, measured horizontally.
-        segments: sides of the polygons that stand for circles.
+        radius_m: outer radius of the rim.
+        height_m: height of the rim.
+        foot_radius_m: radius of the foot.
+        floor_m: thickness of the foot, whose upper face is the floor of the bowl.
+        wall_m: horizontal thickness of the wall.
+        segments: number of wall segments and of sides of the foot.
     """
     inner = foot_radius_m - wall_m / 2
     wall = [
@@ -160,11 +171,11 @@ def bowl_parts(
     angles = np.arange(segments) * (2 * np.pi / segments)
     circle = [(foot_radius_m * np.cos(a), foot_radius_m * np.sin(a)) for a in angles]
     parts = [prism_mesh(circle, 0.0, floor_m), *ring_parts(wall, segments)]
-    return [moved(part, (0.0, 0.0, -height_m / 2)) for part in parts]
+    return [transform_mesh(part, (0.0, 0.0, -height_m / 2)) for part in parts]
 
 
 def centroid(parts: Sequence[Mesh]) -> tuple[float, float, float]:
-    """Return the centre of mass of closed meshes of one density that do not overlap."""
+    """Return the centre of mass of closed, disjoint meshes of uniform density, metres."""
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in parts])  # [F, 3 corners, 3]
     # signed tetrahedra between the origin and each triangle
     volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
@@ -173,7 +184,12 @@ def centroid(parts: Sequence[Mesh]) -> tuple[float, float, float]:
 
 
 def _prism_faces(count: int) -> np.ndarray:
-    """Return the triangles between two congruent polygons, the second above the first."""
+    """Return the faces of a prism.
+
+    Args:
+        count: number of corners of the base; they are the first vertices, followed by those of the
+            upper face.
+    """
     caps = [(0, i + 1, i) for i in range(1, count - 1)]
     caps += [(count, count + i, count + i + 1) for i in range(1, count - 1)]
     sides = []
@@ -184,27 +200,27 @@ def _prism_faces(count: int) -> np.ndarray:
 
 
 def frame_parts(size_m: tuple[float, float, float], wall_m: float) -> list[Mesh]:
-    """Return four upright walls around a rectangle, their bounding box centred on the origin.
+    """Return four vertical walls around a rectangle, their bounding box centred at the origin.
 
     Args:
-        size_m: outer extents.
+        size_m: outer extents along x, y and z.
         wall_m: thickness of the walls.
     """
     x, y, z = size_m
     along_x, along_y = box_mesh((x - 2 * wall_m, wall_m, z)), box_mesh((wall_m, y, z))
     parts = []
     for side in (-0.5, 0.5):
-        parts.append(moved(along_x, (0.0, side * (y - wall_m), 0.0)))
-        parts.append(moved(along_y, (side * (x - wall_m), 0.0, 0.0)))
+        parts.append(transform_mesh(along_x, (0.0, side * (y - wall_m), 0.0)))
+        parts.append(transform_mesh(along_y, (side * (x - wall_m), 0.0, 0.0)))
     return parts
 
 
 def lathe_parts(profile_m: Sequence[tuple[float, float]], sides: int = 16) -> list[Mesh]:
-    """Return a turned solid about z as convex parts, one above the other.
+    """Return a solid of revolution about the z axis as convex parts, one above the other.
 
     Args:
-        profile_m: radius and height of its corners, from the bottom up.
-        sides: of the polygons that stand for circles.
+        profile_m: radius and height of the corners of the profile, from the bottom to the top.
+        sides: number of sides of the polygons that approximate circles.
     """
     angles = 2 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)

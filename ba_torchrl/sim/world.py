@@ -1,4 +1,4 @@
-"""World: one PyBullet client with its bodies, stepping, settling and exact resets."""
+"""World: a PyBullet client with its bodies; stepping, settling and exact resets."""
 
 from __future__ import annotations
 
@@ -14,65 +14,79 @@ import pybullet
 import pybullet_data
 
 from ba_torchrl.errors import SimulationError
-from ba_torchrl.sim.articulated import Articulated, ArticulatedLink, Rail
-from ba_torchrl.sim.bodies import Body, Color, Shape
+from ba_torchrl.sim.articulated import ArticulatedBody, ArticulatedLink, PrismaticJoint
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.shapes import Color, Shape
 
 
 @dataclass(frozen=True)
 class Physics:
     """Settings of the physics engine.
 
-    The defaults are those of close-loop control: with a finger force of 2 and bounded
-    accelerations, 120 Hz with 50 solver iterations holds an object as firmly as 240 Hz.
+    The defaults are those of close-loop control. With a finger force of 2 and bounded
+    accelerations, grasps at 120 Hz with 50 solver iterations are as stable as at 240 Hz.
     """
 
     time_step_s: float = 1 / 120
     solver_iterations: int = 50
     solver_residual: float = 0.0
-    """Residual at which a step's iterations stop early. Above zero, they stop by what the motors
-    remember of earlier steps, which no saved state holds: restored states lose their exactness."""
+    """Residual below which the solver stops early. It must be zero for exact resets: otherwise the
+    number of iterations depends on motor impulses of earlier steps, which no saved state contains.
+    """
     gravity_m_s2: float = 10.0
-    floor_friction: float = 0.5  # at 1.0 a pushed cube tips over its leading edge and wedges
+    floor_friction: float = 0.5  # at 1.0 a pushed cube tips over its leading edge and jams
     settle_speed_m_s: float = 0.01
+    """Largest speed of a body at rest."""
     settle_spin_rad_s: float = 0.2
+    """Largest angular speed of a body at rest."""
 
 
 FINE_PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=200)
-"""Four times the work of the default."""
+"""Half the time step and four times the solver iterations of the default."""
 
 
 class Snapshot:
-    """A state that PyBullet keeps in memory for as long as this object lives."""
+    """A state of a world in PyBullet's memory, freed when this object is deleted.
+
+    Args:
+        client: PyBullet's client id.
+        connection: finalizer of the world that owns the client.
+    """
 
     def __init__(self, client: int, connection: weakref.finalize) -> None:
         self.client = client
         self.connection = connection
         self.id = pybullet.saveState(physicsClientId=client)
-        weakref.finalize(self, _forget, self.id, client, connection)
+        weakref.finalize(self, _remove_state, self.id, client, connection)
 
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state that outlives its world: any other with the same bodies can take it up."""
+    """A state that can be loaded by any world with the same bodies.
+
+    Args:
+        data: content of a PyBullet state file.
+    """
 
     data: bytes = field(repr=False)
 
 
 class World:
-    """A physics client of its own with a floor, whose bodies are loaded once.
+    """A PyBullet client with a floor and bodies that are loaded once.
 
-    After everything is loaded, `seal` takes the pristine state; `restore_pristine` returns to it
-    exactly, so that the same poses and actions give the same future bit by bit. Several worlds
-    live side by side in one process.
+    `seal` saves the state after all bodies are loaded and `restore_pristine` restores it exactly:
+    the same poses and actions then give the same trajectory bit by bit. A process can have several
+    worlds.
 
     Args:
-        physics: settings of the engine.
-        window: show the simulation in PyBullet's window; a process can have one.
-        floor_color: red, green, blue, alpha of the floor; None is PyBullet's chequered blue.
+        physics: settings of the physics engine.
+        window: show the simulation in PyBullet's window, of which a process can have one.
+        floor_color: red, green, blue, alpha of the floor; None keeps PyBullet's blue chequered
+            texture.
 
     Raises:
-        SimulationError: there is no display for the window, it is in use, or PyBullet offers no
-            further client (it allows 1024).
+        SimulationError: there is no display for the window, the process already has a window, or
+            PyBullet has no free client (the maximum is 1024).
     """
 
     def __init__(
@@ -89,14 +103,14 @@ class World:
         self._disconnect = weakref.finalize(self, _disconnect, self.client)
         self.bodies: list[Body] = []
         self.steps = 0
-        """Physics steps since construction, for measurements."""
+        """Number of physics steps since construction."""
         self._pristine: Snapshot | None = None
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=self.physics.time_step_s,
             numSolverIterations=self.physics.solver_iterations,
             solverResidualThreshold=self.physics.solver_residual,
             numSubSteps=0,
-            # contact pairs in a fixed order: without it, identical episodes differ in the last bit
+            # a fixed order of contact pairs: without it, identical episodes differ in the last bit
             deterministicOverlappingPairs=1,
             physicsClientId=self.client,
         )
@@ -120,73 +134,93 @@ class World:
             )
 
     def add(self, shape: Shape, name: str) -> Body:
-        """Load a body; only before `seal`.
+        """Load a body; possible only before `seal`.
+
+        Args:
+            shape: geometry, mass and material.
+            name: used in error messages.
 
         Raises:
             SimulationError: the world is sealed.
         """
-        self._check_open(name)
+        self._check_not_sealed(name)
         body = Body(self.client, shape, name)
         self.bodies.append(body)
         return body
 
-    def add_articulated(self, base: Shape, slider: Shape, rail: Rail, name: str) -> Articulated:
-        """Load a fixed body with a part that slides; both enter `bodies`. Only before `seal`.
+    def add_articulated(
+        self, base: Shape, slider: Shape, joint: PrismaticJoint, name: str
+    ) -> ArticulatedBody:
+        """Load a fixed body with a sliding part; possible only before `seal`.
+
+        Both links are added to `bodies`.
+
+        Args:
+            base: shape of the fixed link.
+            slider: shape of the sliding link.
+            joint: axis, limits and friction of the joint between the two.
+            name: used in error messages.
 
         Raises:
             SimulationError: the world is sealed.
         """
-        self._check_open(name)
-        body = Articulated(self.client, base, slider, rail, name)
+        self._check_not_sealed(name)
+        body = ArticulatedBody(self.client, base, slider, joint, name)
         self.bodies.extend(body.parts)
         return body
 
     def seal(self) -> None:
-        """Take the state that every reset starts from."""
+        """Save the current state as the one that every reset starts from."""
         self._pristine = self.snapshot()
 
     def restore_pristine(self) -> None:
-        """Return to the state taken by `seal`, velocities and contacts included."""
+        """Restore the state saved by `seal`, including velocities and contacts.
+
+        Raises:
+            SimulationError: the world is not sealed.
+        """
         if self._pristine is None:
             raise SimulationError("seal() the world before resetting it")
         self.restore(self._pristine)
 
     def snapshot(self) -> Snapshot:
-        """Keep the state of every body and contact in memory, for `restore`.
+        """Save the state of every body and contact in memory, for `restore`.
 
-        The world goes on from it as it will after each `restore`: what the engine remembers beyond
-        what it saves is given up here and there.
+        The snapshot is also restored at once, which clears the internal caches of the engine that
+        no snapshot contains. The trajectory from here therefore equals that after each `restore`.
         """
         snapshot = Snapshot(self.client, self._disconnect)
         self.restore(snapshot)
         return snapshot
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Return to a snapshot of this world; motor commands are the caller's to repeat.
+        """Restore a snapshot of this world; the caller must repeat the motor commands.
 
         Raises:
-            SimulationError: the snapshot is of another world, or of one that was closed.
+            SimulationError: the snapshot belongs to another or a closed world.
         """
-        # client numbers are used again, connections are not
+        # PyBullet reuses client ids, so that the connection identifies the world
         if snapshot.connection is not self._disconnect or self.is_closed:
-            raise SimulationError("the state is of another world: that one was closed or rebuilt")
-        # once for the places, where the engine then looks afresh, and once for all else
+            raise SimulationError(
+                "the snapshot belongs to another world: its own was closed or rebuilt"
+            )
+        # the first call restores the poses at which the pairs are rebuilt, the second all the rest
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
-        self._forget_pairs()
+        self._rebuild_collision_pairs()
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
 
     def save(self) -> SavedState:
-        """Return the state of every body and contact, for `load` in a world built alike."""
+        """Return the state of every body and contact, for `load` in a world of the same bodies."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "state.bullet"
             pybullet.saveBullet(str(path), physicsClientId=self.client)
             return SavedState(path.read_bytes())
 
     def load(self, state: SavedState) -> None:
-        """Take up a state; motor commands are the caller's to repeat.
+        """Restore a state returned by `save`; the caller must repeat the motor commands.
 
         Raises:
-            SimulationError: its world had other bodies.
+            SimulationError: the state belongs to a world with other bodies.
         """
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "state.bullet"
@@ -194,7 +228,9 @@ class World:
             try:
                 pybullet.restoreState(fileName=str(path), physicsClientId=self.client)
             except pybullet.error as error:
-                raise SimulationError(f"the state is of another world ({error})") from None
+                raise SimulationError(
+                    f"the state belongs to a world with other bodies ({error})"
+                ) from None
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by ``count`` time steps."""
@@ -203,11 +239,11 @@ class World:
         self.steps += count
 
     def detect_collisions(self) -> None:
-        """Bring the contact points up to date without advancing time."""
+        """Update the contact points without advancing time."""
         pybullet.performCollisionDetection(physicsClientId=self.client)
 
     def is_still(self) -> bool:
-        """Whether no movable body moves faster than the settling limits."""
+        """Whether no visible body exceeds the speeds of a body at rest."""
         return all(
             body.is_static
             or body.is_hidden
@@ -216,10 +252,13 @@ class World:
         )
 
     def settle(self, max_steps: int = 200) -> bool:
-        """Step until the bodies are still on two steps in a row, at most ``max_steps``.
+        """Step until `is_still` holds in two consecutive steps.
+
+        Args:
+            max_steps: largest number of steps.
 
         Returns:
-            Whether they came to rest.
+            Whether the bodies came to rest within ``max_steps``.
         """
         still = 0
         for _ in range(max_steps):
@@ -230,12 +269,12 @@ class World:
         return False
 
     def close(self) -> None:
-        """Disconnect the client; further calls do nothing."""
+        """Disconnect the client; repeated calls have no effect."""
         self._disconnect()
 
     @property
     def is_closed(self) -> bool:
-        """Whether the client is gone."""
+        """Whether the client is disconnected."""
         return not self._disconnect.alive
 
     def __enter__(self) -> Self:
@@ -244,13 +283,13 @@ class World:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _forget_pairs(self) -> None:
-        """Let the engine look afresh at what is near each other.
+    def _rebuild_collision_pairs(self) -> None:
+        """Remove all collision pairs from the engine and detect them again.
 
-        It keeps its last guess at how two convex hulls, such as a finger and a block, are apart,
-        which no saved state holds; from another guess the same scene goes on differently. It also
-        goes through its list of pairs a few at a time, to drop those that are apart by now, and
-        starts again at the first one only once the list was empty.
+        The engine caches two values that no saved state contains but that affect the trajectory:
+        the last separating direction of each pair of convex hulls, such as a finger and a block,
+        and the index at which it continues to search the list of pairs for those that have
+        separated. Removing all pairs resets both.
         """
         pybullet.setCollisionFilterGroupMask(self.floor, -1, 0, 0, physicsClientId=self.client)
         for body in self.bodies:
@@ -259,20 +298,20 @@ class World:
                     body.id, link, 0, 0, physicsClientId=self.client
                 )
         self.detect_collisions()
-        _renew_pairs(self.client, self.floor, is_static=True)
+        _enable_collisions(self.client, self.floor, is_static=True)
         for body in self.bodies:
             if isinstance(body, ArticulatedLink):
-                body.forget_pairs()
+                body.rebuild_collision_pairs()
             else:
-                _renew_pairs(self.client, body.id, body.is_static)
+                _enable_collisions(self.client, body.id, body.is_static)
 
-    def _check_open(self, name: str) -> None:
+    def _check_not_sealed(self, name: str) -> None:
         if self._pristine is not None:
             raise SimulationError(f"cannot add {name!r}: the world is sealed")
 
 
-def _renew_pairs(client: int, body: int, is_static: bool) -> None:
-    # PyBullet's own groups: what is static meets all but its like
+def _enable_collisions(client: int, body: int, is_static: bool) -> None:
+    # PyBullet's default collision groups: static bodies do not collide with each other
     group, mask = (2, ~2) if is_static else (1, -1)
     pybullet.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=client)
 
@@ -280,24 +319,24 @@ def _renew_pairs(client: int, body: int, is_static: bool) -> None:
 def _connect_window() -> int:
     """Open PyBullet's window and return its client."""
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        # PyBullet would end the process
+        # PyBullet would terminate the process
         raise SimulationError(
-            "render=True opens a window, and there is no display (DISPLAY is not set): use "
-            "env.render() for pictures, or start under a virtual display such as xvfb-run"
+            "render=True opens a window, but there is no display (DISPLAY is not set): use "
+            "env.render() for images, or run under a virtual display such as xvfb-run"
         )
     try:
         client = pybullet.connect(pybullet.GUI, options="--width=960 --height=720")
     except pybullet.error as error:
         raise SimulationError(
-            f"PyBullet cannot open a window ({error}): a process can have one at a time"
+            f"PyBullet cannot open a window ({error}): a process can have only one"
         ) from None
     if client >= 0:
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
     return client
 
 
-def _forget(state: int, client: int, connection: weakref.finalize) -> None:
-    if connection.alive:  # else the client's number may be another world's by now
+def _remove_state(state: int, client: int, connection: weakref.finalize) -> None:
+    if connection.alive:  # otherwise the client id may already belong to another world
         pybullet.removeState(state, physicsClientId=client)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ba_torchrl.sim.bodies import Body, Shape
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.shapes import Shape
 from ba_torchrl.sim.world import World
 
 ASIDE_Z_M = 1e6

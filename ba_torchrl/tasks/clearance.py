@@ -83,17 +83,17 @@ def finger_rectangles(
 
 def hand_rectangle(robot: Robot, tool: PlanarFrame) -> Rectangle:
     """Return the whole hand as seen from above; it begins at the height of the palm."""
-    return Rectangle(*tool, *robot.hand_half_m)
+    return Rectangle(*tool, *robot.hand_half_extents_m)
 
 
 def tips_below_tool_m(robot: Robot) -> float:
     """Return how far below the tool point the fingers end as they are opened now."""
-    return -robot.gripper.tip_m(robot.opening() * robot.gripper.half_gap_m)
+    return -robot.gripper.tip_height_m(robot.opening() * robot.gripper.half_gap_m)
 
 
 def passing_height_m(gripper: Gripper) -> float:
     """Return the height of the tool above a body at which the fingertips pass over it."""
-    return max(OVER_M, UNDER_TIPS_M - gripper.lowest_m)
+    return max(OVER_M, UNDER_TIPS_M - gripper.lowest_tip_m)
 
 
 # -- clearances --------------------------------------------------------------------------------
@@ -122,7 +122,7 @@ def path_clearance_m(
     gap = math.inf
     for other in others:
         corners = world_vertices(other)
-        if corners[:, 2].max() < bz + gripper.lowest_m:
+        if corners[:, 2].max() < bz + gripper.lowest_tip_m:
             continue
         along, across = frame.to_local(corners[:, 0], corners[:, 1])
         aside = max(across.min(), -across.max()) - gripper.half_width_m
@@ -167,9 +167,9 @@ def hand_clearance_m(
     gap = math.inf
     for other in others:
         corners = world_vertices(other)
-        if corners[:, 2].max() > tool_z_m + robot.gripper.palm_m:
+        if corners[:, 2].max() > tool_z_m + robot.gripper.palm_height_m:
             local = np.stack(tool.to_local(corners[:, 0], corners[:, 1]), axis=1)
-            gaps = np.maximum(local.min(axis=0), -local.max(axis=0)) - robot.hand_half_m
+            gaps = np.maximum(local.min(axis=0), -local.max(axis=0)) - robot.hand_half_extents_m
             gap = min(gap, float(gaps.max()))
     return gap
 

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Box, Color
+from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.tasks.base import BLOCK_M, Task
 from ba_torchrl.tasks.workspace import Workspace
 

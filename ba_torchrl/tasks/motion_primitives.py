@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.clearance import (
@@ -206,7 +206,7 @@ def carry_to(
         hover_m: gap that the body keeps to what it passes over, and to its place before it comes
             down; more is needed where its place has a rim.
     """
-    tool_pose, pose = robot.tool_transform(), body.pose
+    tool_pose, pose = robot.tool_frame(), body.pose
     tool, yaw = tool_pose.position, tool_pose.yaw_rad
     turn = 0.0 if yaw_rad is None else wrap_angle(yaw_rad - yaw)
     x, y, _ = pose.position
@@ -262,7 +262,7 @@ def pick_up(
     )
     is_beside = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
     is_aligned = is_beside and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
-    if robot.opening() < 0.9 and math.dist((x, y), (bx, by)) < radius_m(body):
+    if robot.opening() < 0.9 and math.dist((x, y), (bx, by)) < footprint_radius_m(body):
         return lift(5e-3, OPEN)  # the body may stand between the fingers
     if is_aligned and robot.opening() >= 0.9:
         return move_toward(
@@ -314,7 +314,11 @@ def travel(
     )
     hand = reach_m(robot.gripper)
     zones = [
-        (body.position, hand + radius_m(body), vertical_extent(body)[1] + below_m + hover_m)
+        (
+            body.position,
+            hand + footprint_radius_m(body),
+            vertical_extent(body)[1] + below_m + hover_m,
+        )
         for body in obstacles
     ]
     if _height_needed(start, end, zones) is None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body, vertical_extent
-from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector, yaw_quaternion
+from ba_torchrl.sim.geometry import Matrix, Pose, yaw_quaternion
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.workspace import Area, Spot, Workspace
@@ -42,12 +42,12 @@ class Terrain(ABC):
         """Return the height of the surface at a point, metres."""
 
     @abstractmethod
-    def surface_pose(
-        self, xy: tuple[float, float], yaw_rad: float = 0.0
-    ) -> tuple[Vector, Quaternion]:
-        """Return the frame that touches the surface at a point.
+    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
+        """Return the pose of a frame on the surface, whose z axis is the surface normal.
 
-        Its z axis is the surface's normal, its x axis has the given heading.
+        Args:
+            xy: point of the workspace, metres.
+            yaw_rad: heading of the frame's x axis in the horizontal plane.
         """
 
     @property
@@ -98,13 +98,8 @@ class Terrain(ABC):
 
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Put a body at rest on the surface, upright with respect to it."""
-        position, orientation = self.surface_pose(xy, yaw_rad)
-        qx, qy, qz, qw = orientation
-        normal = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
-        rise_m = -body.shape.bounds_m[0][2]
-        body.move_to(
-            tuple(p + rise_m * n for p, n in zip(position, normal, strict=True)), orientation
-        )
+        offset = Pose((0.0, 0.0, -body.shape.bounds_m[0][2]))
+        body.set_pose(*self.surface_pose(xy, yaw_rad).compose(offset))
 
     # -- heights -----------------------------------------------------------------------------
 
@@ -142,8 +137,6 @@ class Flat(Terrain):
         """Return zero."""
         return 0.0
 
-    def surface_pose(
-        self, xy: tuple[float, float], yaw_rad: float = 0.0
-    ) -> tuple[Vector, Quaternion]:
-        """Return the upright frame at a point."""
-        return (*xy, self.height_m(xy)), yaw_quaternion(yaw_rad)
+    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
+        """Return the pose of an upright frame on the floor."""
+        return Pose((*xy, self.height_m(xy)), yaw_quaternion(yaw_rad))

@@ -222,7 +222,7 @@ def test_episodes_come_out_as_the_experts_do(mode):
             assert built[key].dtype == reference[key].dtype, key
             assert built[key].shape[1:] == reference[key].shape[1:], key
         for body, start in zip(plain.scene.task.objects, env.scene.task.objects, strict=True):
-            body.move_to(*start.pose)
+            body.set_pose(*start.pose)
         plain.scene.world.settle(max_steps=100)
         plain.scene.controller.reset()
         plain._memory = {}

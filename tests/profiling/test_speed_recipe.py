@@ -21,7 +21,7 @@ from ba_torchrl.profiling.table import (
     as_markdown,
     measure,
 )
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 

@@ -1,4 +1,4 @@
-"""Rotations, poses and frames, against SciPy's rotations and homogeneous matrices."""
+"""Rotations, poses and planar frames, compared with SciPy rotations and homogeneous matrices."""
 
 import math
 import re
@@ -57,7 +57,7 @@ def is_same(pose, matrix):
 
 
 @pytest.mark.parametrize("angles", ANGLES)
-def test_matrices_of_angles_and_quaternions(angles):
+def test_rotation_matrices_of_angles_and_quaternions(angles):
     turn = Rotation.from_euler("ZYX", angles)
     quaternion = tuple(turn.as_quat())
     np.testing.assert_allclose(euler_matrix(*angles), turn.as_matrix(), atol=1e-12)
@@ -68,20 +68,20 @@ def test_matrices_of_angles_and_quaternions(angles):
     assert quaternion_tilt(quaternion) == pytest.approx(math.acos(z_axis[2]), abs=1e-7)
 
 
-def test_quaternions_multiply(rng):
+def test_quaternion_product(rng):
     first, second = (Rotation.from_quat(random_pose(rng).orientation) for _ in range(2))
     product = quaternion_product(tuple(first.as_quat()), tuple(second.as_quat()))
     np.testing.assert_allclose(rotation_array(product), (first * second).as_matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize("angles", ANGLES)
-def test_a_tool_points_down_at_zero_angles(angles):
+def test_tool_rotation_and_tool_angles(angles):
     tool = Rotation.from_euler("ZYX", angles) * FLIP
     np.testing.assert_allclose(tool_rotation(*angles), tool.as_matrix(), atol=1e-12)
     assert tool_angles(tuple(tool.as_quat())) == pytest.approx(angles, abs=1e-9)
 
 
-def test_a_tool_without_tilt():
+def test_downward_equals_tool_rotation_without_tilt():
     down = Rotation.from_euler("z", 2.2) * FLIP
     np.testing.assert_allclose(downward(2.2), down.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(tool_rotation(2.2), down.as_matrix(), atol=1e-12)
@@ -90,12 +90,12 @@ def test_a_tool_without_tilt():
     )
 
 
-def test_a_turn_about_the_vertical():
+def test_yaw_quaternion_and_quaternion_yaw():
     assert yaw_quaternion(0.8) == pytest.approx(Rotation.from_euler("z", 0.8).as_quat())
     assert quaternion_yaw(yaw_quaternion(-2.9)) == pytest.approx(-2.9)
 
 
-def test_poses_compose_and_invert(rng):
+def test_pose_compose_and_inverse(rng):
     outer, inner = random_pose(rng), random_pose(rng)
     is_same(outer.compose(inner), homogeneous(outer) @ homogeneous(inner))
     is_same(outer.inverse(), np.linalg.inv(homogeneous(outer)))
@@ -104,7 +104,7 @@ def test_poses_compose_and_invert(rng):
     assert Pose((0.0, 0.0, 0.0)).orientation == IDENTITY
 
 
-def test_pybullet_composes_and_inverts_in_single_precision(rng):
+def test_bullet_compose_and_inverse_are_single_precision(rng):
     outer, inner = random_pose(rng), random_pose(rng)
     np.testing.assert_allclose(
         homogeneous(bullet_compose(outer, inner)),
@@ -122,7 +122,7 @@ def _shift(x, y, z):
     return shift
 
 
-def test_a_pose_applies_to_points_and_directions(rng):
+def test_pose_apply_and_rotate(rng):
     pose, points = random_pose(rng), rng.normal(size=(4, 2, 3))
     matrix = homogeneous(pose)
     expected = np.einsum("ij,abj->abi", matrix[:3, :3], points)
@@ -130,7 +130,7 @@ def test_a_pose_applies_to_points_and_directions(rng):
     np.testing.assert_allclose(pose.apply(points), expected + matrix[:3, 3], atol=1e-12)
 
 
-def test_a_pose_moves_and_turns_about_the_vertical(rng):
+def test_pose_moved_to(rng):
     pose = random_pose(rng)
     moved = pose.moved_to((0.1, 0.2, 0.3), 0.7)
     turn = Rotation.from_euler("z", 0.7) * Rotation.from_quat(pose.orientation)
@@ -141,7 +141,7 @@ def test_a_pose_moves_and_turns_about_the_vertical(rng):
     assert moved.yaw_rad == pytest.approx(math.atan2(x_axis[1], x_axis[0]))
 
 
-def test_frames_of_the_plane(rng):
+def test_planar_frame_to_world_and_to_local(rng):
     x, y, yaw, px, py = rng.normal(size=5).tolist()
     frame = PlanarFrame(x, y, yaw)
     expected = complex(x, y) + complex(px, py) * complex(math.cos(yaw), math.sin(yaw))
@@ -151,7 +151,7 @@ def test_frames_of_the_plane(rng):
     np.testing.assert_allclose(frame.to_world(*many), [(expected.real, x), (expected.imag, y)])
 
 
-def test_vectors():
+def test_dot_cross_and_perpendicular():
     a, b = (0.3, -1.0, 2.0), (1.5, 0.2, -0.4)
     assert dot(a, b) == pytest.approx(np.dot(a, b))
     assert cross(a, b) == pytest.approx(np.cross(a, b))
@@ -163,7 +163,7 @@ def test_vectors():
 TRANSFORMS = r"getMatrixFrom|multiplyTransforms|invertTransform|getQuaternionFrom|getEuler"
 
 
-def test_no_other_file_of_the_package_does_this_algebra():
+def test_only_geometry_py_computes_rotations():
     files = sorted(Path(ba_torchrl.__file__).parent.rglob("*.py"))
     found = {path.name for path in files if re.search(TRANSFORMS, path.read_text("utf-8"))}
     assert found == {"geometry.py"}

@@ -7,11 +7,11 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.errors import SimulationError
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 
-def test_worlds_do_not_share_anything():
+def test_worlds_are_independent():
     with World() as first, World() as second:
         a = first.add(Box(size_m=(0.05, 0.05, 0.05)), "a")
         b = second.add(Box(size_m=(0.05, 0.05, 0.05)), "b")
@@ -22,19 +22,19 @@ def test_worlds_do_not_share_anything():
         assert b.position[2] == 1.0
 
 
-def test_a_sealed_world_takes_no_bodies():
+def test_adding_a_body_to_a_sealed_world_raises():
     with World() as world:
         world.seal()
         with pytest.raises(SimulationError, match="sealed"):
             world.add(Box(size_m=(0.05, 0.05, 0.05)), "late")
 
 
-def test_resetting_before_sealing_is_an_error():
+def test_restore_pristine_before_seal_raises():
     with World() as world, pytest.raises(SimulationError, match="seal"):
         world.restore_pristine()
 
 
-def test_settle_is_bounded_and_says_whether_it_worked():
+def test_settle_returns_whether_bodies_came_to_rest():
     with World() as world:
         box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
         box.place((0, 0, 0.025))
@@ -45,7 +45,7 @@ def test_settle_is_bounded_and_says_whether_it_worked():
         assert world.steps - before == 20
 
 
-def test_closing_frees_the_client():
+def test_close_disconnects_the_client():
     world = World()
     client = world.client
     world.close()
@@ -54,12 +54,12 @@ def test_closing_frees_the_client():
     assert not pybullet.isConnected(physicsClientId=client)
 
 
-def test_dropping_a_world_frees_its_client():
+def test_deleting_a_world_disconnects_its_client():
     client = World().client
     assert not pybullet.isConnected(physicsClientId=client)
 
 
-def test_touching_means_contact():
+def test_touches_detects_contact():
     with World() as world:
         a, b = (world.add(Box(size_m=(0.05, 0.05, 0.05)), n) for n in "ab")
         a.place((0, 0, 0.025))
@@ -69,8 +69,8 @@ def test_touching_means_contact():
             assert a.touches(b) is expected
 
 
-def fingerprint(env):
-    """Hash of every pose, velocity and joint of the scene."""
+def state_hash(env):
+    """Return a hash of all body poses, body velocities and joint states."""
     scene = env.scene
     client = scene.world.client
     values = []
@@ -82,7 +82,7 @@ def fingerprint(env):
     return hashlib.sha1(np.array(values).tobytes()).hexdigest()
 
 
-def test_episodes_repeat_bit_by_bit_whatever_came_before():
+def test_episodes_repeat_bit_by_bit_after_other_episodes():
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (8, 5)).astype(np.float32)
 
@@ -90,11 +90,11 @@ def test_episodes_repeat_bit_by_bit_whatever_came_before():
         import torch
 
         state = env.reset(seed=seed)
-        prints = [fingerprint(env)]
+        hashes = [state_hash(env)]
         for action in actions:
             env.step(state.set("action", torch.from_numpy(action)))
-            prints.append(fingerprint(env))
-        return prints
+            hashes.append(state_hash(env))
+        return hashes
 
     used = ba_torchrl.make("close_loop/block_pulling", obs_size=16)
     fresh = ba_torchrl.make("close_loop/block_pulling", obs_size=16)
@@ -113,7 +113,7 @@ def resident_mb():
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
-def test_two_thousand_resets_do_not_grow():
+def test_resets_do_not_leak_memory_or_bodies():
     env = ba_torchrl.make("close_loop/block_pushing", obs_size=16)
     for _ in range(200):
         env.reset()
@@ -126,15 +126,15 @@ def test_two_thousand_resets_do_not_grow():
     env.close()
 
 
-def test_snapshots_of_a_closed_world_do_no_harm_to_the_next():
+def test_a_snapshot_of_a_closed_world_does_not_affect_the_next():
     first = World()
     first.seal()
-    kept = first.snapshot()
+    snapshot = first.snapshot()
     first.close()
-    with World() as second:  # it has the same client number
+    with World() as second:  # it has the same client id
         second.seal()
-        assert second.client == kept.client
+        assert second.client == snapshot.client
         with pytest.raises(SimulationError, match="another world"):
-            second.restore(kept)
-        del kept, first
+            second.restore(snapshot)
+        del snapshot, first
         second.restore_pristine()

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.clearance import (
     ASIDE_M,
@@ -30,8 +30,8 @@ GRIPPER = Gripper(
     half_gap_m=0.04,
     half_width_m=0.01,
     closed_half_m=0.018,
-    palm_m=0.05,
-    arc=((0.004, -0.01), (0.04, -0.006)),
+    palm_height_m=0.05,
+    tip_arc=((0.004, -0.01), (0.04, -0.006)),
     outline=((0.0, math.inf), (0.04, -0.01), (0.06, 0.015), (0.07, 0.045)),
     closed_outline=((0.0, -0.01), (0.02, 0.01), (0.035, 0.03)),
 )
@@ -50,7 +50,7 @@ def test_a_gripper_reaches_as_far_as_its_x():
     assert GRIPPER.finger_reach_m == 0.06
     tips_only = replace(GRIPPER, outline=((0.0, math.inf), (0.04, -0.01)))
     assert tips_only.finger_reach_m == pytest.approx(0.054)
-    assert GRIPPER.lowest_m == -0.01
+    assert GRIPPER.lowest_tip_m == -0.01
     assert [GRIPPER.closed_reach_m(z) for z in (-0.02, 0.0, 0.02, 0.1)] == [0, 0, 0.02, 0.035]
 
 
@@ -85,10 +85,10 @@ def test_what_the_fingers_pass_over_is_in_no_ones_way(cubes):
 
 def test_the_hand_meets_what_reaches_up_to_its_palm(cubes):
     _, other = cubes
-    robot = SimpleNamespace(gripper=GRIPPER, hand_half_m=(0.07, 0.03))
+    robot = SimpleNamespace(gripper=GRIPPER, hand_half_extents_m=(0.07, 0.03))
     tool = PlanarFrame(0.45, 0.0, math.pi / 2)
     other.place((0.45, 0.1, EDGE_M / 2))
-    above = EDGE_M - GRIPPER.palm_m
+    above = EDGE_M - GRIPPER.palm_height_m
     assert hand_clearance_m(robot, tool, above + 1e-3, [other]) == math.inf
     gap = hand_clearance_m(robot, tool, above - 1e-3, [other])
     assert gap == pytest.approx(0.1 - EDGE_M / 2 - 0.07, abs=1e-4)
@@ -108,6 +108,6 @@ def test_fingers_from_above_and_their_gap_to_an_outline():
 
 def test_heights_follow_from_how_deep_the_fingers_end():
     assert passing_height_m(GRIPPER) == 0.03
-    assert passing_height_m(replace(GRIPPER, arc=((0.0, -0.04),))) == pytest.approx(0.052)
+    assert passing_height_m(replace(GRIPPER, tip_arc=((0.0, -0.04),))) == pytest.approx(0.052)
     robot = SimpleNamespace(gripper=GRIPPER, opening=lambda: 1.0)
     assert tips_below_tool_m(robot) == pytest.approx(0.006)

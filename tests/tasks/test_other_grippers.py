@@ -41,7 +41,7 @@ def test_the_fingers_are_wider_and_nothing_else(robot):
     wider = (float(WIDER_M) - float(WIDTH_M)) / 2
     assert wide.half_width_m - narrow.half_width_m == pytest.approx(wider, abs=1e-3)
     assert wide.half_gap_m == narrow.half_gap_m
-    np.testing.assert_allclose(wide.arc, narrow.arc, atol=1e-6)
+    np.testing.assert_allclose(wide.tip_arc, narrow.tip_arc, atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ import numpy as np
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.assets.hulls import volume_and_center
-from ba_torchrl.sim.bodies import Color, Solid
-from ba_torchrl.sim.meshes import Mesh, moved
+from ba_torchrl.sim.meshes import Mesh, transform_mesh
+from ba_torchrl.sim.shapes import Color, Solid
 
 OBJECT_SETS: Registry[type[ObjectSet]] = Registry("object set", "ba_torchrl.sim.assets")
 
@@ -78,7 +78,7 @@ class ObjectSet(Sequence[Solid], ABC):
             volumes, centers = zip(*(volume_and_center(part) for part in parts), strict=True)
             center = np.average(centers, axis=0, weights=volumes)
             self._shapes[index] = Solid(
-                parts=tuple(moved(part, tuple(-center)) for part in parts),
+                parts=tuple(transform_mesh(part, tuple(-center)) for part in parts),
                 mass_kg=self.mass_kg,
                 friction=self.friction,
                 color=PALETTE[index % len(PALETTE)],

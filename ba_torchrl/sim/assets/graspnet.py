@@ -23,27 +23,27 @@ from ba_torchrl.sim.meshes import Mesh, write_obj
 
 logger = logging.getLogger(__name__)
 
-PREFERRED = ("nontextured_simplified.obj", "nontextured.obj")
+PREFERRED_FILES = ("nontextured_simplified.obj", "nontextured.obj")
 """Taken first where a folder holds several mesh files."""
-EXPECTED = "expected one sub-folder for each object, with a mesh file (.obj, metres) in each"
+EXPECTED_LAYOUT = "expected one sub-folder for each object, with a mesh file (.obj, metres) in each"
 
-WIDEST_M, WIDER = 0.15, 0.8
-LARGEST_M3, LARGER = 6e-4, 0.85
-THINNEST_M, THINNER = 0.014, 1 / 0.95
+MAX_WIDTH_M, WIDTH_FACTOR = 0.15, 0.8
+MAX_VOLUME_M3, VOLUME_FACTOR = 6e-4, 0.85
+MIN_THICKNESS_M, THICKNESS_FACTOR = 0.014, 1 / 0.95
 
-LONGEST_M = 0.35
+MAX_LENGTH_M = 0.35
 """What is longer has no room in the tray: the diagonal of its flat floor, 0.25 m wide in the
 close-loop tasks. Cutlery of 0.3 m, as the rules above enlarge it, lies across."""
-LENGTHS_M = (1e-5, 1e6)
+MESH_LENGTHS_M = (1e-5, 1e6)
 """Lengths of a mesh before it is scaled: micrometres to kilometres may be its unit, as the rules
 above scale it. Far outside arithmetic fails."""
-FLATTEST = 1e-3
+MIN_FLATNESS = 1e-3
 """What is thinner than this share of its length is a sheet and no solid."""
 
 CONVEX_FILL = 0.95
 """A mesh that fills this share of its hull is taken for convex."""
 VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}
-RECIPE = f"graspnet 2 {CONVEX_FILL} {VHACD} {LENGTHS_M} {LONGEST_M} {FLATTEST}"
+RECIPE = f"graspnet 2 {CONVEX_FILL} {VHACD} {MESH_LENGTHS_M} {MAX_LENGTH_M} {MIN_FLATNESS}"
 """The limits belong to it: what was kept is not checked again."""
 
 
@@ -58,16 +58,20 @@ class GraspNet(ObjectSet):
     def __init__(self, asset_root: str | None = None) -> None:
         super().__init__()
         if not asset_root:  # an empty path would stand for the current folder
-            raise ConfigError(f"object_set='graspnet' needs asset_root, a folder: {EXPECTED}")
+            raise ConfigError(
+                f"object_set='graspnet' needs asset_root, a folder: {EXPECTED_LAYOUT}"
+            )
         root = Path(os.path.expanduser(asset_root))
-        with _access(root):
+        with _as_config_error(root):
             if not root.is_dir():
-                raise ConfigError(f"asset_root: there is no folder {str(root)!r}: {EXPECTED}")
+                raise ConfigError(
+                    f"asset_root: there is no folder {str(root)!r}: {EXPECTED_LAYOUT}"
+                )
             folders = sorted(
                 path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")
             )
         if not folders:
-            raise ConfigError(f"asset_root: {str(root)!r} has no sub-folders: {EXPECTED}")
+            raise ConfigError(f"asset_root: {str(root)!r} has no sub-folders: {EXPECTED_LAYOUT}")
         self.paths = [_mesh_file(folder) for folder in folders]
 
     @cached_property
@@ -88,7 +92,7 @@ class GraspNet(ObjectSet):
             check_size(mesh, path)  # first, as cutting takes seconds
             return convex_parts(mesh, path)
 
-        with _access(path):
+        with _as_config_error(path):
             content = path.read_bytes()
         parts = cached_parts(content, RECIPE, decompose)
         points = np.concatenate([part.vertices for part in parts])
@@ -106,9 +110,13 @@ def graspable_scale(extents_m: Sequence[float]) -> float:
         extents_m: of the axis-aligned bounding box.
     """
     smallest, middle, _ = sorted(extents_m)
-    scale = WIDER ** _times(middle / WIDEST_M, 1 / WIDER)
-    scale *= LARGER ** _times(float(np.prod(extents_m)) * scale**3 / LARGEST_M3, LARGER**-3)
-    return scale * THINNER ** _times(THINNEST_M / (smallest * scale), THINNER)
+    scale = WIDTH_FACTOR ** _num_factors(middle / MAX_WIDTH_M, 1 / WIDTH_FACTOR)
+    scale *= VOLUME_FACTOR ** _num_factors(
+        float(np.prod(extents_m)) * scale**3 / MAX_VOLUME_M3, VOLUME_FACTOR**-3
+    )
+    return scale * THICKNESS_FACTOR ** _num_factors(
+        MIN_THICKNESS_M / (smallest * scale), THICKNESS_FACTOR
+    )
 
 
 def check_size(mesh: Mesh, path: Path) -> None:
@@ -119,30 +127,30 @@ def check_size(mesh: Mesh, path: Path) -> None:
         path: where it is from, for messages.
 
     Raises:
-        ConfigError: it is flat, outside `LENGTHS_M`, or when scaled longer than `LONGEST_M`.
+        ConfigError: it is flat, outside `MESH_LENGTHS_M`, or when scaled longer than `MAX_LENGTH_M`.
     """
     sides = _principal_extents(mesh.vertices)
     thinnest, _, longest = sides
-    if not LENGTHS_M[0] <= longest <= LENGTHS_M[1]:
+    if not MESH_LENGTHS_M[0] <= longest <= MESH_LENGTHS_M[1]:
         raise ConfigError(
-            f"asset_root: {str(path)!r} measures {_measures(sides)}: it must be from "
-            f"{LENGTHS_M[0]:g} to {LENGTHS_M[1]:g} m long; check its unit, or remove its folder"
+            f"asset_root: {str(path)!r} measures {_format_extents(sides)}: it must be from "
+            f"{MESH_LENGTHS_M[0]:g} to {MESH_LENGTHS_M[1]:g} m long; check its unit, or remove its folder"
         )
-    if thinnest <= FLATTEST * longest:
+    if thinnest <= MIN_FLATNESS * longest:
         raise ConfigError(
-            f"asset_root: {str(path)!r} measures {_measures(sides)}: it is flat, which is no "
+            f"asset_root: {str(path)!r} measures {_format_extents(sides)}: it is flat, which is no "
             "solid; give the mesh a thickness, or remove its folder"
         )
     scale = graspable_scale(np.ptp(mesh.vertices, axis=0))
-    if longest * scale > LONGEST_M:
+    if longest * scale > MAX_LENGTH_M:
         raise ConfigError(
-            f"asset_root: {str(path)!r} measures {_measures(sides)}, and when scaled so that it "
-            f"can be grasped {_measures(sides * scale)}: the tray has room for {LONGEST_M} m; "
+            f"asset_root: {str(path)!r} measures {_format_extents(sides)}, and when scaled so that it "
+            f"can be grasped {_format_extents(sides * scale)}: the tray has room for {MAX_LENGTH_M} m; "
             "use a less elongated mesh, or remove its folder"
         )
 
 
-def _times(excess: float, step: float) -> int:
+def _num_factors(excess: float, step: float) -> int:
     """Return how often to divide ``excess`` by ``step`` until it is at most 1."""
     return max(0, math.ceil(math.log(excess) / math.log(step) - 1e-9))
 
@@ -191,7 +199,7 @@ def convex_parts(mesh: Mesh, path: Path) -> list[Mesh]:
         write_obj(source, [mesh])
         with _silent_stdout():
             pybullet.vhacd(str(source), str(target), str(Path(folder, "log.txt")), **VHACD)
-        clouds = _objects_of(target) if target.exists() else []
+        clouds = _read_objects(target) if target.exists() else []
     parts = []
     for cloud in clouds:
         with contextlib.suppress(ValueError):  # a sliver without volume holds nothing up
@@ -213,7 +221,7 @@ def _principal_extents(points: np.ndarray) -> np.ndarray:
     return np.sort(np.ptp(centred @ axes, axis=0)) * unit
 
 
-def _measures(extents_m: np.ndarray) -> str:
+def _format_extents(extents_m: np.ndarray) -> str:
     return " x ".join(f"{extent:.2g}" for extent in extents_m) + " m"
 
 
@@ -223,11 +231,11 @@ def _mesh_file(folder: Path) -> Path:
     Raises:
         ConfigError: there is none, or what would be taken is no file.
     """
-    rank = {name: i for i, name in enumerate(PREFERRED)}
-    with _access(folder):
+    rank = {name: i for i, name in enumerate(PREFERRED_FILES)}
+    with _as_config_error(folder):
         meshes = [path for path in folder.iterdir() if path.suffix.lower() == ".obj"]
         if not meshes:
-            raise ConfigError(f"asset_root: {str(folder)!r} has no mesh file: {EXPECTED}")
+            raise ConfigError(f"asset_root: {str(folder)!r} has no mesh file: {EXPECTED_LAYOUT}")
         path = min(meshes, key=lambda path: (rank.get(path.name.lower(), len(rank)), path.name))
         if not path.is_file():
             missing = path.is_symlink() and not path.exists()
@@ -240,7 +248,7 @@ def _mesh_file(folder: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _access(path: Path) -> Iterator[None]:
+def _as_config_error(path: Path) -> Iterator[None]:
     """Turn what the file system refuses into an error that names the path."""
     try:
         yield
@@ -251,7 +259,7 @@ def _access(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _objects_of(path: Path) -> list[np.ndarray]:
+def _read_objects(path: Path) -> list[np.ndarray]:
     """Return the vertices [N, 3] of each object of an OBJ file."""
     clouds: list[list[list[float]]] = []
     for line in path.read_text().splitlines():

@@ -10,11 +10,11 @@ import numpy as np
 
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
 from ba_torchrl.sim.assets.hulls import convex_hull
-from ba_torchrl.sim.meshes import Mesh, box_mesh, lathe_parts, moved, ring_parts
+from ba_torchrl.sim.meshes import Mesh, box_mesh, lathe_parts, ring_parts, transform_mesh
 
-SIDES = 16
+NUM_SIDES = 16
 """Corners of what is round."""
-WALLS = 10
+NUM_WALL_PARTS = 10
 """Pieces of a hollow wall."""
 
 Profile = Sequence[tuple[float, float]]
@@ -35,15 +35,15 @@ def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
         part
         for (low, z0), (high, z1) in pairwise(profile)
         for part in ring_parts(
-            [(low - wall_m, z0), (low, z0), (high, z1), (high - wall_m, z1)], WALLS
+            [(low - wall_m, z0), (low, z0), (high, z1), (high - wall_m, z1)], NUM_WALL_PARTS
         )
     ]
-    return lathe_parts([(radius, z), (inside, z + bottom_m)], WALLS) + walls
+    return lathe_parts([(radius, z), (inside, z + bottom_m)], NUM_WALL_PARTS) + walls
 
 
 def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
     """Return a box with its centre at a point, metres."""
-    return moved(box_mesh(size), at)
+    return transform_mesh(box_mesh(size), at)
 
 
 def mug(radius_m: float, height_m: float) -> list[Mesh]:
@@ -59,14 +59,14 @@ def mug(radius_m: float, height_m: float) -> list[Mesh]:
 
 def spoon() -> list[Mesh]:
     """Return a wooden spoon: a round handle and a thick, oval bowl."""
-    oval = _ring(0.02, SIDES) * (1.3, 1.0, 1.0)
+    oval = _ring(0.02, NUM_SIDES) * (1.3, 1.0, 1.0)
     tip = np.array([0.065, 0.0, 0.0])
     deep = np.array([0.0, 0.0, 0.009])
     bowl = convex_hull(np.concatenate([oval + tip + deep, 0.7 * oval + tip - deep]))
     ring = _ring(0.009, 8)[:, [2, 0, 1]]
     ends = np.array([[[-0.055, 0.0, 0.0]], [[0.05, 0.0, 0.0]]])
     handle = convex_hull((ring + ends).reshape(-1, 3))
-    return [moved(part, (0, 0, 0), np.pi / 2) for part in (handle, bowl)]
+    return [transform_mesh(part, (0, 0, 0), np.pi / 2) for part in (handle, bowl)]
 
 
 def banana() -> list[Mesh]:
@@ -112,10 +112,10 @@ ITEMS: dict[str, Callable[[], Sequence[Mesh]]] = {
         [(0.004, -0.034), (0.018, -0.022), (0.025, 0.0), (0.018, 0.022), (0.004, 0.034)]
     ),
     "cheese": lambda: [
-        convex_hull(np.array([(x, y, z) for x, y in _WEDGE for z in (-0.018, 0.018)]))
+        convex_hull(np.array([(x, y, z) for x, y in _CHEESE_BASE for z in (-0.018, 0.018)]))
     ],
 }
-_WEDGE = ((-0.035, -0.025), (-0.035, 0.025), (0.045, 0.0))
+_CHEESE_BASE = ((-0.035, -0.025), (-0.035, 0.025), (0.045, 0.0))
 
 
 @OBJECT_SETS.register("household")

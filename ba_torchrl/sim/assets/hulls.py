@@ -9,26 +9,26 @@ import numpy as np
 
 from ba_torchrl.sim.meshes import Mesh
 
-REST_MARGIN_M = 2e-3
+STABILITY_MARGIN_M = 2e-3
 """A body rests on a facet if its centre of mass is this far inside it."""
-ROUNDING_M = 1e-3
+FACET_TOLERANCE_M = 1e-3
 """Facets that bulge less than this count as flat: a body rocks on them, and stays."""
-SAME_REST_COSINE = math.cos(math.radians(10))
-SAMPLES = 2000
-FINGER_HALF_M = 0.0125
-GAP_M = 0.066
+SAME_POSE_COSINE = math.cos(math.radians(10))
+NUM_SAMPLES = 2000
+FINGER_HALF_WIDTH_M = 0.0125
+MAX_GAP_M = 0.066
 """Open fingers take no more, with some room to either side."""
-GRIPPED_Z_M = (0.004, 0.04)
+GRASP_Z_M = (0.004, 0.04)
 """Heights above the ground that fingers cover."""
 
 
-class Rest(NamedTuple):
+class StablePose(NamedTuple):
     """A pose in which a convex body lies still."""
 
     height_m: float
     width_m: float
     """Of the narrowest gap between two vertical walls that the body fits into."""
-    squareness: float
+    antipodal_score: float
     """How nearly opposite the surfaces are that two closing fingers meet, and how nearly across
     the line on which they close, for the best line: 1 for parallel upright sides, less for the
     sides of a wedge."""
@@ -67,31 +67,31 @@ def volume_and_center(mesh: Mesh) -> tuple[float, np.ndarray]:
     return total, origin + (volumes[:, None] * (a + b + c)).sum(axis=0) / (4 * total)
 
 
-def rests(hull: Mesh) -> list[Rest]:
+def stable_poses(hull: Mesh) -> list[StablePose]:
     """Return the poses in which a convex body of even density lies still, one per facet."""
     center = volume_and_center(hull)[1]
-    found: list[Rest] = []
+    found: list[StablePose] = []
     normals = np.empty((0, 3))
     a, b, c = (hull.vertices[hull.faces[:, i]] for i in range(3))
     crosses = np.cross(b - a, c - a)
     areas = np.linalg.norm(crosses, axis=1)
     for i in np.argsort(-areas, kind="stable"):
         normal = crosses[i] / areas[i]
-        if (normals @ normal > SAME_REST_COSINE).any():
+        if (normals @ normal > SAME_POSE_COSINE).any():
             continue
         heights = hull.vertices @ -normal
         plane = hull.vertices @ _axes(normal)
-        facet = plane[heights < heights.min() + ROUNDING_M]
-        if _depth_inside(facet, center @ _axes(normal)) >= REST_MARGIN_M:
+        facet = plane[heights < heights.min() + FACET_TOLERANCE_M]
+        if _depth_inside(facet, center @ _axes(normal)) >= STABILITY_MARGIN_M:
             # the plane's axes in this order, with the height, make a right-handed frame
             axes = _axes(normal)[:, ::-1]
             standing = np.column_stack([hull.vertices @ axes, heights - heights.min()])
-            squareness, yaw = _squareness(Mesh(standing, hull.faces), center @ axes)
+            antipodal_score, yaw = _antipodal_score(Mesh(standing, hull.faces), center @ axes)
             cos, sin = math.cos(yaw), math.sin(yaw)
             turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
             turn = turn @ np.column_stack([axes, -normal]).T
             width = narrowest_width(plane)
-            found.append(Rest(float(np.ptp(heights)), width, squareness, turn))
+            found.append(StablePose(float(np.ptp(heights)), width, antipodal_score, turn))
             normals = np.vstack([normals, normal])
     return found
 
@@ -119,17 +119,17 @@ def narrowest_width(points: np.ndarray) -> float:
     return float(np.ptp(points @ axes, axis=0).min())
 
 
-def _squareness(standing: Mesh, center_xy: np.ndarray) -> tuple[float, float]:
-    """Return `Rest.squareness` of a body that stands on z = 0, and the yaw of its direction."""
-    points, normals = surface_samples(standing, SAMPLES)
-    low, high = GRIPPED_Z_M
+def _antipodal_score(standing: Mesh, center_xy: np.ndarray) -> tuple[float, float]:
+    """Return `Rest.antipodal_score` of a body that stands on z = 0, and the yaw of its direction."""
+    points, normals = surface_samples(standing, NUM_SAMPLES)
+    low, high = GRASP_Z_M
     best = (0.0, 0.0)
     for turn in np.linspace(0, np.pi, 24, endpoint=False).tolist():
         axis = np.array([math.cos(turn), math.sin(turn)])
         along = (points[:, :2] - center_xy) @ axis
         across = (points[:, :2] - center_xy) @ np.array([-axis[1], axis[0]])
-        met = (np.abs(across) < FINGER_HALF_M) & (points[:, 2] > low) & (points[:, 2] < high)
-        if not met.any() or np.ptp(along[met]) > GAP_M:
+        met = (np.abs(across) < FINGER_HALF_WIDTH_M) & (points[:, 2] > low) & (points[:, 2] < high)
+        if not met.any() or np.ptp(along[met]) > MAX_GAP_M:
             continue
         left, right = along[met] < along[met].min() + 2e-3, along[met] > along[met].max() - 2e-3
         first, second = (normals[met][side].mean(axis=0) for side in (left, right))

@@ -12,24 +12,24 @@ import pybullet_data
 
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
 from ba_torchrl.sim.assets.cache import cached_parts
-from ba_torchrl.sim.assets.hulls import convex_hull, rests, volume_and_center
+from ba_torchrl.sim.assets.hulls import convex_hull, stable_poses, volume_and_center
 from ba_torchrl.sim.meshes import Mesh
 
 UNIT_M = 0.015
 """Metres per unit of the mesh files, as their URDF files have it."""
-COUNT = 86
-WIDEST_M = 0.06
+NUM_SHAPES = 86
+MAX_WIDTH_M = 0.06
 """Shapes are shrunk until the narrowest width of each of their rests is at most this."""
-FLATTEST_M = 0.02
+MIN_HEIGHT_M = 0.02
 """Least height of any rest; the fingers need something to hold."""
-LONGEST_M = 0.11
-LEAST_SQUARE = 0.82
+MAX_LENGTH_M = 0.11
+MIN_ANTIPODAL_SCORE = 0.82
 """Least squareness of any rest: fingers slip off wedges and domes."""
-LEAST_FILL = 0.6
+MIN_FILL = 0.6
 """Least share of its convex hull that a shape fills: the hull is what is simulated and seen."""
 
 # fmt: off
-CHOICE: tuple[tuple[int, float], ...] = (
+SELECTION: tuple[tuple[int, float], ...] = (
     (2, 0.64), (5, 0.63), (23, 1.00), (39, 0.67), (66, 0.66), (74, 1.00), (81, 0.67), (114, 0.64),
     (137, 0.65), (146, 0.65), (149, 0.64), (179, 0.65), (195, 0.66), (200, 0.65), (207, 0.66),
     (220, 0.69), (228, 1.00), (229, 0.69), (243, 1.00), (258, 0.63), (261, 0.64), (279, 0.65),
@@ -45,7 +45,7 @@ CHOICE: tuple[tuple[int, float], ...] = (
     (998, 0.65),
 )
 # fmt: on
-"""Number and scale of each shape, as `choose` works them out."""
+"""Number and scale of each shape, as `select_shapes` works them out."""
 
 
 class Candidate(NamedTuple):
@@ -64,18 +64,18 @@ class RandomShapes(ObjectSet):
     @property
     def names(self) -> Sequence[str]:
         """Their numbers in PyBullet's collection."""
-        return [f"{number:03d}" for number, _ in CHOICE]
+        return [f"{number:03d}" for number, _ in SELECTION]
 
     def parts(self, index: int) -> tuple[Mesh, ...]:
         """Return the convex hull, which is what PyBullet makes of such a mesh anyway.
 
         It lies flat, with the yaw that suits a gripper at yaw 0 best.
         """
-        number, scale = CHOICE[index]
+        number, scale = SELECTION[index]
 
         def hull() -> list[Mesh]:
             vertices, faces = convex_hull(read_shape(number).vertices * scale)
-            flattest = min(rests(Mesh(vertices, faces)), key=lambda rest: rest.height_m)
+            flattest = min(stable_poses(Mesh(vertices, faces)), key=lambda rest: rest.height_m)
             return [Mesh(vertices @ flattest.turn.T, faces)]
 
         return cached_parts(shape_path(number).read_bytes(), f"random shape 3 {scale}", hull)
@@ -99,7 +99,7 @@ def read_shape(number: int) -> Mesh:
     return Mesh(np.array(vertices) * UNIT_M, np.array(faces, dtype=np.int64))
 
 
-def examine(number: int) -> Candidate | None:
+def scaled_candidate(number: int) -> Candidate | None:
     """Return at which scale a random shape can be grasped however it lies, or None if at none."""
     mesh = read_shape(number)
     try:
@@ -107,31 +107,31 @@ def examine(number: int) -> Candidate | None:
     except ValueError:
         return None  # one of the files has coordinates that are not numbers
     volume = volume_and_center(hull)[0]
-    poses = rests(hull)
-    if not poses or volume_and_center(mesh)[0] < LEAST_FILL * volume:
+    poses = stable_poses(hull)
+    if not poses or volume_and_center(mesh)[0] < MIN_FILL * volume:
         return None
-    scale = min(1.0, WIDEST_M / max(rest.width_m for rest in poses))
+    scale = min(1.0, MAX_WIDTH_M / max(rest.width_m for rest in poses))
     scale = float(np.floor(scale * 100) / 100)
-    poses = rests(Mesh(hull.vertices * scale, hull.faces))
+    poses = stable_poses(Mesh(hull.vertices * scale, hull.faces))
     extents = np.sort(np.ptp(hull.vertices, axis=0))
     if (
-        scale * extents[-1] > LONGEST_M
+        scale * extents[-1] > MAX_LENGTH_M
         or not poses
-        or min(rest.height_m for rest in poses) < FLATTEST_M
-        or min(rest.squareness for rest in poses) < LEAST_SQUARE
+        or min(rest.height_m for rest in poses) < MIN_HEIGHT_M
+        or min(rest.antipodal_score for rest in poses) < MIN_ANTIPODAL_SCORE
     ):
         return None
     return Candidate(scale, (*(extents * scale / 0.05), 2 * volume / float(np.prod(extents))))
 
 
-def choose() -> tuple[tuple[int, float], ...]:
+def select_shapes() -> tuple[tuple[int, float], ...]:
     """Choose the shapes: of those that suit, again and again the one most unlike the chosen."""
-    found = {number: examine(number) for number in range(1000)}
+    found = {number: scaled_candidate(number) for number in range(1000)}
     numbers = [number for number, candidate in found.items() if candidate is not None]
     points = np.array([found[number].features for number in numbers])
     chosen = [0]
     distances = np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < COUNT:
+    while len(chosen) < NUM_SHAPES:
         chosen.append(int(distances.argmax()))
         distances = np.minimum(distances, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return tuple((numbers[i], found[numbers[i]].scale) for i in sorted(chosen))

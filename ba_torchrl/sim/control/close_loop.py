@@ -17,13 +17,13 @@ from dataclasses import dataclass
 
 from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import Contact, bearing_force_n, lateral_force_n, outer_contacts
+from ba_torchrl.sim.contacts import Contact, lateral_force_n, outer_contacts, vertical_force_n
 from ba_torchrl.sim.geometry import Vector, YawPose, downward
 from ba_torchrl.sim.robots.base import Robot
 
 OPENING_TOLERANCE = 0.02
 """An opening this close to the wanted one is reached."""
-STALL_SHARE = 0.1
+STALL_FRACTION = 0.1
 """Fingers slower than this share of their speed have met something."""
 
 
@@ -32,21 +32,21 @@ class MotionLimits:
     """Speeds and forces of close-loop motion."""
 
     contact_speed_m_s: float = 0.4
-    contact_spin_rad_s: float = 6.0
+    contact_speed_rad_s: float = 6.0
     deceleration_m_s2: float = 4.0
     """Less than the floor's friction times gravity, or a pushed body runs ahead."""
     held_time_s: float = 0.1
     """Time for 5 cm with a body in hand; scales with the root of the distance."""
-    max_press_n: float = 40.0
+    max_vertical_force_n: float = 40.0
     """A move stops when the hand or what it holds presses harder than this along z."""
-    max_push_n: float = 150.0
+    max_lateral_force_n: float = 150.0
     """The same for forces from the side."""
-    creep_m: float = 5e-4
+    press_stride_m: float = 5e-4
     """Stride of a move that starts out pressing on something."""
-    creep_steps: int = 8
-    sample_m: float = 0.01
-    sample_rad: float = 0.14
-    gripper_steps: int = 60
+    max_press_steps: int = 8
+    path_sample_m: float = 0.01
+    path_sample_rad: float = 0.14
+    max_gripper_steps: int = 60
 
 
 class CloseLoopController:
@@ -65,7 +65,7 @@ class CloseLoopController:
         self.world = robot.world
         self.teleport = teleport
         self.limits = limits or MotionLimits()
-        self._wanted_opening = 1.0
+        self._target_opening = 1.0
 
     def reset(self, pose: YawPose, opening: float = 1.0) -> None:
         """Put the tool at a pose without moving anything else.
@@ -78,15 +78,15 @@ class CloseLoopController:
             raise ValueError(f"{pose[0]} m is out of the robot's reach")
         self.robot.teleport(joints)
         self.robot.set_opening(opening)
-        self._wanted_opening = opening
+        self._target_opening = opening
 
     def get_state(self) -> float:
         """Return the wanted opening, which the next `grip` is compared with."""
-        return self._wanted_opening
+        return self._target_opening
 
     def set_state(self, state: float) -> None:
         """Take up what `get_state` returned."""
-        self._wanted_opening = state
+        self._target_opening = state
 
     def move_to(self, position: Vector, yaw_rad: float) -> None:
         """Move the tool in a straight line towards a pose, as far as reach and contacts allow."""
@@ -98,22 +98,24 @@ class CloseLoopController:
             fraction = max(path.length_m / 0.05, 0.6 * path.angle_rad / (math.pi / 4), 0.15)
             duration = limits.held_time_s * math.sqrt(fraction)
             count = max(4, round(duration / self.world.physics.time_step_s))
-            self._follow(path, [smooth_step(i / count) for i in range(1, count + 1)], held)
+            self._simulate_path(
+                path, [quintic_time_scaling(i / count) for i in range(1, count + 1)], held
+            )
         else:
-            done = self._skip_free_part(path) if self.teleport else 0.0
-            if done == 0.0 and path.goes_down and self._rests_on_something(held):
-                done = self._creep(path)
+            done = self._teleport_free_part(path) if self.teleport else 0.0
+            if done == 0.0 and path.goes_down and self._is_in_contact_below(held):
+                done = self._press_down(path)
             if done < 1.0:
                 rest = [done + (1 - done) * u for u in self._contact_profile(path, 1 - done)]
-                self._follow(path, rest, None)
+                self._simulate_path(path, rest, None)
         self.world.step()
 
     def grip(self, opening: float) -> None:
         """Open or close the fingers towards an opening until they are there or meet something."""
-        if abs(opening - self._wanted_opening) < 1e-3:
+        if abs(opening - self._target_opening) < 1e-3:
             return
-        self._wanted_opening = opening
-        ramp_fingers(self.robot, opening, self.limits.gripper_steps)
+        self._target_opening = opening
+        move_fingers(self.robot, opening, self.limits.max_gripper_steps)
 
     # ----------------------------------------------------------------------------------------
 
@@ -125,12 +127,15 @@ class CloseLoopController:
             joints[-1] -= turns * 2 * math.pi
             self.robot.teleport(joints)
 
-    def _skip_free_part(self, path: _Path) -> float:
+    def _teleport_free_part(self, path: _Path) -> float:
         """Teleport along the path to the last sample that touches nothing; return its place."""
         count = max(
             1,
             math.ceil(
-                max(path.length_m / self.limits.sample_m, path.angle_rad / self.limits.sample_rad)
+                max(
+                    path.length_m / self.limits.path_sample_m,
+                    path.angle_rad / self.limits.path_sample_rad,
+                )
             ),
         )
         free = self.robot.joints
@@ -146,24 +151,24 @@ class CloseLoopController:
         self.robot.teleport(free)
         return done
 
-    def _creep(self, path: _Path) -> float:
+    def _press_down(self, path: _Path) -> float:
         """Press from where the hand rests, a fraction of a millimetre at a time.
 
         Returns:
             The place reached; 1 if the press is firm, which ends the move.
         """
-        stride = self.limits.creep_m / max(path.length_m, self.limits.creep_m)
+        stride = self.limits.press_stride_m / max(path.length_m, self.limits.press_stride_m)
         place = 0.0
-        for _ in range(self.limits.creep_steps):
+        for _ in range(self.limits.max_press_steps):
             place = min(place + stride, 1.0)
-            if not self._follow(path, [place], None):
+            if not self._simulate_path(path, [place], None):
                 return 1.0
         return place
 
-    def _rests_on_something(self, held: Body | None) -> bool:
+    def _is_in_contact_below(self, held: Body | None) -> bool:
         """Whether the hand, or what it holds, stands on anything else or all but touches it."""
         return any(
-            point.is_vertical and point.distance_m < 2 * self.limits.creep_m
+            point.is_vertical and point.distance_m < 2 * self.limits.press_stride_m
             for point in self._outer_contacts(held)
         )
 
@@ -177,7 +182,7 @@ class CloseLoopController:
         braking = speed / limits.deceleration_m_s2
         cruising = max(length - 0.5 * speed * braking, 0.0) / speed
         duration = max(
-            cruising + braking, path.angle_rad * share / limits.contact_spin_rad_s, 2 * dt
+            cruising + braking, path.angle_rad * share / limits.contact_speed_rad_s, 2 * dt
         )
         count = max(2, math.ceil(duration / dt))
         brake = min(1.0, braking / duration)  # share of the time
@@ -189,7 +194,7 @@ class CloseLoopController:
 
         return [place(i / count) for i in range(1, count + 1)]
 
-    def _follow(self, path: _Path, places: list[float], held: Body | None) -> bool:
+    def _simulate_path(self, path: _Path, places: list[float], held: Body | None) -> bool:
         """Simulate the path; stop where it leaves the reach, step back where it presses.
 
         Returns:
@@ -205,7 +210,7 @@ class CloseLoopController:
             before = robot.joints
             robot.command(joints)
             self.world.step()
-            if self._overloaded(held):
+            if self._is_overloaded(held):
                 # a stiff arm left where it is would press the body deeper with every try
                 robot.command(before)
                 self.world.step()
@@ -216,12 +221,12 @@ class CloseLoopController:
             robot.command(measured)  # do not go on pushing against what stopped it
         return arrived
 
-    def _overloaded(self, held: Body | None) -> bool:
+    def _is_overloaded(self, held: Body | None) -> bool:
         """Whether the hand, or what it holds, presses too hard on anything else."""
         points = self._outer_contacts(held)
         return (
-            bearing_force_n(points) > self.limits.max_press_n
-            or lateral_force_n(points) > self.limits.max_push_n
+            vertical_force_n(points) > self.limits.max_vertical_force_n
+            or lateral_force_n(points) > self.limits.max_lateral_force_n
         )
 
     def _outer_contacts(self, held: Body | None) -> list[Contact]:
@@ -249,12 +254,12 @@ class _Path:
         return self._robot.inverse_kinematics((x, y, z), rotation, self._robot.joints)
 
 
-def smooth_step(u: float) -> float:
+def quintic_time_scaling(u: float) -> float:
     """Return a smooth way from 0 to 1: zero velocity and acceleration at both ends."""
     return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
-def ramp_fingers(robot: Robot, opening: float, max_steps: int) -> None:
+def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:
     """Move the fingers at their speed until they are there or meet something.
 
     Args:
@@ -262,18 +267,18 @@ def ramp_fingers(robot: Robot, opening: float, max_steps: int) -> None:
         opening: where to, 0 to 1.
         max_steps: they are left on their way after so many steps.
     """
-    stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open
+    stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open_position
     target = robot.opening()
     resting = 0
     for _ in range(max_steps):
         before = robot.opening()
         target += min(max(opening - target, -stride), stride)
-        robot.hold_opening(target)
+        robot.command_opening(target)
         robot.world.step()
         after = robot.opening()
         if target == opening and abs(after - opening) < OPENING_TOLERANCE:
             return
-        resting = resting + 1 if abs(after - before) < STALL_SHARE * stride else 0
+        resting = resting + 1 if abs(after - before) < STALL_FRACTION * stride else 0
         if resting >= 2:
             break
-    robot.hold_opening(opening)  # the motors stay on: they squeeze what the fingers met
+    robot.command_opening(opening)  # the motors stay on: they squeeze what the fingers met

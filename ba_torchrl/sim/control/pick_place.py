@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import Contact, bearing_force_n, is_any_within, outer_contacts
-from ba_torchrl.sim.control.close_loop import ramp_fingers, smooth_step
+from ba_torchrl.sim.contacts import Contact, is_any_within, outer_contacts, vertical_force_n
+from ba_torchrl.sim.control.close_loop import move_fingers, quintic_time_scaling
 from ba_torchrl.sim.geometry import (
     Matrix,
     Pose,
@@ -32,46 +32,46 @@ from ba_torchrl.sim.robots.gripper import Gripper
 class PickPlaceLimits:
     """Distances and step counts of picking and placing."""
 
-    approach_m: float = 0.1
+    approach_distance_m: float = 0.1
     """Where a simulated approach starts, along the tool's axis."""
-    free_samples_m: tuple[float, ...] = (0.06, 0.03)
+    approach_samples_m: tuple[float, ...] = (0.06, 0.03)
     """Where on the way down it is tested that nothing is in the way, besides its end."""
     acceleration_m_s2: float = 25.0
     """Greatest acceleration of a simulated way; the arm's motors brake it in time."""
     held_acceleration_m_s2: float = 15.0
     """The same with something in the gripper."""
-    swing_rad_s2: float = 60.0
+    joint_acceleration_rad_s2: float = 60.0
     """Greatest acceleration of a joint in a simulated swing."""
-    held_swing_rad_s2: float = 30.0
-    notch: float = 0.075
+    held_joint_acceleration_rad_s2: float = 30.0
+    closing_stride: float = 0.075
     """Share of the opening by which fingers close without simulation."""
-    closing_steps: int = 40
-    squeeze_steps: int = 3
+    max_closing_steps: int = 40
+    grasp_settle_steps: int = 3
     """Steps after which closed fingers press with all their force, on more than one point."""
-    lift_m: float = 0.005
-    lift_steps: int = 4
+    lift_height_m: float = 0.005
+    min_motion_steps: int = 4
     """Least number of steps of a simulated way."""
-    transit_z_m: float = 0.3
+    transit_height_m: float = 0.3
     """Height of the tool at which simulated swings start and end."""
-    margin_m: float = 5e-4
+    contact_margin_m: float = 5e-4
     """Closer than this, a way is not free."""
-    hover_m: float = 0.003
+    pre_place_height_m: float = 0.003
     """Height above its place from which an object is lowered."""
-    lower_steps: int = 2
+    lowering_steps: int = 2
     release_opening: float = 0.12
     """Share of the opening by which fingers part to let go."""
-    release_steps: int = 10
-    regrasp_steps: int = 5
+    max_release_steps: int = 10
+    max_regrasp_steps: int = 5
     """Steps after which a body that is not squeezed is no longer held."""
-    max_press_n: float = 40.0
+    max_vertical_force_n: float = 40.0
     """A simulated approach stops when it meets this force."""
 
 
 PEAK_ACCELERATION = 10 / math.sqrt(3)
-"""Of `smooth_step`, which covers 1 in a time of 1."""
+"""Of `quintic_time_scaling`, which covers 1 in a time of 1."""
 
 
-LowestTool = Callable[[Gripper, tuple[float, float], Matrix, float], float]
+LowestToolHeight = Callable[[Gripper, tuple[float, float], Matrix, float], float]
 """From a gripper, x and y, the tool's rotation and the opening to the least height of the tool at
 which the fingers close above the support surface."""
 
@@ -104,7 +104,7 @@ class PickPlace:
         teleport: bool = True,
         opening: float = 1.0,
         top_down: bool = False,
-        lowest_tool_m: LowestTool | None = None,
+        lowest_tool_m: LowestToolHeight | None = None,
         limits: PickPlaceLimits | None = None,
     ) -> None:
         self.robot = robot
@@ -121,7 +121,7 @@ class PickPlace:
 
     def reset(self) -> None:
         """Empty the gripper and go home, without moving anything else."""
-        self._release()
+        self._detach()
         self.robot.teleport(self.robot.home_joints)
         self.robot.set_opening(self.opening)
 
@@ -139,16 +139,16 @@ class PickPlace:
         """
         robot, limits = self.robot, self.limits
         robot.set_opening(self.opening)
-        if self._approach(self._above_surface(position, rotation), rotation, 0.0):
-            self._close()
-            reached = robot.tool_transform()[0]
-            above = self._above(reached, rotation, limits.lift_m)
-            self._travel(reached, above, rotation, limits.lift_steps)
+        if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
+            self._close_fingers()
+            reached = robot.tool_frame()[0]
+            above = self._approach_point(reached, rotation, limits.lift_height_m)
+            self._move_straight(reached, above, rotation, limits.min_motion_steps)
             body = robot.held_body()
             if body is not None:
-                self._take(body)
-                self._leave(rotation)
-        self._go_home()
+                self._attach(body)
+                self._retreat(rotation)
+        self._return_home()
         if self.held is None:
             robot.set_opening(self.opening)
         return self.held
@@ -158,15 +158,15 @@ class PickPlace:
 
         Out of reach, it stays in the gripper.
         """
-        if self._approach(position, rotation, self.limits.hover_m):
-            reached = self.robot.tool_transform()[0]
-            down = self._above(reached, rotation, -self.limits.hover_m)
-            self._travel(reached, down, rotation, self.limits.lower_steps)
-            self._release()
-            self._open()
+        if self._approach(position, rotation, self.limits.pre_place_height_m):
+            reached = self.robot.tool_frame()[0]
+            down = self._approach_point(reached, rotation, -self.limits.pre_place_height_m)
+            self._move_straight(reached, down, rotation, self.limits.lowering_steps)
+            self._detach()
+            self._open_fingers()
             if not self.teleport:
-                self._leave(rotation)
-        self._go_home()
+                self._retreat(rotation)
+        self._return_home()
         if self.held is None:
             self.robot.set_opening(self.opening)
 
@@ -177,7 +177,7 @@ class PickPlace:
 
     def set_state(self, state: HeldState) -> None:
         """Take up what `get_state` returned."""
-        self._release()
+        self._detach()
         self.held = None if state.held is None else self.world.bodies[state.held]
         self.grasp = state.grasp
         if self.held is not None:
@@ -185,29 +185,29 @@ class PickPlace:
 
     # -- what is held ------------------------------------------------------------------------
 
-    def _take(self, body: Body) -> None:
+    def _attach(self, body: Body) -> None:
         self.held = body
         body.is_hidden = True
-        self._remember_grasp()
+        self._measure_grasp()
 
-    def _release(self) -> None:
+    def _detach(self) -> None:
         if self.held is not None:
             self.held.is_hidden = False
         self.held = self.grasp = None
 
-    def _remember_grasp(self) -> None:
+    def _measure_grasp(self) -> None:
         """Measure where in the gripper the body is now."""
-        to_tool = bullet_inverse(self.robot.tool_transform())
+        to_tool = bullet_inverse(self.robot.tool_frame())
         self.grasp = bullet_compose(to_tool, self.held.pose)
 
-    def _carry(self, joints: Sequence[float]) -> None:
+    def _teleport(self, joints: Sequence[float]) -> None:
         """Teleport the arm, and rigidly with it what is held."""
         self.robot.teleport(joints)
         if self.held is not None:
             self.world.detect_collisions()  # contacts end: Bullet would not turn their normals
-            self.held.move_to(*bullet_compose(self.robot.tool_transform(), self.grasp))
+            self.held.set_pose(*bullet_compose(self.robot.tool_frame(), self.grasp))
 
-    def check_grasp(self) -> None:
+    def update_grasp(self) -> None:
         """Take note if what was held slipped out.
 
         Contacts need a step or two to be found again where body and hand were put; only a body
@@ -215,21 +215,21 @@ class PickPlace:
         """
         if self.held is None:
             return
-        for _ in range(self.limits.regrasp_steps):
+        for _ in range(self.limits.max_regrasp_steps):
             if self.robot.held_body() is self.held:
-                self._remember_grasp()
+                self._measure_grasp()
                 return
             self.world.step()
-        self._release()
+        self._detach()
 
     # -- ways --------------------------------------------------------------------------------
 
-    def _above(self, position: Vector, rotation: Matrix, height_m: float) -> Vector:
+    def _approach_point(self, position: Vector, rotation: Matrix, height_m: float) -> Vector:
         """Return the point from which the tool comes down to ``position``."""
         up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
         return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
 
-    def _above_surface(self, position: Vector, rotation: Matrix) -> Vector:
+    def _clear_of_surface(self, position: Vector, rotation: Matrix) -> Vector:
         """Return the point, raised if necessary so that the fingers close above the surface."""
         x, y, z = position
         gripper = self.robot.gripper
@@ -238,73 +238,85 @@ class PickPlace:
         return x, y, max(z, self.lowest_tool_m(gripper, (x, y), rotation, self.opening))
 
     def _tool_rotation(self) -> Matrix:
-        return quaternion_matrix(self.robot.tool_transform().orientation)
+        return quaternion_matrix(self.robot.tool_frame().orientation)
 
-    def _joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
+    def _solve_joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
 
     def _approach(self, position: Vector, rotation: Matrix, clearance_m: float) -> bool:
         """Bring the tool ``clearance_m`` above a pose; return False if that is out of reach."""
         limits = self.limits
-        end = self._above(position, rotation, clearance_m)
-        heights = (limits.approach_m, *limits.free_samples_m, 0.0)
-        way = [self._joints(self._above(end, rotation, height), rotation) for height in heights]
+        end = self._approach_point(position, rotation, clearance_m)
+        heights = (limits.approach_distance_m, *limits.approach_samples_m, 0.0)
+        way = [
+            self._solve_joints(self._approach_point(end, rotation, height), rotation)
+            for height in heights
+        ]
         if any(joints is None for joints in way):
             return False
         if self.teleport:
             for joints in way[1:]:
-                self._carry(joints)
+                self._teleport(joints)
                 if self._touches_anything():
                     break
             else:
                 return True
-            self._carry(way[0])
+            self._teleport(way[0])
         else:
-            self._swing_above(end, rotation)
-        self._travel(self._above(end, rotation, limits.approach_m), end, rotation, None)
-        self.check_grasp()
+            self._move_to_approach(end, rotation)
+        self._move_straight(
+            self._approach_point(end, rotation, limits.approach_distance_m), end, rotation, None
+        )
+        self.update_grasp()
         return True
 
-    def _leave(self, rotation: Matrix) -> None:
+    def _retreat(self, rotation: Matrix) -> None:
         """Go up from where the tool is, in simulation unless nothing is in the way."""
-        start = self.robot.tool_transform()[0]
+        start = self.robot.tool_frame()[0]
         if self.teleport:
             here = self.robot.joints
-            for height in reversed(self.limits.free_samples_m):
-                joints = self._joints(self._above(start, rotation, height), rotation)
+            for height in reversed(self.limits.approach_samples_m):
+                joints = self._solve_joints(self._approach_point(start, rotation, height), rotation)
                 if joints is None:
                     break
-                self._carry(joints)
+                self._teleport(joints)
                 if self._touches_anything():
                     break
             else:
                 return
-            self._carry(here)
-        self._travel(start, self._above(start, rotation, self.limits.approach_m), rotation, None)
-        self.check_grasp()
+            self._teleport(here)
+        self._move_straight(
+            start,
+            self._approach_point(start, rotation, self.limits.approach_distance_m),
+            rotation,
+            None,
+        )
+        self.update_grasp()
 
-    def _swing_above(self, end: Vector, rotation: Matrix) -> None:
+    def _move_to_approach(self, end: Vector, rotation: Matrix) -> None:
         """Swing high above everything, then come down to where the approach starts."""
-        start = self._above(end, rotation, self.limits.approach_m)
-        high = (*start[:2], max(self.limits.transit_z_m, start[2]))
-        joints = self._joints(high, rotation)
+        start = self._approach_point(end, rotation, self.limits.approach_distance_m)
+        high = (*start[:2], max(self.limits.transit_height_m, start[2]))
+        joints = self._solve_joints(high, rotation)
         if joints is None:
-            high, joints = start, self._joints(start, rotation)
-        self._swing(joints)
-        self._travel(high, start, rotation, None)
+            high, joints = start, self._solve_joints(start, rotation)
+        self._move_joints(joints)
+        self._move_straight(high, start, rotation, None)
 
-    def _go_home(self) -> None:
+    def _return_home(self) -> None:
         if self.teleport:
-            self._carry(self.robot.home_joints)
+            self._teleport(self.robot.home_joints)
         else:
-            x, y, z = self.robot.tool_transform()[0]
+            x, y, z = self.robot.tool_frame()[0]
             rotation = self._tool_rotation()
-            if z < self.limits.transit_z_m:
-                self._travel((x, y, z), (x, y, self.limits.transit_z_m), rotation, None)
-            self._swing(self.robot.home_joints)
-            self.check_grasp()
+            if z < self.limits.transit_height_m:
+                self._move_straight((x, y, z), (x, y, self.limits.transit_height_m), rotation, None)
+            self._move_joints(self.robot.home_joints)
+            self.update_grasp()
 
-    def _travel(self, start: Vector, end: Vector, rotation: Matrix, count: int | None) -> None:
+    def _move_straight(
+        self, start: Vector, end: Vector, rotation: Matrix, count: int | None
+    ) -> None:
         """Simulate a straight way of the tool; stop where it presses or leaves the reach.
 
         Args:
@@ -318,35 +330,39 @@ class PickPlace:
             most = limits.acceleration_m_s2
             if self.held is not None:
                 most = limits.held_acceleration_m_s2
-            count = max(limits.lift_steps, self._count(math.dist(start, end), most))
+            count = max(limits.min_motion_steps, self._num_steps(math.dist(start, end), most))
         goes_down = end[2] < start[2]
         for i in range(1, count + 1):
-            place = smooth_step(i / count)
+            place = quintic_time_scaling(i / count)
             point = tuple(s + place * (e - s) for s, e in zip(start, end, strict=True))
-            joints = self._joints(point, rotation)
+            joints = self._solve_joints(point, rotation)
             if joints is None:
                 return
             before = self.robot.joints
             self.robot.command(joints)
             self.world.step()
-            if goes_down and bearing_force_n(self._outer_contacts()) > limits.max_press_n:
+            if goes_down and vertical_force_n(self._outer_contacts()) > limits.max_vertical_force_n:
                 self.robot.command(before)
                 self.world.step()
                 return
 
-    def _swing(self, joints: Sequence[float]) -> None:
+    def _move_joints(self, joints: Sequence[float]) -> None:
         """Simulate a smooth move of the arm in joint angles."""
         start = self.robot.joints
         turns = [e - s for s, e in zip(start, joints, strict=True)]
         limits = self.limits
-        most = limits.swing_rad_s2 if self.held is None else limits.held_swing_rad_s2
-        count = max(2, self._count(max(map(abs, turns)), most))
+        most = (
+            limits.joint_acceleration_rad_s2
+            if self.held is None
+            else limits.held_joint_acceleration_rad_s2
+        )
+        count = max(2, self._num_steps(max(map(abs, turns)), most))
         for i in range(1, count + 1):
-            place = smooth_step(i / count)
+            place = quintic_time_scaling(i / count)
             self.robot.command([s + place * t for s, t in zip(start, turns, strict=True)])
             self.world.step()
 
-    def _count(self, length: float, acceleration: float) -> int:
+    def _num_steps(self, length: float, acceleration: float) -> int:
         """Return the number of steps for a smooth way whose acceleration is never above a limit."""
         duration_s = math.sqrt(PEAK_ACCELERATION * length / acceleration)
         return math.ceil(duration_s / self.world.physics.time_step_s)
@@ -360,28 +376,28 @@ class PickPlace:
 
     def _touches_anything(self) -> bool:
         self.world.detect_collisions()
-        return is_any_within(self._outer_contacts(), self.limits.margin_m)
+        return is_any_within(self._outer_contacts(), self.limits.contact_margin_m)
 
     # -- fingers -----------------------------------------------------------------------------
 
-    def _close(self) -> None:
+    def _close_fingers(self) -> None:
         """Close the fingers until they meet something, or each other."""
         if self.teleport:
             free = self.opening
-            for i in range(1, math.ceil(self.opening / self.limits.notch) + 1):
-                opening = max(self.opening - i * self.limits.notch, 0.0)
+            for i in range(1, math.ceil(self.opening / self.limits.closing_stride) + 1):
+                opening = max(self.opening - i * self.limits.closing_stride, 0.0)
                 self.robot.set_opening(opening)
                 if self._touches_anything():
                     break
                 free = opening
             self.robot.set_opening(free)
-        ramp_fingers(self.robot, 0.0, self.limits.closing_steps)
-        self.world.step(self.limits.squeeze_steps)
+        move_fingers(self.robot, 0.0, self.limits.max_closing_steps)
+        self.world.step(self.limits.grasp_settle_steps)
 
-    def _open(self) -> None:
+    def _open_fingers(self) -> None:
         """Let go of what is between the fingers, without pushing what stands beside it."""
         limits = self.limits
         if not self.teleport:
-            self.robot.renew_contacts()  # the hand turned since it closed
+            self.robot.rebuild_contacts()  # the hand turned since it closed
         wanted = min(self.robot.opening() + limits.release_opening, self.opening)
-        ramp_fingers(self.robot, wanted, limits.release_steps)
+        move_fingers(self.robot, wanted, limits.max_release_steps)

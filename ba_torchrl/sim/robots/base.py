@@ -10,7 +10,7 @@ import pybullet
 
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import CONTACT_M, contacts, is_any_within, nearest_points
+from ba_torchrl.sim.contacts import CONTACT_DISTANCE_M, contacts, is_any_within, nearest_points
 from ba_torchrl.sim.geometry import (
     IDENTITY,
     Matrix,
@@ -28,16 +28,16 @@ from ba_torchrl.sim.world import World
 
 ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
 
-CLOSING_COSINE = 0.7
+GRASP_NORMAL_COSINE = 0.7
 """A finger squeezes what it touches within 45 degrees of the line it closes on."""
 OPPOSED_COSINE = 0.8
 """Two fingers hold a body if they press on it from opposite sides, within the friction cone, as
 seen along the approach: the sides of a roof may slope. An edge pushed into the wedge between them
 meets their surfaces at twice that angle: it is not held."""
 
-_FAR_M = 10.0
+_DISTANT_M = 10.0
 
-QUERY_M = 2e-3
+GRASP_QUERY_M = 2e-3
 """Distance up to which a fresh query looks for the surfaces in contact."""
 
 
@@ -52,16 +52,16 @@ class Robot(ABC):
     arm_joints: ClassVar[tuple[int, ...]]
     finger_joints: ClassVar[tuple[int, ...]]
     """The two driven joints of the gripper, left and right."""
-    finger_signs: ClassVar[tuple[float, float]]
+    finger_open_signs: ClassVar[tuple[float, float]]
     """Sign of each finger's joint position when open."""
-    finger_open: ClassVar[float]
+    finger_open_position: ClassVar[float]
     """Joint position, up to the sign, of the fully open gripper: radians or metres, as are the
     finger speed and force below. Closed is zero."""
     finger_links: ClassVar[tuple[frozenset[int], frozenset[int]]]
     """Links that belong to the left and to the right finger."""
-    closing_sign: ClassVar[tuple[float, float]]
+    grasp_normal_signs: ClassVar[tuple[float, float]]
     """Sign along the tool's x axis in which each finger is pushed back by what it holds."""
-    passive_links: ClassVar[tuple[int, ...]]
+    non_colliding_links: ClassVar[tuple[int, ...]]
     """Links that collide with nothing: the arm, which stays above everything it works on."""
     hand_link: ClassVar[int]
     """The link that the tool point is fixed to."""
@@ -78,7 +78,7 @@ class Robot(ABC):
     """The close-loop camera hangs this far above the tool point."""
     finger_span_m: ClassVar[float]
     """Distance between the finger squares in the close-loop image when fully open."""
-    hand_half_m: ClassVar[tuple[float, float]] = (0.07, 0.03)
+    hand_half_extents_m: ClassVar[tuple[float, float]] = (0.07, 0.03)
     """Half the extents of the open hand above its fingertips, along the line on which it closes and
     across."""
 
@@ -96,8 +96,10 @@ class Robot(ABC):
         self.joints: list[float] = [0.0] * len(self.arm_joints)
         """Commanded arm joints in radians."""
         self.commanded_opening = 1.0
-        self._side = {link: side for side, links in enumerate(self.finger_links) for link in links}
-        for link in self.passive_links:
+        self._finger_of_link = {
+            link: side for side, links in enumerate(self.finger_links) for link in links
+        }
+        for link in self.non_colliding_links:
             pybullet.setCollisionFilterGroupMask(self.id, link, 0, 0, physicsClientId=self.client)
 
     @abstractmethod
@@ -118,7 +120,7 @@ class Robot(ABC):
 
     # -- for subclasses ----------------------------------------------------------------------
 
-    def _free_limits(self, robot: int) -> None:
+    def _widen_joint_limits(self, robot: int) -> None:
         """Widen the arm's joint limits: a joint put beyond one is flung back by its constraint."""
         for joint in self.arm_joints:
             pybullet.changeDynamics(
@@ -129,7 +131,7 @@ class Robot(ABC):
                 physicsClientId=self.client,
             )
 
-    def _gear(
+    def _add_gear(
         self, robot: int, first: int, second: int, ratio: float, max_force: float = 50
     ) -> None:
         """Couple two joints: the first moves by minus ``ratio`` times what the second does."""
@@ -179,7 +181,7 @@ class Robot(ABC):
         states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
         return [state[0] for state in states]
 
-    def tool_transform(self) -> Pose:
+    def tool_frame(self) -> Pose:
         """Return the pose of the tool."""
         state = pybullet.getLinkState(
             self.id, self.hand_link, computeForwardKinematics=1, physicsClientId=self.client
@@ -189,7 +191,7 @@ class Robot(ABC):
 
     def tool_pose(self) -> YawPose:
         """Return the tool point and the gripper's yaw in [-pi, pi)."""
-        tool = self.tool_transform()
+        tool = self.tool_frame()
         # the fingers open along the tool's x axis
         return tool.position, tool.yaw_rad
 
@@ -203,37 +205,39 @@ class Robot(ABC):
     def opening(self) -> float:
         """Return how far the gripper is open, 0 to 1."""
         states = pybullet.getJointStates(self.id, self.finger_joints, physicsClientId=self.client)
-        mean = sum(s * state[0] for s, state in zip(self.finger_signs, states, strict=True)) / 2
-        return min(max(mean / self.finger_open, 0.0), 1.0)
+        mean = (
+            sum(s * state[0] for s, state in zip(self.finger_open_signs, states, strict=True)) / 2
+        )
+        return min(max(mean / self.finger_open_position, 0.0), 1.0)
 
     def set_opening(self, opening: float) -> None:
         """Put the fingers at rest at an opening and hold them there."""
         pybullet.resetJointStatesMultiDof(
             self.id,
             self.finger_joints,
-            [[sign * opening * self.finger_open] for sign in self.finger_signs],
+            [[sign * opening * self.finger_open_position] for sign in self.finger_open_signs],
             [[0.0]] * len(self.finger_joints),
             physicsClientId=self.client,
         )
         self.commanded_opening = opening
-        self.hold_opening(opening)
+        self.command_opening(opening)
 
-    def hold_opening(self, opening: float) -> None:
+    def command_opening(self, opening: float) -> None:
         """Command the fingers to an opening."""
         if self.has_flat_pads and self.commanded_opening < min(opening, self.opening()) - 1e-3:
-            self.renew_contacts()  # they squeezed, now they let go
+            self.rebuild_contacts()  # they squeezed, now they let go
         pybullet.setJointMotorControlArray(
             self.id,
             self.finger_joints,
             pybullet.POSITION_CONTROL,
-            [sign * opening * self.finger_open for sign in self.finger_signs],
+            [sign * opening * self.finger_open_position for sign in self.finger_open_signs],
             forces=[self.finger_force] * 2,
             positionGains=[1.0] * 2,
             physicsClientId=self.client,
         )
         self.commanded_opening = opening
 
-    def renew_contacts(self) -> None:
+    def rebuild_contacts(self) -> None:
         """Have what the fingers touch lose and find its contacts anew, without moving it.
 
         Bullet keeps the normals of lasting contacts as they were in the world. Once the hand has
@@ -241,7 +245,9 @@ class Robot(ABC):
         the opening fingers off they would pull the body along.
         """
         touched = {
-            point.other_id for point in contacts(self.client, self.id) if point.link in self._side
+            point.other_id
+            for point in contacts(self.client, self.id)
+            if point.link in self._finger_of_link
         }
         bodies = [body.id for body in self.world.bodies if body.id in touched and body.is_free]
         kept = []
@@ -250,7 +256,7 @@ class Robot(ABC):
             velocity = pybullet.getBaseVelocity(body, physicsClientId=self.client)
             kept.append((body, pose, velocity))
             pybullet.resetBasePositionAndOrientation(
-                body, (_FAR_M, i * _FAR_M, _FAR_M), pose[1], physicsClientId=self.client
+                body, (_DISTANT_M, i * _DISTANT_M, _DISTANT_M), pose[1], physicsClientId=self.client
             )
         if kept:
             self.world.detect_collisions()
@@ -268,7 +274,7 @@ class Robot(ABC):
         """Repeat the commands that `get_state` returned."""
         joints, self.commanded_opening = state
         self.command(joints)
-        self.hold_opening(self.commanded_opening)
+        self.command_opening(self.commanded_opening)
 
     # -- contacts ----------------------------------------------------------------------------
 
@@ -281,8 +287,8 @@ class Robot(ABC):
         """
         touching: tuple[set[tuple[int, int]], ...] = (set(), set())
         for point in contacts(self.client, self.id):
-            side = self._side.get(point.link)
-            if side is not None and point.distance_m < CONTACT_M:
+            side = self._finger_of_link.get(point.link)
+            if side is not None and point.distance_m < CONTACT_DISTANCE_M:
                 touching[side].add((point.other_id, point.link))
         both = {body for body, _ in touching[0]} & {body for body, _ in touching[1]}
         for body in self.world.bodies:
@@ -292,17 +298,17 @@ class Robot(ABC):
 
     def _is_squeezed(self, body: Body, touching: tuple[set[tuple[int, int]], ...]) -> bool:
         """Whether a link of each finger pushes the body towards the other finger."""
-        axis, _, approach = zip(*quaternion_matrix(self.tool_transform().orientation), strict=True)
+        axis, _, approach = zip(*quaternion_matrix(self.tool_frame().orientation), strict=True)
         left, right = (
             [
                 point.normal
                 for body_id, link in links
                 if body_id == body.id
                 # a fresh query: normals of lasting contacts do not turn with the bodies
-                for point in nearest_points(self.client, self.id, body.id, QUERY_M, link)
-                if sign * dot(point.normal, axis) > CLOSING_COSINE
+                for point in nearest_points(self.client, self.id, body.id, GRASP_QUERY_M, link)
+                if sign * dot(point.normal, axis) > GRASP_NORMAL_COSINE
             ]
-            for sign, links in zip(self.closing_sign, touching, strict=True)
+            for sign, links in zip(self.grasp_normal_signs, touching, strict=True)
         )
         return any(
             dot(perpendicular(a, approach), perpendicular(b, approach)) < -OPPOSED_COSINE

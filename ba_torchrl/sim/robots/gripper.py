@@ -13,18 +13,18 @@ import pybullet
 from ba_torchrl.sim.geometry import Matrix, Vector, YawPose, downward
 from ba_torchrl.sim.world import World
 
-FLOOR_GAP_M = 1e-3
+FLOOR_CLEARANCE_M = 1e-3
 """Distance that fingertips keep from the floor while they close."""
-GRASPING_M = 0.02
+GRASP_HEIGHT_M = 0.02
 """Height above the tool point up to which fingers are beside what they grasp."""
-TIPS_M = 0.01
+TIP_HEIGHT_M = 0.01
 """The lowest part of the fingers, which counts as their tips."""
 
 _OPENINGS = tuple(np.linspace(0.0, 1.0, 9).tolist())
-_STRIDE_M = 5e-3
-_SPACING_M = 1e-3
-_HALF_U_M, _HALF_V_M = 0.14, 0.02
-_BELOW_M, _ABOVE_M = 0.05, 0.1
+_OUTLINE_SPACING_M = 5e-3
+_RAY_SPACING_M = 1e-3
+_MAX_U_M, _MAX_V_M = 0.14, 0.02
+_RAY_START_BELOW_M, _RAY_END_ABOVE_M = 0.05, 0.1
 _CHAMFER_M = 2e-3
 _RAYS_AT_ONCE = 8192
 _POSITION = (0.45, 0.0, 0.25)
@@ -66,7 +66,7 @@ class Gripper:
     """Half the fingertips' width, across the line on which they close."""
     closed_half_m: float
     """Half the extent of both fingertips along that line when they are closed."""
-    palm_m: float
+    palm_height_m: float
     """Height of the lowest part over the gap between the fingers, however wide it is."""
     arc: tuple[tuple[float, float], ...]
     """Half gaps from closed to open, and the height at which the fingers end there: those that
@@ -85,10 +85,10 @@ class Gripper:
     def finger_reach_m(self) -> float:
         """Distance from the tool point to the outside of the open fingers, where they grasp."""
         tips_m = self.half_gap_m + self.finger_depth_m
-        return max([tips_m, *(u for u, z in self.outline if z < GRASPING_M)])
+        return max([tips_m, *(u for u, z in self.outline if z < GRASP_HEIGHT_M)])
 
     @property
-    def lowest_m(self) -> float:
+    def lowest_tip_m(self) -> float:
         """Height at which the fingers end where their arc is lowest."""
         return min(z for _, z in self.arc)
 
@@ -96,7 +96,7 @@ class Gripper:
         """Return how far the closed hand reaches from the tool point below a height."""
         return max((u for u, z in self.closed_outline if z < height_m), default=0.0)
 
-    def tip_m(self, half_gap_m: float) -> float:
+    def tip_height_m(self, half_gap_m: float) -> float:
         """Return the height at which the fingers end, given half the distance between them."""
         gaps, heights = zip(*self.arc, strict=True)
         return float(np.interp(half_gap_m, gaps, heights))
@@ -119,7 +119,7 @@ class Gripper:
             abs(along) * min(gap, widest) + abs(across) * self.half_width_m + ahead * height
             for gap, height in self.arc
         ]
-        return max(depths) + FLOOR_GAP_M
+        return max(depths) + FLOOR_CLEARANCE_M
 
 
 @cache
@@ -129,8 +129,8 @@ def measured_gripper(robot: type[MeasurableRobot]) -> Gripper:
     Rays from below find the collision shapes as contacts do, their margins included. It takes a
     world of its own and tenths of a second, once in a process.
     """
-    us = np.arange(0.0, _HALF_U_M + _SPACING_M / 2, _SPACING_M)
-    vs = np.arange(-_HALF_V_M, _HALF_V_M + _SPACING_M / 2, _SPACING_M)
+    us = np.arange(0.0, _MAX_U_M + _RAY_SPACING_M / 2, _RAY_SPACING_M)
+    vs = np.arange(-_MAX_V_M, _MAX_V_M + _RAY_SPACING_M / 2, _RAY_SPACING_M)
     with World() as world:
         body = robot(world)
         body.teleport(body.inverse_kinematics(_POSITION, downward(0.0)))
@@ -145,9 +145,9 @@ def measured_gripper(robot: type[MeasurableRobot]) -> Gripper:
     tips = _are_tips(opened)
     return Gripper(
         half_gap_m=arc[-1][0],
-        half_width_m=float(np.abs(vs[tips.any(axis=0)]).max()) + _SPACING_M / 2,
-        closed_half_m=float(us[_are_tips(closed).any(axis=1)].max()) + _SPACING_M / 2,
-        palm_m=float(palm),
+        half_width_m=float(np.abs(vs[tips.any(axis=0)]).max()) + _RAY_SPACING_M / 2,
+        closed_half_m=float(us[_are_tips(closed).any(axis=1)].max()) + _RAY_SPACING_M / 2,
+        palm_height_m=float(palm),
         arc=tuple(arc),
         outline=_outline(us, opened),
         closed_outline=_outline(us, closed),
@@ -159,13 +159,13 @@ def _outline(us: np.ndarray, heights: np.ndarray) -> tuple[tuple[float, float], 
     profile = heights.min(axis=1)
     reach = us[np.isfinite(profile)].max()
     return tuple(
-        (float(u), float(profile[np.abs(us - u) < _STRIDE_M / 2].min()))
-        for u in np.arange(0.0, reach + _STRIDE_M / 2, _STRIDE_M)
+        (float(u), float(profile[np.abs(us - u) < _OUTLINE_SPACING_M / 2].min()))
+        for u in np.arange(0.0, reach + _OUTLINE_SPACING_M / 2, _OUTLINE_SPACING_M)
     )
 
 
 def _are_tips(heights: np.ndarray) -> np.ndarray:
-    return heights < heights.min() + TIPS_M
+    return heights < heights.min() + TIP_HEIGHT_M
 
 
 def _underside(
@@ -181,7 +181,7 @@ def _underside(
     grid = np.stack(np.meshgrid(np.concatenate([us, -us]), vs, indexing="ij"), -1).reshape(-1, 2)
     low, high = (
         np.column_stack([grid + np.array([x, y]), np.full(len(grid), z + height)])
-        for height in (-_BELOW_M, _ABOVE_M)
+        for height in (-_RAY_START_BELOW_M, _RAY_END_ABOVE_M)
     )
     hits = [
         hit

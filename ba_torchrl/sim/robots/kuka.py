@@ -24,11 +24,11 @@ class Kuka(Robot):
 
     arm_joints = tuple(range(7))
     finger_joints = (8, 11)
-    finger_signs = (-1.0, 1.0)
-    finger_open = 0.2
+    finger_open_signs = (-1.0, 1.0)
+    finger_open_position = 0.2
     finger_links = (frozenset({8, 9, 10}), frozenset({11, 12, 13}))
-    closing_sign = (-1.0, 1.0)
-    passive_links = tuple(range(-1, 7))
+    grasp_normal_signs = (-1.0, 1.0)
+    non_colliding_links = tuple(range(-1, 7))
     hand_link = 7
     tool_offset_m = (0.0, 0.0218, 0.222)
     home_joints = (1.128, 0.187, 0.0, -1.146, 0.0, 1.809, -2.014)
@@ -50,7 +50,7 @@ class Kuka(Robot):
             (0, 0, 0, 1),
             physicsClientId=self.client,
         )
-        self._free_limits(robot)
+        self._widen_joint_limits(robot)
         for joint in (7, *self._tip_joints):
             pybullet.setJointMotorControl2(
                 robot,
@@ -62,7 +62,7 @@ class Kuka(Robot):
                 physicsClientId=self.client,
             )
         # two force-limited fingers have no stiffness along their common axis: held bodies slide
-        self._gear(robot, *self.finger_joints, ratio=1)
+        self._add_gear(robot, *self.finger_joints, ratio=1)
         return robot
 
     def set_opening(self, opening: float) -> None:

@@ -24,16 +24,16 @@ _BASE_M = (-0.05, 0.0, 0.0)
 
 _SHOULDER_TO_ELBOW_M = math.hypot(_UPPER_ARM_M, _ELBOW_OFFSET_M)
 _ELBOW_TO_WRIST_M = math.hypot(_FOREARM_M, _ELBOW_OFFSET_M)
-_SHOULDER_SLANT = math.atan2(_ELBOW_OFFSET_M, _UPPER_ARM_M)
-_WRIST_SLANT = math.atan2(_ELBOW_OFFSET_M, _FOREARM_M)
-_HAND_ANGLE = math.pi / 4
+_SHOULDER_OFFSET_RAD = math.atan2(_ELBOW_OFFSET_M, _UPPER_ARM_M)
+_WRIST_OFFSET_RAD = math.atan2(_ELBOW_OFFSET_M, _FOREARM_M)
+_HAND_ANGLE_RAD = math.pi / 4
 """Angle of the fingers' line about the axis of joint 7."""
 
-_SWIVEL_ROUNDS = 6
-_SWIVEL_STRIDE = 1e-4
+_SWIVEL_ITERATIONS = 6
+_SWIVEL_DIFFERENCE_RAD = 1e-4
 _SWIVEL_DAMPING = 0.04
-_SWIVEL_LIMIT = 0.6
-_PRECISION = 1e-10
+_SWIVEL_LIMIT_RAD = 0.6
+_TOLERANCE = 1e-10
 
 
 @ROBOTS.register("panda")
@@ -42,18 +42,18 @@ class Panda(Robot):
 
     arm_joints = tuple(range(7))
     finger_joints = (9, 10)
-    finger_signs = (1.0, 1.0)
-    finger_open = 0.04
+    finger_open_signs = (1.0, 1.0)
+    finger_open_position = 0.04
     finger_links = (frozenset({9}), frozenset({10}))
-    closing_sign = (1.0, -1.0)
-    passive_links = (*range(-1, 8), 11)
+    grasp_normal_signs = (1.0, -1.0)
+    non_colliding_links = (*range(-1, 8), 11)
     hand_link = 8
     tool_offset_m = (0.0, 0.0, _TOOL_M)
     tool_orientation = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))  # the fingers open along y
     home_joints = (1.212, -0.42, 0.0, -2.188, 0.0, 1.768, 0.427)
     camera_height_m = 0.04
     finger_span_m = 42 * 0.3 / 128
-    hand_half_m = (0.105, 0.035)
+    hand_half_extents_m = (0.105, 0.035)
 
     finger_force = 10.0
     finger_speed = 0.4
@@ -66,9 +66,9 @@ class Panda(Robot):
             useFixedBase=True,
             physicsClientId=self.client,
         )
-        self._free_limits(robot)
+        self._widen_joint_limits(robot)
         # two force-limited fingers have no stiffness along their common axis: held bodies slide
-        self._gear(robot, *self.finger_joints, ratio=-1)
+        self._add_gear(robot, *self.finger_joints, ratio=-1)
         return robot
 
     def inverse_kinematics(
@@ -91,25 +91,25 @@ class Panda(Robot):
         start = perpendicular(outwards, approach)
         across = cross(approach, start)
 
-        def solve(turn: float) -> _Arm | None:
-            swivel = _SWIVEL_LIMIT * math.tanh(turn / _SWIVEL_LIMIT)
+        def solve(turn: float) -> _ArmConfiguration | None:
+            swivel = _SWIVEL_LIMIT_RAD * math.tanh(turn / _SWIVEL_LIMIT_RAD)
             cos, sin = math.cos(swivel), math.sin(swivel)
             offset = tuple(cos * s + sin * a for s, a in zip(start, across, strict=True))
-            return _solve(center, approach, offset)
+            return _solve_arm(center, approach, offset)
 
         turn = 0.0
         arm = solve(turn)
         if arm is None:
             return None
         # damped Gauss-Newton, a fixed number of rounds: smooth in the pose, converged or not
-        for _ in range(_SWIVEL_ROUNDS):
+        for _ in range(_SWIVEL_ITERATIONS):
             lean = dot(arm.upper_arm, beside)
-            if abs(lean) < _PRECISION:
+            if abs(lean) < _TOLERANCE:
                 break
-            ahead = solve(turn + _SWIVEL_STRIDE)
+            ahead = solve(turn + _SWIVEL_DIFFERENCE_RAD)
             if ahead is None:
                 break
-            slope = (dot(ahead.upper_arm, beside) - lean) / _SWIVEL_STRIDE
+            slope = (dot(ahead.upper_arm, beside) - lean) / _SWIVEL_DIFFERENCE_RAD
             turn -= lean * slope / (slope * slope + _SWIVEL_DAMPING)
             moved = solve(turn)
             if moved is None:
@@ -119,7 +119,7 @@ class Panda(Robot):
 
     def _joints(
         self,
-        arm: _Arm,
+        arm: _ArmConfiguration,
         outwards: Vector,
         finger: Vector,
         approach: Vector,
@@ -140,33 +140,33 @@ class Panda(Robot):
             c1, s1 = outwards[0], outwards[1]
         q2 = math.atan2(sign * level, uz)
         c2, s2 = math.cos(q2), math.sin(q2)
-        elbow_axis = cross(arm.lower_front, arm.forearm)  # of joint 4
+        elbow_axis = cross(arm.forearm_normal, arm.forearm)  # of joint 4
         upper_front = cross(arm.upper_arm, elbow_axis)
         q3 = math.atan2(dot(upper_front, (-s1, c1, 0.0)), dot(upper_front, (c1 * c2, s1 * c2, -s2)))
         across = cross(approach, arm.offset)  # axis of joint 6
-        q5 = math.atan2(dot(across, arm.lower_front), dot(across, elbow_axis))
-        q7 = math.atan2(dot(finger, across), dot(finger, arm.offset)) - _HAND_ANGLE
-        joints = [math.atan2(s1, c1), q2, q3, arm.bend, q5, arm.wrist, q7]
+        q5 = math.atan2(dot(across, arm.forearm_normal), dot(across, elbow_axis))
+        q7 = math.atan2(dot(finger, across), dot(finger, arm.offset)) - _HAND_ANGLE_RAD
+        joints = [math.atan2(s1, c1), q2, q3, arm.elbow_rad, q5, arm.wrist, q7]
         if near is not None:
             full = 2 * math.pi
             joints = [q + full * round((n - q) / full) for q, n in zip(joints, near, strict=True)]
         return joints
 
 
-class _Arm(NamedTuple):
+class _ArmConfiguration(NamedTuple):
     """Directions of the links, and the two angles that follow from lengths alone."""
 
     upper_arm: Vector
     forearm: Vector
-    lower_front: Vector
+    forearm_normal: Vector
     """Of the forearm, perpendicular to it, to the inside of the elbow."""
     offset: Vector
     """From the axis of joint 6 to that of joint 7."""
-    bend: float
+    elbow_rad: float
     wrist: float
 
 
-def _solve(center: Vector, approach: Vector, offset: Vector) -> _Arm | None:
+def _solve_arm(center: Vector, approach: Vector, offset: Vector) -> _ArmConfiguration | None:
     """Solve the arm that ends at a point of the axis of joint 7, given the wrist's offset.
 
     Args:
@@ -181,9 +181,9 @@ def _solve(center: Vector, approach: Vector, offset: Vector) -> _Arm | None:
     )
     if abs(cos_elbow) > 1:
         return None
-    bend = math.acos(cos_elbow) - _SHOULDER_SLANT - _WRIST_SLANT - math.pi
+    elbow_rad = math.acos(cos_elbow) - _SHOULDER_OFFSET_RAD - _WRIST_OFFSET_RAD - math.pi
     # angle of the forearm with the line from wrist to shoulder; it is perpendicular to joint 6
-    slant = _WRIST_SLANT + math.acos(
+    slant = _WRIST_OFFSET_RAD + math.acos(
         min(
             (distance**2 + _ELBOW_TO_WRIST_M**2 - _SHOULDER_TO_ELBOW_M**2)
             / (2 * distance * _ELBOW_TO_WRIST_M),
@@ -208,4 +208,4 @@ def _solve(center: Vector, approach: Vector, offset: Vector) -> _Arm | None:
         (_UPPER_ARM_M * e + _ELBOW_OFFSET_M * t) / _SHOULDER_TO_ELBOW_M**2
         for e, t in zip(elbow, turned, strict=True)
     )
-    return _Arm(upper_arm, forearm, front, offset, bend, angle)
+    return _ArmConfiguration(upper_arm, forearm, front, offset, elbow_rad, angle)

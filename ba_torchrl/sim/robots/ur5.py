@@ -35,7 +35,7 @@ class UR5(Robot):
     gripper_model: ClassVar[str]
 
     arm_joints = tuple(range(6))
-    passive_links = tuple(range(-1, 6))
+    non_colliding_links = tuple(range(-1, 6))
     hand_link = 6
     finger_span_m = 42 * 0.3 / 128
 
@@ -44,7 +44,7 @@ class UR5(Robot):
         robot = _load_joined(
             (_MODELS / "ur5_arm.urdf", _MODELS / self.gripper_model), _BASE_M, self.client
         )
-        self._free_limits(robot)
+        self._widen_joint_limits(robot)
         return robot
 
     def inverse_kinematics(
@@ -97,10 +97,10 @@ class UR5ParallelJaw(UR5):
     gripper_model = "parallel_jaw.urdf"
 
     finger_joints = (7, 8)
-    finger_signs = (1.0, 1.0)
-    finger_open = 0.04
+    finger_open_signs = (1.0, 1.0)
+    finger_open_position = 0.04
     finger_links = (frozenset({7}), frozenset({8}))
-    closing_sign = (1.0, -1.0)
+    grasp_normal_signs = (1.0, -1.0)
     tool_offset_m = (0.0, 0.0, 0.1413)
     home_joints = (0.954, -1.732, 1.566, -1.404, -1.571, -0.617)
     camera_height_m = 0.06
@@ -112,7 +112,7 @@ class UR5ParallelJaw(UR5):
         """Load the robot with a gear between its fingers."""
         robot = super().load()
         # two force-limited fingers have no stiffness along their common axis: held bodies slide
-        self._gear(robot, *self.finger_joints, ratio=-1)
+        self._add_gear(robot, *self.finger_joints, ratio=-1)
         return robot
 
 
@@ -123,14 +123,14 @@ class UR5Robotiq(UR5):
     gripper_model = "robotiq_2f85.urdf"
 
     finger_joints = (7, 10)
-    finger_signs = (1.0, 1.0)
-    finger_open = 0.8
+    finger_open_signs = (1.0, 1.0)
+    finger_open_position = 0.8
     finger_links = (frozenset({7, 8, 9}), frozenset({10, 11, 12}))
-    closing_sign = (1.0, -1.0)
+    grasp_normal_signs = (1.0, -1.0)
     tool_offset_m = (0.0, 0.0, 0.1543)
     home_joints = (0.954, -1.727, 1.529, -1.372, -1.571, -0.617)
     camera_height_m = 0.04
-    hand_half_m = (0.08, 0.03)
+    hand_half_extents_m = (0.08, 0.03)
 
     finger_force = 0.6
     finger_speed = 7.5
@@ -146,8 +146,8 @@ class UR5Robotiq(UR5):
                 robot, joint, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=self.client
             )
         for joint, driver in self._followers.items():
-            self._gear(robot, driver, joint, ratio=-1)
-        self._gear(robot, *self.finger_joints, ratio=-1)
+            self._add_gear(robot, driver, joint, ratio=-1)
+        self._add_gear(robot, *self.finger_joints, ratio=-1)
         return robot
 
     def set_opening(self, opening: float) -> None:
@@ -155,7 +155,7 @@ class UR5Robotiq(UR5):
         pybullet.resetJointStatesMultiDof(
             self.id,
             list(self._followers),
-            [[opening * self.finger_open]] * len(self._followers),
+            [[opening * self.finger_open_position]] * len(self._followers),
             [[0.0]] * len(self._followers),
             physicsClientId=self.client,
         )

@@ -19,23 +19,23 @@ from typing import Protocol
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Decal, Shape
 from ba_torchrl.sim.geometry import Quaternion, Vector, quaternion_yaw
 from ba_torchrl.sim.meshes import Mesh
+from ba_torchrl.sim.shapes import Decal, Shape
 from ba_torchrl.sim.vision.kernels import (
-    floor_depth,
-    lower_depth,
     paint_square,
-    raise_heights,
+    rasterize_depth,
+    rasterize_floor,
+    rasterize_heights,
+    rotate_about,
     splat,
     transform,
-    turn_about,
     unproject,
 )
 from ba_torchrl.sim.vision.lens import FAR_M, NEAR_M, Lens, Range
 
 
-class Visible(Protocol):
+class Renderable(Protocol):
     """What a camera needs to know of a body."""
 
     shape: Shape
@@ -47,7 +47,7 @@ class Visible(Protocol):
 
 
 @dataclass(frozen=True)
-class Placed:
+class PosedShape:
     """A shape at a fixed pose that exists for cameras only."""
 
     shape: Shape
@@ -55,17 +55,17 @@ class Placed:
     is_hidden: bool = False
 
 
-class Surface:
+class SceneMesh:
     """The surface of a set of bodies, wherever they are now; hidden ones do not count.
 
     Args:
         bodies: all that may become visible.
     """
 
-    def __init__(self, bodies: Iterable[Visible]) -> None:
+    def __init__(self, bodies: Iterable[Renderable]) -> None:
         bodies = list(bodies)
         self._decals = [
-            body for body in bodies if isinstance(body.shape, Decal) and body.shape.depth_m
+            body for body in bodies if isinstance(body.shape, Decal) and body.shape.recess_depth_m
         ]
         self._bodies = [body for body in bodies if not isinstance(body.shape, Decal)]
         self._meshes: list[Mesh | None] = [None] * len(self._bodies)
@@ -89,7 +89,7 @@ class Surface:
             if not decal.is_hidden:
                 (x, y, _), turn = decal.pose
                 yaw = quaternion_yaw(turn)
-                half, depth = decal.shape.size_m[0] / 2, decal.shape.depth_m
+                half, depth = decal.shape.size_m[0] / 2, decal.shape.recess_depth_m
                 rows.append((x, y, half, math.cos(yaw), math.sin(yaw), depth))
         return np.array(rows).reshape(-1, 6)
 
@@ -119,7 +119,7 @@ class Surface:
                 (dx / pixel_m, dy / pixel_m),
                 decal.shape.size_m[0] / 2 / pixel_m,
                 quaternion_yaw(turn) - yaw_rad,
-                -decal.shape.depth_m,
+                -decal.shape.recess_depth_m,
             )
 
     def _collect(self, shown: list[int]) -> None:
@@ -151,8 +151,8 @@ class HeightCamera:
         bodies: what the camera sees besides the floor (height 0).
     """
 
-    def __init__(self, bodies: Sequence[Visible]) -> None:
-        self.surface = Surface(bodies)
+    def __init__(self, bodies: Sequence[Renderable]) -> None:
+        self.surface = SceneMesh(bodies)
 
     def heightmap(
         self, center_m: tuple[float, float], side_m: float, pixels: int, yaw_rad: float = 0.0
@@ -174,12 +174,12 @@ class HeightCamera:
         self.surface.paint_recesses(image, (x0, y0), pixel, yaw_rad)
         vertices, faces = self.surface.triangles()
         if yaw_rad:
-            turn_about(vertices, float(center_m[0]), float(center_m[1]), -float(yaw_rad))
-        raise_heights(vertices, faces, x0, y0, pixel, image)
+            rotate_about(vertices, float(center_m[0]), float(center_m[1]), -float(yaw_rad))
+        rasterize_heights(vertices, faces, x0, y0, pixel, image)
         return image
 
 
-def depth_image(surfaces: Sequence[Surface], lens: Lens, pixels: int) -> np.ndarray:
+def depth_image(surfaces: Sequence[SceneMesh], lens: Lens, pixels: int) -> np.ndarray:
     """Return the depth of surfaces and floor in perspective.
 
     Through a dip of the floor one sees a floor that much lower.
@@ -196,24 +196,24 @@ def depth_image(surfaces: Sequence[Surface], lens: Lens, pixels: int) -> np.ndar
     return _depth(surfaces, lens, pixels, recesses)
 
 
-def _recesses(surfaces: Sequence[Surface]) -> np.ndarray:
+def _recesses(surfaces: Sequence[SceneMesh]) -> np.ndarray:
     return np.concatenate([np.empty((0, 6)), *(surface.recesses() for surface in surfaces)])
 
 
 def _depth(
-    surfaces: Sequence[Surface], lens: Lens, pixels: int, recesses: np.ndarray
+    surfaces: Sequence[SceneMesh], lens: Lens, pixels: int, recesses: np.ndarray
 ) -> np.ndarray:
     image = np.empty((pixels, pixels))
     eye, focal = np.array(lens.eye_m, dtype=float), lens.focal_px(pixels)
-    floor_depth(eye, lens.axes, focal, FAR_M, recesses, image)
+    rasterize_floor(eye, lens.axes, focal, FAR_M, recesses, image)
     for surface in surfaces:
         vertices, faces = surface.triangles()
-        lower_depth(vertices, faces, eye, lens.axes, focal, NEAR_M, image)
+        rasterize_depth(vertices, faces, eye, lens.axes, focal, NEAR_M, image)
     return image
 
 
 def visible_points(
-    surfaces: Sequence[Surface],
+    surfaces: Sequence[SceneMesh],
     lenses: Sequence[Lens],
     pixels: int,
     bounds_m: tuple[Range, Range, Range],
@@ -245,7 +245,7 @@ def visible_points(
 
 
 def point_cloud(
-    surfaces: Sequence[Surface],
+    surfaces: Sequence[SceneMesh],
     lenses: Sequence[Lens],
     count: int,
     bounds_m: tuple[Range, Range, Range],

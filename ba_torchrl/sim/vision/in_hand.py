@@ -85,7 +85,7 @@ class ProjectedImage(InHandImage):
         cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
         voxels = np.zeros((size, size, size), dtype=bool)
         voxels[tuple(cells.T)] = True
-        voxels = _median_of_eight(voxels)
+        voxels = _median_filter(voxels)
         return np.stack([voxels.sum(axis=axis) for axis in range(3)]).astype(np.float64)
 
 
@@ -121,7 +121,7 @@ def crop(
     )
 
 
-def _median_of_eight(voxels: np.ndarray) -> np.ndarray:
+def _median_filter(voxels: np.ndarray) -> np.ndarray:
     """Return which cells have four of the eight cells filled that end at them along each axis."""
     padded = np.pad(voxels, ((1, 0), (1, 0), (1, 0)), mode="edge").astype(np.int8)
     n = voxels.shape[0]

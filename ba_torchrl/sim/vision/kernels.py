@@ -28,7 +28,7 @@ def transform(vertices, owner, poses, out):
 
 
 @numba.njit(cache=True)
-def turn_about(vertices, x0, y0, yaw):
+def rotate_about(vertices, x0, y0, yaw):
     """Turn the vertices in place about the vertical through (x0, y0)."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     for v in range(vertices.shape[0]):
@@ -38,7 +38,7 @@ def turn_about(vertices, x0, y0, yaw):
 
 
 @numba.njit(cache=True)
-def raise_heights(vertices, faces, x0, y0, pixel, image):
+def rasterize_heights(vertices, faces, x0, y0, pixel, image):
     """Raise ``image`` to the height of the upward faces, seen from straight above."""
     rows, cols = image.shape
     for f in range(faces.shape[0]):
@@ -95,7 +95,7 @@ def paint_square(
 
 
 @numba.njit(cache=True)
-def dip_at(x, y, recesses):
+def recess_depth_at(x, y, recesses):
     """Return how deep the floor dips at a point; a dip is x, y, half edge, cos, sin, depth."""
     depth = 0.0
     for d in range(recesses.shape[0]):
@@ -107,7 +107,7 @@ def dip_at(x, y, recesses):
 
 
 @numba.njit(cache=True)
-def floor_depth(eye, axes, focal, far, recesses, depth):
+def rasterize_floor(eye, axes, focal, far, recesses, depth):
     """Fill ``depth`` with the floor's; the rows of ``axes`` point down, right and forward.
 
     Through a dip one looks on to a floor that much lower.
@@ -122,12 +122,12 @@ def floor_depth(eye, axes, focal, far, recesses, depth):
             if reach < far:
                 x = eye[0] + reach * (axes[2, 0] + p * axes[0, 0] + q * axes[1, 0])
                 y = eye[1] + reach * (axes[2, 1] + p * axes[0, 1] + q * axes[1, 1])
-                reach += dip_at(x, y, recesses) / fall
+                reach += recess_depth_at(x, y, recesses) / fall
             depth[i, j] = min(reach, far)
 
 
 @numba.njit(cache=True)
-def _fill(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
+def _rasterize_triangle(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
     """Lower ``depth`` to a triangle given by row, column and depth of its corners."""
     area = (bp - ap) * (cq - aq) - (cp - ap) * (bq - aq)
     if area <= 1e-12:
@@ -146,7 +146,7 @@ def _fill(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
 
 
 @numba.njit(cache=True)
-def lower_depth(vertices, faces, eye, axes, focal, near, depth):
+def rasterize_depth(vertices, faces, eye, axes, focal, near, depth):
     """Lower ``depth`` to the faces seen in perspective; what is nearer than ``near`` is cut off."""
     rows, cols = depth.shape
     seen = np.empty_like(vertices)  # along the image's rows, its columns, and in depth
@@ -176,7 +176,7 @@ def lower_depth(vertices, faces, eye, axes, focal, near, depth):
             a0, a1, a2 = corner[0]
             b0, b1, b2 = corner[k]
             c0, c1, c2 = corner[k + 1]
-            _fill(a0, a1, a2, b0, b1, b2, c0, c1, c2, depth)
+            _rasterize_triangle(a0, a1, a2, b0, b1, b2, c0, c1, c2, depth)
 
 
 @numba.njit(cache=True)
@@ -196,7 +196,7 @@ def unproject(depth, eye, axes, focal, recesses, low, high, out, start):
             y = eye[1] + t * (axes[2, 1] + p * axes[0, 1] + q * axes[1, 1])
             z = eye[2] + t * (axes[2, 2] + p * axes[0, 2] + q * axes[1, 2])
             if z < 1e-9:
-                z -= dip_at(x, y, recesses)
+                z -= recess_depth_at(x, y, recesses)
             if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] - 1e-9 <= z <= high[2]:
                 out[count, 0], out[count, 1], out[count, 2] = x, y, z
                 count += 1

@@ -53,7 +53,7 @@ class Lens:
         fall = self.axes[2, 2] + offsets[:, None] * self.axes[0, 2] + offsets * self.axes[1, 2]
         return self.eye_m[2] + depth * fall
 
-    def plane_depth_m(self, z_m: float) -> Range:
+    def plane_depth_range_m(self, z_m: float) -> Range:
         """Return the least and greatest depth at which the image shows a horizontal plane.
 
         Args:

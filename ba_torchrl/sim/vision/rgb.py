@@ -12,25 +12,25 @@ from collections.abc import Sequence
 import numpy as np
 import pybullet
 
-from ba_torchrl.sim.bodies import Decal
 from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.lens import Lens
 from ba_torchrl.sim.world import World
 
 RGBD_RANGE_M = (0.1, 5.0)
 """Near and far end of what `render_rgbd` shows."""
 
-LIGHT_FLOOR = (0.95, 0.95, 0.93)
+DEFAULT_FLOOR_RGB = (0.95, 0.95, 0.93)
 
-_LIGHT: Vector = (0.30, -0.35, 1.0)
+_LIGHT_DIRECTION: Vector = (0.30, -0.35, 1.0)
 """Direction towards the light."""
-_LAMP_M = 4.0
+_LIGHT_DISTANCE_M = 4.0
 """Distance of the lamp; TinyRenderer has no use for one infinitely far."""
 _SHADOW_WIDTH_M = 2.0
 _SHADOW_PIXELS = 240
 _SHADOW_BLUR = 2
 _SHADOW_DEPTH = 0.3
-_LENS_DEG = 40.0
+_FOV_DEG = 40.0
 
 
 def render_rgb(
@@ -41,7 +41,7 @@ def render_rgb(
     distance_m: float = 1.05,
     yaw_deg: float = 62.0,
     pitch_deg: float = -27.0,
-    floor_rgb: tuple[float, float, float] | None = LIGHT_FLOOR,
+    floor_rgb: tuple[float, float, float] | None = DEFAULT_FLOOR_RGB,
 ) -> np.ndarray:
     """Return a picture of the whole scene, arm included, for people to look at.
 
@@ -63,19 +63,19 @@ def render_rgb(
     view = pybullet.computeViewMatrixFromYawPitchRoll(
         target_m, distance_m, yaw_deg, pitch_deg, 0, 2
     )
-    projection = pybullet.computeProjectionMatrixFOV(_LENS_DEG, width / height, 0.05, 10.0)
-    rgb, _, parts = _draw(world, width, height, view, projection, links=True)
+    projection = pybullet.computeProjectionMatrixFOV(_FOV_DEG, width / height, 0.05, 10.0)
+    rgb, _, parts = _render(world, width, height, view, projection, links=True)
     owner = np.where(parts >= 0, parts & 0xFFFFFF, -1)
-    picture = rgb.astype(np.float32)
+    image = rgb.astype(np.float32)
     floor = owner == world.floor
     if floor_rgb is not None:
-        picture[floor] = np.multiply(floor_rgb, 255.0)
+        image[floor] = np.multiply(floor_rgb, 255.0)
     flat = np.isin(owner, [world.floor, *_decals(world)])
     rows, cols = np.nonzero(flat)
     points = _floor_points(view, width, height, rows, cols)
-    shade = _shade(world, target_m, points)
-    picture[rows, cols] *= (1 - _SHADOW_DEPTH * shade)[:, None]
-    return _smooth_edges(picture, parts).round().astype(np.uint8)
+    shade = _shadow(world, target_m, points)
+    image[rows, cols] *= (1 - _SHADOW_DEPTH * shade)[:, None]
+    return _smooth_edges(image, parts).round().astype(np.uint8)
 
 
 def render_rgbd(world: World, lens: Lens, pixels: int) -> tuple[np.ndarray, np.ndarray]:
@@ -93,11 +93,11 @@ def render_rgbd(world: World, lens: Lens, pixels: int) -> tuple[np.ndarray, np.n
     near, far = RGBD_RANGE_M
     view = pybullet.computeViewMatrix(lens.eye_m, lens.target_m, (-lens.axes[0]).tolist())
     projection = pybullet.computeProjectionMatrixFOV(math.degrees(lens.fov_rad), 1.0, near, far)
-    rgb, buffer, _ = _draw(world, pixels, pixels, view, projection)
+    rgb, buffer, _ = _render(world, pixels, pixels, view, projection)
     return rgb, far * near / (far - (far - near) * buffer.astype(float))
 
 
-def _draw(
+def _render(
     world: World,
     width: int,
     height: int,
@@ -121,7 +121,7 @@ def _draw(
         view,
         projection,
         shadow=0,
-        lightDirection=_LIGHT,
+        lightDirection=_LIGHT_DIRECTION,
         lightAmbientCoeff=0.6,
         lightDiffuseCoeff=0.45,
         lightSpecularCoeff=0.05,
@@ -144,30 +144,30 @@ def _floor_points(
     pose = np.reshape(view, (4, 4)).T
     turn = pose[:3, :3]  # rows: right, up, backward
     eye = -turn.T @ pose[:3, 3]
-    edge = math.tan(math.radians(_LENS_DEG) / 2)
+    edge = math.tan(math.radians(_FOV_DEG) / 2)
     right = (2 * (cols + 0.5) / width - 1) * edge * width / height
     up = (1 - 2 * (rows + 0.5) / height) * edge
     rays = right[:, None] * turn[0] + up[:, None] * turn[1] - turn[2]
     return eye[:2] + rays[:, :2] * (eye[2] / np.maximum(-rays[:, 2:], 1e-6))
 
 
-def _shade(world: World, target_m: Vector, points: np.ndarray) -> np.ndarray:
+def _shadow(world: World, target_m: Vector, points: np.ndarray) -> np.ndarray:
     """Return how much of the light is blocked at points [N, 2] of the floor, 0 to 1."""
     size, reach = _SHADOW_PIXELS, _SHADOW_WIDTH_M / 2
-    toward = np.array(_LIGHT) / np.linalg.norm(_LIGHT)
+    toward = np.array(_LIGHT_DIRECTION) / np.linalg.norm(_LIGHT_DIRECTION)
     right = np.cross((1.0, 0.0, 0.0), toward)
     right /= np.linalg.norm(right)
     up = np.cross(toward, right)
     middle = np.array([target_m[0], target_m[1], 0.0])
-    lamp = middle + _LAMP_M * toward
+    lamp = middle + _LIGHT_DISTANCE_M * toward
     view = pybullet.computeViewMatrix(lamp.tolist(), middle.tolist(), up.tolist())
-    fov = 2 * math.degrees(math.atan(reach / _LAMP_M))
-    projection = pybullet.computeProjectionMatrixFOV(fov, 1.0, 1.0, 2 * _LAMP_M)
-    _, _, owner = _draw(world, size, size, view, projection)
+    fov = 2 * math.degrees(math.atan(reach / _LIGHT_DISTANCE_M))
+    projection = pybullet.computeProjectionMatrixFOV(fov, 1.0, 1.0, 2 * _LIGHT_DISTANCE_M)
+    _, _, owner = _render(world, size, size, view, projection)
     blocked = ~np.isin(owner, [-1, world.floor, *_decals(world)])
     soft = _blurred(_blurred(blocked.astype(np.float32)))
     offset = np.pad(points, ((0, 0), (0, 1))) - lamp
-    scale = size / _SHADOW_WIDTH_M * _LAMP_M / -(offset @ toward)
+    scale = size / _SHADOW_WIDTH_M * _LIGHT_DISTANCE_M / -(offset @ toward)
     col = np.clip(size / 2 + offset @ right * scale - 0.5, 0, size - 1.001)
     row = np.clip(size / 2 - offset @ up * scale - 0.5, 0, size - 1.001)
     i, j = row.astype(int), col.astype(int)
@@ -192,7 +192,7 @@ def _blurred(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _smooth_edges(picture: np.ndarray, parts: np.ndarray) -> np.ndarray:
+def _smooth_edges(image: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """Return the picture with the borders between its parts blended, as finer pixels would be."""
     edge = np.zeros(parts.shape, dtype=bool)
     for axis in (0, 1):
@@ -202,11 +202,11 @@ def _smooth_edges(picture: np.ndarray, parts: np.ndarray) -> np.ndarray:
         edge[low] |= differs
         edge[high] |= differs
     rows, cols = np.nonzero(edge)
-    padded = np.pad(picture, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
     mixed = np.zeros((len(rows), 3), dtype=np.float32)
     for i, a in enumerate((0.25, 0.5, 0.25)):
         for j, b in enumerate((0.25, 0.5, 0.25)):
             mixed += a * b * padded[rows + i, cols + j]
-    smooth = picture.copy()
+    smooth = image.copy()
     smooth[rows, cols] = mixed
     return smooth

@@ -29,12 +29,12 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import YawPose, yaw_quaternion
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
-    Placed,
-    Surface,
+    PosedShape,
+    SceneMesh,
     depth_image,
     splat_heightmap,
     visible_points,
@@ -46,13 +46,13 @@ from ba_torchrl.sim.world import World
 
 VIEWS: Registry[View] = Registry("view type", "ba_torchrl.sim")
 
-FINGER_GLYPH_HALF_M = 5 * 0.3 / 128
+FINGER_SQUARE_HALF_M = 5 * 0.3 / 128
 """Half the edge of the square that stands for a finger."""
 FINGER_LENGTH_M = 0.1
 """Height of the post that stands for a finger in oblique views."""
-DEEPEST_RECESS_M = 0.02
+MAX_RECESS_M = 0.02
 """Goal areas appear as dips of this depth."""
-HEADROOM_M = 0.04
+FIXED_CAMERA_CLEARANCE_M = 0.04
 """Cameras at a fixed height hang this far above the workspace: 0.29 m by default."""
 
 
@@ -79,9 +79,9 @@ class ViewSetup:
     finger_span_m: float
 
     @property
-    def ceiling_m(self) -> float:
+    def fixed_camera_z_m(self) -> float:
         """Height of the cameras that do not follow the tool."""
-        return self.z_m[1] + HEADROOM_M
+        return self.z_m[1] + FIXED_CAMERA_CLEARANCE_M
 
 
 @dataclass(frozen=True)
@@ -136,29 +136,29 @@ class TopDown(View):
 
     follows_xy: bool
     follows_z: bool
-    turns: bool
+    follows_yaw: bool
     shows_height: bool
 
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the range of depth below camera, of depth below the tool, or of height."""
         low, high = setup.z_m
         if self.shows_height:
-            top = high + setup.camera_height_m if self.follows_z else setup.ceiling_m
-            return -DEEPEST_RECESS_M, top
+            top = high + setup.camera_height_m if self.follows_z else setup.fixed_camera_z_m
+            return -MAX_RECESS_M, top
         if self.follows_z:
-            return 0.0, high + setup.camera_height_m + DEEPEST_RECESS_M
-        return low - setup.ceiling_m, high + DEEPEST_RECESS_M
+            return 0.0, high + setup.camera_height_m + MAX_RECESS_M
+        return low - setup.fixed_camera_z_m, high + MAX_RECESS_M
 
     def image(self, seen: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
         setup, ((x, y, z), yaw) = seen.setup, seen.tool
         center = (x, y) if self.follows_xy else setup.center_m
-        turn = yaw if self.turns else 0.0
+        turn = yaw if self.follows_yaw else 0.0
         heights = seen.camera.heightmap(center, setup.width_m, setup.pixels, turn)
-        camera_z = z + setup.camera_height_m if self.follows_z else setup.ceiling_m
-        return self.finish(seen, heights, center, turn, camera_z)
+        camera_z = z + setup.camera_height_m if self.follows_z else setup.fixed_camera_z_m
+        return self.to_values(seen, heights, center, turn, camera_z)
 
-    def finish(
+    def to_values(
         self,
         seen: ViewInput,
         heights: np.ndarray,
@@ -192,7 +192,7 @@ class TopDown(View):
             values,
             (setup.pixels / 2 + dx / pixel, setup.pixels / 2 + dy / pixel),
             seen.finger_offset_m / pixel,
-            FINGER_GLYPH_HALF_M / pixel,
+            FINGER_SQUARE_HALF_M / pixel,
             yaw - turn_rad,
             z if self.shows_height else 0.0,
         )
@@ -200,7 +200,7 @@ class TopDown(View):
 
 
 @dataclass(frozen=True)
-class Splatted(View):
+class PointSplat(View):
     """Points that two cameras beside the workspace see, looked at from straight above the tool.
 
     Only points below the fingers count, or the arm of a real robot would hide the scene; what
@@ -213,10 +213,10 @@ class Splatted(View):
     shows_height: bool
 
     # the reference's 5 cm are a block's height: a hair decided whether its top was seen
-    _least_ceiling_m: ClassVar[float] = 0.055
+    _min_ceiling_m: ClassVar[float] = 0.055
     _clearance_m: ClassVar[float] = 0.01
-    _resolution: ClassVar[int] = 2  # pixels of the cameras for each pixel of the image
-    _most_pixels: ClassVar[int] = 1024
+    _camera_pixels_per_pixel: ClassVar[int] = 2  # pixels of the cameras for each pixel of the image
+    _max_pixels: ClassVar[int] = 1024
 
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the range of depth below the tool, or of height."""
@@ -225,28 +225,28 @@ class Splatted(View):
     def image(self, seen: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
         setup, ((x, y, z), _) = seen.setup, seen.tool
-        ceiling = max(z - self._clearance_m, self._least_ceiling_m)
+        ceiling = max(z - self._clearance_m, self._min_ceiling_m)
         # wherever in the workspace the tool is, the image lies in sight
         lenses = side_lenses(setup.center_m, setup.workspace_m + setup.width_m)
         everywhere = (-math.inf, math.inf)
         points = visible_points(
             [seen.camera.surface],
             lenses,
-            min(self._resolution * setup.pixels, self._most_pixels),
+            min(self._camera_pixels_per_pixel * setup.pixels, self._max_pixels),
             (everywhere, everywhere, (-math.inf, ceiling)),
         )
         heights = splat_heightmap(points, (x, y), setup.width_m, setup.pixels)
-        return self._top_down.finish(seen, heights, (x, y), 0.0, ceiling)
+        return self._top_down.to_values(seen, heights, (x, y), 0.0, ceiling)
 
     @property
     def _top_down(self) -> TopDown:
         return TopDown(
-            follows_xy=True, follows_z=False, turns=False, shows_height=self.shows_height
+            follows_xy=True, follows_z=False, follows_yaw=False, shows_height=self.shows_height
         )
 
 
 @dataclass(frozen=True)
-class Overhead(View):
+class PerspectiveTopDown(View):
     """A perspective camera that hangs above the tool and looks straight down.
 
     The values are depths below the camera, the same for all of the floor. The fingers are drawn
@@ -257,7 +257,7 @@ class Overhead(View):
 
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the range of depth below the camera."""
-        return 0.0, setup.z_m[1] + setup.camera_height_m + DEEPEST_RECESS_M
+        return 0.0, setup.z_m[1] + setup.camera_height_m + MAX_RECESS_M
 
     def image(self, seen: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
@@ -270,7 +270,7 @@ class Overhead(View):
             values,
             (setup.pixels / 2, setup.pixels / 2),
             seen.finger_offset_m * scale,
-            FINGER_GLYPH_HALF_M * scale,
+            FINGER_SQUARE_HALF_M * scale,
             yaw,
             0.0,
         )
@@ -290,15 +290,17 @@ class Oblique(View):
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the range of depth from the workspace's ceiling to the floor, or of height."""
         if self.shows_height:
-            return -DEEPEST_RECESS_M, setup.ceiling_m
+            return -MAX_RECESS_M, setup.fixed_camera_z_m
         lens = oblique_lens(setup.center_m)
-        return lens.plane_depth_m(setup.ceiling_m)[0], lens.plane_depth_m(-DEEPEST_RECESS_M)[1]
+        return lens.plane_depth_range_m(setup.fixed_camera_z_m)[0], lens.plane_depth_range_m(
+            -MAX_RECESS_M
+        )[1]
 
     def image(self, seen: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
         setup = seen.setup
         lens = oblique_lens(setup.center_m)
-        fingers = finger_posts(seen.tool, seen.finger_offset_m)
+        fingers = finger_boxes(seen.tool, seen.finger_offset_m)
         values = depth_image([seen.camera.surface, fingers], lens, setup.pixels)
         if self.shows_height:
             values = lens.heights_m(values)
@@ -323,7 +325,7 @@ class ObliqueRgbd(View):
         return np.concatenate([np.moveaxis(rgb / 255.0, -1, 0), depth[None]])
 
 
-def finger_posts(tool: YawPose, offset_m: float) -> Surface:
+def finger_boxes(tool: YawPose, offset_m: float) -> SceneMesh:
     """Return two upright posts that stand for the fingers.
 
     Args:
@@ -331,9 +333,9 @@ def finger_posts(tool: YawPose, offset_m: float) -> Surface:
         offset_m: distance of each post's axis from the tool point.
     """
     (x, y, z), yaw = tool
-    post = Box(size_m=(2 * FINGER_GLYPH_HALF_M, 2 * FINGER_GLYPH_HALF_M, FINGER_LENGTH_M))
-    return Surface(
-        Placed(
+    post = Box(size_m=(2 * FINGER_SQUARE_HALF_M, 2 * FINGER_SQUARE_HALF_M, FINGER_LENGTH_M))
+    return SceneMesh(
+        PosedShape(
             post,
             (
                 (x + side * math.cos(yaw), y + side * math.sin(yaw), z + FINGER_LENGTH_M / 2),
@@ -370,10 +372,10 @@ for _axes in ("xyz", "xyzr", "xyr", "xy", "z"):
         TopDown,
         follows_xy="x" in _axes,
         follows_z="z" in _axes,
-        turns="r" in _axes,
+        follows_yaw="r" in _axes,
     )
-_register("camera_fix", TopDown, follows_xy=False, follows_z=False, turns=False)
-_register("render_center", Splatted)
+_register("camera_fix", TopDown, follows_xy=False, follows_z=False, follows_yaw=False)
+_register("render_center", PointSplat)
 _register("camera_side", Oblique)
 VIEWS.register("camera_side_rgbd")(ObliqueRgbd())
-VIEWS.register("pers_center_xyz")(Overhead(math.radians(70)))
+VIEWS.register("pers_center_xyz")(PerspectiveTopDown(math.radians(70)))

@@ -9,8 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand
-from ba_torchrl.sim.bodies import Body, Solid, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.meshes import bowl_parts, centroid
+from ba_torchrl.sim.shapes import Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import BLUE, CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import CLOSED, OPEN, move_toward, pick_up, travel

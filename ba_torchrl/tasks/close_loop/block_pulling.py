@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand
-from ba_torchrl.sim.bodies import Body, Box
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import BLUE, RED, CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import behind_point, push

@@ -9,8 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand
-from ba_torchrl.sim.bodies import Body, Decal
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose
+from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.tasks.base import BLOCK_M, TASKS
 from ba_torchrl.tasks.close_loop_task import GREEN, CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import push
@@ -32,7 +33,7 @@ class BlockPushing(CloseLoopTask):
         """Load the block and the goal area."""
         self.block = self.world.add(self.cube(), "block")
         size = (self.goal_size_m, self.goal_size_m, 1e-3)
-        self.goal = self.world.add(Decal(size_m=size, color=GREEN, depth_m=0.02), "goal")
+        self.goal = self.world.add(Decal(size_m=size, color=GREEN, recess_depth_m=0.02), "goal")
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Put block and goal at least 9 cm apart; with fixed orientations, along y."""

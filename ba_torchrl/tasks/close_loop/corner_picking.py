@@ -9,10 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, Box, Color, Solid, vertical_extent
-from ba_torchrl.sim.contacts import bearing_force_n, contacts, gap_m
+from ba_torchrl.sim.bodies import Body, vertical_extent
+from ba_torchrl.sim.contacts import contacts, gap_m, vertical_force_n
 from ba_torchrl.sim.geometry import PlanarFrame
-from ba_torchrl.sim.meshes import box_mesh, moved
+from ba_torchrl.sim.meshes import box_mesh, transform_mesh
+from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.clearance import reach_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
@@ -86,8 +87,8 @@ class CornerPicking(CloseLoopTask):
         edge, wall = self.base_m / 2, self.wall_m
         height = self.wall_height_m * self.settings.scale
         parts = (
-            moved(box_mesh((wall, 2 * edge + wall / 2, height)), (-edge, -wall / 4, 0.0)),
-            moved(box_mesh((2 * edge - wall / 2, wall, height)), (wall / 4, -edge, 0.0)),
+            transform_mesh(box_mesh((wall, 2 * edge + wall / 2, height)), (-edge, -wall / 4, 0.0)),
+            transform_mesh(box_mesh((2 * edge - wall / 2, wall, height)), (wall / 4, -edge, 0.0)),
         )
         self.walls = self.world.add(Solid(parts=parts, mass_kg=0, color=WALL), "walls")
 
@@ -124,7 +125,7 @@ class CornerPicking(CloseLoopTask):
             return lift(limits.step_m)
         yaw = robot.tool_pose()[1]
         touching = contacts(self.world.client, robot.id, block.id)
-        is_pressing = robot.opening() < 0.5 and bearing_force_n(touching) > FIRM_N
+        is_pressing = robot.opening() < 0.5 and vertical_force_n(touching) > FIRM_N
         yaws = [
             nearest_equivalent_yaw(yaw, block.yaw_rad + k * math.pi / 2, limits, math.pi)
             for k in (0, 1)
@@ -163,7 +164,7 @@ class CornerPicking(CloseLoopTask):
     @property
     def _tips_below_m(self) -> float:
         """How far below the tool point the closed fingers end."""
-        return -self.robot.gripper.tip_m(0.0)
+        return -self.robot.gripper.tip_height_m(0.0)
 
     def _press(self) -> GripperCommand:
         """Go over the block with closed fingers, come down to it, and press."""

@@ -10,10 +10,11 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.articulated import Rail
-from ba_torchrl.sim.bodies import Body, Color, Solid
+from ba_torchrl.sim.articulated import PrismaticJoint
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
-from ba_torchrl.sim.meshes import Mesh, box_mesh, moved, rod_mesh
+from ba_torchrl.sim.meshes import Mesh, box_mesh, rod_mesh, transform_mesh
+from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.clearance import passing_height_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
@@ -79,7 +80,7 @@ class DrawerOpening(CloseLoopTask):
                 mass_kg=0.5,
                 color=LIGHT_WOOD,
             ),
-            Rail(range_m=(low * scale, high * scale), friction_n=self.friction_n),
+            PrismaticJoint(limits_m=(low * scale, high * scale), friction_n=self.friction_n),
             "cabinet",
         )
 
@@ -152,7 +153,7 @@ class DrawerOpening(CloseLoopTask):
         is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
         if is_beside and turn <= ALIGNED_RAD and is_closed:
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
-        across = 2 * finger if turn < SLIGHT_TURN_RAD else robot.hand_half_m[0]
+        across = 2 * finger if turn < SLIGHT_TURN_RAD else robot.hand_half_extents_m[0]
         is_over_cabinet = ahead < front + across
         top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
         over_z = top + passing_height_m(robot.gripper)
@@ -201,11 +202,11 @@ def cabinet_parts() -> tuple[Mesh, ...]:
     side = (depth, WALL_M, height - 2 * WALL_M)
     y = (width - WALL_M) / 2
     return (
-        moved(box_mesh((depth, width, WALL_M)), (0.0, 0.0, WALL_M / 2)),
-        moved(box_mesh((depth, width, WALL_M)), (0.0, 0.0, height - WALL_M / 2)),
-        moved(box_mesh(side), (0.0, y, height / 2)),
-        moved(box_mesh(side), (0.0, -y, height / 2)),
-        moved(
+        transform_mesh(box_mesh((depth, width, WALL_M)), (0.0, 0.0, WALL_M / 2)),
+        transform_mesh(box_mesh((depth, width, WALL_M)), (0.0, 0.0, height - WALL_M / 2)),
+        transform_mesh(box_mesh(side), (0.0, y, height / 2)),
+        transform_mesh(box_mesh(side), (0.0, -y, height / 2)),
+        transform_mesh(
             box_mesh((WALL_M, width - 2 * WALL_M, height - 2 * WALL_M)),
             ((WALL_M - depth) / 2, 0.0, height / 2),
         ),
@@ -229,17 +230,21 @@ def drawer_parts() -> tuple[Mesh, ...]:
     post = box_mesh((limits, POST_M, POST_M))
     rod = rod_mesh(ROD_LENGTH_M, ROD_DIAMETER_M)
     return (
-        moved(box_mesh((length, outer, DRAWER_WALL_M)), (middle, 0.0, low + DRAWER_WALL_M / 2)),
-        moved(box_mesh((length, DRAWER_WALL_M, rise)), (middle, side_y, rim_z)),
-        moved(box_mesh((length, DRAWER_WALL_M, rise)), (middle, -side_y, rim_z)),
-        moved(
+        transform_mesh(
+            box_mesh((length, outer, DRAWER_WALL_M)), (middle, 0.0, low + DRAWER_WALL_M / 2)
+        ),
+        transform_mesh(box_mesh((length, DRAWER_WALL_M, rise)), (middle, side_y, rim_z)),
+        transform_mesh(box_mesh((length, DRAWER_WALL_M, rise)), (middle, -side_y, rim_z)),
+        transform_mesh(
             box_mesh((DRAWER_WALL_M, outer - 2 * DRAWER_WALL_M, rise)),
             (back_x + DRAWER_WALL_M / 2, 0.0, rim_z),
         ),
-        moved(box_mesh((WALL_M, outer, high - low)), (front_x - WALL_M / 2, 0.0, (low + high) / 2)),
-        moved(post, (front_x + limits / 2, post_y, ROD_HEIGHT_M)),
-        moved(post, (front_x + limits / 2, -post_y, ROD_HEIGHT_M)),
-        moved(rod, (front_x + limits, 0.0, ROD_HEIGHT_M)),
+        transform_mesh(
+            box_mesh((WALL_M, outer, high - low)), (front_x - WALL_M / 2, 0.0, (low + high) / 2)
+        ),
+        transform_mesh(post, (front_x + limits / 2, post_y, ROD_HEIGHT_M)),
+        transform_mesh(post, (front_x + limits / 2, -post_y, ROD_HEIGHT_M)),
+        transform_mesh(rod, (front_x + limits, 0.0, ROD_HEIGHT_M)),
     )
 
 

@@ -119,7 +119,7 @@ class Clutter:
                 x, y = center + rng.uniform(WALL_M - half_m, half_m - WALL_M, 2)
                 turn = _random_turn(rng) if settings.random_orientation else (0.0, 0.0, 0.0, 1.0)
                 pool.activate(bodies[i])
-                bodies[i].move_to((x, y, DROP_Z_M), turn)
+                bodies[i].set_pose((x, y, DROP_Z_M), turn)
                 world.step(pause)
             if world.settle(round(SETTLE_S / world.physics.time_step_s)):
                 break

@@ -72,10 +72,10 @@ class GraspPlanner:
         self._jaws = _Jaws(
             half_gap=gripper.half_gap_m,
             band_half=self.band_half_m,
-            palm=gripper.palm_m,
+            palm=gripper.palm_height_m,
             depth=gripper.finger_depth_m,
-            arc_u=np.array([u for u, _ in gripper.arc]),
-            arc_z=np.array([z for _, z in gripper.arc]),
+            arc_u=np.array([u for u, _ in gripper.tip_arc]),
+            arc_z=np.array([z for _, z in gripper.tip_arc]),
             outline_u=outline[:, 0].copy(),
             outline_z=outline[:, 1].copy(),
         )

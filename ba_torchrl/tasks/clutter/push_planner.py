@@ -60,7 +60,7 @@ class PushPlanner:
         self._grasps = grasps
         self._tray = tray
         gripper = grasps.gripper
-        self._tip_m = gripper.tip_m(0.0)
+        self._tip_m = gripper.tip_height_m(0.0)
         """Height at which the closed fingers end, above the tool point."""
         self._standoff_m = gripper.closed_half_m + BEHIND_M
         """A push starts this far from the surface."""

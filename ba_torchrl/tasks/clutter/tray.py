@@ -7,10 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, Color, Solid
-from ba_torchrl.sim.geometry import Matrix, Quaternion, Vector, yaw_quaternion
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import Matrix, Pose, yaw_quaternion
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain import Terrain
 from ba_torchrl.tasks.workspace import Workspace
@@ -100,11 +101,9 @@ class Tray(Terrain):
         """
         return gripper.lowest_tool_m(rotation, opening)
 
-    def surface_pose(
-        self, xy: tuple[float, float], yaw_rad: float = 0.0
-    ) -> tuple[Vector, Quaternion]:
-        """Return the upright frame at a point of the base."""
-        return (*xy, FLOOR_Z_M), yaw_quaternion(yaw_rad)
+    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
+        """Return the pose of an upright frame on the base."""
+        return Pose((*xy, FLOOR_Z_M), yaw_quaternion(yaw_rad))
 
 
 _SIGNS = ((-1, -1), (1, -1), (1, 1), (-1, 1))

@@ -10,9 +10,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Body, Box, Color, Shape, Solid, vertical_extent, world_vertices
+from ba_torchrl.sim.bodies import Body, vertical_extent, world_vertices
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_mesh
+from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool

@@ -9,9 +9,10 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import lathe_parts
+from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clearance import half_gap_m, outline_clearance_m

@@ -10,9 +10,10 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.bodies import Body, Box, Color, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
+from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import move_out_of_scene
 from ba_torchrl.tasks.clearance import grasp_clearance_m
@@ -329,7 +330,7 @@ class CovidTest(OpenLoopTask):
             along_rad: how it is to lie in that frame; a gripper that cannot turn leaves it.
             rim_m: height that the fingertips stay above.
         """
-        tool = self.robot.tool_transform()
+        tool = self.robot.tool_frame()
         others = [other.position for other in self.objects if other is not held]
         x, y = max(
             (self._to_world(area, spot) for spot in spots),
@@ -345,7 +346,7 @@ class CovidTest(OpenLoopTask):
     @property
     def _grasp_m(self) -> float:
         """Height of the tool above what an object lies on, for the lower part of a swab."""
-        return TIPS_GAP_M - self.robot.gripper.lowest_m
+        return TIPS_GAP_M - self.robot.gripper.lowest_tip_m
 
     def _grasp_yaw(self, body: Body) -> float:
         return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0

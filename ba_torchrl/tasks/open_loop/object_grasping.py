@@ -60,8 +60,8 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
             xy: of the target.
         """
         gripper = self.robot.gripper
-        tips_m = gripper.tip_m(USUAL_WIDTH_M / 2)
-        depth_m = min(gripper.palm_m - PALM_GAP_M, DEEPEST_M + tips_m)
+        tips_m = gripper.tip_height_m(USUAL_WIDTH_M / 2)
+        depth_m = min(gripper.palm_height_m - PALM_GAP_M, DEEPEST_M + tips_m)
         return max(top_m - depth_m, self.terrain.height_m(xy) + FLOOR_GAP_M - tips_m)
 
     def window_m(self, held: Body | None) -> float:

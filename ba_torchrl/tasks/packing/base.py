@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 import pybullet
 
 from ba_torchrl.actions import PickPlaceCommand
-from ba_torchrl.sim.bodies import Body, Color, Solid, vertical_extent
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
-from ba_torchrl.sim.meshes import box_mesh, frame_parts, joined, moved
+from ba_torchrl.sim.meshes import box_mesh, frame_parts, merge_meshes, transform_mesh
+from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clearance import half_gap_m, hand_rectangle, outline_clearance_m
@@ -63,10 +64,12 @@ def open_box(size_m: Vector, wall_m: float, floor_m: float, color: Color) -> Blo
     x, y, z = size_m
     walls = frame_parts(size_m, wall_m)
     inside = (x - 2 * wall_m, y - 2 * wall_m)
-    sheet = moved(box_mesh((*inside, floor_m)), (0.0, 0.0, (floor_m - z) / 2))
+    sheet = transform_mesh(box_mesh((*inside, floor_m)), (0.0, 0.0, (floor_m - z) / 2))
     depth = floor_m + UNDERGROUND_M
-    slab = moved(box_mesh((*inside, depth)), (0.0, 0.0, floor_m - (z + depth) / 2))
-    return Blocks(parts=(*walls, slab), surface=joined([*walls, sheet]), mass_kg=0.0, color=color)
+    slab = transform_mesh(box_mesh((*inside, depth)), (0.0, 0.0, floor_m - (z + depth) / 2))
+    return Blocks(
+        parts=(*walls, slab), surface=merge_meshes([*walls, sheet]), mass_kg=0.0, color=color
+    )
 
 
 class PackingTask(OpenLoopControl, Task):
@@ -140,7 +143,7 @@ class PackingTask(OpenLoopControl, Task):
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         gripper = self.robot.gripper
         others = self.obstacles(body, height + self.tips_m)
-        tall = self.obstacles(body, height + gripper.palm_m)
+        tall = self.obstacles(body, height + gripper.palm_height_m)
         half_open = half_gap_m(gripper, self.finger_opening)
         choices = []
         for side in narrowest(body, None if self.action_limits.turn_rad else 0.0):
@@ -163,7 +166,7 @@ class PackingTask(OpenLoopControl, Task):
             position: of its origin.
             turn_rad: about the vertical, from how it is held now.
         """
-        tool = self.robot.tool_transform()
+        tool = self.robot.tool_frame()
         yaw = (tool.yaw_rad + turn_rad) % math.pi if self.action_limits.turn_rad else 0.0
         if yaw > math.pi - TURN_MARGIN_RAD:
             yaw = 0.0
@@ -173,7 +176,7 @@ class PackingTask(OpenLoopControl, Task):
     def tips_m(self) -> float:
         """Height above the tool point at which the open fingers end."""
         gripper = self.robot.gripper
-        return gripper.tip_m(self.finger_opening * gripper.half_gap_m)
+        return gripper.tip_height_m(self.finger_opening * gripper.half_gap_m)
 
     def release_half_m(self, held: Body) -> float:
         """Return how far from the tool point the fingers' inner sides are as they let go."""

@@ -61,7 +61,7 @@ def scatter(
                     body.resized(footprint.hand_x, footprint.hand_y) if footprint.hand_x else None
                 )
                 if clear_of is not None:
-                    whole_hand = body.resized(*task.robot.hand_half_m)
+                    whole_hand = body.resized(*task.robot.hand_half_extents_m)
                     if gap_m(whole_hand, clear_of) < 0:
                         continue
                 if body.is_inside(task.settings.workspace) and all(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import CONTACT_M, contacts
+from ba_torchrl.sim.contacts import CONTACT_DISTANCE_M, contacts
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
@@ -50,7 +50,7 @@ def read_piece_states(
     for body, piece in pieces.items():
         touched, below = set(), set()
         for point in contacts(world.client, body.id):
-            if point.distance_m >= CONTACT_M:
+            if point.distance_m >= CONTACT_DISTANCE_M:
                 continue
             touched.add(point.other_id)
             other = by_id.get(point.other_id)

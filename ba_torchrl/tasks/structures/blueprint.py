@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ba_torchrl.sim.bodies import Body, Shape
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Vector, quaternion_matrix
+from ba_torchrl.sim.shapes import Shape
 from ba_torchrl.tasks.workspace import Spot
 
 UPRIGHT_RAD = math.pi / 9

@@ -10,8 +10,9 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand
-from ba_torchrl.sim.bodies import Body, Color
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.shapes import Color
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.clearance import grasp_clearance_m
 from ba_torchrl.tasks.close_loop_task import BLUE, GREEN, RED, CloseLoopControl

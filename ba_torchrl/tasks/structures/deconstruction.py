@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.geometry import (
     ORIGIN,
     PlanarFrame,
@@ -102,7 +102,7 @@ class Deconstruction(OpenLoopTask):
             if not slot.on
             and (planner.blueprint.partner(i) is None or planner.blueprint.partner(i) > i)
         ]
-        room = 2 * max(map(radius_m, bodies)) + self.block_m
+        room = 2 * max(map(footprint_radius_m, bodies)) + self.block_m
         centers = dict(
             zip(grounded, self.random_points(rng, [Spot(room, room)] * len(grounded)), strict=True)
         )
@@ -279,11 +279,11 @@ class Deconstruction(OpenLoopTask):
 
     def _put_away(self, held: Body) -> PickPlaceCommand:
         """Return the place on the first of many random sites that has room enough."""
-        tool, pose = self.robot.tool_transform(), held.pose
+        tool, pose = self.robot.tool_frame(), held.pose
         others = [other for other in self.objects if other is not held]
         shadows = [_shadow(world_vertices(other)[:, :2]) for other in others]
         outline = world_vertices(held)[:, :2] - held.position[:2]
-        border = radius_m(held) + self.block_m / 4
+        border = footprint_radius_m(held) + self.block_m / 4
         ranges = self.terrain.build_area.shrunk(border)
         rise_m = held.position[2] - vertical_extent(held)[0]
         rng = self._generator()

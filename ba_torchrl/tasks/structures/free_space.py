@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, radius_m, vertical_extent, world_vertices
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.geometry import Vector
 
 SPOT_STEP_M = 0.02
@@ -65,8 +65,8 @@ def placement_deficit_m(
         return outside
     at = np.array([other.position[:2] for other in others])
     gaps = np.hypot(*(spots[:, None] - at).transpose(2, 0, 1))
-    room = (gaps - [radius_m(other) for other in others]).min(axis=1)
-    return outside + np.maximum(area.gap_m + radius_m(body) - room, 0.0)
+    room = (gaps - [footprint_radius_m(other) for other in others]).min(axis=1)
+    return outside + np.maximum(area.gap_m + footprint_radius_m(body) - room, 0.0)
 
 
 def extent_along_m(body: Body, ways: np.ndarray) -> np.ndarray:

@@ -14,8 +14,8 @@ import numpy as np
 from ba_torchrl.sim.assets.cache import cached_parts
 from ba_torchrl.sim.assets.hulls import convex_hull, surface_samples, volume_and_center
 from ba_torchrl.sim.assets.random_shapes import UNIT_M, read_shape, shape_path
-from ba_torchrl.sim.bodies import Box, Color, Shape, Solid
 from ba_torchrl.sim.meshes import Mesh
+from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
 from ba_torchrl.tasks.structures.blueprint import CUBOID, Piece, Span
 from ba_torchrl.tasks.structures.parts import BLUE
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, radius_m
+from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, downward_pose
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.clearance import grasp_clearance_m, hand_clearance_m, path_clearance_m
@@ -201,11 +201,11 @@ class StructureTask(OpenLoopControl, GraspQueries, Task):
         """Return the gap between the hand, open around a body, and some others."""
         at = body.position if at is None else at
         (x, y), z = _tool_point(at, candidate), at[2]
-        extent = math.hypot(*self.robot.hand_half_m) + AMPLE_M
+        extent = math.hypot(*self.robot.hand_half_extents_m) + AMPLE_M
         others = [
             other
             for other in others
-            if math.dist(other.position[:2], (x, y)) < extent + radius_m(other)
+            if math.dist(other.position[:2], (x, y)) < extent + footprint_radius_m(other)
         ]
         gripper, yaw = self.robot.gripper, candidate.yaw_rad
         if candidate.shift_m:
@@ -232,7 +232,7 @@ class StructureTask(OpenLoopControl, GraspQueries, Task):
             low, high = other.shape.bounds_m
             load = tuple(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True))
             yaws.append([grasps[0], grasps[-1], self.planner.pieces[other].yaw_rad(other)])
-            halves.append([self.robot.hand_half_m, self.robot.hand_half_m, load])
+            halves.append([self.robot.hand_half_extents_m, self.robot.hand_half_extents_m, load])
         x, y = np.moveaxis(sites[:, :, None] - centers, 3, 0)[..., None]  # [S, P, rest, 1]
         cos, sin = np.cos(yaws), np.sin(yaws)
         half_along, half_across = np.moveaxis(np.array(halves), 2, 0)
@@ -270,7 +270,7 @@ class StructureTask(OpenLoopControl, GraspQueries, Task):
 
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings what is held to where it goes."""
-        tool, held = self.robot.tool_transform(), move.body.pose
+        tool, held = self.robot.tool_frame(), move.body.pose
         yaw = tool.yaw_rad
         if not self.action_limits.turn_rad:
             yaw = 0.0

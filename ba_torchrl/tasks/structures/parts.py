@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from ba_torchrl.sim.bodies import Box, Color, Solid
-from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, moved
+from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, transform_mesh
+from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.tasks.structures.blueprint import (
     CUBE,
     CUBOID,
@@ -44,7 +44,9 @@ def cylinder(block_m: float) -> Piece:
     """Return an upright cylinder, as high as it is wide."""
     radius, half = block_m / 2, block_m / 2
     (upright,) = lathe_parts(((radius, -half), (radius, half)), CYLINDER_SIDES)
-    mesh = moved(upright, (0.0, 0.0, 0.0), math.pi / CYLINDER_SIDES)  # sides, not edges, across x
+    mesh = transform_mesh(
+        upright, (0.0, 0.0, 0.0), math.pi / CYLINDER_SIDES
+    )  # sides, not edges, across x
     shape = Solid(parts=(mesh,), color=ORANGE)
     return replace(CYLINDER, shape=shape, spot=_spot(SHORT_SPOT * block_m))
 

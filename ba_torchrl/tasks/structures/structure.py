@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, radius_m
+from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
@@ -99,7 +99,7 @@ class Structure:
         """
         spots, largest_radius_m = [], 0.0
         for body, piece in self.pieces.items():
-            radius = radius_m(body)
+            radius = footprint_radius_m(body)
             padding_m, distance_m = (2 * radius, 0.0) if piece.spot is None else piece.spot
             spots.append(Spot(padding_m, max(distance_m, radius + largest_radius_m + gap_m)))
             largest_radius_m = max(largest_radius_m, radius)

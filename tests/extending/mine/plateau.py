@@ -1,7 +1,7 @@
 """A terrain: a level plateau above the floor, and a stack that is built on it."""
 
-from ba_torchrl.sim.bodies import Box
-from ba_torchrl.sim.geometry import yaw_quaternion
+from ba_torchrl.sim.geometry import Pose, yaw_quaternion
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
 from ba_torchrl.tasks.structures.open_loop import StructureTask
@@ -30,8 +30,8 @@ class Plateau(Terrain):
         return HEIGHT_M
 
     def surface_pose(self, xy, yaw_rad=0.0):
-        """Return the upright frame on the slab."""
-        return (*xy, HEIGHT_M), yaw_quaternion(yaw_rad)
+        """Return the pose of an upright frame on the slab."""
+        return Pose((*xy, HEIGHT_M), yaw_quaternion(yaw_rad))
 
 
 @TASKS.register("mine/stack_on_plateau")

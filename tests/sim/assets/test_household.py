@@ -7,7 +7,7 @@ import pybullet
 
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.assets.household import ITEMS
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.control.pick_place import (
     PEAK_ACCELERATION,
     PickPlace,
     PickPlaceLimits,
-    smooth_step,
+    quintic_time_scaling,
 )
 from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import Physics, World
 
 B = 0.03
@@ -45,13 +45,13 @@ class Table:
     def pick(self, x, y, z, rz=0.0, ry=0.0, rx=0.0):
         body = self.hand.pick((x, y, z), tool_rotation(rz, ry, rx))
         self.world.settle()
-        self.hand.check_grasp()
+        self.hand.update_grasp()
         return body
 
     def place(self, x, y, z, rz=0.0, ry=0.0, rx=0.0):
         self.hand.place((x, y, z), tool_rotation(rz, ry, rx))
         self.world.settle()
-        self.hand.check_grasp()
+        self.hand.update_grasp()
 
 
 @pytest.fixture
@@ -104,10 +104,10 @@ def test_a_tilted_block_is_picked_along_its_normal(table, tilt_rad):
     slope = (0.2, 0.2, 0.02)
     t = table(1, static=[(slope, (0.5, 0.0, 0.06))])
     turn = pybullet.getQuaternionFromEuler((tilt_rad, 0.0, 0.0))
-    t.things[0].move_to((0.5, 0.0, 0.06), turn)
+    t.things[0].set_pose((0.5, 0.0, 0.06), turn)
     normal = np.reshape(pybullet.getMatrixFromQuaternion(turn), (3, 3))[:, 2]
     block = t.blocks[0]
-    block.move_to(tuple(np.array((0.5, 0.0, 0.06)) + (0.01 + B / 2) * normal), turn)
+    block.set_pose(tuple(np.array((0.5, 0.0, 0.06)) + (0.01 + B / 2) * normal), turn)
     t.world.settle()
     assert block.tilt_rad == pytest.approx(abs(tilt_rad), abs=0.02)  # friction holds it there
     assert t.pick(*block.position, 0.0, 0.0, tilt_rad) is block
@@ -204,8 +204,8 @@ def test_a_pick_that_is_high_enough_goes_where_it_was_sent(table):
     t = table(1)
     lowest = t.robot.gripper.lowest_tool_m()
     reached = []
-    close = t.hand._close
-    t.hand._close = lambda: (reached.append(t.robot.tool_transform()[0][2]), close())
+    close = t.hand._close_fingers
+    t.hand._close_fingers = lambda: (reached.append(t.robot.tool_frame()[0][2]), close())
     for z in (lowest - 5e-3, lowest, lowest + 5e-3):
         t.pick(0.5, 0.15, z)
     assert reached == pytest.approx([lowest, lowest, lowest + 5e-3], abs=1e-5)
@@ -219,7 +219,7 @@ def test_something_in_the_way_stops_the_hand(table):
 
     def watch(count=1):
         step(count)
-        lowest.append(t.robot.tool_transform()[0][2])
+        lowest.append(t.robot.tool_frame()[0][2])
 
     t.world.step = watch
     assert t.pick(0.5, 0.0, 0.02) is None
@@ -279,14 +279,14 @@ def test_what_slips_out_is_no_longer_held(table):
     block = t.blocks[0]
     assert t.pick(*block.position) is block
     block.place((0.5, 0.1, B / 2))
-    t.hand.check_grasp()
+    t.hand.update_grasp()
     assert t.hand.held is None
     assert not block.is_hidden
 
 
 def test_simulated_ways_keep_their_acceleration():
     u = np.linspace(0.0, 1.0, 20001)
-    place = np.array([smooth_step(x) for x in u.tolist()])
+    place = np.array([quintic_time_scaling(x) for x in u.tolist()])
     acceleration = np.diff(place, n=2) / (u[1] - u[0]) ** 2
     assert place[0] == 0.0
     assert place[-1] == 1.0

@@ -1,4 +1,4 @@
-"""The measured outlines of the grippers, against contacts and against what the models say."""
+"""The measured outlines of the grippers, compared with contacts and with the models."""
 
 import math
 
@@ -12,7 +12,7 @@ from ba_torchrl.sim.world import World
 
 POSITION = (0.45, 0.0, 0.25)
 RAY_M = 3e-3
-"""Rays, a millimetre apart, meet shapes up to this far beside them: these have margins."""
+"""Largest lateral error of the measurement: the ray spacing plus the collision margins."""
 
 
 @pytest.fixture(params=list(ROBOTS))
@@ -21,7 +21,7 @@ def name(request):
 
 
 class Probe:
-    """Boxes that are put beside a gripper which points down, to see whether they touch it."""
+    """A gripper that points down and is tested for contact with boxes."""
 
     def __init__(self, world, name, opening):
         self.world = world
@@ -30,7 +30,13 @@ class Probe:
         self.robot.set_opening(opening)
 
     def touches(self, size_m, x_m, top_m):
-        """Whether a box, beside the tool by x_m, with its top so far above it, touches."""
+        """Whether the gripper touches a box.
+
+        Args:
+            size_m: edge lengths of the box.
+            x_m: of the box relative to the tool point.
+            top_m: height of the top of the box above the tool point.
+        """
         box = pybullet.createMultiBody(
             0,
             pybullet.createCollisionShape(
@@ -49,7 +55,7 @@ class Probe:
         return nearest <= 0
 
 
-def test_it_is_measured_once_and_of_each_robot(name):
+def test_gripper_is_measured_once_per_robot_class(name):
     with World() as world:
         robot = ROBOTS[name](world)
         assert robot.gripper is measured_gripper(ROBOTS[name])
@@ -57,9 +63,9 @@ def test_it_is_measured_once_and_of_each_robot(name):
     assert isinstance(robot.gripper, Gripper)
 
 
-def test_the_open_fingers_leave_the_gap(name):
+def test_half_gap_of_the_open_fingers(name):
     gripper = measured_gripper(ROBOTS[name])
-    low = gripper.tip_m(gripper.half_gap_m)
+    low = gripper.tip_height_m(gripper.half_gap_m)
     with World() as world:
         probe = Probe(world, name, 1.0)
         for margin, touches in ((-RAY_M, False), (RAY_M, True)):
@@ -68,7 +74,7 @@ def test_the_open_fingers_leave_the_gap(name):
 
 
 @pytest.mark.parametrize("opening", [0.0, 1.0])
-def test_nothing_is_below_the_outline_and_something_above_it(name, opening):
+def test_outline_is_the_lower_boundary_of_the_hand(name, opening):
     gripper = measured_gripper(ROBOTS[name])
     outline = gripper.outline if opening else gripper.closed_outline
     spacing = outline[1][0]
@@ -79,7 +85,7 @@ def test_nothing_is_below_the_outline_and_something_above_it(name, opening):
             if not math.isfinite(height):
                 continue
             for side in (-1, 1):
-                # as wide as the outline's points are apart, less what rays meet beside shapes
+                # as wide as the spacing of the outline, reduced by the lateral error
                 assert not probe.touches((spacing - RAY_M, band, 0.02), side * u, height - 1e-3)
                 assert probe.touches((spacing + 2 * RAY_M, 0.04, 0.02), side * u, height + 2e-3)
         reach = outline[-1][0]
@@ -87,9 +93,9 @@ def test_nothing_is_below_the_outline_and_something_above_it(name, opening):
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.5, 1.0])
-def test_the_tips_end_where_the_arc_says(name, opening):
+def test_tip_arc_is_the_height_of_the_fingertips(name, opening):
     gripper = measured_gripper(ROBOTS[name])
-    gap, height = gripper.arc[round(opening * (len(gripper.arc) - 1))]
+    gap, height = gripper.tip_arc[round(opening * (len(gripper.tip_arc) - 1))]
     with World() as world:
         probe = Probe(world, name, opening)
         assert not probe.touches((0.2, 0.1, 0.02), 0.0, height - 1e-3)
@@ -98,47 +104,49 @@ def test_the_tips_end_where_the_arc_says(name, opening):
             assert not probe.touches((2 * (gap - RAY_M), 0.005, 0.01), 0.0, height + 0.01)
 
 
-def test_the_palm_is_above_the_gap_however_wide(name):
+def test_palm_height_at_every_opening(name):
     gripper = measured_gripper(ROBOTS[name])
     with World() as world:
         probe = Probe(world, name, 1.0)
         for opening in (0.4, 0.7, 1.0):
             probe.robot.set_opening(opening)
-            gap = next(gap for gap, _ in gripper.arc if gap > 0.9 * opening * gripper.half_gap_m)
+            gap = next(
+                gap for gap, _ in gripper.tip_arc if gap > 0.9 * opening * gripper.half_gap_m
+            )
             width = 2 * (min(gap, opening * gripper.half_gap_m) - 3 * RAY_M)
-            assert not probe.touches((width, 0.005, 0.02), 0.0, gripper.palm_m - 1e-3)
+            assert not probe.touches((width, 0.005, 0.02), 0.0, gripper.palm_height_m - 1e-3)
 
 
-def test_the_hand_is_as_wide_as_the_robot_says(name):
+def test_hand_half_extents_agree_with_the_outline(name):
     reach = measured_gripper(ROBOTS[name]).outline[-1][0]
-    assert ROBOTS[name].hand_half_m[0] == pytest.approx(reach, abs=6e-3)
+    assert ROBOTS[name].hand_half_extents_m[0] == pytest.approx(reach, abs=6e-3)
 
 
-def test_the_parallel_jaw_is_that_of_its_model():
+def test_parallel_jaw_agrees_with_its_model():
     gripper = measured_gripper(ROBOTS["ur5"])
     assert gripper.half_gap_m == pytest.approx(0.04, abs=RAY_M)
     assert gripper.half_width_m == pytest.approx(0.019 / 2, abs=RAY_M)
     assert gripper.closed_half_m == pytest.approx(0.016, abs=RAY_M)
-    # flange to hand is the frame; fingers from 7 cm, 8 cm long, the tool at 14.13 cm
-    assert gripper.tip_m(0.02) == pytest.approx(0.1413 - (0.07 + 0.047 + 0.033), abs=1.5e-3)
-    assert gripper.palm_m == pytest.approx(0.1413 - 0.069, abs=1.5e-3)
+    # from the flange: fingers start at 7 cm and are 8 cm long, the tool point is at 14.13 cm
+    assert gripper.tip_height_m(0.02) == pytest.approx(0.1413 - (0.07 + 0.047 + 0.033), abs=1.5e-3)
+    assert gripper.palm_height_m == pytest.approx(0.1413 - 0.069, abs=1.5e-3)
 
 
-def test_the_pads_of_the_swinging_gripper_go_down_as_the_linkage_says():
+def test_tip_arc_of_the_robotiq_agrees_with_its_linkage():
     gripper = measured_gripper(ROBOTS["ur5_robotiq"])
     crank, rest = math.hypot(0.00465, 0.05693), math.atan2(0.00465, 0.05693)
     for i, angle in enumerate(0.1 * k for k in range(9)):
-        gap, height = gripper.arc[i]
-        # driver, finger and pad: 16 mm of it inside of its middle at 17.95 mm
+        gap, height = gripper.tip_arc[i]
+        # driver, finger and pad; the pad extends inwards by 8 mm from its centre at 17.95 mm
         expected_gap = 0.0306 + crank * math.sin(angle - rest) - 0.01795 - 0.008
         reach = 0.0549 + crank * math.cos(angle - rest) + 0.0316 + 0.0196
         assert gap == pytest.approx(expected_gap, abs=RAY_M)
         assert height == pytest.approx(0.1543 - reach, abs=1.5e-3)
-    assert gripper.tip_m(gripper.half_gap_m) - gripper.tip_m(0.0) > 0.013
+    assert gripper.tip_height_m(gripper.half_gap_m) - gripper.tip_height_m(0.0) > 0.013
 
 
-def test_a_height_between_two_openings_is_interpolated():
+def test_tip_height_is_interpolated():
     arc, flat = ((0.0, -0.01), (0.04, 0.006)), ((0.0, 0.05),)
     gripper = Gripper(0.04, 0.01, 0.02, 0.05, arc, outline=flat, closed_outline=flat)
-    assert gripper.tip_m(0.01) == pytest.approx(-0.006)
-    assert gripper.tip_m(0.1) == pytest.approx(0.006)
+    assert gripper.tip_height_m(0.01) == pytest.approx(-0.006)
+    assert gripper.tip_height_m(0.1) == pytest.approx(0.006)

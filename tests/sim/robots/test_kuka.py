@@ -4,10 +4,10 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.kuka import Kuka
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 
@@ -43,7 +43,7 @@ def test_inverse_kinematics_puts_the_tool_where_it_should_be(world):
             continue
         solved += 1
         robot.teleport(joints)
-        reached, quaternion = robot.tool_transform()
+        reached, quaternion = robot.tool_frame()
         np.testing.assert_allclose(reached, position, atol=2e-5)
         np.testing.assert_allclose(rotation_of(quaternion), rotation, atol=1e-4)
     assert solved > 400

@@ -7,10 +7,10 @@ import pybullet
 import pytest
 
 import ba_torchrl
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 
 CLOSE_LOOP = ((0.3, -0.15, 0.01), (0.6, 0.15, 0.25))
@@ -63,7 +63,7 @@ def block_scene(world, robot_class, edge=0.05, yaw=0.0, xy=(0.45, 0.0)):
 
 def in_hand(robot, block):
     """Return the block's position in the frame of the tool."""
-    to_tool = pybullet.invertTransform(*robot.tool_transform())
+    to_tool = pybullet.invertTransform(*robot.tool_frame())
     return np.array(pybullet.multiplyTransforms(*to_tool, *block.pose)[0])
 
 
@@ -90,7 +90,7 @@ def test_inverse_kinematics_reaches_the_workspace(world, robot_class, box, tilt,
             continue
         solved += 1
         robot.teleport(joints)
-        reached, quaternion = robot.tool_transform()
+        reached, quaternion = robot.tool_frame()
         np.testing.assert_allclose(reached, position, atol=1e-4)
         assert angle_between(rotation_of(quaternion), rotation) < 2e-3
     assert solved >= share * 400
@@ -319,7 +319,7 @@ def test_the_arm_passes_through_things(world, robot_class):
     world.detect_collisions()
     points = pybullet.getContactPoints(robot.id, physicsClientId=world.client)
     assert {point[3] for point in points} <= {robot.hand_link, *range(robot.hand_link, 20)}
-    assert not {point[3] for point in points} & set(robot.passive_links)
+    assert not {point[3] for point in points} & set(robot.non_colliding_links)
 
 
 def drive(world, robot, blocks, motion):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import Placed
 from ba_torchrl.sim.vision.lens import FAR_M
 

@@ -6,8 +6,8 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.bodies import Box, Decal
 from ba_torchrl.sim.geometry import yaw_quaternion
+from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera, Placed, Surface, depth_image, paint_square
 from ba_torchrl.sim.vision.lens import Lens, oblique_lens, side_lenses
 from ba_torchrl.sim.world import World

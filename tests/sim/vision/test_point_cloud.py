@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.sim.bodies import Decal
+from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.depth import (
     Placed,
     Surface,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import Surface, depth_image
 from ba_torchrl.sim.vision.lens import oblique_lens
 from ba_torchrl.sim.vision.rgb import render_rgb, render_rgbd

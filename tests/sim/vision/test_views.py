@@ -7,14 +7,14 @@ import pytest
 import ba_torchrl
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import UnknownNameError
-from ba_torchrl.sim.bodies import Box, Decal
 from ba_torchrl.sim.geometry import yaw_quaternion
-from ba_torchrl.sim.vision.depth import HeightCamera, Placed
+from ba_torchrl.sim.shapes import Box, Decal
+from ba_torchrl.sim.vision.depth import HeightCamera, PosedShape
 from ba_torchrl.sim.vision.kernels import paint_square
 from ba_torchrl.sim.vision.lens import oblique_lens
 from ba_torchrl.sim.vision.views import (
-    DEEPEST_RECESS_M,
-    FINGER_GLYPH_HALF_M,
+    FINGER_SQUARE_HALF_M,
+    MAX_RECESS_M,
     VIEWS,
     ViewInput,
     ViewSetup,
@@ -44,12 +44,12 @@ def world():
 
 
 def block(x=0.45, y=-0.05, yaw=0.4, size=(0.05, 0.05, 0.05)):
-    return Placed(Box(size_m=size), ((x, y, size[2] / 2), yaw_quaternion(yaw)))
+    return PosedShape(Box(size_m=size), ((x, y, size[2] / 2), yaw_quaternion(yaw)))
 
 
 def goal(x=0.52, y=0.03, yaw=0.2):
-    shape = Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02)
-    return Placed(shape, ((x, y, 0.0), yaw_quaternion(yaw)))
+    shape = Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02)
+    return PosedShape(shape, ((x, y, 0.0), yaw_quaternion(yaw)))
 
 
 def seen(world, bodies, tool=TOOL, opening=1.0, **setup):
@@ -212,11 +212,11 @@ def test_fingers_are_drawn_where_they_are(name, opening, world):
     along = (points - [x, y]) @ [math.cos(yaw), math.sin(yaw)]
     across = (points - [x, y]) @ [-math.sin(yaw), math.cos(yaw)]
     offset = 0.105 * opening / 2
-    assert np.abs(np.abs(along) - offset).max() <= FINGER_GLYPH_HALF_M + 1e-6
-    assert np.abs(across).max() <= FINGER_GLYPH_HALF_M + 1e-6
+    assert np.abs(np.abs(along) - offset).max() <= FINGER_SQUARE_HALF_M + 1e-6
+    assert np.abs(across).max() <= FINGER_SQUARE_HALF_M + 1e-6
     assert along[along > 0].mean() == pytest.approx(offset, abs=2e-3)
     assert along[along < 0].mean() == pytest.approx(-offset, abs=2e-3)
-    assert len(rows) == pytest.approx(2 * (2 * FINGER_GLYPH_HALF_M * 128 / 0.45) ** 2, rel=0.2)
+    assert len(rows) == pytest.approx(2 * (2 * FINGER_SQUARE_HALF_M * 128 / 0.45) ** 2, rel=0.2)
 
 
 def test_views_of_the_workspace_stay_when_the_tool_moves(world):
@@ -274,7 +274,7 @@ def test_perspective_from_above_has_the_tools_depth_in_the_middle(world):
     rows, cols = np.nonzero(values == 0)
     scale = 64 / math.tan(math.radians(35)) / 0.12
     assert rows[rows > 64].mean() + 0.5 - 64 == pytest.approx(0.105 / 2 * scale, abs=0.6)
-    assert np.ptp(cols) + 1 == pytest.approx(2 * FINGER_GLYPH_HALF_M * scale, abs=1)
+    assert np.ptp(cols) + 1 == pytest.approx(2 * FINGER_SQUARE_HALF_M * scale, abs=1)
 
 
 def test_the_side_view_looks_from_opposite_the_robot(world):
@@ -318,4 +318,4 @@ def test_the_view_widths_follow_the_setup(world):
         assert (heights == 0.05).sum() == pytest.approx((0.2 * 128 / width) ** 2, rel=0.1)
     assert VIEWS["camera_center_xyz"].range_m(
         dataclasses.replace(SETUP, z_m=(0.0, 0.4), camera_height_m=0.06)
-    ) == (0.0, 0.4 + 0.06 + DEEPEST_RECESS_M)
+    ) == (0.0, 0.4 + 0.06 + MAX_RECESS_M)

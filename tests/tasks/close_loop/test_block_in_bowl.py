@@ -7,8 +7,15 @@ import pybullet
 import pytest
 
 import ba_torchrl
-from ba_torchrl.sim.bodies import Box, Solid
-from ba_torchrl.sim.meshes import bowl_parts, box_mesh, centroid, moved, prism_mesh, ring_parts
+from ba_torchrl.sim.meshes import (
+    bowl_parts,
+    box_mesh,
+    centroid,
+    prism_mesh,
+    ring_parts,
+    transform_mesh,
+)
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 
 TASK = "close_loop/block_in_bowl"
@@ -47,7 +54,10 @@ def test_volumes_and_centroid_against_formulas():
     assert volume(disc) == pytest.approx(math.pi * 0.01 * 0.3, rel=2e-3)
     ring = ring_parts([(0.1, 0.0), (0.2, 0.0), (0.2, 0.3), (0.1, 0.3)], 64)
     assert sum(map(volume, ring)) == pytest.approx(math.pi * 0.03 * 0.3, rel=2e-3)
-    boxes = [moved(box_mesh((1, 1, 1)), (0, 0, 0.5)), moved(box_mesh((1, 1, 3)), (2, 0, 1.5))]
+    boxes = [
+        transform_mesh(box_mesh((1, 1, 1)), (0, 0, 0.5)),
+        transform_mesh(box_mesh((1, 1, 3)), (2, 0, 1.5)),
+    ]
     np.testing.assert_allclose(centroid(boxes), (1.5, 0.0, 1.25), atol=1e-12)
 
 
@@ -151,7 +161,7 @@ def test_a_held_block_does_not_count(env):
 def test_a_tipped_bowl_ends_the_episode(env):
     task = env.scene.task
     env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
-    task.bowl.move_to((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((2.5, 0.0, 0.0)))
+    task.bowl.set_pose((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((2.5, 0.0, 0.0)))
     env.scene.world.settle(400)
     assert task.bowl.tilt_rad > task.tipped_rad
     outcome = env._step(env.full_action_spec.zero())
@@ -162,7 +172,7 @@ def test_a_tipped_bowl_ends_the_episode(env):
 def test_a_bowl_nudged_up_on_one_side_falls_back(env):
     task = env.scene.task
     env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
-    task.bowl.move_to((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((0.6, 0.0, 0.0)))
+    task.bowl.set_pose((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((0.6, 0.0, 0.0)))
     env.scene.world.settle(400)
     assert task.bowl.tilt_rad < 0.02
 

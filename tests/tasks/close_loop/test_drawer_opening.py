@@ -7,7 +7,7 @@ import torch
 
 import ba_torchrl
 from ba_torchrl.envs.episodes import evaluate_at_rest
-from ba_torchrl.sim.bodies import Box, Solid
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.close_loop.drawer_opening import cabinet_parts, drawer_parts
 
@@ -86,7 +86,7 @@ def test_the_drawer_is_hollow_and_open_on_top(make):
     with World() as world:
         env = make()
         shapes = [part.shape for part in env.scene.task.cabinet.parts]
-        cabinet = world.add_articulated(*shapes, env.scene.task.cabinet.rail, "cabinet")
+        cabinet = world.add_articulated(*shapes, env.scene.task.cabinet.joint, "cabinet")
         dropped = world.add(block, "block")
         cabinet.place((0.0, 0.0, 0.0), travel_m=0.2)
         dropped.place((0.18, 0.03, 0.13))
@@ -249,7 +249,7 @@ def test_random_actions_keep_the_drawer_on_its_rail(make):
 
 def test_scaled_drawers_open_by_scaled_travel(make):
     env = make(object_scale_range=0.9, expert=True)
-    assert env.scene.task.cabinet.rail.range_m == (0.0, pytest.approx(0.18))
+    assert env.scene.task.cabinet.joint.limits_m == (0.0, pytest.approx(0.18))
     np.testing.assert_allclose(env.scene.task.handle_pose[0][2], 0.072, atol=1e-6)
     state = env.reset()
     while not state["done"]:

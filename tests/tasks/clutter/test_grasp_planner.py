@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ba_torchrl.sim.bodies import Box
 from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.clutter import grasp_planner
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M, DEEPEST_M, PIXEL_M, GraspPlanner
 from ba_torchrl.tasks.clutter.push_planner import PushPlanner
@@ -27,8 +27,8 @@ JAW = Gripper(
     half_gap_m=0.04,
     half_width_m=0.01,
     closed_half_m=0.016,
-    palm_m=0.07,
-    arc=((0.0, -0.01), (0.04, -0.01)),
+    palm_height_m=0.07,
+    tip_arc=((0.0, -0.01), (0.04, -0.01)),
     outline=(
         *((u, 0.07) for u in np.arange(0.0, 0.04, 0.005).tolist()),
         *((u, -0.01) for u in (0.04, 0.045, 0.05, 0.055)),
@@ -38,7 +38,7 @@ JAW = Gripper(
 """Fingers that slide, 1 cm past the tool."""
 SWING = replace(
     JAW,
-    arc=((0.0, -0.01), (0.04, 0.006)),
+    tip_arc=((0.0, -0.01), (0.04, 0.006)),
     outline=(*JAW.outline[:-4], *((u, 0.006) for u in (0.04, 0.045, 0.05, 0.055))),
 )
 """Fingers that end above the tool when they are open, and go down as they close."""
@@ -95,16 +95,18 @@ def test_a_slab_is_grasped_across_in_its_middle():
 
 
 @pytest.mark.parametrize("gripper", [JAW, SWING], ids=["slides", "swings"])
-@pytest.mark.parametrize("palm_m", [0.02, 0.03, 0.07])
-def test_the_palm_stays_above_a_tall_block_and_the_fingers_reach_deep(gripper, palm_m):
-    inner = [(u, min(z, palm_m)) for u, z in gripper.outline]
-    gripper = replace(gripper, palm_m=palm_m, outline=tuple(inner))
+@pytest.mark.parametrize("palm_height_m", [0.02, 0.03, 0.07])
+def test_the_palm_stays_above_a_tall_block_and_the_fingers_reach_deep(gripper, palm_height_m):
+    inner = [(u, min(z, palm_height_m)) for u, z in gripper.outline]
+    gripper = replace(gripper, palm_height_m=palm_height_m, outline=tuple(inner))
     target = block((0.03, 0.03, 0.1))
     top = FLOOR_M + 0.1
     grasp = plan(gripper, target)
     # at half a gap of 15 mm
-    deepest = DEEPEST_M + gripper.tip_m(0.015)
-    assert grasp.position[2] == pytest.approx(top - min(palm_m - CLEARANCE_M, deepest), abs=1e-3)
+    deepest = DEEPEST_M + gripper.tip_height_m(0.015)
+    assert grasp.position[2] == pytest.approx(
+        top - min(palm_height_m - CLEARANCE_M, deepest), abs=1e-3
+    )
 
 
 def test_open_fingers_stay_above_what_is_beside():
@@ -122,7 +124,7 @@ def test_fingers_that_swing_down_keep_off_what_is_under_their_way():
     beside = [block((0.03, 0.2, 0.03), (0.45 + x, 0.0)) for x in (-0.065, 0.065)]
     grasp = plan(SWING, target, *beside)
     # over the neighbours' inner edge, 50 mm off, a finger 16 mm deep is at half a gap of 34 mm
-    swung = SWING.tip_m(0.034)
+    swung = SWING.tip_height_m(0.034)
     assert swung < 0.006
     assert grasp.position[2] >= FLOOR_M + 0.03 - swung + CLEARANCE_M - 1e-3
 
@@ -132,7 +134,7 @@ def test_what_is_wider_than_the_gap_is_left(half_gap_m):
     gripper = replace(
         JAW,
         half_gap_m=half_gap_m,
-        arc=((0.0, -0.01), (half_gap_m, -0.01)),
+        tip_arc=((0.0, -0.01), (half_gap_m, -0.01)),
     )
     for width, fits in ((2 * half_gap_m - 0.01, True), (2 * half_gap_m + 0.004, False)):
         assert (plan(gripper, block((width, width, 0.03))) is not None) is fits
@@ -141,7 +143,7 @@ def test_what_is_wider_than_the_gap_is_left(half_gap_m):
 def test_a_flat_body_is_out_of_reach_of_fingers_that_end_high():
     flat = block((0.07, 0.07, 0.012))
     assert plan(JAW, flat) is not None
-    high = replace(SWING, arc=((0.0, 0.0), (0.04, 0.006)))
+    high = replace(SWING, tip_arc=((0.0, 0.0), (0.04, 0.006)))
     assert plan(high, flat) is None
 
 
@@ -161,7 +163,7 @@ def test_pushing_fingers_stand_off_the_floor_and_behind_the_body(name):
     target = block((0.03, 0.03, 0.03), (0.4, 0.0))
     planner, heights = scene(gripper, target)
     push = PushPlanner(planner, TRAY).plan([target], TOOL, REACH, heights)
-    tips = push.start[2] + gripper.tip_m(0.0)
+    tips = push.start[2] + gripper.tip_height_m(0.0)
     assert FLOOR_M + 2e-3 < tips < FLOOR_M + 0.01
     assert math.dist(push.start[:2], target.position[:2]) > 0.015 + gripper.closed_half_m
 

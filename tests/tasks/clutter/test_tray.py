@@ -7,7 +7,7 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.bodies import Box
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, RIM_Z_M, Tray, profile
@@ -87,7 +87,7 @@ def test_nothing_falls_through(world):
     rng = np.random.default_rng(0)
     for block in blocks:
         x, y = (c + rng.uniform(-0.1, 0.1) for c in CENTER)
-        block.move_to((x, y, 0.4), (0.3, 0.1, 0.0, 0.9487))
+        block.set_pose((x, y, 0.4), (0.3, 0.1, 0.0, 0.9487))
         world.step(30)
     world.settle(600)
     for block in blocks:

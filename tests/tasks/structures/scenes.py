@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Box, Solid
 from ba_torchrl.sim.meshes import gable_mesh
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.tasks.structures.blueprint import CUBE, CUBOID, ROOF, Blueprint, Slot, Span
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.planner import StructurePlanner

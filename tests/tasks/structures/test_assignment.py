@@ -5,7 +5,8 @@ import math
 
 import pytest
 
-from ba_torchrl.sim.bodies import Box, vertical_extent
+from ba_torchrl.sim.bodies import vertical_extent
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.blueprint import CUBE, TRIANGLE, tower
 from ba_torchrl.tasks.structures.planner import StructurePlanner

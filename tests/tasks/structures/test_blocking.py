@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.sim.bodies import Box, Solid
-from ba_torchrl.sim.meshes import box_mesh, moved
+from ba_torchrl.sim.meshes import box_mesh, transform_mesh
 from ba_torchrl.sim.robots.gripper import Gripper
+from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.clearance import path_clearance_m
 from ba_torchrl.tasks.structures.blocking import edge_grasps
@@ -19,8 +19,8 @@ GRIPPER = Gripper(
     half_gap_m=0.04,
     half_width_m=0.01,
     closed_half_m=0.018,
-    palm_m=0.05,
-    arc=((0.004, -0.01), (0.04, -0.01)),
+    palm_height_m=0.05,
+    tip_arc=((0.004, -0.01), (0.04, -0.01)),
     outline=((0.0, math.inf), (0.04, -0.01)),
     closed_outline=((0.0, -0.01),),
 )
@@ -59,7 +59,7 @@ def test_the_shift_is_what_body_and_opening_leave(world, yaw, opening, half_m):
 
 
 def test_a_body_off_its_origin_gives_each_finger_its_own_shift(world):
-    off = moved(box_mesh((0.03, 0.03, 0.03)), (0.01, 0.0, 0.0), 0.0)
+    off = transform_mesh(box_mesh((0.03, 0.03, 0.03)), (0.01, 0.0, 0.0), 0.0)
     body = world.add(Solid(parts=(off,)), "off")
     body.place(AT)
     shifts = [candidate.shift_m for candidate in edge_grasps(GRIPPER, body, 0.0)]

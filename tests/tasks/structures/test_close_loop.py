@@ -189,7 +189,7 @@ def test_a_tipped_triangle_ends_the_episode_without_reward(make):
     env = make(HOUSE)
     triangle = triangle_of(env.scene.task)
     slope = math.pi - math.atan2(0.05, 0.025)
-    triangle.move_to((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
+    triangle.set_pose((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
     env.scene.world.settle()
     assert triangle.tilt_rad > 1.0
     outcome = wait(env)
@@ -201,7 +201,7 @@ def test_a_tipped_triangle_ends_the_episode_without_reward(make):
 def test_a_tumbled_cube_is_as_good_as_any(make):
     env = make(HOUSE, expert=True)
     task = env.scene.task
-    cubes_of(task)[0].move_to(
+    cubes_of(task)[0].set_pose(
         (*cubes_of(task)[0].position[:2], 0.025),
         (math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4)),
     )
@@ -277,7 +277,7 @@ def cylinders(make):
 
 
 def on_its_side(body, position):
-    body.move_to(position, (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))
+    body.set_pose(position, (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4)))
 
 
 def test_cylinders_are_as_high_and_wide_as_blocks(cylinders):
@@ -301,7 +301,7 @@ def test_fingers_close_on_sides_of_a_cylinder_at_every_grasp_yaw(cylinders):
 def test_a_stack_of_cylinders_is_the_goal_whichever_end_is_up(cylinders):
     assert cylinders.is_success()
     top = cylinders.objects[-1]
-    top.move_to(top.position, (1.0, 0.0, 0.0, 0.0))
+    top.set_pose(top.position, (1.0, 0.0, 0.0, 0.0))
     cylinders.world.settle()
     assert cylinders.is_success()
     assert cylinders.is_valid()

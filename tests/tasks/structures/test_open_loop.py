@@ -60,7 +60,7 @@ class House:
         if turn is None:
             body.place(position)
         else:
-            body.move_to(position, turn)
+            body.set_pose(position, turn)
 
     @property
     def top(self):
@@ -122,7 +122,7 @@ def test_a_block_that_only_leans_against_the_stack_does_not_count(house, name):
 def test_a_tipped_roof_ends_the_episode_and_does_not_count(house, name, kind):
     h = house(name)
     turn = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
-    h.named[kind].move_to((X + 0.13, Y, 0.02), turn)
+    h.named[kind].set_pose((X + 0.13, Y, 0.02), turn)
     assert not h.is_success()
     assert not h.task.is_valid()
 
