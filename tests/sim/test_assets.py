@@ -81,10 +81,10 @@ def test_rests_of_a_box_are_its_six_faces():
         assert rest.width_m == pytest.approx(least, abs=1e-6)
         assert rest.antipodal_score > 0.9
         # in this pose the fingers' line is along x, the height along z
-        extents = np.ptp(box_mesh(size).vertices @ rest.turn.T, axis=0)
+        extents = np.ptp(box_mesh(size).vertices @ rest.rotation.T, axis=0)
         assert extents[2] == pytest.approx(rest.height_m)
-        assert extents[0] <= hulls.GAP_M + 1e-3
-        assert np.linalg.det(rest.turn) == pytest.approx(1)
+        assert extents[0] <= hulls.MAX_GAP_M + 1e-3
+        assert np.linalg.det(rest.rotation) == pytest.approx(1)
 
 
 def test_a_wedge_is_less_square_than_a_box():
@@ -167,8 +167,8 @@ def test_random_shapes_stand_so_that_fingers_at_yaw_zero_fit():
     for shape in load_object_set("random"):
         low, high = shape.bounds_m
         vertices = shape.mesh().vertices
-        across = vertices[np.abs(vertices[:, 1]) < hulls.FINGER_HALF_M]
-        assert len(across) == 0 or np.ptp(across[:, 0]) <= hulls.GAP_M + 1e-3
+        across = vertices[np.abs(vertices[:, 1]) < hulls.FINGER_HALF_WIDTH_M]
+        assert len(across) == 0 or np.ptp(across[:, 0]) <= hulls.MAX_GAP_M + 1e-3
         assert high[2] - low[2] >= random_shapes.MIN_HEIGHT_M - 1e-6
 
 
@@ -468,7 +468,7 @@ def test_a_damaged_entry_is_made_anew(own_cache, caplog):
             (part,) = cached_parts(b"content", "recipe", make)
         np.testing.assert_array_equal(part.vertices, box_mesh((1.0, 1.0, 1.0)).vertices)
         assert path.read_bytes() == whole
-    assert "made anew" in caplog.text
+    assert "computed again" in caplog.text
 
 
 def test_a_cache_that_cannot_be_written_is_reported_and_done_without(monkeypatch, tmp_path, caplog):
