@@ -1,4 +1,4 @@
-"""ObjectSet: shapes that a task draws its objects from, loaded when they are asked for."""
+"""ObjectSet: a collection of shapes from which a task samples its objects."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ PALETTE: tuple[Color, ...] = (
 
 
 class ObjectSet(Sequence[Solid], ABC):
-    """A sequence of shapes, each made when it is first asked for.
+    """A sequence of shapes, each created at its first access.
 
-    The frame of a shape has its origin in the centre of mass.
+    The origin of a shape's frame is its centre of mass.
 
     Args:
-        asset_root: folder of the user's meshes, for sets that read one.
+        asset_root: folder of the user's meshes, for object sets that read one.
 
     Raises:
-        ConfigError: the folder is needed and missing, or given without need.
+        ConfigError: the folder is missing, or the object set does not read one.
     """
 
     mass_kg: ClassVar[float] = 0.15
@@ -46,19 +46,19 @@ class ObjectSet(Sequence[Solid], ABC):
     def __init__(self, asset_root: str | None = None) -> None:
         if asset_root is not None:
             raise ConfigError(
-                f"asset_root: this object set comes with the package and reads no folder "
-                f"(got {asset_root!r}); object_set='graspnet' does"
+                f"asset_root: this object set is part of the package and reads no folder "
+                f"(got {asset_root!r}); use object_set='graspnet' for a folder of meshes"
             )
         self._shapes: dict[int, Solid] = {}
 
     @property
     @abstractmethod
     def names(self) -> Sequence[str]:
-        """What the shapes are called, in their order."""
+        """Names of the shapes, in their order."""
 
     @abstractmethod
     def parts(self, index: int) -> tuple[Mesh, ...]:
-        """Return the convex parts of a shape, metres, in any frame."""
+        """Return the convex parts of a shape, metres, in any common frame."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -87,13 +87,13 @@ class ObjectSet(Sequence[Solid], ABC):
 
 
 def load_object_set(name: str, asset_root: str | None = None) -> ObjectSet:
-    """Return a set of objects.
+    """Return an object set by its name.
 
     Args:
-        name: "random", "household" or "graspnet".
-        asset_root: "graspnet": the folder with the meshes.
+        name: a name in `OBJECT_SETS`, such as "random", "household" or "graspnet".
+        asset_root: for "graspnet": folder of the meshes.
 
     Raises:
-        ConfigError: there is no such set, or its folder is missing or cannot be used.
+        ConfigError: the name is unknown, or the folder is missing or not readable.
     """
     return OBJECT_SETS[name](asset_root)

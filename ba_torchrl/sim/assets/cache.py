@@ -1,4 +1,4 @@
-"""Convex parts on disk: what takes long to work out is worked out once per machine."""
+"""Cache on disk for the convex parts of meshes, so that they are computed once per machine."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ba_torchrl.sim.meshes import Mesh
 logger = logging.getLogger(__name__)
 
 CACHE_VARIABLE = "BA_TORCHRL_CACHE"
-"""Environment variable with the folder to use instead of the user's cache folder."""
+"""Environment variable that replaces the user's cache folder."""
 
 
 def cache_folder() -> Path:
-    """Return the folder that holds the cached parts; it may not exist yet."""
+    """Return the folder of the cached parts, which may not exist."""
     root = os.environ.get(CACHE_VARIABLE)
     return (Path(root) if root else user_cache_path("ba_torchrl")) / "parts"
 
@@ -30,14 +30,14 @@ def cache_folder() -> Path:
 def cached_parts(
     content: bytes, recipe: str, make: Callable[[], Sequence[Mesh]]
 ) -> tuple[Mesh, ...]:
-    """Return convex parts from the cache, or make and keep them.
+    """Return convex parts from the cache, or compute and store them.
 
-    Several processes may ask for the same parts at once: a file appears complete or not at all.
+    Several processes can request the same parts concurrently: files are written atomically.
 
     Args:
-        content: of the file that the parts are made from.
-        recipe: what is done to it; another recipe gives another entry.
-        make: works the parts out.
+        content: content of the file from which the parts are computed.
+        recipe: identifies the computation and its parameters; it is part of the cache key.
+        make: computes the parts.
     """
     key = hashlib.sha256(recipe.encode() + b"\0" + content).hexdigest()
     path = cache_folder() / f"{key}.npz"
@@ -46,14 +46,13 @@ def cached_parts(
     except FileNotFoundError:
         pass
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        logger.warning("%s is not readable and is made anew: %s", path, error)
+        logger.warning("%s cannot be read and is computed again: %s", path, error)
     parts = tuple(make())
     try:
         _write(path, parts)
     except OSError as error:
         logger.warning(
-            "cannot keep convex parts for next time in %s (%s): set %s to a folder that can be "
-            "written to",
+            "cannot store convex parts in %s (%s): set %s to a writable folder",
             path.parent,
             error,
             CACHE_VARIABLE,

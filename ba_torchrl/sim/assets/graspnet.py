@@ -1,4 +1,4 @@
-"""A folder of the user's meshes, such as the models of GraspNet-1Billion (appendix, figure 16)."""
+"""Meshes in a folder of the user, such as those of GraspNet-1Billion (appendix, figure 16)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ba_torchrl.sim.meshes import Mesh, write_obj
 logger = logging.getLogger(__name__)
 
 PREFERRED_FILES = ("nontextured_simplified.obj", "nontextured.obj")
-"""Taken first where a folder holds several mesh files."""
+"""Names preferred where a folder contains several mesh files."""
 EXPECTED_LAYOUT = "expected one sub-folder for each object, with a mesh file (.obj, metres) in each"
 
 MAX_WIDTH_M, WIDTH_FACTOR = 0.15, 0.8
@@ -32,32 +32,38 @@ MAX_VOLUME_M3, VOLUME_FACTOR = 6e-4, 0.85
 MIN_THICKNESS_M, THICKNESS_FACTOR = 0.014, 1 / 0.95
 
 MAX_LENGTH_M = 0.35
-"""What is longer has no room in the tray: the diagonal of its flat floor, 0.25 m wide in the
-close-loop tasks. Cutlery of 0.3 m, as the rules above enlarge it, lies across."""
+"""Greatest length after scaling: the diagonal of the flat base of the tray, which is 0.25 m wide
+in the close-loop tasks. Cutlery, which `graspable_scale` enlarges to 0.3 m, fits diagonally."""
 MESH_LENGTHS_M = (1e-5, 1e6)
-"""Lengths of a mesh before it is scaled: micrometres to kilometres may be its unit, as the rules
-above scale it. Far outside arithmetic fails."""
+"""Range of lengths before scaling. It admits meshes in units from micrometres to kilometres, which
+`graspable_scale` corrects, and excludes lengths at which the arithmetic fails."""
 MIN_FLATNESS = 1e-3
-"""What is thinner than this share of its length is a sheet and no solid."""
+"""Least ratio of thickness to length of a solid."""
 
 CONVEX_FILL = 0.95
-"""A mesh that fills this share of its hull is taken for convex."""
+"""Least ratio of the volume of a convex mesh to that of its convex hull."""
 VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}
 RECIPE = f"graspnet 2 {CONVEX_FILL} {VHACD} {MESH_LENGTHS_M} {MAX_LENGTH_M} {MIN_FLATNESS}"
-"""The limits belong to it: what was kept is not checked again."""
+"""Cache key. It includes the limits because cached meshes are not checked again."""
 
 
 @OBJECT_SETS.register("graspnet")
 class GraspNet(ObjectSet):
-    """One object for each sub-folder of ``asset_root``, scaled to what a gripper can grasp.
+    """One object for each sub-folder of ``asset_root``, scaled so that a gripper can grasp it.
 
-    Meshes are cut into convex parts the first time they are used, which takes seconds each, and
-    kept on disk.
+    At its first use, a mesh is decomposed into convex parts, which takes seconds; the parts are
+    cached on disk.
+
+    Args:
+        asset_root: folder with one sub-folder for each object.
+
+    Raises:
+        ConfigError: the folder or a mesh file is missing or cannot be read.
     """
 
     def __init__(self, asset_root: str | None = None) -> None:
         super().__init__()
-        if not asset_root:  # an empty path would stand for the current folder
+        if not asset_root:  # an empty path would be the current folder
             raise ConfigError(
                 f"object_set='graspnet' needs asset_root, a folder: {EXPECTED_LAYOUT}"
             )
@@ -83,13 +89,13 @@ class GraspNet(ObjectSet):
         """Return the convex parts of a mesh, scaled.
 
         Raises:
-            ConfigError: the file cannot be read, or is no mesh of an object that fits.
+            ConfigError: the file cannot be read, or its mesh does not satisfy the limits.
         """
         path = self.paths[index]
 
         def decompose() -> list[Mesh]:
             mesh = read_mesh(path)
-            check_size(mesh, path)  # first, as cutting takes seconds
+            check_size(mesh, path)  # before the decomposition, which takes seconds
             return convex_parts(mesh, path)
 
         with _as_config_error(path):
@@ -101,13 +107,14 @@ class GraspNet(ObjectSet):
 
 
 def graspable_scale(extents_m: Sequence[float]) -> float:
-    """Return the factor that makes a mesh graspable.
+    """Return the scale at which a mesh is graspable.
 
-    Shrunk by 0.8 until its second-largest extent is at most 15 cm, then by 0.85 until its bounding
-    box is at most 0.6 litres, then enlarged by 1 / 0.95 until its smallest extent is 1.4 cm.
+    The mesh is scaled by 0.8 until its second-largest extent is at most 15 cm, then by 0.85 until
+    the volume of its bounding box is at most 0.6 litres, then by 1 / 0.95 until its smallest extent
+    is at least 1.4 cm.
 
     Args:
-        extents_m: of the axis-aligned bounding box.
+        extents_m: extents of the axis-aligned bounding box.
     """
     smallest, middle, _ = sorted(extents_m)
     scale = WIDTH_FACTOR ** _num_factors(middle / MAX_WIDTH_M, 1 / WIDTH_FACTOR)
@@ -120,54 +127,56 @@ def graspable_scale(extents_m: Sequence[float]) -> float:
 
 
 def check_size(mesh: Mesh, path: Path) -> None:
-    """Check that a mesh is a solid which fits the tray once it is graspable.
+    """Check that a mesh is a solid that fits into the tray at its graspable scale.
 
     Args:
-        mesh: metres.
-        path: where it is from, for messages.
+        mesh: the mesh, metres.
+        path: its file, used in error messages.
 
     Raises:
-        ConfigError: it is flat, outside `MESH_LENGTHS_M`, or when scaled longer than `MAX_LENGTH_M`.
+        ConfigError: the mesh is flat, its length is outside of `MESH_LENGTHS_M`, or its scaled
+            length exceeds `MAX_LENGTH_M`.
     """
-    sides = _principal_extents(mesh.vertices)
-    thinnest, _, longest = sides
-    if not MESH_LENGTHS_M[0] <= longest <= MESH_LENGTHS_M[1]:
+    extents = _principal_extents(mesh.vertices)
+    thinnest, _, longest = extents
+    measured = f"asset_root: {str(path)!r} measures {_format_extents(extents)}"
+    low, high = MESH_LENGTHS_M
+    if not low <= longest <= high:
         raise ConfigError(
-            f"asset_root: {str(path)!r} measures {_format_extents(sides)}: it must be from "
-            f"{MESH_LENGTHS_M[0]:g} to {MESH_LENGTHS_M[1]:g} m long; check its unit, or remove its folder"
+            f"{measured}: it must be from {low:g} to {high:g} m long; check its unit, or remove "
+            "its folder"
         )
     if thinnest <= MIN_FLATNESS * longest:
         raise ConfigError(
-            f"asset_root: {str(path)!r} measures {_format_extents(sides)}: it is flat, which is no "
-            "solid; give the mesh a thickness, or remove its folder"
+            f"{measured}: it is flat and not a solid; give the mesh a thickness, or remove its "
+            "folder"
         )
     scale = graspable_scale(np.ptp(mesh.vertices, axis=0))
     if longest * scale > MAX_LENGTH_M:
         raise ConfigError(
-            f"asset_root: {str(path)!r} measures {_format_extents(sides)}, and when scaled so that it "
-            f"can be grasped {_format_extents(sides * scale)}: the tray has room for {MAX_LENGTH_M} m; "
-            "use a less elongated mesh, or remove its folder"
+            f"{measured}, and at its graspable scale {_format_extents(extents * scale)}: the tray "
+            f"has room for {MAX_LENGTH_M} m; use a less elongated mesh, or remove its folder"
         )
 
 
-def _num_factors(excess: float, step: float) -> int:
-    """Return how often to divide ``excess`` by ``step`` until it is at most 1."""
-    return max(0, math.ceil(math.log(excess) / math.log(step) - 1e-9))
+def _num_factors(ratio: float, factor: float) -> int:
+    """Return the least number of divisions by ``factor`` after which ``ratio`` is at most 1."""
+    return max(0, math.ceil(math.log(ratio) / math.log(factor) - 1e-9))
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read a mesh file.
+    """Return the mesh in a file.
 
     Raises:
-        ConfigError: it holds no triangles, or values that are not finite.
+        ConfigError: the file contains too few triangles or coordinates that are not finite.
     """
-    import trimesh  # most of a second, and only this set needs it
+    import trimesh  # imported here: it takes most of a second, and only this object set needs it
 
     try:
         loaded = trimesh.load(path, process=False, force="mesh", skip_materials=True)
         vertices = np.asarray(loaded.vertices, dtype=np.float64)
         faces = np.asarray(loaded.faces, dtype=np.int64)
-    except Exception as error:  # the parser fails in many ways on what is no mesh
+    except Exception as error:  # the parser raises exceptions of many types
         raise ConfigError(f"asset_root: cannot read {str(path)!r} as a mesh: {error}") from error
     if len(faces) < 4 or not np.isfinite(vertices).all():
         raise ConfigError(
@@ -178,14 +187,14 @@ def read_mesh(path: Path) -> Mesh:
 
 
 def convex_parts(mesh: Mesh, path: Path) -> list[Mesh]:
-    """Cut a mesh into convex parts.
+    """Return the approximate convex decomposition of a mesh (V-HACD).
 
     Args:
-        mesh: metres.
-        path: where it is from, for messages.
+        mesh: the mesh, metres.
+        path: its file, used in messages.
 
     Raises:
-        ConfigError: it has no volume.
+        ConfigError: the mesh has no volume.
     """
     try:
         hull = convex_hull(mesh.vertices)
@@ -193,7 +202,7 @@ def convex_parts(mesh: Mesh, path: Path) -> list[Mesh]:
         raise ConfigError(f"asset_root: {str(path)!r} has no volume: {error}") from None
     if volume_and_center(mesh)[0] >= CONVEX_FILL * volume_and_center(hull)[0]:
         return [hull]
-    logger.info("cutting %s into convex parts; this happens once", path)
+    logger.info("decomposing %s into convex parts; the result is cached", path)
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder, "mesh.obj"), Path(folder, "parts.obj")
         write_obj(source, [mesh])
@@ -202,20 +211,20 @@ def convex_parts(mesh: Mesh, path: Path) -> list[Mesh]:
         clouds = _read_objects(target) if target.exists() else []
     parts = []
     for cloud in clouds:
-        with contextlib.suppress(ValueError):  # a sliver without volume holds nothing up
+        with contextlib.suppress(ValueError):  # parts without volume are omitted
             parts.append(convex_hull(cloud))
     if not parts:
-        logger.warning("%s could not be cut into convex parts: its hull stands for it", path)
+        logger.warning("%s cannot be decomposed into convex parts: using its convex hull", path)
         return [hull]
     return parts
 
 
 def _principal_extents(points: np.ndarray) -> np.ndarray:
-    """Return the extents [3] of points [N, 3] along their principal axes, the smallest first.
+    """Return the extents [3] of points [N, 3] along their principal axes, in ascending order.
 
-    They tell a sheet or a bar however it lies in its file, where the bounding box does not.
+    Unlike those of the bounding box, they do not depend on the orientation of the mesh.
     """
-    unit = np.abs(points).max() or 1.0  # squares of what is tiny or huge would not be numbers
+    unit = np.abs(points).max() or 1.0  # avoids underflow and overflow of the squares
     centred = points / unit - np.mean(points / unit, axis=0)
     _, axes = np.linalg.eigh(centred.T @ centred)
     return np.sort(np.ptp(centred @ axes, axis=0)) * unit
@@ -229,7 +238,7 @@ def _mesh_file(folder: Path) -> Path:
     """Return the mesh file of a sub-folder.
 
     Raises:
-        ConfigError: there is none, or what would be taken is no file.
+        ConfigError: there is no mesh file, or the path is not a file.
     """
     rank = {name: i for i, name in enumerate(PREFERRED_FILES)}
     with _as_config_error(folder):
@@ -249,7 +258,7 @@ def _mesh_file(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _as_config_error(path: Path) -> Iterator[None]:
-    """Turn what the file system refuses into an error that names the path."""
+    """Raise a `ConfigError` that names the path instead of an `OSError`."""
     try:
         yield
     except OSError as error:
@@ -273,13 +282,13 @@ def _read_objects(path: Path) -> list[np.ndarray]:
 
 @contextlib.contextmanager
 def _silent_stdout() -> Iterator[None]:
-    """Keep what C code prints away from the user: hundreds of lines of progress."""
+    """Discard what C code prints to the standard output: hundreds of lines of progress."""
     sys.stdout.flush()
-    kept = os.dup(1)
-    with open(os.devnull, "wb") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
+    stdout = os.dup(1)
+    with open(os.devnull, "wb") as null:
+        os.dup2(null.fileno(), 1)
         try:
             yield
         finally:
-            os.dup2(kept, 1)
-            os.close(kept)
+            os.dup2(stdout, 1)
+            os.close(stdout)

@@ -1,4 +1,4 @@
-"""Household items made of convex parts: no file is needed, and what is hollow stays hollow."""
+"""Procedural household items that consist of convex parts, so that cups and bowls are hollow."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from ba_torchrl.sim.assets.hulls import convex_hull
 from ba_torchrl.sim.meshes import Mesh, box_mesh, lathe_parts, ring_parts, transform_mesh
 
 NUM_SIDES = 16
-"""Corners of what is round."""
+"""Number of corners of polygons that approximate circles."""
 NUM_WALL_PARTS = 10
-"""Pieces of a hollow wall."""
+"""Number of convex segments of a hollow wall."""
 
 Profile = Sequence[tuple[float, float]]
-"""Radii and heights, from the bottom up, metres."""
+"""Radii and heights of the corners of a profile, from the bottom to the top, metres."""
 
 
 def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
-    """Return a hollow solid of revolution with a bottom, open on top.
+    """Return a hollow solid of revolution with a bottom and an open top.
 
     Args:
-        profile: outer surface, metres; its height grows.
+        profile: outer surface, with strictly increasing heights, metres.
         wall_m: thickness of the wall.
         bottom_m: thickness of the bottom.
     """
@@ -42,12 +42,17 @@ def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
 
 
 def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
-    """Return a box with its centre at a point, metres."""
+    """Return a box.
+
+    Args:
+        size: edge lengths, metres.
+        at: position of the centre, metres.
+    """
     return transform_mesh(box_mesh(size), at)
 
 
 def mug(radius_m: float, height_m: float) -> list[Mesh]:
-    """Return a mug with a handle that fingers fit through."""
+    """Return a mug whose handle leaves space for a finger."""
     grip_x, top, bottom = radius_m + 0.022, 0.8 * height_m, 0.25 * height_m
     bar = 0.008
     return [
@@ -58,7 +63,7 @@ def mug(radius_m: float, height_m: float) -> list[Mesh]:
 
 
 def spoon() -> list[Mesh]:
-    """Return a wooden spoon: a round handle and a thick, oval bowl."""
+    """Return a spoon with a cylindrical handle and an oval bowl."""
     oval = _ring(0.02, NUM_SIDES) * (1.3, 1.0, 1.0)
     tip = np.array([0.065, 0.0, 0.0])
     deep = np.array([0.0, 0.0, 0.009])
@@ -70,14 +75,14 @@ def spoon() -> list[Mesh]:
 
 
 def banana() -> list[Mesh]:
-    """Return a bent fruit of four tapered pieces."""
+    """Return a banana: four tapered segments along an arc."""
     rings = []
-    turns, radii = np.linspace(-0.75, 0.75, 5).tolist(), (0.008, 0.015, 0.017, 0.015, 0.007)
-    for turn, radius in zip(turns, radii, strict=True):
+    angles, radii = np.linspace(-0.75, 0.75, 5).tolist(), (0.008, 0.015, 0.017, 0.015, 0.007)
+    for angle, radius in zip(angles, radii, strict=True):
         ring = _ring(radius, 8)[:, [0, 2, 1]]  # in the plane of x and z
-        cos, sin = math.cos(turn), math.sin(turn)
-        turned = ring @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-        rings.append(turned + np.array([0.065 * cos - 0.065, 0.065 * sin, 0]))
+        cos, sin = math.cos(angle), math.sin(angle)
+        rotated = ring @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+        rings.append(rotated + np.array([0.065 * cos - 0.065, 0.065 * sin, 0]))
     return [convex_hull(np.concatenate(ends)) for ends in pairwise(rings)]
 
 
@@ -120,19 +125,19 @@ _CHEESE_BASE = ((-0.035, -0.025), (-0.035, 0.025), (0.045, 0.0))
 
 @OBJECT_SETS.register("household")
 class Household(ObjectSet):
-    """Bottles, cups, bowls, boxes and tools, small enough for a two-finger gripper."""
+    """Bottles, cups, bowls, boxes and tools that a two-finger gripper can grasp."""
 
     @property
     def names(self) -> Sequence[str]:
-        """What the items are."""
+        """Names of the items."""
         return list(ITEMS)
 
     def parts(self, index: int) -> tuple[Mesh, ...]:
-        """Return an item's convex parts."""
+        """Return the convex parts of an item."""
         return tuple(list(ITEMS.values())[index]())
 
 
 def _ring(radius_m: float, corners: int) -> np.ndarray:
     """Return points [corners, 3] on a horizontal circle about the origin."""
-    turns = np.linspace(0, 2 * np.pi, corners, endpoint=False)
-    return radius_m * np.stack([np.cos(turns), np.sin(turns), np.zeros(corners)], axis=1)
+    angles = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    return radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros(corners)], axis=1)

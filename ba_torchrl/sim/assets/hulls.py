@@ -1,4 +1,4 @@
-"""Convex hulls: what PyBullet collides is what the cameras see, so objects are made of them."""
+"""Convex hulls and their stable poses."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ import numpy as np
 from ba_torchrl.sim.meshes import Mesh
 
 STABILITY_MARGIN_M = 2e-3
-"""A body rests on a facet if its centre of mass is this far inside it."""
+"""A facet is stable if the projected centre of mass is at least this far from its border."""
 FACET_TOLERANCE_M = 1e-3
-"""Facets that bulge less than this count as flat: a body rocks on them, and stays."""
+"""Vertices within this distance of the support plane belong to the facet."""
 SAME_POSE_COSINE = math.cos(math.radians(10))
+"""Facets whose normals differ by less than this angle count as one stable pose."""
 NUM_SAMPLES = 2000
 FINGER_HALF_WIDTH_M = 0.0125
 MAX_GAP_M = 0.066
-"""Open fingers take no more, with some room to either side."""
+"""Largest object width between the open fingers, with clearance on both sides."""
 GRASP_Z_M = (0.004, 0.04)
-"""Heights above the ground that fingers cover."""
+"""Range of heights above the support surface that the fingers cover in a grasp."""
 
 
 class StablePose(NamedTuple):
-    """A pose in which a convex body lies still."""
+    """A stable resting pose of a convex body on a horizontal surface."""
 
     height_m: float
     width_m: float
-    """Of the narrowest gap between two vertical walls that the body fits into."""
+    """Smallest distance of two parallel vertical planes that enclose the body."""
     antipodal_score: float
-    """How nearly opposite the surfaces are that two closing fingers meet, and how nearly across
-    the line on which they close, for the best line: 1 for parallel upright sides, less for the
-    sides of a wedge."""
-    turn: np.ndarray
-    """[3, 3] rotation into this pose, with that direction along x."""
+    """Quality of the best top-down antipodal grasp, in [0, 1]: 1 if the contact normals of the two
+    fingers are opposite and parallel to the grasp axis, less for the sides of a wedge."""
+    rotation: np.ndarray
+    """[3, 3] rotation into this pose, with the axis of that grasp along x."""
 
 
 def convex_hull(points: np.ndarray) -> Mesh:
     """Return the convex hull of points [N, 3], metres.
 
     Raises:
-        ValueError: the points are not finite, or all in one plane.
+        ValueError: the points are not finite, or coplanar.
     """
-    from scipy.spatial import ConvexHull, QhullError  # a third of a second, so only if needed
+    from scipy.spatial import ConvexHull, QhullError  # imported here: it takes a third of a second
 
     try:
         hull = ConvexHull(points)
@@ -59,7 +59,7 @@ def convex_hull(points: np.ndarray) -> Mesh:
 
 
 def volume_and_center(mesh: Mesh) -> tuple[float, np.ndarray]:
-    """Return the volume (cubic metres) of a closed surface and the centroid [3] of its inside."""
+    """Return the volume (cubic metres) and the centroid [3] of the solid inside a closed mesh."""
     origin = mesh.vertices.mean(axis=0)
     a, b, c = (mesh.vertices[mesh.faces[:, i]] - origin for i in range(3))
     volumes = np.einsum("fi,fi->f", a, np.cross(b, c)) / 6
@@ -68,7 +68,7 @@ def volume_and_center(mesh: Mesh) -> tuple[float, np.ndarray]:
 
 
 def stable_poses(hull: Mesh) -> list[StablePose]:
-    """Return the poses in which a convex body of even density lies still, one per facet."""
+    """Return the stable poses of a convex body of uniform density, one for each stable facet."""
     center = volume_and_center(hull)[1]
     found: list[StablePose] = []
     normals = np.empty((0, 3))
@@ -83,23 +83,23 @@ def stable_poses(hull: Mesh) -> list[StablePose]:
         plane = hull.vertices @ _axes(normal)
         facet = plane[heights < heights.min() + FACET_TOLERANCE_M]
         if _depth_inside(facet, center @ _axes(normal)) >= STABILITY_MARGIN_M:
-            # the plane's axes in this order, with the height, make a right-handed frame
+            # in this order, the two axes and the upward direction form a right-handed frame
             axes = _axes(normal)[:, ::-1]
-            standing = np.column_stack([hull.vertices @ axes, heights - heights.min()])
-            antipodal_score, yaw = _antipodal_score(Mesh(standing, hull.faces), center @ axes)
+            resting = np.column_stack([hull.vertices @ axes, heights - heights.min()])
+            score, yaw = _antipodal_score(Mesh(resting, hull.faces), center @ axes)
             cos, sin = math.cos(yaw), math.sin(yaw)
-            turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-            turn = turn @ np.column_stack([axes, -normal]).T
+            rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+            rotation = rotation @ np.column_stack([axes, -normal]).T
             width = narrowest_width(plane)
-            found.append(StablePose(float(np.ptp(heights)), width, antipodal_score, turn))
+            found.append(StablePose(float(np.ptp(heights)), width, score, rotation))
             normals = np.vstack([normals, normal])
     return found
 
 
 def surface_samples(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [count, 3] spread evenly over a surface, and the outer normals there.
+    """Return points [count, 3] of a uniform density on a surface, and their outward normals.
 
-    They follow from the surface alone: the same points every time.
+    The result is deterministic: the same mesh gives the same points.
     """
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     crosses = np.cross(b - a, c - a)
@@ -113,33 +113,40 @@ def surface_samples(mesh: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def narrowest_width(points: np.ndarray) -> float:
-    """Return the least distance of two parallel lines that hold points [N, 2] between them."""
-    turns = np.linspace(0, np.pi, 90, endpoint=False)
-    axes = np.stack([np.cos(turns), np.sin(turns)])
+    """Return the smallest distance of two parallel lines that enclose points [N, 2], metres."""
+    angles = np.linspace(0, np.pi, 90, endpoint=False)
+    axes = np.stack([np.cos(angles), np.sin(angles)])
     return float(np.ptp(points @ axes, axis=0).min())
 
 
-def _antipodal_score(standing: Mesh, center_xy: np.ndarray) -> tuple[float, float]:
-    """Return `Rest.antipodal_score` of a body that stands on z = 0, and the yaw of its direction."""
-    points, normals = surface_samples(standing, NUM_SAMPLES)
+def _antipodal_score(resting: Mesh, center_xy: np.ndarray) -> tuple[float, float]:
+    """Return `StablePose.antipodal_score` of a body, and the yaw of the best grasp axis.
+
+    Args:
+        resting: the body in its stable pose on the plane z = 0.
+        center_xy: its centre of mass.
+    """
+    points, normals = surface_samples(resting, NUM_SAMPLES)
     low, high = GRASP_Z_M
     best = (0.0, 0.0)
-    for turn in np.linspace(0, np.pi, 24, endpoint=False).tolist():
-        axis = np.array([math.cos(turn), math.sin(turn)])
+    for yaw in np.linspace(0, np.pi, 24, endpoint=False).tolist():
+        axis = np.array([math.cos(yaw), math.sin(yaw)])
         along = (points[:, :2] - center_xy) @ axis
         across = (points[:, :2] - center_xy) @ np.array([-axis[1], axis[0]])
-        met = (np.abs(across) < FINGER_HALF_WIDTH_M) & (points[:, 2] > low) & (points[:, 2] < high)
-        if not met.any() or np.ptp(along[met]) > MAX_GAP_M:
+        between = np.abs(across) < FINGER_HALF_WIDTH_M
+        between &= (points[:, 2] > low) & (points[:, 2] < high)
+        if not between.any() or np.ptp(along[between]) > MAX_GAP_M:
             continue
-        left, right = along[met] < along[met].min() + 2e-3, along[met] > along[met].max() - 2e-3
-        first, second = (normals[met][side].mean(axis=0) for side in (left, right))
-        facing = min(-float(first[:2] @ axis), float(second[:2] @ axis))
-        best = max(best, (-float(first @ second) * max(facing, 0.0), turn))
+        along, normals_between = along[between], normals[between]
+        left, right = along < along.min() + 2e-3, along > along.max() - 2e-3
+        first, second = (normals_between[side].mean(axis=0) for side in (left, right))
+        alignment = min(-float(first[:2] @ axis), float(second[:2] @ axis))
+        best = max(best, (-float(first @ second) * max(alignment, 0.0), yaw))
     return best
 
 
 def _axes(normal: np.ndarray) -> np.ndarray:
-    """Return two axes [3, 2] across ``normal``, which follows them in a right-handed frame."""
+    """Return two columns [3, 2] that form a right-handed frame with ``normal`` as the third."""
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     u = np.cross(normal, helper)
     u /= np.linalg.norm(u)
@@ -147,7 +154,10 @@ def _axes(normal: np.ndarray) -> np.ndarray:
 
 
 def _depth_inside(points: np.ndarray, target: np.ndarray) -> float:
-    """Return how far ``target`` [2] lies inside the hull of points [N, 2]; negative outside."""
-    turns = np.linspace(0, 2 * np.pi, 180, endpoint=False)
-    axes = np.stack([np.cos(turns), np.sin(turns)])
+    """Return the distance of ``target`` [2] to the border of the convex hull of points [N, 2].
+
+    It is negative outside of the hull.
+    """
+    angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    axes = np.stack([np.cos(angles), np.sin(angles)])
     return float(((points @ axes).max(axis=0) - target @ axes).min())

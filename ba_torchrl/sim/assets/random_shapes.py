@@ -1,4 +1,4 @@
-"""A choice of the random shapes that come with PyBullet."""
+"""A selection of the random shapes that PyBullet's data package contains."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from ba_torchrl.sim.assets.hulls import convex_hull, stable_poses, volume_and_ce
 from ba_torchrl.sim.meshes import Mesh
 
 UNIT_M = 0.015
-"""Metres per unit of the mesh files, as their URDF files have it."""
+"""Metres per unit of the mesh files; their URDF files contain this scale."""
 NUM_SHAPES = 86
 MAX_WIDTH_M = 0.06
-"""Shapes are shrunk until the narrowest width of each of their rests is at most this."""
+"""Shapes are scaled down until the width of every stable pose is at most this."""
 MIN_HEIGHT_M = 0.02
-"""Least height of any rest; the fingers need something to hold."""
+"""Least height in any stable pose, so that fingers can grasp the shape."""
 MAX_LENGTH_M = 0.11
 MIN_ANTIPODAL_SCORE = 0.82
-"""Least squareness of any rest: fingers slip off wedges and domes."""
+"""Least antipodal score of any stable pose: fingers slip off wedges and domes."""
 MIN_FILL = 0.6
-"""Least share of its convex hull that a shape fills: the hull is what is simulated and seen."""
+"""Least ratio of a shape's volume to that of its convex hull, which replaces it."""
 
 # fmt: off
 SELECTION: tuple[tuple[int, float], ...] = (
@@ -45,49 +45,53 @@ SELECTION: tuple[tuple[int, float], ...] = (
     (998, 0.65),
 )
 # fmt: on
-"""Number and scale of each shape, as `select_shapes` works them out."""
+"""Number and scale of each selected shape: the result of `select_shapes`."""
 
 
 class Candidate(NamedTuple):
-    """A shape that suits."""
+    """A shape that satisfies the limits above."""
 
     scale: float
     features: tuple[float, ...]
-    """What tells shapes apart: the extents in ascending order, each in units of 5 cm, and twice
-    the share of its bounding box that it fills."""
+    """Features for diversity: the extents in ascending order, in units of 5 cm, and twice the ratio
+    of the volume to that of the bounding box."""
 
 
 @OBJECT_SETS.register("random")
 class RandomShapes(ObjectSet):
-    """86 of PyBullet's 1000 random shapes: graspable however they lie, and unlike each other."""
+    """86 of PyBullet's 1000 random shapes: diverse, and graspable in every stable pose."""
 
     @property
     def names(self) -> Sequence[str]:
-        """Their numbers in PyBullet's collection."""
+        """Numbers of the shapes in PyBullet's data package."""
         return [f"{number:03d}" for number, _ in SELECTION]
 
     def parts(self, index: int) -> tuple[Mesh, ...]:
-        """Return the convex hull, which is what PyBullet makes of such a mesh anyway.
+        """Return the convex hull of a shape, which PyBullet would also use for such a mesh.
 
-        It lies flat, with the yaw that suits a gripper at yaw 0 best.
+        The hull is in its lowest stable pose, with the axis of the best grasp along x.
         """
         number, scale = SELECTION[index]
 
         def hull() -> list[Mesh]:
             vertices, faces = convex_hull(read_shape(number).vertices * scale)
-            flattest = min(stable_poses(Mesh(vertices, faces)), key=lambda rest: rest.height_m)
-            return [Mesh(vertices @ flattest.turn.T, faces)]
+            flattest = min(stable_poses(Mesh(vertices, faces)), key=lambda pose: pose.height_m)
+            return [Mesh(vertices @ flattest.rotation.T, faces)]
 
         return cached_parts(shape_path(number).read_bytes(), f"random shape 3 {scale}", hull)
 
 
 def shape_path(number: int) -> Path:
-    """Return the mesh file of a random shape, 0 to 999."""
+    """Return the mesh file of a random shape.
+
+    Args:
+        number: 0 to 999.
+    """
     return Path(pybullet_data.getDataPath(), "random_urdfs", f"{number:03d}", f"{number:03d}.obj")
 
 
 def read_shape(number: int) -> Mesh:
-    """Return the mesh of a random shape in metres, at its original size."""
+    """Return the mesh of a random shape at its original size, metres."""
     vertices, faces = [], []
     for line in shape_path(number).read_text().splitlines():
         kind, *values = line.split() or [""]
@@ -100,38 +104,45 @@ def read_shape(number: int) -> Mesh:
 
 
 def scaled_candidate(number: int) -> Candidate | None:
-    """Return at which scale a random shape can be grasped however it lies, or None if at none."""
+    """Return the scale at which a random shape is graspable in every stable pose.
+
+    Args:
+        number: 0 to 999.
+
+    Returns:
+        None if the shape does not satisfy the limits at any scale.
+    """
     mesh = read_shape(number)
     try:
         hull = convex_hull(mesh.vertices)
     except ValueError:
-        return None  # one of the files has coordinates that are not numbers
+        return None  # one of the files contains NaN coordinates
     volume = volume_and_center(hull)[0]
     poses = stable_poses(hull)
     if not poses or volume_and_center(mesh)[0] < MIN_FILL * volume:
         return None
-    scale = min(1.0, MAX_WIDTH_M / max(rest.width_m for rest in poses))
+    scale = min(1.0, MAX_WIDTH_M / max(pose.width_m for pose in poses))
     scale = float(np.floor(scale * 100) / 100)
     poses = stable_poses(Mesh(hull.vertices * scale, hull.faces))
     extents = np.sort(np.ptp(hull.vertices, axis=0))
     if (
         scale * extents[-1] > MAX_LENGTH_M
         or not poses
-        or min(rest.height_m for rest in poses) < MIN_HEIGHT_M
-        or min(rest.antipodal_score for rest in poses) < MIN_ANTIPODAL_SCORE
+        or min(pose.height_m for pose in poses) < MIN_HEIGHT_M
+        or min(pose.antipodal_score for pose in poses) < MIN_ANTIPODAL_SCORE
     ):
         return None
     return Candidate(scale, (*(extents * scale / 0.05), 2 * volume / float(np.prod(extents))))
 
 
 def select_shapes() -> tuple[tuple[int, float], ...]:
-    """Choose the shapes: of those that suit, again and again the one most unlike the chosen."""
+    """Select diverse shapes among the candidates by farthest-point sampling of their features."""
     found = {number: scaled_candidate(number) for number in range(1000)}
     numbers = [number for number, candidate in found.items() if candidate is not None]
     points = np.array([found[number].features for number in numbers])
-    chosen = [0]
+    selected = [0]
     distances = np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < NUM_SHAPES:
-        chosen.append(int(distances.argmax()))
-        distances = np.minimum(distances, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return tuple((numbers[i], found[numbers[i]].scale) for i in sorted(chosen))
+    while len(selected) < NUM_SHAPES:
+        selected.append(int(distances.argmax()))
+        distances = np.minimum(distances, np.linalg.norm(points - points[selected[-1]], axis=1))
+    return tuple((numbers[i], found[numbers[i]].scale) for i in sorted(selected))

@@ -1,1 +1,1 @@
-"""Robot arms; each file registers its own."""
+"""Robots: arms with grippers, one file for each arm."""

@@ -1,4 +1,4 @@
-"""Robot: an arm with a two-finger gripper, as the rest of the simulator sees it."""
+"""Robot: the interface of an arm with a two-finger gripper."""
 
 from __future__ import annotations
 
@@ -29,73 +29,83 @@ from ba_torchrl.sim.world import World
 ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
 
 GRASP_NORMAL_COSINE = 0.7
-"""A finger squeezes what it touches within 45 degrees of the line it closes on."""
+"""A contact contributes to a grasp if its normal is within 45 degrees of the closing axis."""
 OPPOSED_COSINE = 0.8
-"""Two fingers hold a body if they press on it from opposite sides, within the friction cone, as
-seen along the approach: the sides of a roof may slope. An edge pushed into the wedge between them
-meets their surfaces at twice that angle: it is not held."""
+"""A grasp needs contact normals of the two fingers that are opposite within 37 degrees (the
+friction cone) in the plane perpendicular to the approach direction, so that the sides of a roof can
+slope. The normals of an edge that is wedged between the fingers differ by more."""
+GRASP_QUERY_M = 2e-3
+"""Maximum distance of the closest points whose normals are examined for a grasp."""
 
 _DISTANT_M = 10.0
-
-GRASP_QUERY_M = 2e-3
-"""Distance up to which a fresh query looks for the surfaces in contact."""
+"""Coordinates outside of every workspace."""
 
 
 class Robot(ABC):
-    """An arm with a parallel gripper in a world.
+    """An arm with a two-finger gripper in a world.
 
-    The arm follows stiff position motors, so that it is where it was told to be after one step;
-    whoever moves it keeps the steps small. Subclasses give the model's numbers and its inverse
-    kinematics. A robot is commanded in joint angles; `ba_torchrl.sim.control` plans them.
+    The arm has stiff position motors and reaches commanded joint angles within one physics step;
+    callers therefore command small displacements (see `ba_torchrl.sim.control`). Subclasses define
+    the constants of the model and its inverse kinematics. The tool frame has its origin between the
+    fingertips, its z axis along the approach direction and its x axis along the closing axis, the
+    line along which the fingers close.
+
+    Args:
+        world: the world into which the robot is loaded.
     """
 
     arm_joints: ClassVar[tuple[int, ...]]
+    """PyBullet indices of the arm joints, from the base to the hand."""
     finger_joints: ClassVar[tuple[int, ...]]
-    """The two driven joints of the gripper, left and right."""
+    """PyBullet indices of the two actuated finger joints, left and right."""
     finger_open_signs: ClassVar[tuple[float, float]]
-    """Sign of each finger's joint position when open."""
+    """Sign of each finger joint's position when the gripper is open."""
     finger_open_position: ClassVar[float]
-    """Joint position, up to the sign, of the fully open gripper: radians or metres, as are the
-    finger speed and force below. Closed is zero."""
+    """Absolute position of the finger joints when the gripper is fully open, in radians for
+    revolute and metres for prismatic joints. The closed position is zero."""
     finger_links: ClassVar[tuple[frozenset[int], frozenset[int]]]
-    """Links that belong to the left and to the right finger."""
+    """PyBullet indices of the links of the left and of the right finger."""
     grasp_normal_signs: ClassVar[tuple[float, float]]
-    """Sign along the tool's x axis in which each finger is pushed back by what it holds."""
+    """For each finger, the sign along the tool's x axis of the normal of a contact with a grasped
+    body (from the body to the finger)."""
     non_colliding_links: ClassVar[tuple[int, ...]]
-    """Links that collide with nothing: the arm, which stays above everything it works on."""
+    """Links whose collisions are disabled: the base and the arm."""
     hand_link: ClassVar[int]
-    """The link that the tool point is fixed to."""
+    """PyBullet index of the link to which the tool frame is fixed."""
     tool_offset_m: ClassVar[Vector]
-    """Tool point between the fingertips, in the frame of the hand link."""
+    """Position of the tool frame in the frame of the hand link."""
     tool_orientation: ClassVar[Quaternion] = IDENTITY
-    """Orientation of the tool in the frame of the hand link (x, y, z, w): the fingers open along
-    its x axis, its z axis is the direction of approach."""
+    """Orientation (x, y, z, w) of the tool frame in the frame of the hand link."""
     home_joints: ClassVar[tuple[float, ...]]
-    """Arm joints with which hand and arm are beside and above the workspace, out of any picture."""
+    """Arm joints of the home configuration, in which the robot is outside of every image."""
     has_flat_pads: ClassVar[bool] = True
-    """The fingers touch a face by several points at once, which grow stale as the hand turns."""
+    """Whether the fingers have flat pads, which touch a face at several contact points. PyBullet
+    does not update the normals of such contacts when the hand rotates (see `rebuild_contacts`)."""
     camera_height_m: ClassVar[float]
-    """The close-loop camera hangs this far above the tool point."""
+    """Height of the close-loop camera above the tool point."""
     finger_span_m: ClassVar[float]
-    """Distance between the finger squares in the close-loop image when fully open."""
+    """Distance between the finger squares in the close-loop image of a fully open gripper."""
     hand_half_extents_m: ClassVar[tuple[float, float]] = (0.07, 0.03)
-    """Half the extents of the open hand above its fingertips, along the line on which it closes and
-    across."""
+    """Half extents of the open hand above the fingertips, along and perpendicular to the closing
+    axis."""
 
     arm_force: ClassVar[float] = 300.0
+    """Maximum torque of an arm joint's motor, newton metres."""
     finger_force: ClassVar[float] = 2.0
-    """Largest torque or force of a finger's motor; 5 to 10 N at the tip."""
+    """Maximum torque (newton metres) or force (newtons) of a finger joint's motor; it corresponds
+    to 5 to 10 N at the fingertip."""
     finger_speed: ClassVar[float] = 2.0
-    """Speed of the finger joints per second: 4 mm per step at the tips. Twice as fast, they sink a
-    centimetre into what they meet."""
+    """Speed of the finger joints, radians or metres per second. The default is 4 mm per physics
+    step at the fingertips; at twice the speed they penetrate objects by a centimetre."""
 
     def __init__(self, world: World) -> None:
         self.world = world
         self.client = world.client
         self.id = self.load()
         self.joints: list[float] = [0.0] * len(self.arm_joints)
-        """Commanded arm joints in radians."""
+        """Commanded arm joints, radians."""
         self.commanded_opening = 1.0
+        """Commanded opening, 0 to 1."""
         self._finger_of_link = {
             link: side for side, links in enumerate(self.finger_links) for link in links
         }
@@ -104,24 +114,30 @@ class Robot(ABC):
 
     @abstractmethod
     def load(self) -> int:
-        """Load the model and return its PyBullet id."""
+        """Load the model into the world and return its PyBullet id."""
 
     @abstractmethod
     def inverse_kinematics(
         self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
     ) -> list[float] | None:
-        """Return arm joints that bring the tool to a pose, or None if it is out of reach.
+        """Return the arm joints for a pose of the tool.
 
         Args:
-            position: tool point in metres.
-            rotation: orientation of the tool; `downward` makes those of top-down grasps.
-            near: joints to stay close to where several solutions exist.
+            position: of the tool point, metres.
+            rotation: of the tool, such as `downward(yaw_rad)`.
+            near: reference joints, radians; among equivalent solutions, the closest is returned.
+
+        Returns:
+            Joint angles in radians; None if the pose is out of reach.
         """
 
     # -- for subclasses ----------------------------------------------------------------------
 
     def _widen_joint_limits(self, robot: int) -> None:
-        """Widen the arm's joint limits: a joint put beyond one is flung back by its constraint."""
+        """Widen the joint limits of the arm.
+
+        PyBullet's limit constraint would accelerate a joint that is teleported beyond its limit.
+        """
         for joint in self.arm_joints:
             pybullet.changeDynamics(
                 robot,
@@ -134,7 +150,15 @@ class Robot(ABC):
     def _add_gear(
         self, robot: int, first: int, second: int, ratio: float, max_force: float = 50
     ) -> None:
-        """Couple two joints: the first moves by minus ``ratio`` times what the second does."""
+        """Couple two joints by a gear constraint.
+
+        Args:
+            robot: PyBullet's id of the robot.
+            first: joint index.
+            second: joint index.
+            ratio: the velocity of the first joint is minus ``ratio`` times that of the second.
+            max_force: of the constraint.
+        """
         gear = pybullet.createConstraint(
             robot,
             first,
@@ -153,7 +177,11 @@ class Robot(ABC):
     # -- arm ---------------------------------------------------------------------------------
 
     def teleport(self, joints: Sequence[float]) -> None:
-        """Put the arm at rest at ``joints`` and command it to stay."""
+        """Set the arm joints, with zero velocities, and command them.
+
+        Args:
+            joints: radians.
+        """
         pybullet.resetJointStatesMultiDof(
             self.id,
             self.arm_joints,
@@ -164,7 +192,11 @@ class Robot(ABC):
         self.command(joints)
 
     def command(self, joints: Sequence[float]) -> None:
-        """Command the arm's motors to ``joints``, to be reached in the next step."""
+        """Set the targets of the arm's motors, which are reached in the next physics step.
+
+        Args:
+            joints: radians.
+        """
         pybullet.setJointMotorControlArray(
             self.id,
             self.arm_joints,
@@ -177,12 +209,12 @@ class Robot(ABC):
         self.joints = list(joints)
 
     def measured_joints(self) -> list[float]:
-        """Return the arm's joint angles as they are."""
+        """Return the current arm joints, radians."""
         states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
         return [state[0] for state in states]
 
     def tool_frame(self) -> Pose:
-        """Return the pose of the tool."""
+        """Return the pose of the tool frame in the world."""
         state = pybullet.getLinkState(
             self.id, self.hand_link, computeForwardKinematics=1, physicsClientId=self.client
         )
@@ -190,20 +222,19 @@ class Robot(ABC):
         return bullet_compose(hand, Pose(self.tool_offset_m, self.tool_orientation))
 
     def tool_pose(self) -> YawPose:
-        """Return the tool point and the gripper's yaw in [-pi, pi)."""
+        """Return the position of the tool frame and the yaw of its x axis, in [-pi, pi)."""
         tool = self.tool_frame()
-        # the fingers open along the tool's x axis
         return tool.position, tool.yaw_rad
 
     # -- gripper -----------------------------------------------------------------------------
 
     @property
     def gripper(self) -> Gripper:
-        """The gripper's outline, measured on the model."""
+        """Dimensions of the gripper, measured on the model."""
         return measured_gripper(type(self))
 
     def opening(self) -> float:
-        """Return how far the gripper is open, 0 to 1."""
+        """Return the opening of the gripper, from 0 (closed) to 1 (fully open)."""
         states = pybullet.getJointStates(self.id, self.finger_joints, physicsClientId=self.client)
         mean = (
             sum(s * state[0] for s, state in zip(self.finger_open_signs, states, strict=True)) / 2
@@ -211,7 +242,11 @@ class Robot(ABC):
         return min(max(mean / self.finger_open_position, 0.0), 1.0)
 
     def set_opening(self, opening: float) -> None:
-        """Put the fingers at rest at an opening and hold them there."""
+        """Set the opening of the fingers, with zero velocities, and command it.
+
+        Args:
+            opening: 0 to 1.
+        """
         pybullet.resetJointStatesMultiDof(
             self.id,
             self.finger_joints,
@@ -223,9 +258,13 @@ class Robot(ABC):
         self.command_opening(opening)
 
     def command_opening(self, opening: float) -> None:
-        """Command the fingers to an opening."""
+        """Set the targets of the finger motors.
+
+        Args:
+            opening: 0 to 1.
+        """
         if self.has_flat_pads and self.commanded_opening < min(opening, self.opening()) - 1e-3:
-            self.rebuild_contacts()  # they squeezed, now they let go
+            self.rebuild_contacts()  # the fingers grasped and now release
         pybullet.setJointMotorControlArray(
             self.id,
             self.finger_joints,
@@ -238,11 +277,11 @@ class Robot(ABC):
         self.commanded_opening = opening
 
     def rebuild_contacts(self) -> None:
-        """Have what the fingers touch lose and find its contacts anew, without moving it.
+        """Delete and detect again the contacts of all free bodies that the fingers touch.
 
-        Bullet keeps the normals of lasting contacts as they were in the world. Once the hand has
-        turned by half a turn, those of a flat face point the wrong way, and instead of pushing
-        the opening fingers off they would pull the body along.
+        Bullet does not rotate the normals of persistent contacts with the bodies. After a rotation
+        of the hand by half a turn, the normals of a flat face are reversed, and a body would follow
+        the opening finger. The poses and velocities of the bodies are unchanged.
         """
         touched = {
             point.other_id
@@ -250,28 +289,32 @@ class Robot(ABC):
             if point.link in self._finger_of_link
         }
         bodies = [body.id for body in self.world.bodies if body.id in touched and body.is_free]
-        kept = []
+        states = []
         for i, body in enumerate(bodies):
             pose = pybullet.getBasePositionAndOrientation(body, physicsClientId=self.client)
             velocity = pybullet.getBaseVelocity(body, physicsClientId=self.client)
-            kept.append((body, pose, velocity))
+            states.append((body, pose, velocity))
             pybullet.resetBasePositionAndOrientation(
                 body, (_DISTANT_M, i * _DISTANT_M, _DISTANT_M), pose[1], physicsClientId=self.client
             )
-        if kept:
+        if states:
             self.world.detect_collisions()
-        for body, pose, velocity in kept:
+        for body, pose, velocity in states:
             pybullet.resetBasePositionAndOrientation(body, *pose, physicsClientId=self.client)
             pybullet.resetBaseVelocity(body, *velocity, physicsClientId=self.client)
 
     # -- state -------------------------------------------------------------------------------
 
     def get_state(self) -> tuple[list[float], float]:
-        """Return the motors' commands, which PyBullet's own snapshots leave out."""
+        """Return the commanded joints and opening, which PyBullet's snapshots do not contain."""
         return list(self.joints), self.commanded_opening
 
     def set_state(self, state: tuple[list[float], float]) -> None:
-        """Repeat the commands that `get_state` returned."""
+        """Command the joints and the opening that `get_state` returned.
+
+        Args:
+            state: commanded joints (radians) and opening (0 to 1).
+        """
         joints, self.commanded_opening = state
         self.command(joints)
         self.command_opening(self.commanded_opening)
@@ -279,11 +322,11 @@ class Robot(ABC):
     # -- contacts ----------------------------------------------------------------------------
 
     def held_body(self) -> Body | None:
-        """Return the body squeezed between the fingers, as of the last step.
+        """Return the body that the fingers grasped in the last physics step.
 
-        Only contacts of finger links count. Both fingers must press on it from opposite sides,
-        along the line they close on up to what friction can bear: a block whose corner rests
-        against both fingers is not held.
+        Only contacts of finger links are considered. Each finger needs a contact whose normal is
+        close to the closing axis (`GRASP_NORMAL_COSINE`), and the normals of the two fingers must
+        be opposite (`OPPOSED_COSINE`): a block whose corner touches both fingers is not held.
         """
         touching: tuple[set[tuple[int, int]], ...] = (set(), set())
         for point in contacts(self.client, self.id):
@@ -292,19 +335,24 @@ class Robot(ABC):
                 touching[side].add((point.other_id, point.link))
         both = {body for body, _ in touching[0]} & {body for body, _ in touching[1]}
         for body in self.world.bodies:
-            if body.id in both and body.is_free and self._is_squeezed(body, touching):
+            if body.id in both and body.is_free and self._is_grasped(body, touching):
                 return body
         return None
 
-    def _is_squeezed(self, body: Body, touching: tuple[set[tuple[int, int]], ...]) -> bool:
-        """Whether a link of each finger pushes the body towards the other finger."""
+    def _is_grasped(self, body: Body, touching: tuple[set[tuple[int, int]], ...]) -> bool:
+        """Whether contact normals of the two fingers on a body are opposite.
+
+        Args:
+            body: the body.
+            touching: for each finger, pairs of the ids of touched bodies and the touching links.
+        """
         axis, _, approach = zip(*quaternion_matrix(self.tool_frame().orientation), strict=True)
         left, right = (
             [
                 point.normal
                 for body_id, link in links
                 if body_id == body.id
-                # a fresh query: normals of lasting contacts do not turn with the bodies
+                # closest points, as the normals of persistent contacts do not rotate with bodies
                 for point in nearest_points(self.client, self.id, body.id, GRASP_QUERY_M, link)
                 if sign * dot(point.normal, axis) > GRASP_NORMAL_COSINE
             ]
@@ -317,6 +365,6 @@ class Robot(ABC):
         )
 
     def is_near_anything(self, margin_m: float = 1e-3) -> bool:
-        """Whether the hand is closer than ``margin_m`` to a body or the floor, as of now."""
+        """Whether the hand is closer than ``margin_m`` to a body or the floor."""
         self.world.detect_collisions()
         return is_any_within(contacts(self.client, self.id), margin_m)

@@ -1,4 +1,4 @@
-"""The outline of a robot's gripper, measured on its collision shapes."""
+"""Gripper: the dimensions of a robot's gripper, measured on its collision shapes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ba_torchrl.sim.geometry import Matrix, Vector, YawPose, downward
 from ba_torchrl.sim.world import World
 
 FLOOR_CLEARANCE_M = 1e-3
-"""Distance that fingertips keep from the floor while they close."""
+"""Clearance between the closing fingertips and the floor."""
 GRASP_HEIGHT_M = 0.02
-"""Height above the tool point up to which fingers are beside what they grasp."""
+"""Height above the tool point up to which the fingers are beside a grasped object."""
 TIP_HEIGHT_M = 0.01
-"""The lowest part of the fingers, which counts as their tips."""
+"""Height of the lowest part of the fingers, which is considered as the fingertips."""
 
 _OPENINGS = tuple(np.linspace(0.0, 1.0, 9).tolist())
 _OUTLINE_SPACING_M = 5e-3
@@ -31,7 +31,7 @@ _POSITION = (0.45, 0.0, 0.25)
 
 
 class MeasurableRobot(Protocol):
-    """What the measurement needs of a `Robot`."""
+    """The part of the interface of `Robot` that the measurement uses."""
 
     id: int
     client: int
@@ -40,94 +40,94 @@ class MeasurableRobot(Protocol):
     def __init__(self, world: World) -> None: ...
 
     def inverse_kinematics(self, position: Vector, rotation: Matrix) -> list[float] | None:
-        """Return arm joints that bring the tool to a pose."""
+        """Return the arm joints for a pose of the tool."""
 
     def teleport(self, joints: Sequence[float]) -> None:
-        """Put the arm at rest at joint angles."""
+        """Set the arm joints, with zero velocities."""
 
     def set_opening(self, opening: float) -> None:
-        """Put the fingers at rest at an opening from 0 to 1."""
+        """Set the opening of the fingers, 0 to 1, with zero velocities."""
 
     def tool_pose(self) -> YawPose:
-        """Return the tool point and the gripper's yaw."""
+        """Return the position and yaw of the tool."""
 
 
 @dataclass(frozen=True)
 class Gripper:
-    """Outline of a gripper that points down, as things beneath it meet it.
+    """Dimensions and lower outline of a gripper that points straight down.
 
-    Distances are from the tool point along the line on which the fingers close, the same on both
-    sides; heights are above the tool point.
+    Distances are measured from the tool point along the closing axis, the line along which the
+    fingers close; the gripper is symmetric. Heights are relative to the tool point.
     """
 
     half_gap_m: float
     """Half the distance between the open fingers."""
     half_width_m: float
-    """Half the fingertips' width, across the line on which they close."""
+    """Half the width of the fingertips, perpendicular to the closing axis."""
     closed_half_m: float
-    """Half the extent of both fingertips along that line when they are closed."""
+    """Half the extent of the two closed fingertips along the closing axis."""
     palm_height_m: float
-    """Height of the lowest part over the gap between the fingers, however wide it is."""
-    arc: tuple[tuple[float, float], ...]
-    """Half gaps from closed to open, and the height at which the fingers end there: those that
-    swing go down as they close."""
+    """Height of the palm: the lowest part above the gap between the fingers at any opening."""
+    tip_arc: tuple[tuple[float, float], ...]
+    """Pairs of half the distance between the fingers, from closed to open, and the height of the
+    fingertips at this opening. Fingers that rotate move down as they close."""
     outline: tuple[tuple[float, float], ...]
-    """Distances, ascending from zero, and the height at which the open gripper begins there."""
+    """Pairs of distance, ascending from zero, and height of the open gripper's lower surface."""
     closed_outline: tuple[tuple[float, float], ...]
-    """The same of the closed gripper."""
+    """The same for the closed gripper."""
 
     @property
     def finger_depth_m(self) -> float:
-        """Extent of a fingertip along the line on which the fingers close."""
-        return self.closed_half_m - self.arc[0][0]
+        """Extent of a fingertip along the closing axis."""
+        return self.closed_half_m - self.tip_arc[0][0]
 
     @property
     def finger_reach_m(self) -> float:
-        """Distance from the tool point to the outside of the open fingers, where they grasp."""
+        """Distance of the outer side of the open fingers, up to `GRASP_HEIGHT_M`."""
         tips_m = self.half_gap_m + self.finger_depth_m
         return max([tips_m, *(u for u, z in self.outline if z < GRASP_HEIGHT_M)])
 
     @property
     def lowest_tip_m(self) -> float:
-        """Height at which the fingers end where their arc is lowest."""
-        return min(z for _, z in self.arc)
+        """Least height of the fingertips at any opening."""
+        return min(z for _, z in self.tip_arc)
 
     def closed_reach_m(self, height_m: float) -> float:
-        """Return how far the closed hand reaches from the tool point below a height."""
+        """Return the largest distance of the closed gripper below a height."""
         return max((u for u, z in self.closed_outline if z < height_m), default=0.0)
 
     def tip_height_m(self, half_gap_m: float) -> float:
-        """Return the height at which the fingers end, given half the distance between them."""
-        gaps, heights = zip(*self.arc, strict=True)
+        """Return the height of the fingertips for half the distance between the fingers."""
+        gaps, heights = zip(*self.tip_arc, strict=True)
         return float(np.interp(half_gap_m, gaps, heights))
 
     def lowest_tool_m(self, rotation: Matrix | None = None, opening: float = 1.0) -> float:
-        """Return how low the tool may be for the fingers to close without touching the floor.
+        """Return the least height of the tool at which the fingers close clear of the floor.
 
-        Those that swing go down as they close: on the floor they would close against it.
+        Fingers that rotate move down as they close, so that the height depends on the opening.
 
         Args:
-            rotation: of the tool; if None, it points down.
-            opening: how far the fingers are open at the start, 0 to 1.
+            rotation: of the tool; None means straight down.
+            opening: of the fingers before they close, 0 to 1.
 
         Returns:
             Height of the tool point above the floor, metres.
         """
         along, across, ahead = (0.0, 0.0, -1.0) if rotation is None else rotation[2]
-        widest = max(opening * self.half_gap_m, self.arc[0][0])
+        widest = max(opening * self.half_gap_m, self.tip_arc[0][0])
         depths = [
             abs(along) * min(gap, widest) + abs(across) * self.half_width_m + ahead * height
-            for gap, height in self.arc
+            for gap, height in self.tip_arc
         ]
         return max(depths) + FLOOR_CLEARANCE_M
 
 
 @cache
 def measured_gripper(robot: type[MeasurableRobot]) -> Gripper:
-    """Return the outline of a robot's gripper.
+    """Return the gripper of a robot class, measured once per process.
 
-    Rays from below find the collision shapes as contacts do, their margins included. It takes a
-    world of its own and tenths of a second, once in a process.
+    The measurement casts rays from below in a temporary world, which takes tenths of a second. The
+    rays hit the collision shapes including their margins, as contacts do.
     """
     us = np.arange(0.0, _MAX_U_M + _RAY_SPACING_M / 2, _RAY_SPACING_M)
     vs = np.arange(-_MAX_V_M, _MAX_V_M + _RAY_SPACING_M / 2, _RAY_SPACING_M)
@@ -137,25 +137,25 @@ def measured_gripper(robot: type[MeasurableRobot]) -> Gripper:
         closed, opened = (_underside(body, opening, us, vs) for opening in (0.0, 1.0))
         lines = [_underside(body, opening, us, np.zeros(1))[:, 0] for opening in _OPENINGS]
 
-    arc, palm = [], np.inf
+    tip_arc, palm = [], np.inf
     for heights in lines:
         gap = us[_are_tips(heights)].min()
-        arc.append((float(gap), float(heights.min())))
+        tip_arc.append((float(gap), float(heights.min())))
         palm = min([palm, *heights[us < gap - _CHAMFER_M]])
     tips = _are_tips(opened)
     return Gripper(
-        half_gap_m=arc[-1][0],
+        half_gap_m=tip_arc[-1][0],
         half_width_m=float(np.abs(vs[tips.any(axis=0)]).max()) + _RAY_SPACING_M / 2,
         closed_half_m=float(us[_are_tips(closed).any(axis=1)].max()) + _RAY_SPACING_M / 2,
         palm_height_m=float(palm),
-        arc=tuple(arc),
+        tip_arc=tuple(tip_arc),
         outline=_outline(us, opened),
         closed_outline=_outline(us, closed),
     )
 
 
 def _outline(us: np.ndarray, heights: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Return the lowest heights around every few millimetres of the way out, as far as they go."""
+    """Return pairs of distance and least height around it, up to the end of the gripper."""
     profile = heights.min(axis=1)
     reach = us[np.isfinite(profile)].max()
     return tuple(
@@ -171,9 +171,16 @@ def _are_tips(heights: np.ndarray) -> np.ndarray:
 def _underside(
     robot: MeasurableRobot, opening: float, us: np.ndarray, vs: np.ndarray
 ) -> np.ndarray:
-    """Return heights [U, V] above the tool at which rays from below meet the gripper.
+    """Return the least height [U, V] of the gripper above the tool point.
 
-    Both sides count, and infinity stands for nothing there.
+    Args:
+        robot: a robot whose tool points straight down.
+        opening: of the fingers, 0 to 1.
+        us: [U] distances along the closing axis, taken on both sides of the tool point.
+        vs: [V] coordinates perpendicular to the closing axis.
+
+    Returns:
+        The lower of the two sides; infinity where no ray hits the gripper.
     """
     robot.set_opening(opening)
     robot.world.detect_collisions()

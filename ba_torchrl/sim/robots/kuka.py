@@ -1,4 +1,4 @@
-"""Kuka LBR iiwa with PyBullet's two-finger gripper: closed-form inverse kinematics."""
+"""Kuka LBR iiwa with a two-finger gripper: model and closed-form inverse kinematics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _BASE_M = (-0.1, 0.0, -0.07)
 
 @ROBOTS.register("kuka")
 class Kuka(Robot):
-    """Seven-joint arm on a base behind the workspace (paper section 3.4)."""
+    """Kuka LBR iiwa, a seven-joint arm with a two-finger gripper (paper section 3.4).
+
+    The model is `kuka_iiwa/kuka_with_gripper2.sdf` of PyBullet's data package.
+    """
 
     arm_joints = tuple(range(7))
     finger_joints = (8, 11)
@@ -39,10 +42,10 @@ class Kuka(Robot):
     _tip_joints = (10, 13)
 
     def load(self) -> int:
-        """Load the arm, its gear between the fingers, and widen its joint limits."""
+        """Load the model, couple the fingers by a gear, and widen the joint limits."""
         model = f"{pybullet_data.getDataPath()}/kuka_iiwa/kuka_with_gripper2.sdf"
         robot = pybullet.loadSDF(model, physicsClientId=self.client)[0]
-        # PyBullet places the centre of mass, not the link frame
+        # PyBullet sets the pose of the centre of mass, not of the link frame
         offset = pybullet.getDynamicsInfo(robot, -1, physicsClientId=self.client)[3]
         pybullet.resetBasePositionAndOrientation(
             robot,
@@ -61,12 +64,13 @@ class Kuka(Robot):
                 positionGain=1.0,
                 physicsClientId=self.client,
             )
-        # two force-limited fingers have no stiffness along their common axis: held bodies slide
+        # without the gear, two fingers with limited force do not resist motion of a held body along
+        # the closing axis
         self._add_gear(robot, *self.finger_joints, ratio=1)
         return robot
 
     def set_opening(self, opening: float) -> None:
-        """Put the fingers at rest at an opening, their tips straight."""
+        """Set the opening of the fingers, with zero velocities, and straighten their tips."""
         pybullet.resetJointStatesMultiDof(
             self.id, self._tip_joints, [[0.0]] * 2, [[0.0]] * 2, physicsClientId=self.client
         )
@@ -75,16 +79,16 @@ class Kuka(Robot):
     def inverse_kinematics(
         self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
     ) -> list[float] | None:
-        """Solve shoulder, elbow and wrist in closed form, the elbow in the vertical plane.
+        """Return the arm joints for a pose of the tool; see `Robot.inverse_kinematics`.
 
-        The third joint stays at zero, which leaves one solution with the elbow up and the wrist
-        not flipped over.
+        Joint 3 is fixed at zero, so that the elbow is in the vertical plane through the wrist. Of
+        the remaining solutions, the one with the elbow up and the wrist not flipped is returned.
         """
         _, side, approach = zip(*rotation, strict=True)
         _, tool_y, tool_z = self.tool_offset_m
-        reach = _WRIST_TO_HAND_M + tool_z
+        tool_distance = _WRIST_TO_HAND_M + tool_z
         x, y, z = (
-            p - s * tool_y - a * reach - b
+            p - s * tool_y - a * tool_distance - b
             for p, s, a, b in zip(position, side, approach, _BASE_M, strict=True)
         )
         z -= _SHOULDER_HEIGHT_M
@@ -95,14 +99,14 @@ class Kuka(Robot):
         if abs(cos_elbow) > 1:
             return None
         elbow = math.acos(cos_elbow)
-        turn = math.atan2(y, x)
+        base_yaw = math.atan2(y, x)
         shoulder = math.atan2(radius, z) - math.atan2(
             _FOREARM_M * math.sin(elbow), _UPPER_ARM_M + _FOREARM_M * math.cos(elbow)
         )
-        # rotation left for the wrist, as Rz(q5) Ry(q6) Rz(q7) in the frame of the forearm
+        # remaining rotation of the wrist, Rz(q5) Ry(q6) Rz(q7), in the frame of the forearm
         tilt = shoulder + elbow
         ct, st = math.cos(tilt), math.sin(tilt)
-        c1, s1 = math.cos(turn), math.sin(turn)
+        c1, s1 = math.cos(base_yaw), math.sin(base_yaw)
         forearm_x = (c1 * ct, s1 * ct, -st)
         forearm_y = (-s1, c1, 0.0)
         forearm_z = (c1 * st, s1 * st, ct)
@@ -111,14 +115,14 @@ class Kuka(Robot):
         bend = math.hypot(m02, m12)
         if bend > 1e-9:
             q5, q6, sign = math.atan2(m12, m02), math.atan2(bend, m22), 1.0
-            if abs(q5) > math.pi / 2:  # the other solution, with the wrist folded forward
+            if abs(q5) > math.pi / 2:  # take the other solution, whose wrist is not flipped
                 q5, q6, sign = q5 - math.copysign(math.pi, q5), -q6, -1.0
             q7 = math.atan2(sign * dot(forearm_z, side), -sign * dot(forearm_z, hand_x))
-        else:  # wrist stretched or folded: the last two turns are about the same line
+        else:  # wrist singularity: the axes of joints 5 and 7 coincide
             q5, q6 = 0.0, math.atan2(0.0, m22)
             q7 = math.atan2(
                 dot(forearm_y, hand_x), math.copysign(1.0, m22) * dot(forearm_x, hand_x)
             )
         if near is not None:
             q7 += 2 * math.pi * round((near[6] - q7) / (2 * math.pi))
-        return [turn, shoulder, 0.0, -elbow, q5, q6, q7]
+        return [base_yaw, shoulder, 0.0, -elbow, q5, q6, q7]

@@ -1,4 +1,4 @@
-"""Franka Emika Panda with its own two-finger hand: closed-form inverse kinematics."""
+"""Franka Emika Panda with the Franka hand: model and closed-form inverse kinematics."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ELBOW_OFFSET_M = 0.0825
 _WRIST_OFFSET_M = 0.088
 _FLANGE_M = 0.107
 _TOOL_M = 0.1035
-"""From the flange to the tool point; the fingertips end at 0.1122 m."""
+"""Distance from the flange to the tool point; that to the fingertips is 0.1122 m."""
 _BASE_M = (-0.05, 0.0, 0.0)
 
 _SHOULDER_TO_ELBOW_M = math.hypot(_UPPER_ARM_M, _ELBOW_OFFSET_M)
@@ -27,7 +27,7 @@ _ELBOW_TO_WRIST_M = math.hypot(_FOREARM_M, _ELBOW_OFFSET_M)
 _SHOULDER_OFFSET_RAD = math.atan2(_ELBOW_OFFSET_M, _UPPER_ARM_M)
 _WRIST_OFFSET_RAD = math.atan2(_ELBOW_OFFSET_M, _FOREARM_M)
 _HAND_ANGLE_RAD = math.pi / 4
-"""Angle of the fingers' line about the axis of joint 7."""
+"""Angle of the closing axis about the axis of joint 7."""
 
 _SWIVEL_ITERATIONS = 6
 _SWIVEL_DIFFERENCE_RAD = 1e-4
@@ -38,7 +38,10 @@ _TOLERANCE = 1e-10
 
 @ROBOTS.register("panda")
 class Panda(Robot):
-    """Seven-joint arm on a base behind the workspace (paper section 3.4)."""
+    """Franka Emika Panda, a seven-joint arm with the Franka hand (paper section 3.4).
+
+    The model is `franka_panda/panda.urdf` of PyBullet's data package.
+    """
 
     arm_joints = tuple(range(7))
     finger_joints = (9, 10)
@@ -59,7 +62,7 @@ class Panda(Robot):
     finger_speed = 0.4
 
     def load(self) -> int:
-        """Load the arm, its gear between the fingers, and widen its joint limits."""
+        """Load the model, couple the fingers by a gear, and widen the joint limits."""
         robot = pybullet.loadURDF(
             f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf",
             _BASE_M,
@@ -67,57 +70,61 @@ class Panda(Robot):
             physicsClientId=self.client,
         )
         self._widen_joint_limits(robot)
-        # two force-limited fingers have no stiffness along their common axis: held bodies slide
+        # without the gear, two fingers with limited force do not resist motion of a held body along
+        # the closing axis
         self._add_gear(robot, *self.finger_joints, ratio=-1)
         return robot
 
     def inverse_kinematics(
         self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
     ) -> list[float] | None:
-        """Solve in closed form for a given swivel of the hand about its approach.
+        """Return the arm joints for a pose of the tool; see `Robot.inverse_kinematics`.
 
-        The arm has a joint to spare. The swivel that is chosen turns the first joint towards the
-        hand, so that the upper arm may pass through the vertical. Where the forearm points along
-        the approach the swivel hardly moves the elbow: there it stays as it is, the wrist's offset
-        pointing outwards. Pointing down, both are the same and nothing is left to search for.
+        The arm is redundant. For a given swivel angle, by which the wrist offset is rotated about
+        the approach direction, the solution is in closed form. A few Gauss-Newton iterations find
+        the swivel angle at which the upper arm is in the vertical plane through the wrist; the
+        damping keeps the angle near zero where it hardly affects the elbow. If the tool points
+        straight down, the angle is zero without iterations.
         """
         finger, _, approach = zip(*rotation, strict=True)
-        reach = _FLANGE_M + _TOOL_M
-        x, y, z = (p - reach * a - b for p, a, b in zip(position, approach, _BASE_M, strict=True))
+        tool_distance = _FLANGE_M + _TOOL_M
+        x, y, z = (
+            p - tool_distance * a - b for p, a, b in zip(position, approach, _BASE_M, strict=True)
+        )
         center = (x, y, z - _SHOULDER_HEIGHT_M)
         radius = math.hypot(x, y) or 1.0
         outwards = (x / radius, y / radius, 0.0)
-        beside = (-outwards[1], outwards[0], 0.0)
+        sideways = (-outwards[1], outwards[0], 0.0)
         start = perpendicular(outwards, approach)
         across = cross(approach, start)
 
-        def solve(turn: float) -> _ArmConfiguration | None:
-            swivel = _SWIVEL_LIMIT_RAD * math.tanh(turn / _SWIVEL_LIMIT_RAD)
+        def solve(parameter: float) -> _ArmConfiguration | None:
+            swivel = _SWIVEL_LIMIT_RAD * math.tanh(parameter / _SWIVEL_LIMIT_RAD)
             cos, sin = math.cos(swivel), math.sin(swivel)
             offset = tuple(cos * s + sin * a for s, a in zip(start, across, strict=True))
             return _solve_arm(center, approach, offset)
 
-        turn = 0.0
-        arm = solve(turn)
+        parameter = 0.0
+        arm = solve(parameter)
         if arm is None:
             return None
-        # damped Gauss-Newton, a fixed number of rounds: smooth in the pose, converged or not
+        # a fixed number of damped iterations: the solution is continuous even if not converged
         for _ in range(_SWIVEL_ITERATIONS):
-            lean = dot(arm.upper_arm, beside)
-            if abs(lean) < _TOLERANCE:
+            residual = dot(arm.upper_arm, sideways)
+            if abs(residual) < _TOLERANCE:
                 break
-            ahead = solve(turn + _SWIVEL_DIFFERENCE_RAD)
-            if ahead is None:
+            shifted = solve(parameter + _SWIVEL_DIFFERENCE_RAD)
+            if shifted is None:
                 break
-            slope = (dot(ahead.upper_arm, beside) - lean) / _SWIVEL_DIFFERENCE_RAD
-            turn -= lean * slope / (slope * slope + _SWIVEL_DAMPING)
-            moved = solve(turn)
-            if moved is None:
+            slope = (dot(shifted.upper_arm, sideways) - residual) / _SWIVEL_DIFFERENCE_RAD
+            parameter -= residual * slope / (slope * slope + _SWIVEL_DAMPING)
+            updated = solve(parameter)
+            if updated is None:
                 break
-            arm = moved
-        return self._joints(arm, outwards, finger, approach, near)
+            arm = updated
+        return self._joint_angles(arm, outwards, finger, approach, near)
 
-    def _joints(
+    def _joint_angles(
         self,
         arm: _ArmConfiguration,
         outwards: Vector,
@@ -125,20 +132,28 @@ class Panda(Robot):
         approach: Vector,
         near: Sequence[float] | None,
     ) -> list[float]:
-        """Read the joint angles off the directions of the links."""
+        """Return the joint angles for the directions of the links.
+
+        Args:
+            arm: directions of the links.
+            outwards: horizontal direction from the base to the wrist.
+            finger: direction of the closing axis.
+            approach: approach direction.
+            near: reference joints of `inverse_kinematics`.
+        """
         ux, uy, uz = arm.upper_arm
-        level = math.hypot(ux, uy)
-        # leaning back is a negative second joint, not a base turned round; leaning sideways,
-        # either will do, but not one after the other
-        ahead = outwards
+        horizontal = math.hypot(ux, uy)
+        # an upper arm that leans backwards is a negative joint 2, not a base rotated by half a
+        # turn; near the border between the two cases, the reference joints decide
+        forward = outwards
         if near is not None:
-            ahead = (ahead[0] + math.cos(near[0]), ahead[1] + math.sin(near[0]), 0.0)
-        sign = 1.0 if dot(arm.upper_arm, ahead) >= 0 else -1.0
-        if level > 1e-7:
-            c1, s1 = sign * ux / level, sign * uy / level
+            forward = (forward[0] + math.cos(near[0]), forward[1] + math.sin(near[0]), 0.0)
+        sign = 1.0 if dot(arm.upper_arm, forward) >= 0 else -1.0
+        if horizontal > 1e-7:
+            c1, s1 = sign * ux / horizontal, sign * uy / horizontal
         else:
             c1, s1 = outwards[0], outwards[1]
-        q2 = math.atan2(sign * level, uz)
+        q2 = math.atan2(sign * horizontal, uz)
         c2, s2 = math.cos(q2), math.sin(q2)
         elbow_axis = cross(arm.forearm_normal, arm.forearm)  # of joint 4
         upper_front = cross(arm.upper_arm, elbow_axis)
@@ -146,7 +161,7 @@ class Panda(Robot):
         across = cross(approach, arm.offset)  # axis of joint 6
         q5 = math.atan2(dot(across, arm.forearm_normal), dot(across, elbow_axis))
         q7 = math.atan2(dot(finger, across), dot(finger, arm.offset)) - _HAND_ANGLE_RAD
-        joints = [math.atan2(s1, c1), q2, q3, arm.elbow_rad, q5, arm.wrist, q7]
+        joints = [math.atan2(s1, c1), q2, q3, arm.elbow_rad, q5, arm.wrist_rad, q7]
         if near is not None:
             full = 2 * math.pi
             joints = [q + full * round((n - q) / full) for q, n in zip(joints, near, strict=True)]
@@ -154,25 +169,30 @@ class Panda(Robot):
 
 
 class _ArmConfiguration(NamedTuple):
-    """Directions of the links, and the two angles that follow from lengths alone."""
+    """Directions of the links, and the angles of joints 4 and 6."""
 
     upper_arm: Vector
     forearm: Vector
     forearm_normal: Vector
-    """Of the forearm, perpendicular to it, to the inside of the elbow."""
+    """Perpendicular to the forearm, towards the inside of the elbow."""
     offset: Vector
-    """From the axis of joint 6 to that of joint 7."""
+    """Direction from the axis of joint 6 to that of joint 7."""
     elbow_rad: float
-    wrist: float
+    """Angle of joint 4."""
+    wrist_rad: float
+    """Angle of joint 6."""
 
 
 def _solve_arm(center: Vector, approach: Vector, offset: Vector) -> _ArmConfiguration | None:
-    """Solve the arm that ends at a point of the axis of joint 7, given the wrist's offset.
+    """Return the arm configuration for a position of joint 7 and a direction of the wrist offset.
 
     Args:
-        center: the point on the axis of joint 7, seen from the shoulder, in metres.
-        approach: direction of that axis.
-        offset: direction of the wrist's offset.
+        center: point on the axis of joint 7, relative to the shoulder, metres.
+        approach: direction of this axis.
+        offset: direction from the axis of joint 6 to that of joint 7.
+
+    Returns:
+        None if the point is out of reach.
     """
     wrist = tuple(c - _WRIST_OFFSET_M * o for c, o in zip(center, offset, strict=True))
     distance = math.sqrt(dot(wrist, wrist))
@@ -182,7 +202,7 @@ def _solve_arm(center: Vector, approach: Vector, offset: Vector) -> _ArmConfigur
     if abs(cos_elbow) > 1:
         return None
     elbow_rad = math.acos(cos_elbow) - _SHOULDER_OFFSET_RAD - _WRIST_OFFSET_RAD - math.pi
-    # angle of the forearm with the line from wrist to shoulder; it is perpendicular to joint 6
+    # angle between the forearm, which is perpendicular to joint 6, and the line wrist - shoulder
     slant = _WRIST_OFFSET_RAD + math.acos(
         min(
             (distance**2 + _ELBOW_TO_WRIST_M**2 - _SHOULDER_TO_ELBOW_M**2)
@@ -203,9 +223,9 @@ def _solve_arm(center: Vector, approach: Vector, offset: Vector) -> _ArmConfigur
         w - _FOREARM_M * f + _ELBOW_OFFSET_M * n
         for w, f, n in zip(wrist, forearm, front, strict=True)
     )
-    turned = cross(cross(front, forearm), elbow)
+    perpendicular_to_elbow = cross(cross(front, forearm), elbow)
     upper_arm = tuple(
         (_UPPER_ARM_M * e + _ELBOW_OFFSET_M * t) / _SHOULDER_TO_ELBOW_M**2
-        for e, t in zip(elbow, turned, strict=True)
+        for e, t in zip(elbow, perpendicular_to_elbow, strict=True)
     )
     return _ArmConfiguration(upper_arm, forearm, front, offset, elbow_rad, angle)

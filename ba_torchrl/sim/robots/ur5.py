@@ -1,4 +1,4 @@
-"""UR5 with a parallel jaw or with a Robotiq 2F-85: closed-form inverse kinematics."""
+"""UR5 with a parallel-jaw or Robotiq 2F-85 gripper: models and closed-form inverse kinematics."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ _BASE_M = (-0.05, 0.0, 0.1)
 
 
 class UR5(Robot):
-    """Six-joint arm on a base behind the workspace (paper section 3.4), without a gripper.
+    """Universal Robots UR5, a six-joint arm (paper section 3.4); subclasses add the gripper.
 
-    Subclasses name a gripper's model, which is joined to the arm's at the link "flange".
+    The model is `models/ur5_arm.urdf` of this package, with the published Denavit-Hartenberg
+    parameters and simplified visual shapes.
     """
 
     gripper_model: ClassVar[str]
+    """File in `models/`, whose root link is attached to the link "flange" of the arm."""
 
     arm_joints = tuple(range(6))
     non_colliding_links = tuple(range(-1, 6))
@@ -40,7 +42,7 @@ class UR5(Robot):
     finger_span_m = 42 * 0.3 / 128
 
     def load(self) -> int:
-        """Load arm and gripper as one model and widen the arm's joint limits."""
+        """Load arm and gripper as one model and widen the joint limits of the arm."""
         robot = _load_joined(
             (_MODELS / "ur5_arm.urdf", _MODELS / self.gripper_model), _BASE_M, self.client
         )
@@ -50,30 +52,32 @@ class UR5(Robot):
     def inverse_kinematics(
         self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
     ) -> list[float] | None:
-        """Solve in closed form: arm to the front, elbow up, wrist 2 pointing outwards.
+        """Return the arm joints for a pose of the tool; see `Robot.inverse_kinematics`.
 
-        Of the eight solutions this one is smooth all over the workspace as long as the gripper
-        does not point sideways.
+        Of the eight solutions, the one with the shoulder forward, the elbow up and wrist 2 pointing
+        outwards is returned. It is continuous in the workspace unless the tool is horizontal.
         """
         finger, _, approach = zip(*rotation, strict=True)
-        reach = _WRIST_3_M + self.tool_offset_m[2]
-        x, y, z = (p - reach * a - b for p, a, b in zip(position, approach, _BASE_M, strict=True))
+        tool_distance = _WRIST_3_M + self.tool_offset_m[2]
+        x, y, z = (
+            p - tool_distance * a - b for p, a, b in zip(position, approach, _BASE_M, strict=True)
+        )
         radius = math.hypot(x, y)
         if radius < _WRIST_1_M:
             return None
-        # the arm's vertical plane passes beside the wrist
-        turn = math.atan2(y, x) - math.asin(_WRIST_1_M / radius)
-        c1, s1 = math.cos(turn), math.sin(turn)
+        # the vertical plane of the arm is offset from the wrist
+        base_yaw = math.atan2(y, x) - math.asin(_WRIST_1_M / radius)
+        c1, s1 = math.cos(base_yaw), math.sin(base_yaw)
         front, side = (c1, s1, 0.0), (-s1, c1, 0.0)
         cos5 = min(max(dot(approach, side), -1.0), 1.0)
         q5 = -math.acos(cos5)
         sin5 = math.sqrt(1 - cos5 * cos5)
         if sin5 < 1e-6:
-            return None  # the last axis parallel to those of the arm: the wrist is free to spin
+            return None  # wrist singularity: the last axis is parallel to those of joints 2 to 4
         across = tuple((a - cos5 * s) / sin5 for a, s in zip(approach, side, strict=True))
         wrist_2 = cross(across, side)  # axis of joint 5
         total = math.atan2(across[2], -dot(across, front))  # sum of joints 2, 3 and 4
-        # what is left is two links in the plane
+        # joints 2 and 3: a planar arm with two links
         u = math.sqrt(radius**2 - _WRIST_1_M**2) - _WRIST_2_M * dot(wrist_2, front)
         v = z - _WRIST_2_M * wrist_2[2] - _SHOULDER_HEIGHT_M
         cos3 = (u**2 + v**2 - _UPPER_ARM_M**2 - _FOREARM_M**2) / (2 * _UPPER_ARM_M * _FOREARM_M)
@@ -87,12 +91,15 @@ class UR5(Robot):
         q6 = math.atan2(-dot(finger, wrist_2), dot(finger, axis_x))
         if near is not None:
             q6 += 2 * math.pi * round((near[5] - q6) / (2 * math.pi))
-        return [turn, q2, q3, total - q2 - q3, q5, q6]
+        return [base_yaw, q2, q3, total - q2 - q3, q5, q6]
 
 
 @ROBOTS.register("ur5")
 class UR5ParallelJaw(UR5):
-    """UR5 with two fingers that slide on a rail."""
+    """UR5 with a parallel-jaw gripper, whose two fingers move on prismatic joints.
+
+    The model of the gripper is `models/parallel_jaw.urdf` of this package.
+    """
 
     gripper_model = "parallel_jaw.urdf"
 
@@ -109,16 +116,21 @@ class UR5ParallelJaw(UR5):
     finger_speed = 0.4
 
     def load(self) -> int:
-        """Load the robot with a gear between its fingers."""
+        """Load the model and couple the fingers by a gear."""
         robot = super().load()
-        # two force-limited fingers have no stiffness along their common axis: held bodies slide
+        # without the gear, two fingers with limited force do not resist motion of a held body along
+        # the closing axis
         self._add_gear(robot, *self.finger_joints, ratio=-1)
         return robot
 
 
 @ROBOTS.register("ur5_robotiq")
 class UR5Robotiq(UR5):
-    """UR5 with a Robotiq 2F-85, whose pads swing on an arc and stay parallel."""
+    """UR5 with a Robotiq 2F-85 gripper, whose finger pads move on arcs and stay parallel.
+
+    The model of the gripper is `models/robotiq_2f85.urdf` of this package, with the dimensions of
+    the published linkage.
+    """
 
     gripper_model = "robotiq_2f85.urdf"
 
@@ -136,10 +148,10 @@ class UR5Robotiq(UR5):
     finger_speed = 7.5
 
     _followers: ClassVar[dict[int, int]] = {8: 7, 9: 7, 11: 10, 12: 10}
-    """Finger and inner knuckle of each side, and the driving joint whose angle they take."""
+    """Joints of each side's finger and inner knuckle, and the actuated joint that they follow."""
 
     def load(self) -> int:
-        """Load the robot and close its linkage by gears."""
+        """Load the model and couple the joints of the linkage by gears."""
         robot = super().load()
         for joint in self._followers:
             pybullet.setJointMotorControl2(
@@ -151,7 +163,7 @@ class UR5Robotiq(UR5):
         return robot
 
     def set_opening(self, opening: float) -> None:
-        """Put the whole linkage at rest at an opening."""
+        """Set the opening of all joints of the linkage, with zero velocities."""
         pybullet.resetJointStatesMultiDof(
             self.id,
             list(self._followers),
@@ -163,7 +175,13 @@ class UR5Robotiq(UR5):
 
 
 def _load_joined(models: Sequence[Path], base_m: Vector, client: int) -> int:
-    """Load URDF files, whose links refer to each other's, as one body."""
+    """Load several URDF files as one body and return its PyBullet id.
+
+    Args:
+        models: the files; a joint can connect links of different files.
+        base_m: position of the fixed base.
+        client: PyBullet's client id.
+    """
     joined = ElementTree.Element("robot", name="+".join(model.stem for model in models))
     materials = set()
     for model in models:
@@ -174,7 +192,7 @@ def _load_joined(models: Sequence[Path], base_m: Vector, client: int) -> int:
             for mesh in part.iter("mesh"):
                 mesh.set("filename", str(model.with_name(mesh.get("filename"))))
             joined.append(part)
-    file, name = tempfile.mkstemp(suffix=".urdf")  # PyBullet reads from files only
+    file, name = tempfile.mkstemp(suffix=".urdf")  # PyBullet loads models only from files
     try:
         with os.fdopen(file, "wb") as out:
             ElementTree.ElementTree(joined).write(out)
