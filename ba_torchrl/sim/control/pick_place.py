@@ -27,7 +27,6 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
 
-
 PEAK_ACCELERATION = 10 / math.sqrt(3)
 """Greatest acceleration of `quintic_time_scaling` for a unit distance and a unit duration."""
 

@@ -230,7 +230,7 @@ class PointSplat(View):
         lenses = side_lenses(setup.center_m, setup.workspace_m + setup.width_m)
         everywhere = (-math.inf, math.inf)
         points = visible_points(
-            [seen.camera.surface],
+            [seen.camera.mesh],
             lenses,
             min(self._camera_pixels_per_pixel * setup.pixels, self._max_pixels),
             (everywhere, everywhere, (-math.inf, ceiling)),
@@ -263,7 +263,7 @@ class PerspectiveTopDown(View):
         """Return the image, [1, H, W]."""
         setup, ((x, y, z), yaw) = seen.setup, seen.tool
         lens = Lens((x, y, z + setup.camera_height_m), (x, y, z), self.fov_rad)
-        depth = depth_image([seen.camera.surface], lens, setup.pixels)
+        depth = depth_image([seen.camera.mesh], lens, setup.pixels)
         values = np.clip(depth, *self.range_m(setup))
         scale = lens.focal_px(setup.pixels) / setup.camera_height_m
         _draw_fingers(
@@ -301,7 +301,7 @@ class Oblique(View):
         setup = seen.setup
         lens = oblique_lens(setup.center_m)
         fingers = finger_boxes(seen.tool, seen.finger_offset_m)
-        values = depth_image([seen.camera.surface, fingers], lens, setup.pixels)
+        values = depth_image([seen.camera.mesh, fingers], lens, setup.pixels)
         if self.shows_height:
             values = lens.heights_m(values)
         return np.clip(values, *self.range_m(setup))[None]
