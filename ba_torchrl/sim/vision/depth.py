@@ -75,7 +75,8 @@ class SceneMesh:
         self._bodies = [body for body in bodies if not isinstance(body.shape, Decal)]
         self._meshes: list[Mesh | None] = [None] * len(self._bodies)
         self._shown: list[int] | None = None
-        self._vertices = self._owner = self._faces = self._poses = self._world_vertices = np.empty(0)
+        self._vertices = self._owner = self._faces = np.empty(0)
+        self._poses = self._world_vertices = np.empty(0)
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return vertices [V, 3] in metres and faces [F, 3]; the next call overwrites both."""
