@@ -159,7 +159,7 @@ class PointCloud(Observation):
         robot, workspace = scene.robot, self.workspace
         fingers = finger_boxes(robot.tool_pose(), robot.finger_span_m * robot.opening() / 2)
         points = point_cloud(
-            [scene.camera.surface, fingers],
+            [scene.camera.mesh, fingers],
             side_lenses(workspace.center, workspace.width),
             self.config.point_cloud,
             (workspace.x, workspace.y, workspace.z),

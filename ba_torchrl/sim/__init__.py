@@ -1,1 +1,1 @@
-"""The simulator: PyBullet worlds, bodies, robots and cameras; knows no torch."""
+"""The simulator: PyBullet worlds, bodies, robots, controllers and cameras, without torch."""

@@ -1,1 +1,1 @@
-"""Sets of objects: PyBullet's random shapes, procedural household items, folders of meshes."""
+"""Object sets: PyBullet random shapes, household items and folders of meshes."""

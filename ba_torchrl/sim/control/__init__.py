@@ -1,1 +1,1 @@
-"""Motion of the arm: close-loop displacements, picks and places."""
+"""Controllers: close-loop motion, and open-loop pick and place."""

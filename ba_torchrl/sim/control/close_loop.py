@@ -1,60 +1,39 @@
-"""Close-loop motion of a top-down gripper: bounded, guarded, and simulated only where it matters.
+"""Close-loop control of a tool that points straight down.
 
-Nothing here loops until something converges: every move has a step count that is known when it
-starts. Three regimes, chosen by contact and not by task:
+The number of physics steps of a motion is bounded and known when it starts. There are three cases,
+which depend only on contacts:
 
-- nothing held and the way free: the arm is teleported along the free part of its path, which is
-  sampled every centimetre (`fast_mode`; otherwise this part is simulated as well);
-- nothing held and something near: the rest of the path at a bounded speed with a constant
-  deceleration below the floor's friction, so that a pushed body stays at the finger;
-- something held: a smooth quintic profile that the grasp's friction can follow.
+- Nothing is held, and the path is free: the arm is teleported along the free part of the path,
+  which is checked at samples (with `fast_mode`; otherwise this part is simulated, too).
+- Nothing is held, and something is near: the rest of the path is simulated at a bounded speed. The
+  deceleration is below that of the floor's friction, so that a pushed body stays at the finger.
+- A body is held: the path is simulated with quintic time scaling, whose acceleration the friction
+  of the grasp can transmit.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import Contact, lateral_force_n, outer_contacts, vertical_force_n
+from ba_torchrl.sim.control.limits import MotionLimits
 from ba_torchrl.sim.geometry import Vector, YawPose, downward
 from ba_torchrl.sim.robots.base import Robot
 
 OPENING_TOLERANCE = 0.02
-"""An opening this close to the wanted one is reached."""
+"""Tolerance within which a target opening counts as reached."""
 STALL_FRACTION = 0.1
-"""Fingers slower than this share of their speed have met something."""
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """Speeds and forces of close-loop motion."""
-
-    contact_speed_m_s: float = 0.4
-    contact_speed_rad_s: float = 6.0
-    deceleration_m_s2: float = 4.0
-    """Less than the floor's friction times gravity, or a pushed body runs ahead."""
-    held_time_s: float = 0.1
-    """Time for 5 cm with a body in hand; scales with the root of the distance."""
-    max_vertical_force_n: float = 40.0
-    """A move stops when the hand or what it holds presses harder than this along z."""
-    max_lateral_force_n: float = 150.0
-    """The same for forces from the side."""
-    press_stride_m: float = 5e-4
-    """Stride of a move that starts out pressing on something."""
-    max_press_steps: int = 8
-    path_sample_m: float = 0.01
-    path_sample_rad: float = 0.14
-    max_gripper_steps: int = 60
+"""Fingers that move at less than this fraction of their commanded speed are in contact."""
 
 
 class CloseLoopController:
-    """Moves a robot's tool and works its gripper.
+    """Moves a tool that points straight down, and opens and closes the gripper.
 
     Args:
-        robot: the robot, pointing down.
-        teleport: skip the simulation of free travel.
+        robot: the robot.
+        teleport: teleport the arm along the free part of a path instead of simulating it.
         limits: speeds and forces.
     """
 
@@ -68,7 +47,11 @@ class CloseLoopController:
         self._target_opening = 1.0
 
     def reset(self, pose: YawPose, opening: float = 1.0) -> None:
-        """Put the tool at a pose without moving anything else.
+        """Teleport the tool to a pose, without simulation.
+
+        Args:
+            pose: position and yaw of the tool.
+            opening: of the gripper, 0 to 1.
 
         Raises:
             ValueError: the pose is out of reach.
@@ -81,15 +64,23 @@ class CloseLoopController:
         self._target_opening = opening
 
     def get_state(self) -> float:
-        """Return the wanted opening, which the next `grip` is compared with."""
+        """Return the target opening of the last `grip`."""
         return self._target_opening
 
     def set_state(self, state: float) -> None:
-        """Take up what `get_state` returned."""
+        """Restore the target opening of the last `grip`."""
         self._target_opening = state
 
     def move_to(self, position: Vector, yaw_rad: float) -> None:
-        """Move the tool in a straight line towards a pose, as far as reach and contacts allow."""
+        """Move the tool along a straight line to a pose.
+
+        The motion ends early where the pose is out of reach or the contact forces exceed their
+        limits.
+
+        Args:
+            position: target of the tool point, metres.
+            yaw_rad: target yaw of the tool.
+        """
         robot, limits = self.robot, self.limits
         self._unwind_wrist()
         path = _Path(robot, robot.tool_pose(), (position, yaw_rad))
@@ -111,7 +102,11 @@ class CloseLoopController:
         self.world.step()
 
     def grip(self, opening: float) -> None:
-        """Open or close the fingers towards an opening until they are there or meet something."""
+        """Open or close the fingers until they reach an opening or are stopped by a contact.
+
+        Args:
+            opening: target, 0 to 1.
+        """
         if abs(opening - self._target_opening) < 1e-3:
             return
         self._target_opening = opening
@@ -120,15 +115,15 @@ class CloseLoopController:
     # ----------------------------------------------------------------------------------------
 
     def _unwind_wrist(self) -> None:
-        """Turn the last joint back by whole turns, which moves nothing, before it hits a limit."""
-        turns = round(self.robot.joints[-1] / (2 * math.pi))
-        if turns:
+        """Change the last joint by a multiple of 2 pi, which keeps it within its limits."""
+        revolutions = round(self.robot.joints[-1] / (2 * math.pi))
+        if revolutions:
             joints = self.robot.measured_joints()
-            joints[-1] -= turns * 2 * math.pi
+            joints[-1] -= revolutions * 2 * math.pi
             self.robot.teleport(joints)
 
     def _teleport_free_part(self, path: _Path) -> float:
-        """Teleport along the path to the last sample that touches nothing; return its place."""
+        """Teleport to the last sample before the first contact; return its fraction of the path."""
         count = max(
             1,
             math.ceil(
@@ -152,77 +147,93 @@ class CloseLoopController:
         return done
 
     def _press_down(self, path: _Path) -> float:
-        """Press from where the hand rests, a fraction of a millimetre at a time.
+        """Start a downward motion in contact with small displacements.
 
         Returns:
-            The place reached; 1 if the press is firm, which ends the move.
+            The fraction of the path that was reached; 1 if a force limit ended the motion.
         """
         stride = self.limits.press_stride_m / max(path.length_m, self.limits.press_stride_m)
-        place = 0.0
+        fraction = 0.0
         for _ in range(self.limits.max_press_steps):
-            place = min(place + stride, 1.0)
-            if not self._simulate_path(path, [place], None):
+            fraction = min(fraction + stride, 1.0)
+            if not self._simulate_path(path, [fraction], None):
                 return 1.0
-        return place
+        return fraction
 
     def _is_in_contact_below(self, held: Body | None) -> bool:
-        """Whether the hand, or what it holds, stands on anything else or all but touches it."""
+        """Whether the hand or the held body has a vertical contact, or is close to one."""
         return any(
             point.is_vertical and point.distance_m < 2 * self.limits.press_stride_m
             for point in self._outer_contacts(held)
         )
 
-    def _contact_profile(self, path: _Path, share: float) -> list[float]:
-        """Return the places along the last ``share`` of the path, one per step, from 0 to 1."""
+    def _contact_profile(self, path: _Path, remaining: float) -> list[float]:
+        """Return the time scaling for a constant speed followed by a constant deceleration.
+
+        Args:
+            path: the path.
+            remaining: fraction of the path that the motion covers, at its end.
+
+        Returns:
+            For each physics step, the covered fraction of this part, ending with 1.
+        """
         limits, dt = self.limits, self.world.physics.time_step_s
-        length = path.length_m * share
+        length = path.length_m * remaining
         speed = min(
             limits.contact_speed_m_s, math.sqrt(2 * limits.deceleration_m_s2 * max(length, 1e-6))
         )
-        braking = speed / limits.deceleration_m_s2
-        cruising = max(length - 0.5 * speed * braking, 0.0) / speed
-        duration = max(
-            cruising + braking, path.angle_rad * share / limits.contact_speed_rad_s, 2 * dt
+        braking_s = speed / limits.deceleration_m_s2
+        cruising_s = max(length - 0.5 * speed * braking_s, 0.0) / speed
+        duration_s = max(
+            cruising_s + braking_s, path.angle_rad * remaining / limits.contact_speed_rad_s, 2 * dt
         )
-        count = max(2, math.ceil(duration / dt))
-        brake = min(1.0, braking / duration)  # share of the time
+        count = max(2, math.ceil(duration_s / dt))
+        brake = min(1.0, braking_s / duration_s)  # fraction of the duration
         total = 1 - brake / 2
 
-        def place(u: float) -> float:
+        def fraction(u: float) -> float:
             covered = u if u <= 1 - brake else total - (1 - u) ** 2 / (2 * brake)
             return covered / total
 
-        return [place(i / count) for i in range(1, count + 1)]
+        return [fraction(i / count) for i in range(1, count + 1)]
 
-    def _simulate_path(self, path: _Path, places: list[float], held: Body | None) -> bool:
-        """Simulate the path; stop where it leaves the reach, step back where it presses.
+    def _simulate_path(self, path: _Path, fractions: list[float], held: Body | None) -> bool:
+        """Simulate a motion along the path.
+
+        The motion ends where the path is out of reach. If a force limit is exceeded, the last
+        displacement is reverted.
+
+        Args:
+            path: the path.
+            fractions: of the path, one for each physics step.
+            held: the held body.
 
         Returns:
-            Whether it went all the way.
+            Whether the motion reached the last fraction.
         """
         robot = self.robot
-        arrived = True
-        for place in places:
-            joints = path.joints_at(place)
+        has_arrived = True
+        for fraction in fractions:
+            joints = path.joints_at(fraction)
             if joints is None:
-                arrived = False
+                has_arrived = False
                 break
             before = robot.joints
             robot.command(joints)
             self.world.step()
             if self._is_overloaded(held):
-                # a stiff arm left where it is would press the body deeper with every try
+                # without this, repeated actions would move the stiff arm deeper into the body
                 robot.command(before)
                 self.world.step()
-                arrived = False
+                has_arrived = False
                 break
         measured = robot.measured_joints()
         if max(abs(a - b) for a, b in zip(measured, robot.joints, strict=True)) > 5e-3:
-            robot.command(measured)  # do not go on pushing against what stopped it
-        return arrived
+            robot.command(measured)  # ends the force against the body that stopped the arm
+        return has_arrived
 
     def _is_overloaded(self, held: Body | None) -> bool:
-        """Whether the hand, or what it holds, presses too hard on anything else."""
+        """Whether the contact forces of the hand and the held body exceed a limit."""
         points = self._outer_contacts(held)
         return (
             vertical_force_n(points) > self.limits.max_vertical_force_n
@@ -230,46 +241,58 @@ class CloseLoopController:
         )
 
     def _outer_contacts(self, held: Body | None) -> list[Contact]:
-        """Return the contacts of the hand and the held body with everything else."""
+        """Return the contacts of the hand and the held body with other bodies."""
         inner = () if held is None else (held.id,)
         return outer_contacts(self.world.client, self.robot.id, *inner)
 
 
 class _Path:
-    """A straight line of the tool with a steady turn, in joint angles."""
+    """A straight line of the tool point with a proportional rotation about the vertical.
+
+    Args:
+        robot: the robot.
+        start: position and yaw of the tool at the start.
+        end: position and yaw of the tool at the end.
+    """
 
     def __init__(self, robot: Robot, start: YawPose, end: YawPose) -> None:
         self._robot = robot
         self._start, self._start_yaw = start
         self._delta = tuple(e - s for s, e in zip(self._start, end[0], strict=True))
-        self._turn = wrap_angle(end[1] - start[1])
+        self._rotation_rad = wrap_angle(end[1] - start[1])
         self.length_m = math.hypot(*self._delta)
         self.goes_down = self._delta[2] < -1e-4
-        self.angle_rad = abs(self._turn)
+        self.angle_rad = abs(self._rotation_rad)
 
-    def joints_at(self, place: float) -> list[float] | None:
-        """Return the joints at a place between 0 and 1, or None out of reach."""
-        x, y, z = (s + place * d for s, d in zip(self._start, self._delta, strict=True))
-        rotation = downward(self._start_yaw + place * self._turn)
+    def joints_at(self, fraction: float) -> list[float] | None:
+        """Return the arm joints at a fraction of the path, 0 to 1; None if out of reach."""
+        x, y, z = (s + fraction * d for s, d in zip(self._start, self._delta, strict=True))
+        rotation = downward(self._start_yaw + fraction * self._rotation_rad)
         return self._robot.inverse_kinematics((x, y, z), rotation, self._robot.joints)
 
 
 def quintic_time_scaling(u: float) -> float:
-    """Return a smooth way from 0 to 1: zero velocity and acceleration at both ends."""
+    """Return the quintic polynomial from 0 to 1 with zero velocity and acceleration at both ends.
+
+    Args:
+        u: fraction of the duration, 0 to 1.
+    """
     return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
 def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:
-    """Move the fingers at their speed until they are there or meet something.
+    """Simulate a motion of the fingers until they reach an opening or are stopped by a contact.
+
+    The motors then keep the target, so that the fingers press on what they touch.
 
     Args:
-        robot: whose fingers; the simulation goes on meanwhile.
-        opening: where to, 0 to 1.
-        max_steps: they are left on their way after so many steps.
+        robot: the robot.
+        opening: target, 0 to 1.
+        max_steps: maximum number of physics steps.
     """
     stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open_position
     target = robot.opening()
-    resting = 0
+    stalled_steps = 0
     for _ in range(max_steps):
         before = robot.opening()
         target += min(max(opening - target, -stride), stride)
@@ -278,7 +301,7 @@ def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:
         after = robot.opening()
         if target == opening and abs(after - opening) < OPENING_TOLERANCE:
             return
-        resting = resting + 1 if abs(after - before) < STALL_FRACTION * stride else 0
-        if resting >= 2:
+        stalled_steps = stalled_steps + 1 if abs(after - before) < STALL_FRACTION * stride else 0
+        if stalled_steps >= 2:
             break
-    robot.command_opening(opening)  # the motors stay on: they squeeze what the fingers met
+    robot.command_opening(opening)

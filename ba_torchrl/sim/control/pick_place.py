@@ -1,21 +1,21 @@
-"""Open-loop pick and place: the physics that a grasp and a release need, and no more.
+"""Open-loop pick and place, of which only the parts with contacts are simulated.
 
-What touches nothing is not simulated: the arm is teleported above the object if the way down is
-free, the fingers are closed up to the last notch before they touch, and what is held is carried
-rigidly. Closing, lifting off, setting down and letting go are physics; a grasp holds by friction or
-it does not. With ``teleport`` off every centimetre is simulated.
+The arm is teleported to the approach if it is free, the fingers are teleported to the smallest
+opening without contact, and a held body is teleported with the hand. Grasping, lifting, lowering
+and releasing are simulated, so that a grasp holds only by friction. With ``teleport`` off, all
+motions are simulated.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import Contact, is_any_within, outer_contacts, vertical_force_n
 from ba_torchrl.sim.control.close_loop import move_fingers, quintic_time_scaling
+from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.geometry import (
     Matrix,
     Pose,
@@ -27,74 +27,36 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
 
-
-@dataclass(frozen=True)
-class PickPlaceLimits:
-    """Distances and step counts of picking and placing."""
-
-    approach_distance_m: float = 0.1
-    """Where a simulated approach starts, along the tool's axis."""
-    approach_samples_m: tuple[float, ...] = (0.06, 0.03)
-    """Where on the way down it is tested that nothing is in the way, besides its end."""
-    acceleration_m_s2: float = 25.0
-    """Greatest acceleration of a simulated way; the arm's motors brake it in time."""
-    held_acceleration_m_s2: float = 15.0
-    """The same with something in the gripper."""
-    joint_acceleration_rad_s2: float = 60.0
-    """Greatest acceleration of a joint in a simulated swing."""
-    held_joint_acceleration_rad_s2: float = 30.0
-    closing_stride: float = 0.075
-    """Share of the opening by which fingers close without simulation."""
-    max_closing_steps: int = 40
-    grasp_settle_steps: int = 3
-    """Steps after which closed fingers press with all their force, on more than one point."""
-    lift_height_m: float = 0.005
-    min_motion_steps: int = 4
-    """Least number of steps of a simulated way."""
-    transit_height_m: float = 0.3
-    """Height of the tool at which simulated swings start and end."""
-    contact_margin_m: float = 5e-4
-    """Closer than this, a way is not free."""
-    pre_place_height_m: float = 0.003
-    """Height above its place from which an object is lowered."""
-    lowering_steps: int = 2
-    release_opening: float = 0.12
-    """Share of the opening by which fingers part to let go."""
-    max_release_steps: int = 10
-    max_regrasp_steps: int = 5
-    """Steps after which a body that is not squeezed is no longer held."""
-    max_vertical_force_n: float = 40.0
-    """A simulated approach stops when it meets this force."""
-
-
 PEAK_ACCELERATION = 10 / math.sqrt(3)
-"""Of `quintic_time_scaling`, which covers 1 in a time of 1."""
+"""Greatest acceleration of `quintic_time_scaling` for a unit distance and a unit duration."""
 
 
 LowestToolHeight = Callable[[Gripper, tuple[float, float], Matrix, float], float]
-"""From a gripper, x and y, the tool's rotation and the opening to the least height of the tool at
-which the fingers close above the support surface."""
+"""Function of the gripper, x and y of the tool, its rotation and the opening. It returns the least
+height of the tool at which the fingers close clear of the support surface."""
 
 
 class HeldState(NamedTuple):
-    """What `PickPlace` remembers."""
+    """State of `PickPlace`."""
 
     held: int | None
-    """Its place among the world's bodies."""
+    """Index of the held body in `World.bodies`; None if the gripper is empty."""
     grasp: Pose | None
+    """Pose of the held body in the tool frame."""
 
 
 class PickPlace:
-    """Picks and places with a robot.
+    """Executes picks and places.
 
     Args:
         robot: the robot.
-        teleport: skip the simulation of free travel.
-        opening: how far the fingers open, 0 to 1.
-        top_down: come from straight above even where the tool is tilted, instead of along its
-            axis.
-        lowest_tool_m: least height of the tool at a place; that above the world's floor if None.
-        limits: distances and step counts.
+        teleport: teleport the arm, the fingers and the held body where they have no contacts.
+        opening: of the fingers before a pick and after a place, 0 to 1.
+        top_down: approach vertically even with a tilted tool, instead of along the z axis of the
+            tool.
+        lowest_tool_m: least height of the tool above the support surface; None means that above
+            the floor of the world.
+        limits: distances, accelerations and step counts.
     """
 
     def __init__(
@@ -115,33 +77,33 @@ class PickPlace:
         self.lowest_tool_m = lowest_tool_m
         self.limits = limits or PickPlaceLimits()
         self.held: Body | None = None
-        """What is in the gripper; it is hidden from cameras, as is the arm."""
+        """The held body, which is hidden from cameras."""
         self.grasp: Pose | None = None
-        """Its pose in the frame of the tool."""
+        """Pose of the held body in the tool frame."""
 
     def reset(self) -> None:
-        """Empty the gripper and go home, without moving anything else."""
+        """Teleport the arm to its home configuration with an empty, open gripper."""
         self._detach()
         self.robot.teleport(self.robot.home_joints)
         self.robot.set_opening(self.opening)
 
     def pick(self, position: Vector, rotation: Matrix) -> Body | None:
-        """Grasp what is at a pose, lift it and go home.
+        """Grasp at a pose, lift and return to the home configuration.
 
-        The tool stays so high that its fingers can close above the support surface.
+        The position is raised where the fingers could not close clear of the support surface.
 
         Args:
-            position: of the tool point, metres.
+            position: of the tool point at the grasp, metres.
             rotation: of the tool.
 
         Returns:
-            What is held at the end; None if nothing is, or the pose is out of reach.
+            The held body; None if the grasp failed or the pose is out of reach.
         """
         robot, limits = self.robot, self.limits
         robot.set_opening(self.opening)
         if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
             self._close_fingers()
-            reached = robot.tool_frame()[0]
+            reached = robot.tool_frame().position
             above = self._approach_point(reached, rotation, limits.lift_height_m)
             self._move_straight(reached, above, rotation, limits.min_motion_steps)
             body = robot.held_body()
@@ -154,12 +116,16 @@ class PickPlace:
         return self.held
 
     def place(self, position: Vector, rotation: Matrix) -> None:
-        """Set down what is held at a pose of the tool, let go and go home.
+        """Release the held body at a pose of the tool and return to the home configuration.
 
-        Out of reach, it stays in the gripper.
+        If the pose is out of reach, the body stays in the gripper.
+
+        Args:
+            position: of the tool point at the release, metres.
+            rotation: of the tool.
         """
         if self._approach(position, rotation, self.limits.pre_place_height_m):
-            reached = self.robot.tool_frame()[0]
+            reached = self.robot.tool_frame().position
             down = self._approach_point(reached, rotation, -self.limits.pre_place_height_m)
             self._move_straight(reached, down, rotation, self.limits.lowering_steps)
             self._detach()
@@ -171,47 +137,53 @@ class PickPlace:
             self.robot.set_opening(self.opening)
 
     def get_state(self) -> HeldState:
-        """Return what is held, and how."""
+        """Return the held body and its pose in the tool frame."""
         held = None if self.held is None else self.world.bodies.index(self.held)
         return HeldState(held, self.grasp)
 
     def set_state(self, state: HeldState) -> None:
-        """Take up what `get_state` returned."""
+        """Restore the held body and its pose in the tool frame.
+
+        Args:
+            state: from `get_state`, in a world with the same bodies.
+        """
         self._detach()
         self.held = None if state.held is None else self.world.bodies[state.held]
         self.grasp = state.grasp
         if self.held is not None:
             self.held.is_hidden = True
 
-    # -- what is held ------------------------------------------------------------------------
+    # -- held body ---------------------------------------------------------------------------
 
     def _attach(self, body: Body) -> None:
+        """Make a grasped body the held body."""
         self.held = body
         body.is_hidden = True
         self._measure_grasp()
 
     def _detach(self) -> None:
+        """Make the held body an ordinary body, without moving it."""
         if self.held is not None:
             self.held.is_hidden = False
         self.held = self.grasp = None
 
     def _measure_grasp(self) -> None:
-        """Measure where in the gripper the body is now."""
+        """Measure the pose of the held body in the tool frame."""
         to_tool = bullet_inverse(self.robot.tool_frame())
         self.grasp = bullet_compose(to_tool, self.held.pose)
 
     def _teleport(self, joints: Sequence[float]) -> None:
-        """Teleport the arm, and rigidly with it what is held."""
+        """Teleport the arm and the held body, which keeps its pose in the tool frame."""
         self.robot.teleport(joints)
         if self.held is not None:
-            self.world.detect_collisions()  # contacts end: Bullet would not turn their normals
+            # deletes the contacts of the fingers: Bullet does not rotate their normals
+            self.world.detect_collisions()
             self.held.set_pose(*bullet_compose(self.robot.tool_frame(), self.grasp))
 
     def update_grasp(self) -> None:
-        """Take note if what was held slipped out.
+        """Measure the grasp again, or release the held body if it is no longer grasped.
 
-        Contacts need a step or two to be found again where body and hand were put; only a body
-        that stays lost is.
+        After a teleport, PyBullet needs a few steps to detect the contacts of the fingers.
         """
         if self.held is None:
             return
@@ -222,15 +194,15 @@ class PickPlace:
             self.world.step()
         self._detach()
 
-    # -- ways --------------------------------------------------------------------------------
+    # -- motions -----------------------------------------------------------------------------
 
-    def _approach_point(self, position: Vector, rotation: Matrix, height_m: float) -> Vector:
-        """Return the point from which the tool comes down to ``position``."""
-        up = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
-        return tuple(p + height_m * u for p, u in zip(position, up, strict=True))
+    def _approach_point(self, position: Vector, rotation: Matrix, distance_m: float) -> Vector:
+        """Return the point at a distance before ``position`` on the approach line."""
+        away = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
+        return tuple(p + distance_m * a for p, a in zip(position, away, strict=True))
 
     def _clear_of_surface(self, position: Vector, rotation: Matrix) -> Vector:
-        """Return the point, raised if necessary so that the fingers close above the surface."""
+        """Return the point, raised if necessary so that the fingers close clear of the surface."""
         x, y, z = position
         gripper = self.robot.gripper
         if self.lowest_tool_m is None:
@@ -244,24 +216,33 @@ class PickPlace:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
 
     def _approach(self, position: Vector, rotation: Matrix, clearance_m: float) -> bool:
-        """Bring the tool ``clearance_m`` above a pose; return False if that is out of reach."""
+        """Move the tool along the approach line to a target, or to a clearance before it.
+
+        Args:
+            position: target of the tool point, metres.
+            rotation: of the tool.
+            clearance_m: distance from the target, along the approach direction.
+
+        Returns:
+            Whether the approach is within reach; if not, the arm does not move.
+        """
         limits = self.limits
         end = self._approach_point(position, rotation, clearance_m)
-        heights = (limits.approach_distance_m, *limits.approach_samples_m, 0.0)
-        way = [
-            self._solve_joints(self._approach_point(end, rotation, height), rotation)
-            for height in heights
+        distances = (limits.approach_distance_m, *limits.approach_samples_m, 0.0)
+        path = [
+            self._solve_joints(self._approach_point(end, rotation, distance), rotation)
+            for distance in distances
         ]
-        if any(joints is None for joints in way):
+        if any(joints is None for joints in path):
             return False
         if self.teleport:
-            for joints in way[1:]:
+            for joints in path[1:]:
                 self._teleport(joints)
-                if self._touches_anything():
+                if self._is_in_contact():
                     break
             else:
                 return True
-            self._teleport(way[0])
+            self._teleport(path[0])
         else:
             self._move_to_approach(end, rotation)
         self._move_straight(
@@ -271,20 +252,22 @@ class PickPlace:
         return True
 
     def _retreat(self, rotation: Matrix) -> None:
-        """Go up from where the tool is, in simulation unless nothing is in the way."""
-        start = self.robot.tool_frame()[0]
+        """Retract the tool against the approach direction, simulated unless the path is free."""
+        start = self.robot.tool_frame().position
         if self.teleport:
-            here = self.robot.joints
-            for height in reversed(self.limits.approach_samples_m):
-                joints = self._solve_joints(self._approach_point(start, rotation, height), rotation)
+            joints_at_start = self.robot.joints
+            for distance in reversed(self.limits.approach_samples_m):
+                joints = self._solve_joints(
+                    self._approach_point(start, rotation, distance), rotation
+                )
                 if joints is None:
                     break
                 self._teleport(joints)
-                if self._touches_anything():
+                if self._is_in_contact():
                     break
             else:
                 return
-            self._teleport(here)
+            self._teleport(joints_at_start)
         self._move_straight(
             start,
             self._approach_point(start, rotation, self.limits.approach_distance_m),
@@ -294,7 +277,7 @@ class PickPlace:
         self.update_grasp()
 
     def _move_to_approach(self, end: Vector, rotation: Matrix) -> None:
-        """Swing high above everything, then come down to where the approach starts."""
+        """Simulate a motion to the start of an approach, at the transit height first."""
         start = self._approach_point(end, rotation, self.limits.approach_distance_m)
         high = (*start[:2], max(self.limits.transit_height_m, start[2]))
         joints = self._solve_joints(high, rotation)
@@ -304,10 +287,11 @@ class PickPlace:
         self._move_straight(high, start, rotation, None)
 
     def _return_home(self) -> None:
+        """Move the arm to its home configuration, simulated without `teleport`."""
         if self.teleport:
             self._teleport(self.robot.home_joints)
         else:
-            x, y, z = self.robot.tool_frame()[0]
+            x, y, z = self.robot.tool_frame().position
             rotation = self._tool_rotation()
             if z < self.limits.transit_height_m:
                 self._move_straight((x, y, z), (x, y, self.limits.transit_height_m), rotation, None)
@@ -317,24 +301,28 @@ class PickPlace:
     def _move_straight(
         self, start: Vector, end: Vector, rotation: Matrix, count: int | None
     ) -> None:
-        """Simulate a straight way of the tool; stop where it presses or leaves the reach.
+        """Simulate a straight motion of the tool.
+
+        The motion ends where it is out of reach, or, if downward, at the force limit.
 
         Args:
-            start: of the tool point.
-            end: of the tool point.
+            start: position of the tool point at the start, metres.
+            end: position of the tool point at the end, metres.
             rotation: of the tool.
-            count: number of steps; if None, as many as the limits of acceleration ask for.
+            count: number of physics steps; None means the least within the acceleration limits.
         """
         limits = self.limits
         if count is None:
-            most = limits.acceleration_m_s2
+            acceleration = limits.acceleration_m_s2
             if self.held is not None:
-                most = limits.held_acceleration_m_s2
-            count = max(limits.min_motion_steps, self._num_steps(math.dist(start, end), most))
+                acceleration = limits.held_acceleration_m_s2
+            count = max(
+                limits.min_motion_steps, self._num_steps(math.dist(start, end), acceleration)
+            )
         goes_down = end[2] < start[2]
         for i in range(1, count + 1):
-            place = quintic_time_scaling(i / count)
-            point = tuple(s + place * (e - s) for s, e in zip(start, end, strict=True))
+            fraction = quintic_time_scaling(i / count)
+            point = tuple(s + fraction * (e - s) for s, e in zip(start, end, strict=True))
             joints = self._solve_joints(point, rotation)
             if joints is None:
                 return
@@ -347,47 +335,47 @@ class PickPlace:
                 return
 
     def _move_joints(self, joints: Sequence[float]) -> None:
-        """Simulate a smooth move of the arm in joint angles."""
+        """Simulate a joint-space motion of the arm with quintic time scaling."""
         start = self.robot.joints
-        turns = [e - s for s, e in zip(start, joints, strict=True)]
+        deltas = [e - s for s, e in zip(start, joints, strict=True)]
         limits = self.limits
-        most = (
+        acceleration = (
             limits.joint_acceleration_rad_s2
             if self.held is None
             else limits.held_joint_acceleration_rad_s2
         )
-        count = max(2, self._num_steps(max(map(abs, turns)), most))
+        count = max(2, self._num_steps(max(map(abs, deltas)), acceleration))
         for i in range(1, count + 1):
-            place = quintic_time_scaling(i / count)
-            self.robot.command([s + place * t for s, t in zip(start, turns, strict=True)])
+            fraction = quintic_time_scaling(i / count)
+            self.robot.command([s + fraction * d for s, d in zip(start, deltas, strict=True)])
             self.world.step()
 
     def _num_steps(self, length: float, acceleration: float) -> int:
-        """Return the number of steps for a smooth way whose acceleration is never above a limit."""
+        """Return the least number of steps of a quintic motion within an acceleration limit."""
         duration_s = math.sqrt(PEAK_ACCELERATION * length / acceleration)
         return math.ceil(duration_s / self.world.physics.time_step_s)
 
     # -- contacts ----------------------------------------------------------------------------
 
     def _outer_contacts(self) -> list[Contact]:
-        """Return the contacts of the hand and the held body with everything else."""
+        """Return the contacts of the hand and the held body with other bodies."""
         held = () if self.held is None else (self.held.id,)
         return outer_contacts(self.world.client, self.robot.id, *held)
 
-    def _touches_anything(self) -> bool:
+    def _is_in_contact(self) -> bool:
         self.world.detect_collisions()
         return is_any_within(self._outer_contacts(), self.limits.contact_margin_m)
 
     # -- fingers -----------------------------------------------------------------------------
 
     def _close_fingers(self) -> None:
-        """Close the fingers until they meet something, or each other."""
+        """Close the fingers until they are stopped by a contact."""
         if self.teleport:
             free = self.opening
             for i in range(1, math.ceil(self.opening / self.limits.closing_stride) + 1):
                 opening = max(self.opening - i * self.limits.closing_stride, 0.0)
                 self.robot.set_opening(opening)
-                if self._touches_anything():
+                if self._is_in_contact():
                     break
                 free = opening
             self.robot.set_opening(free)
@@ -395,9 +383,9 @@ class PickPlace:
         self.world.step(self.limits.grasp_settle_steps)
 
     def _open_fingers(self) -> None:
-        """Let go of what is between the fingers, without pushing what stands beside it."""
+        """Open the fingers only as far as a release needs, to avoid pushing bodies beside them."""
         limits = self.limits
         if not self.teleport:
-            self.robot.rebuild_contacts()  # the hand turned since it closed
-        wanted = min(self.robot.opening() + limits.release_opening, self.opening)
-        move_fingers(self.robot, wanted, limits.max_release_steps)
+            self.robot.rebuild_contacts()  # the hand may have rotated since it closed
+        opening = min(self.robot.opening() + limits.release_opening, self.opening)
+        move_fingers(self.robot, opening, limits.max_release_steps)

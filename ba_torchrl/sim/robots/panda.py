@@ -210,15 +210,15 @@ def _solve_arm(center: Vector, approach: Vector, offset: Vector) -> _ArmConfigur
             1.0,
         )
     )
-    back = tuple(-w / distance for w in wrist)
-    along, down = dot(back, offset), dot(back, approach)
-    cos_rest = math.cos(slant) / max(math.hypot(along, down), 1e-9)
-    if abs(cos_rest) > 1:
+    to_shoulder = tuple(-w / distance for w in wrist)
+    along, down = dot(to_shoulder, offset), dot(to_shoulder, approach)
+    cos_remaining = math.cos(slant) / max(math.hypot(along, down), 1e-9)
+    if abs(cos_remaining) > 1:
         return None
-    angle = math.acos(cos_rest) + math.pi - math.atan2(-along, -down)
-    c6, s6 = math.cos(angle), math.sin(angle)
+    wrist_rad = math.acos(cos_remaining) + math.pi - math.atan2(-along, -down)
+    c6, s6 = math.cos(wrist_rad), math.sin(wrist_rad)
     forearm = tuple(s6 * o - c6 * a for o, a in zip(offset, approach, strict=True))
-    front = perpendicular(back, forearm)
+    front = perpendicular(to_shoulder, forearm)
     elbow = tuple(
         w - _FOREARM_M * f + _ELBOW_OFFSET_M * n
         for w, f, n in zip(wrist, forearm, front, strict=True)
@@ -228,4 +228,4 @@ def _solve_arm(center: Vector, approach: Vector, offset: Vector) -> _ArmConfigur
         (_UPPER_ARM_M * e + _ELBOW_OFFSET_M * t) / _SHOULDER_TO_ELBOW_M**2
         for e, t in zip(elbow, perpendicular_to_elbow, strict=True)
     )
-    return _ArmConfiguration(upper_arm, forearm, front, offset, elbow_rad, angle)
+    return _ArmConfiguration(upper_arm, forearm, front, offset, elbow_rad, wrist_rad)

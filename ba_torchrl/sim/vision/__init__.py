@@ -1,1 +1,1 @@
-"""Cameras: depth, height and colour images, and images of the held object."""
+"""Cameras: depth, height and colour images, and in-hand images."""

@@ -1,13 +1,12 @@
-"""Depth images, height images and point clouds from body poses.
+"""Depth images, height images and point clouds, rasterised from the meshes of the bodies.
 
-All are rasterised here, from the triangles of the bodies' meshes. Compared on 128 x 128 pixels with
-four cubes (`recipes/speed.py` prints it): PyBullet's TinyRenderer takes milliseconds, cannot be
-asked to leave out the arm cheaply, shifts edges by half a pixel and its orthographic depth does not
-read linearly; a NumPy z-buffer is correct and takes tenths of a millisecond; the compiled one of
-`ba_torchrl.sim.vision.kernels` gives the same numbers in hundredths.
+PyBullet's TinyRenderer is not used: it takes milliseconds for 128 x 128 pixels and four cubes,
+cannot omit the arm at low cost, shifts edges by half a pixel, and its orthographic depth is not
+linear. The compiled kernels take hundredths of a millisecond, a NumPy z-buffer with the same result
+takes tenths (`recipes/speed.py` measures both).
 
-All depth is linear and in metres, along the optical axis. Rows follow +x as far as the direction
-of view allows, columns +y; a pixel stands for its centre.
+Depth is linear, in metres, along the optical axis. Image rows follow +x as far as the viewing
+direction allows, columns +y. Pixels are sampled at their centres.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ba_torchrl.sim.geometry import Quaternion, Vector, quaternion_yaw
+from ba_torchrl.sim.geometry import Pose, quaternion_yaw
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Decal, Shape
 from ba_torchrl.sim.vision.kernels import (
@@ -36,30 +35,36 @@ from ba_torchrl.sim.vision.lens import FAR_M, NEAR_M, Lens, Range
 
 
 class Renderable(Protocol):
-    """What a camera needs to know of a body."""
+    """The part of the interface of `Body` that cameras use."""
 
     shape: Shape
     is_hidden: bool
 
     @property
-    def pose(self) -> tuple[Vector, Quaternion]:
-        """Position (metres) and orientation (x, y, z, w) of the shape's frame."""
+    def pose(self) -> Pose:
+        """Pose of the frame of the shape in the world."""
 
 
 @dataclass(frozen=True)
 class PosedShape:
-    """A shape at a fixed pose that exists for cameras only."""
+    """A shape at a fixed pose, visible to cameras but not simulated.
+
+    Args:
+        shape: geometry.
+        pose: of the frame of the shape in the world.
+        is_hidden: whether cameras ignore it.
+    """
 
     shape: Shape
-    pose: tuple[Vector, Quaternion]
+    pose: Pose
     is_hidden: bool = False
 
 
 class SceneMesh:
-    """The surface of a set of bodies, wherever they are now; hidden ones do not count.
+    """Triangle mesh of the visible bodies of a set, at their current poses.
 
     Args:
-        bodies: all that may become visible.
+        bodies: the bodies; those that are hidden when the mesh is requested are omitted.
     """
 
     def __init__(self, bodies: Iterable[Renderable]) -> None:
@@ -70,25 +75,30 @@ class SceneMesh:
         self._bodies = [body for body in bodies if not isinstance(body.shape, Decal)]
         self._meshes: list[Mesh | None] = [None] * len(self._bodies)
         self._shown: list[int] | None = None
-        self._vertices = self._owner = self._faces = self._poses = self._moved = np.empty(0)
+        self._vertices = self._owner = self._faces = np.empty(0)
+        self._poses = self._world_vertices = np.empty(0)
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return vertices [V, 3] in metres and faces [F, 3]; the next call overwrites them."""
+        """Return vertices [V, 3] in metres and faces [F, 3]; the next call overwrites both."""
         shown = [n for n, body in enumerate(self._bodies) if not body.is_hidden]
         if shown != self._shown:
             self._collect(shown)
         for row, n in zip(self._poses, shown, strict=True):
             row[:3], row[3:] = self._bodies[n].pose
-        transform(self._vertices, self._owner, self._poses, self._moved)
-        return self._moved, self._faces
+        transform(self._vertices, self._owner, self._poses, self._world_vertices)
+        return self._world_vertices, self._faces
 
     def recesses(self) -> np.ndarray:
-        """Return the dips that decals make: x, y, half edge, cos and sin of yaw, depth; [D, 6]."""
+        """Return the recesses of the visible decals.
+
+        Returns:
+            [R, 6] float64: x, y and half edge (metres), cos and sin of the yaw, depth (metres).
+        """
         rows = []
         for decal in self._decals:
             if not decal.is_hidden:
-                (x, y, _), turn = decal.pose
-                yaw = quaternion_yaw(turn)
+                (x, y, _), orientation = decal.pose
+                yaw = quaternion_yaw(orientation)
                 half, depth = decal.shape.size_m[0] / 2, decal.shape.recess_depth_m
                 rows.append((x, y, half, math.cos(yaw), math.sin(yaw), depth))
         return np.array(rows).reshape(-1, 6)
@@ -96,34 +106,38 @@ class SceneMesh:
     def paint_recesses(
         self, image: np.ndarray, corner_m: tuple[float, float], pixel_m: float, yaw_rad: float
     ) -> None:
-        """Write the dips into a height image seen from straight above.
+        """Paint the recesses of the visible decals into an orthographic height image.
 
         Args:
-            image: [H, W], changed in place.
-            corner_m: x and y of its first pixel's outer corner.
+            image: [H, W], modified in place.
+            corner_m: x and y of the outer corner of pixel (0, 0), before the rotation.
             pixel_m: edge of a pixel.
-            yaw_rad: turn of the image about its centre.
+            yaw_rad: rotation of the image about its centre.
         """
-        reach_x, reach_y = (size * pixel_m / 2 for size in image.shape)
+        half_x, half_y = (size * pixel_m / 2 for size in image.shape)
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         for decal in self._decals:
             if decal.is_hidden:
                 continue
-            (x, y, _), turn = decal.pose
+            (x, y, _), orientation = decal.pose
             dx, dy = x - corner_m[0], y - corner_m[1]
             if yaw_rad:
-                dx, dy = dx - reach_x, dy - reach_y
-                dx, dy = reach_x + cos * dx + sin * dy, reach_y + cos * dy - sin * dx
+                dx, dy = dx - half_x, dy - half_y
+                dx, dy = half_x + cos * dx + sin * dy, half_y + cos * dy - sin * dx
             paint_square(
                 image,
                 (dx / pixel_m, dy / pixel_m),
                 decal.shape.size_m[0] / 2 / pixel_m,
-                quaternion_yaw(turn) - yaw_rad,
+                quaternion_yaw(orientation) - yaw_rad,
                 -decal.shape.recess_depth_m,
             )
 
     def _collect(self, shown: list[int]) -> None:
-        """Gather the meshes of these bodies into one."""
+        """Concatenate the meshes of some bodies.
+
+        Args:
+            shown: indices of the visible bodies.
+        """
         for n in shown:
             if self._meshes[n] is None:
                 self._meshes[n] = self._bodies[n].shape.mesh()
@@ -138,32 +152,30 @@ class SceneMesh:
             ]
         )
         self._poses = np.empty((len(meshes), 7))
-        self._moved = np.empty_like(self._vertices)
+        self._world_vertices = np.empty_like(self._vertices)
         self._shown = shown
 
 
 class HeightCamera:
-    """Looks straight down on a set of bodies, without perspective and without the arm.
-
-    Rows follow +x, columns +y; a pixel stands for its centre.
+    """An orthographic camera that looks straight down on a set of bodies, but not on the robot.
 
     Args:
-        bodies: what the camera sees besides the floor (height 0).
+        bodies: what is visible besides the floor, which has height 0.
     """
 
     def __init__(self, bodies: Sequence[Renderable]) -> None:
-        self.surface = SceneMesh(bodies)
+        self.mesh = SceneMesh(bodies)
 
     def heightmap(
         self, center_m: tuple[float, float], side_m: float, pixels: int, yaw_rad: float = 0.0
     ) -> np.ndarray:
-        """Return the height of what is seen.
+        """Render a height image.
 
         Args:
-            center_m: x and y of the image's centre.
-            side_m: width of the image.
+            center_m: x and y of the centre of the image.
+            side_m: edge of the square that the image shows.
             pixels: number of rows and columns.
-            yaw_rad: turn of the camera: its rows run along (cos, sin) of this angle.
+            yaw_rad: heading of the image rows; 0 is +x.
 
         Returns:
             [pixels, pixels] float64, metres above the floor.
@@ -171,72 +183,69 @@ class HeightCamera:
         image = np.zeros((pixels, pixels))
         pixel = side_m / pixels
         x0, y0 = center_m[0] - side_m / 2, center_m[1] - side_m / 2
-        self.surface.paint_recesses(image, (x0, y0), pixel, yaw_rad)
-        vertices, faces = self.surface.triangles()
+        self.mesh.paint_recesses(image, (x0, y0), pixel, yaw_rad)
+        vertices, faces = self.mesh.triangles()
         if yaw_rad:
             rotate_about(vertices, float(center_m[0]), float(center_m[1]), -float(yaw_rad))
         rasterize_heights(vertices, faces, x0, y0, pixel, image)
         return image
 
 
-def depth_image(surfaces: Sequence[SceneMesh], lens: Lens, pixels: int) -> np.ndarray:
-    """Return the depth of surfaces and floor in perspective.
-
-    Through a dip of the floor one sees a floor that much lower.
+def depth_image(meshes: Sequence[SceneMesh], lens: Lens, pixels: int) -> np.ndarray:
+    """Render a perspective depth image.
 
     Args:
-        surfaces: what the camera sees besides the floor.
+        meshes: what is visible besides the floor and its recesses.
         lens: the camera.
         pixels: number of rows and columns.
 
     Returns:
         [pixels, pixels] float64, metres along the optical axis, at most `FAR_M`.
     """
-    recesses = _recesses(surfaces)
-    return _depth(surfaces, lens, pixels, recesses)
+    return _depth(meshes, lens, pixels, _recesses(meshes))
 
 
-def _recesses(surfaces: Sequence[SceneMesh]) -> np.ndarray:
-    return np.concatenate([np.empty((0, 6)), *(surface.recesses() for surface in surfaces)])
+def _recesses(meshes: Sequence[SceneMesh]) -> np.ndarray:
+    return np.concatenate([np.empty((0, 6)), *(mesh.recesses() for mesh in meshes)])
 
 
 def _depth(
-    surfaces: Sequence[SceneMesh], lens: Lens, pixels: int, recesses: np.ndarray
+    meshes: Sequence[SceneMesh], lens: Lens, pixels: int, recesses: np.ndarray
 ) -> np.ndarray:
     image = np.empty((pixels, pixels))
     eye, focal = np.array(lens.eye_m, dtype=float), lens.focal_px(pixels)
     rasterize_floor(eye, lens.axes, focal, FAR_M, recesses, image)
-    for surface in surfaces:
-        vertices, faces = surface.triangles()
+    for mesh in meshes:
+        vertices, faces = mesh.triangles()
         rasterize_depth(vertices, faces, eye, lens.axes, focal, NEAR_M, image)
     return image
 
 
 def visible_points(
-    surfaces: Sequence[SceneMesh],
+    meshes: Sequence[SceneMesh],
     lenses: Sequence[Lens],
     pixels: int,
     bounds_m: tuple[Range, Range, Range],
 ) -> np.ndarray:
-    """Return the points of surfaces and floor that cameras see, one for each of their pixels.
+    """Return the points that perspective cameras see, one for each pixel.
 
-    Points of the floor inside a dip are sunk straight down by its depth.
+    Points of the floor inside a recess are moved down by its depth.
 
     Args:
-        surfaces: what the cameras see besides the floor.
+        meshes: what is visible besides the floor and its recesses.
         lenses: the cameras.
-        pixels: rows and columns of each.
-        bounds_m: ranges of x, y and z that points must lie in.
+        pixels: number of rows and columns of each camera.
+        bounds_m: ranges of x, y and z outside of which points are omitted.
 
     Returns:
-        [N, 3] float64, metres; camera by camera and row by row.
+        [N, 3] float64, metres, ordered by camera, row and column.
     """
-    recesses = _recesses(surfaces)
+    recesses = _recesses(meshes)
     low, high = np.array(bounds_m, dtype=float).T.copy()
     points = np.empty((len(lenses) * pixels * pixels, 3))
     count = 0
     for lens in lenses:
-        depth = _depth(surfaces, lens, pixels, np.empty((0, 6)))
+        depth = _depth(meshes, lens, pixels, np.empty((0, 6)))
         eye = np.array(lens.eye_m, dtype=float)
         count = unproject(
             depth, eye, lens.axes, lens.focal_px(pixels), recesses, low, high, points, count
@@ -245,25 +254,25 @@ def visible_points(
 
 
 def point_cloud(
-    surfaces: Sequence[SceneMesh],
+    meshes: Sequence[SceneMesh],
     lenses: Sequence[Lens],
     count: int,
     bounds_m: tuple[Range, Range, Range],
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Return a given number of the points that cameras see, floor included.
+    """Return a random sample of the points that cameras see, including points of the floor.
 
-    They are drawn without replacement; where fewer are seen than asked for, all of them are there
-    and some repeat. Without a generator the draw is always the same, so that the cloud follows
-    from the scene alone.
+    The points are drawn without replacement; if there are fewer than ``count``, each is repeated
+    equally often, up to one.
 
     Args:
-        surfaces: what the cameras see besides the floor.
+        meshes: what is visible besides the floor and its recesses.
         lenses: the cameras, such as `side_lenses`.
         count: number of points.
-        bounds_m: ranges of x, y and z; what is below the range of z counts as well, such as the
-            floor of a workspace that starts above it.
-        rng: draws the points; None stands for a fixed seed.
+        bounds_m: ranges of x, y and z outside of which points are omitted; the lower bound of z is
+            ignored, so that the floor is included where the workspace starts above it.
+        rng: random generator; None means one with a fixed seed, so that the same scene gives the
+            same points.
 
     Returns:
         [count, 3] float32, metres.
@@ -273,14 +282,14 @@ def point_cloud(
     """
     pixels = min(max(math.ceil(math.sqrt(2 * count)), 128), 512)
     x, y, z = bounds_m
-    points = visible_points(surfaces, lenses, pixels, (x, y, (-math.inf, z[1])))
-    seen = len(points)
-    if not seen:
+    points = visible_points(meshes, lenses, pixels, (x, y, (-math.inf, z[1])))
+    n = len(points)
+    if not n:
         raise ValueError(f"the cameras see nothing inside {bounds_m} m")
     rng = np.random.default_rng(0) if rng is None else rng
-    whole, rest = divmod(count, seen)
+    repeats, rest = divmod(count, n)
     chosen = np.concatenate(
-        [np.tile(np.arange(seen), whole), rng.choice(seen, rest, replace=False, shuffle=False)]
+        [np.tile(np.arange(n), repeats), rng.choice(n, rest, replace=False, shuffle=False)]
     )
     return points[chosen].astype(np.float32)
 
@@ -288,12 +297,14 @@ def point_cloud(
 def splat_heightmap(
     points: np.ndarray, center_m: tuple[float, float], side_m: float, pixels: int
 ) -> np.ndarray:
-    """Return the height of points seen from straight above; gaps take the nearest pixel's.
+    """Return the orthographic height image of points.
+
+    Pixels without points take the value of the nearest pixel with points.
 
     Args:
         points: [N, 3] float64, metres.
-        center_m: x and y of the image's centre.
-        side_m: width of the image.
+        center_m: x and y of the centre of the image.
+        side_m: edge of the square that the image shows.
         pixels: number of rows and columns.
 
     Returns:

@@ -1,7 +1,7 @@
-"""Images of what the gripper holds, cut from the heightmap that was there before the pick.
+"""In-hand images of the held object, cropped from the heightmap before the pick.
 
-They live in the frame of the gripper: rows run along the line on which the fingers close. The tool
-point is in the middle of the image, and pixels are as large as the heightmap's.
+Images are in the tool frame: rows run along the closing axis of the fingers, and the tool point is
+at the centre. The size of a pixel equals that of the heightmap.
 """
 
 from __future__ import annotations
@@ -19,35 +19,45 @@ IN_HAND_MODES: Registry[type[InHandImage]] = Registry("in_hand_mode", "ba_torchr
 
 
 class PickView(NamedTuple):
-    """A pick as seen from above."""
+    """Heightmaps before and after a pick, and the pose of the tool at the grasp."""
 
     before: np.ndarray
-    """[N, N] heightmap before it, metres."""
+    """[N, N] heightmap before the pick, metres."""
     after: np.ndarray
-    """[N, N] heightmap after it."""
+    """[N, N] heightmap after the pick, metres."""
     center_px: tuple[float, float]
-    """Row and column of the tool point; pixel (i, j) has its centre at (i + 1/2, j + 1/2)."""
+    """Row and column of the tool point; the centre of pixel (i, j) is (i + 1/2, j + 1/2)."""
     pixel_m: float
+    """Edge of a pixel."""
     z_m: float
     """Height of the tool point."""
     rz_rad: float
+    """Rotation of the tool about z; the angles are those of `tool_rotation`."""
     ry_rad: float = 0.0
     rx_rad: float = 0.0
 
 
 class InHandImage(ABC):
-    """A way to show what is held."""
+    """A method to compute the in-hand image."""
 
     channels: ClassVar[int] = 1
 
     @abstractmethod
     def draw(self, view: PickView, size: int) -> np.ndarray:
-        """Return the image of a pick, [channels, size, size] float64."""
+        """Return the in-hand image.
+
+        Args:
+            view: the pick.
+            size: number of rows and columns.
+
+        Returns:
+            [channels, size, size] float64.
+        """
 
 
 @IN_HAND_MODES.register("raw")
 class RawImage(InHandImage):
-    """The heights around the tool point before the pick, turned into the gripper's frame."""
+    """Heights around the tool point before the pick, rotated into the tool frame."""
 
     def draw(self, view: PickView, size: int) -> np.ndarray:
         """Return heights [1, size, size] in metres."""
@@ -56,32 +66,36 @@ class RawImage(InHandImage):
 
 @IN_HAND_MODES.register("sub")
 class SubtractedImage(InHandImage):
-    """As raw, but measured from the top of what the pick left behind, where higher than that."""
+    """Like "raw", with the highest remaining height subtracted from all heights above it.
+
+    The remaining height is the maximum around the tool point after the pick.
+    """
 
     def draw(self, view: PickView, size: int) -> np.ndarray:
         """Return heights [1, size, size] in metres."""
-        left = crop(view.after, view.center_px, size).max()
-        before = np.where(view.before >= left, view.before - left, view.before)
+        remaining = crop(view.after, view.center_px, size).max()
+        before = np.where(view.before >= remaining, view.before - remaining, view.before)
         return crop(before, view.center_px, size, view.rz_rad)[None]
 
 
 @IN_HAND_MODES.register("proj")
 class ProjectedImage(InHandImage):
-    """The space below the surface, as voxels in the gripper's frame, counted along three axes.
+    """Projections of the occupied voxels along the three axes of the tool frame (appendix D.2).
 
-    The voxels reach as far above and below the tool point as to its sides (appendix D.2).
+    A voxel below the height of its pixel is occupied. The voxel grid is a cube whose centre is the
+    tool point.
     """
 
     channels = 3
 
     def draw(self, view: PickView, size: int) -> np.ndarray:
-        """Return numbers of voxels [3, size, size]: seen along x, y and z of the gripper."""
+        """Return numbers of occupied voxels along the x, y and z axes, [3, size, size]."""
         heights = crop(view.before, view.center_px, size).round(5)
         middle = (size - 1) / 2
         levels = view.z_m + (np.arange(size) - middle) * view.pixel_m
         occupied = np.argwhere(heights[:, :, None] > levels) - middle
-        turn = np.array(euler_matrix(view.rz_rad, view.ry_rad, view.rx_rad))
-        cells = np.rint(occupied @ turn + middle).astype(np.int64)  # into the gripper's frame
+        rotation = np.array(euler_matrix(view.rz_rad, view.ry_rad, view.rx_rad))
+        cells = np.rint(occupied @ rotation + middle).astype(np.int64)  # in the tool frame
         cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
         voxels = np.zeros((size, size, size), dtype=bool)
         voxels[tuple(cells.T)] = True
@@ -92,13 +106,13 @@ class ProjectedImage(InHandImage):
 def crop(
     heightmap: np.ndarray, center_px: tuple[float, float], size: int, rz_rad: float = 0.0
 ) -> np.ndarray:
-    """Return a turned square of a heightmap, interpolated bilinearly, zero beyond its border.
+    """Return a rotated square of a heightmap, interpolated bilinearly and zero outside of it.
 
     Args:
         heightmap: [N, N].
-        center_px: row and column of the square's centre.
-        size: pixels along each side.
-        rz_rad: turn of the square's rows, from rows towards columns of the heightmap.
+        center_px: row and column of the centre of the square.
+        size: number of rows and columns of the square.
+        rz_rad: rotation of the square, from rows towards columns of the heightmap.
 
     Returns:
         [size, size] float64.
@@ -122,7 +136,10 @@ def crop(
 
 
 def _median_filter(voxels: np.ndarray) -> np.ndarray:
-    """Return which cells have four of the eight cells filled that end at them along each axis."""
+    """Return the median filter with a kernel of 2 x 2 x 2 voxels, where a tie is occupied.
+
+    The kernel of voxel (i, j, k) starts at (i - 1, j - 1, k - 1); the border is replicated.
+    """
     padded = np.pad(voxels, ((1, 0), (1, 0), (1, 0)), mode="edge").astype(np.int8)
     n = voxels.shape[0]
     count = sum(

@@ -1,7 +1,7 @@
-"""Compiled kernels of the depth cameras: triangles, floor and points into z-buffers.
+"""Compiled kernels that rasterise triangles, the floor and points into z-buffers.
 
-Every pixel stands for its centre. Faces are counter-clockwise seen from outside; those turned away
-are left out. The kernels are cached on disk and loaded when first called, one by one.
+Pixels are sampled at their centres. Faces are counter-clockwise seen from outside; back faces are
+culled. Numba caches each kernel on disk and loads it at its first call.
 """
 
 # ruff: noqa: ANN001, ANN201, ANN202 -- compiled functions
@@ -16,7 +16,14 @@ import numpy as np
 
 @numba.njit(cache=True)
 def transform(vertices, owner, poses, out):
-    """Move each vertex by the pose (x, y, z, qx, qy, qz, qw) of its body."""
+    """Transform vertices into the world frame.
+
+    Args:
+        vertices: [V, 3] in the frames of their bodies, metres.
+        owner: [V] index of each vertex's body.
+        poses: [B, 7] position and quaternion (x, y, z, w) of each body.
+        out: [V, 3] result.
+    """
     for v in range(vertices.shape[0]):
         x, y, z, qx, qy, qz, qw = poses[owner[v]]
         a, b, c = vertices[v]
@@ -29,7 +36,7 @@ def transform(vertices, owner, poses, out):
 
 @numba.njit(cache=True)
 def rotate_about(vertices, x0, y0, yaw):
-    """Turn the vertices in place about the vertical through (x0, y0)."""
+    """Rotate the vertices in place about the vertical line through (x0, y0)."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     for v in range(vertices.shape[0]):
         dx, dy = vertices[v, 0] - x0, vertices[v, 1] - y0
@@ -39,7 +46,16 @@ def rotate_about(vertices, x0, y0, yaw):
 
 @numba.njit(cache=True)
 def rasterize_heights(vertices, faces, x0, y0, pixel, image):
-    """Raise ``image`` to the height of the upward faces, seen from straight above."""
+    """Rasterise faces into an orthographic height image: the maximum of old and new heights.
+
+    Args:
+        vertices: [V, 3] metres.
+        faces: [F, 3] vertex indices.
+        x0: of the outer corner of pixel (0, 0).
+        y0: of the outer corner of pixel (0, 0).
+        pixel: edge of a pixel, metres.
+        image: [H, W] heights, modified in place.
+    """
     rows, cols = image.shape
     for f in range(faces.shape[0]):
         a, b, c = faces[f]
@@ -48,7 +64,7 @@ def rasterize_heights(vertices, faces, x0, y0, pixel, image):
         cx, cy = (vertices[c, 0] - x0) / pixel - 0.5, (vertices[c, 1] - y0) / pixel - 0.5
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         if area <= 1e-12:
-            continue  # faces down or is edge-on
+            continue  # back face or edge-on
         i0 = max(0, math.ceil(min(ax, bx, cx)))
         i1 = min(rows - 1, math.floor(max(ax, bx, cx)))
         j0 = max(0, math.ceil(min(ay, by, cy)))
@@ -77,18 +93,22 @@ def paint_square(
     """Set the pixels whose centres lie in a rotated square.
 
     Args:
-        image: [H, W], changed in place.
-        center_px: row and column of the square's centre; pixel (i, j) has its at (i+1/2, j+1/2).
-        half_px: half the square's edge.
-        yaw_rad: turn from rows towards columns.
-        value: what to write.
+        image: [H, W], modified in place.
+        center_px: row and column of the square's centre; that of pixel (i, j) is (i+1/2, j+1/2).
+        half_px: half the edge of the square.
+        yaw_rad: rotation from rows towards columns.
+        value: new value of the pixels.
     """
-    reach = half_px * math.sqrt(2)
+    half_diagonal = half_px * math.sqrt(2)
     x, y = center_px
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     limit = half_px + 1e-9
-    for i in range(max(0, math.floor(x - reach)), min(image.shape[0], math.ceil(x + reach))):
-        for j in range(max(0, math.floor(y - reach)), min(image.shape[1], math.ceil(y + reach))):
+    for i in range(
+        max(0, math.floor(x - half_diagonal)), min(image.shape[0], math.ceil(x + half_diagonal))
+    ):
+        for j in range(
+            max(0, math.floor(y - half_diagonal)), min(image.shape[1], math.ceil(y + half_diagonal))
+        ):
             di, dj = i + 0.5 - x, j + 0.5 - y
             if abs(cos * di + sin * dj) <= limit and abs(cos * dj - sin * di) <= limit:
                 image[i, j] = value
@@ -96,7 +116,13 @@ def paint_square(
 
 @numba.njit(cache=True)
 def recess_depth_at(x, y, recesses):
-    """Return how deep the floor dips at a point; a dip is x, y, half edge, cos, sin, depth."""
+    """Return the depth of the floor's recess at a point; 0 outside of recesses.
+
+    Args:
+        x: of the point.
+        y: of the point.
+        recesses: [R, 6] x, y, half edge, cos and sin of the yaw, and depth of square recesses.
+    """
     depth = 0.0
     for d in range(recesses.shape[0]):
         dx, dy = x - recesses[d, 0], y - recesses[d, 1]
@@ -108,30 +134,51 @@ def recess_depth_at(x, y, recesses):
 
 @numba.njit(cache=True)
 def rasterize_floor(eye, axes, focal, far, recesses, depth):
-    """Fill ``depth`` with the floor's; the rows of ``axes`` point down, right and forward.
+    """Set a perspective depth image to the depth of the floor.
 
-    Through a dip one looks on to a floor that much lower.
+    A ray that hits the floor inside a recess continues to the plane at the bottom of the recess.
+
+    Args:
+        eye: [3] position of the camera.
+        axes: [3, 3] directions of the image rows, of the image columns and of the view, as rows.
+        focal: focal length, pixels.
+        far: far plane, metres.
+        recesses: [R, 6] as for `recess_depth_at`.
+        depth: [H, W] result, metres.
     """
     rows, cols = depth.shape
     for i in range(rows):
         p = (i + 0.5 - rows / 2) / focal
         for j in range(cols):
             q = (j + 0.5 - cols / 2) / focal
-            fall = -(axes[2, 2] + p * axes[0, 2] + q * axes[1, 2])
-            reach = eye[2] / fall if fall > 1e-9 else far
-            if reach < far:
-                x = eye[0] + reach * (axes[2, 0] + p * axes[0, 0] + q * axes[1, 0])
-                y = eye[1] + reach * (axes[2, 1] + p * axes[0, 1] + q * axes[1, 1])
-                reach += recess_depth_at(x, y, recesses) / fall
-            depth[i, j] = min(reach, far)
+            descent = -(axes[2, 2] + p * axes[0, 2] + q * axes[1, 2])
+            t = eye[2] / descent if descent > 1e-9 else far
+            if t < far:
+                x = eye[0] + t * (axes[2, 0] + p * axes[0, 0] + q * axes[1, 0])
+                y = eye[1] + t * (axes[2, 1] + p * axes[0, 1] + q * axes[1, 1])
+                t += recess_depth_at(x, y, recesses) / descent
+            depth[i, j] = min(t, far)
 
 
 @numba.njit(cache=True)
 def _rasterize_triangle(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
-    """Lower ``depth`` to a triangle given by row, column and depth of its corners."""
+    """Rasterise a triangle into a depth image: the minimum of old and new depths.
+
+    Args:
+        ap: row of corner a, pixels.
+        aq: column of corner a, pixels.
+        ad: depth of corner a, metres.
+        bp: row of corner b.
+        bq: column of corner b.
+        bd: depth of corner b.
+        cp: row of corner c.
+        cq: column of corner c.
+        cd: depth of corner c.
+        depth: [H, W] modified in place.
+    """
     area = (bp - ap) * (cq - aq) - (cp - ap) * (bq - aq)
     if area <= 1e-12:
-        return  # turned away or edge-on
+        return  # back face or edge-on
     rows, cols = depth.shape
     i0, i1 = max(0, math.ceil(min(ap, bp, cp))), min(rows - 1, math.floor(max(ap, bp, cp)))
     j0, j1 = max(0, math.ceil(min(aq, bq, cq))), min(cols - 1, math.floor(max(aq, bq, cq)))
@@ -140,33 +187,43 @@ def _rasterize_triangle(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
             u = ((i - ap) * (cq - aq) - (cp - ap) * (j - aq)) / area
             v = ((bp - ap) * (j - aq) - (i - ap) * (bq - aq)) / area
             if u >= -1e-9 and v >= -1e-9 and u + v <= 1 + 1e-9:
-                # in the image, 1 / depth is linear and depth is not
+                # 1 / depth, not depth, is linear in image coordinates
                 inverse = (1 - u - v) / ad + u / bd + v / cd
                 depth[i, j] = min(depth[i, j], 1 / inverse)
 
 
 @numba.njit(cache=True)
 def rasterize_depth(vertices, faces, eye, axes, focal, near, depth):
-    """Lower ``depth`` to the faces seen in perspective; what is nearer than ``near`` is cut off."""
+    """Rasterise faces into a perspective depth image: the minimum of old and new depths.
+
+    Args:
+        vertices: [V, 3] metres.
+        faces: [F, 3] vertex indices.
+        eye: [3] position of the camera.
+        axes: [3, 3] directions of the image rows, of the image columns and of the view, as rows.
+        focal: focal length, pixels.
+        near: near plane, metres, at which triangles are clipped.
+        depth: [H, W] modified in place, metres.
+    """
     rows, cols = depth.shape
-    seen = np.empty_like(vertices)  # along the image's rows, its columns, and in depth
+    camera = np.empty_like(vertices)  # in the camera frame: along rows, along columns, depth
     for v in range(vertices.shape[0]):
         x, y, z = vertices[v, 0] - eye[0], vertices[v, 1] - eye[1], vertices[v, 2] - eye[2]
         for k in range(3):
-            seen[v, k] = axes[k, 0] * x + axes[k, 1] * y + axes[k, 2] * z
-    corner = np.empty((4, 3))  # a triangle without a corner has at most four
+            camera[v, k] = axes[k, 0] * x + axes[k, 1] * y + axes[k, 2] * z
+    corner = np.empty((4, 3))  # a clipped triangle has at most four corners
     for f in range(faces.shape[0]):
         count = 0
         for k in range(3):
             a, b = faces[f, k], faces[f, (k + 1) % 3]
-            da, db = seen[a, 2], seen[b, 2]
+            da, db = camera[a, 2], camera[b, 2]
             if da >= near:
-                corner[count] = seen[a]
+                corner[count] = camera[a]
                 count += 1
             if (da >= near) != (db >= near):
-                share = (near - da) / (db - da)
+                weight = (near - da) / (db - da)
                 for m in range(3):
-                    corner[count, m] = seen[a, m] + share * (seen[b, m] - seen[a, m])
+                    corner[count, m] = camera[a, m] + weight * (camera[b, m] - camera[a, m])
                 count += 1
         for k in range(count):
             scale = focal / corner[k, 2]
@@ -181,9 +238,23 @@ def rasterize_depth(vertices, faces, eye, axes, focal, near, depth):
 
 @numba.njit(cache=True)
 def unproject(depth, eye, axes, focal, recesses, low, high, out, start):
-    """Write the points that the pixels show, if inside a box, into ``out`` from ``start`` on.
+    """Convert a perspective depth image to points in the world frame.
 
-    Points of the floor inside a dip are sunk by its depth, straight down. Returns the end.
+    Points of the floor inside a recess are moved down by its depth.
+
+    Args:
+        depth: [H, W] metres.
+        eye: [3] position of the camera.
+        axes: [3, 3] directions of the image rows, of the image columns and of the view, as rows.
+        focal: focal length, pixels.
+        recesses: [R, 6] as for `recess_depth_at`.
+        low: [3] lower corner of the box that the points must lie in.
+        high: [3] upper corner of this box.
+        out: [N, 3] the points are written from row ``start`` on.
+        start: first row to write.
+
+    Returns:
+        The row after the last point.
     """
     rows, cols = depth.shape
     count = start
@@ -205,27 +276,36 @@ def unproject(depth, eye, axes, focal, recesses, low, high, out, start):
 
 @numba.njit(cache=True)
 def splat(points, count, x0, y0, pixel, image):
-    """Return the greatest height of the points in each pixel; pixels without one copy the nearest.
+    """Set a height image to the greatest height of the points in each pixel.
 
-    Where there is no point at all the image stays as it is.
+    Pixels without points take the value of the nearest pixel with points. Without any points, the
+    image is unchanged.
+
+    Args:
+        points: [N, 3] metres.
+        count: number of points to use, from the start.
+        x0: of the outer corner of pixel (0, 0).
+        y0: of the outer corner of pixel (0, 0).
+        pixel: edge of a pixel, metres.
+        image: [H, W] heights, modified in place.
     """
     rows, cols = image.shape
-    seen = np.full((rows, cols), -np.inf)
+    heights = np.full((rows, cols), -np.inf)
     for n in range(count):
         i, j = math.floor((points[n, 0] - x0) / pixel), math.floor((points[n, 1] - y0) / pixel)
         if 0 <= i < rows and 0 <= j < cols:
-            seen[i, j] = max(seen[i, j], points[n, 2])
-    # in each row, the nearest column with a point
+            heights[i, j] = max(heights[i, j], points[n, 2])
+    # for each pixel, the nearest column of its row with points
     column = np.full((rows, cols), -1)
     for i in range(rows):
         last = -1
         for j in range(cols):
-            if seen[i, j] > -np.inf:
+            if heights[i, j] > -np.inf:
                 last = j
             column[i, j] = last
         last = -1
         for j in range(cols - 1, -1, -1):
-            if seen[i, j] > -np.inf:
+            if heights[i, j] > -np.inf:
                 last = j
             if last >= 0 and (column[i, j] < 0 or last - j < j - column[i, j]):
                 column[i, j] = last
@@ -240,4 +320,4 @@ def splat(points, count, x0, y0, pixel, image):
                         distance = r * r + (column[k, j] - j) ** 2
                         if distance < best:
                             best = distance
-                            image[i, j] = seen[k, column[k, j]]
+                            image[i, j] = heights[k, column[k, j]]

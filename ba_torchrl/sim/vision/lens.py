@@ -1,4 +1,4 @@
-"""Perspective cameras: where they are and how points project into their images."""
+"""Lens: pose and intrinsics of a perspective camera."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from ba_torchrl.sim.geometry import Vector
 Range = tuple[float, float]
 
 NEAR_M = 0.01
+"""Near plane of perspective cameras."""
 FAR_M = 10.0
-"""Perspective cameras see nothing nearer and nothing farther."""
+"""Far plane of perspective cameras."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A square perspective camera that looks from one point at another.
+    """Pose and field of view of a perspective camera with square images.
 
     Args:
-        eye_m: where it is.
-        target_m: what it shows in the middle.
-        fov_rad: angle between opposite edges of the image.
+        eye_m: position of the camera.
+        target_m: point at the centre of the image.
+        fov_rad: field of view between opposite edges of the image.
     """
 
     eye_m: Vector
@@ -33,62 +34,77 @@ class Lens:
 
     @cached_property
     def axes(self) -> np.ndarray:
-        """[3, 3]: directions of the rows, of the columns, and of the view."""
+        """Directions of the image rows, of the image columns and of the view, [3, 3] as rows."""
         forward = np.subtract(self.target_m, self.eye_m)
         forward = forward / np.linalg.norm(forward)
-        # rows follow +x, or lead down if that is where the camera looks
+        # image rows follow +x, or -z if the camera looks along x
         hint = np.array([1.0, 0.0, 0.0] if abs(forward[0]) < 0.99 else [0.0, 0.0, -1.0])
         down = hint - (hint @ forward) * forward
         down /= np.linalg.norm(down)
         return np.stack([down, np.cross(down, forward), forward])
 
     def focal_px(self, pixels: int) -> float:
-        """Return the focal length in pixels of an image of this size."""
+        """Return the focal length in pixels.
+
+        Args:
+            pixels: number of rows and columns of the image.
+        """
         return pixels / 2 / math.tan(self.fov_rad / 2)
 
     def heights_m(self, depth: np.ndarray) -> np.ndarray:
-        """Return the height above the floor of what an image [N, N] of depths shows."""
+        """Convert a depth image to heights above the floor.
+
+        Args:
+            depth: [N, N] metres.
+
+        Returns:
+            [N, N] metres.
+        """
         pixels = len(depth)
         offsets = (np.arange(pixels) + 0.5 - pixels / 2) / self.focal_px(pixels)
-        fall = self.axes[2, 2] + offsets[:, None] * self.axes[0, 2] + offsets * self.axes[1, 2]
-        return self.eye_m[2] + depth * fall
+        slope = self.axes[2, 2] + offsets[:, None] * self.axes[0, 2] + offsets * self.axes[1, 2]
+        return self.eye_m[2] + depth * slope
 
     def plane_depth_range_m(self, z_m: float) -> Range:
-        """Return the least and greatest depth at which the image shows a horizontal plane.
+        """Return the least and greatest depth of a horizontal plane in the image.
 
         Args:
             z_m: height of the plane.
         """
         edge = math.tan(self.fov_rad / 2)
-        falls = [
+        descents = [
             -(self.axes[2, 2] + p * self.axes[0, 2] + q * self.axes[1, 2])
             for p in (-edge, edge)
             for q in (-edge, edge)
         ]
         above = self.eye_m[2] - z_m
-        low = above / max(falls) if max(falls) > 0 else FAR_M
-        high = above / min(falls) if min(falls) > 0 else FAR_M
+        low = above / max(descents) if max(descents) > 0 else FAR_M
+        high = above / min(descents) if min(descents) > 0 else FAR_M
         return max(low, NEAR_M), min(max(high, NEAR_M), FAR_M)
 
 
 def oblique_lens(center_m: tuple[float, float]) -> Lens:
-    """Return the camera opposite the robot, 0.81 m from the workspace's centre, 47 degrees up."""
+    """Return the camera opposite the robot, 0.81 m from the workspace centre at 47 degrees.
+
+    Args:
+        center_m: x and y of the workspace centre.
+    """
     x, y = center_m
     return Lens((x + 0.55, y, 0.6), (x, y, 0.0), math.radians(40))
 
 
 def side_lenses(center_m: tuple[float, float], width_m: float) -> tuple[Lens, Lens]:
-    """Return two cameras on either side, 0.5 m along y and 1 m up, that show a square of the floor.
+    """Return two cameras at y offsets of -0.5 and 0.5 m, 1 m high, that show a square of the floor.
 
     Args:
-        center_m: middle of the square.
-        width_m: its edge.
+        center_m: x and y of the centre of the square.
+        width_m: edge of the square.
     """
     x, y = center_m
-    # the corners of the near edge are the widest apart
-    below, aside = 1.0, 0.5 - width_m / 2
-    distance = (below + 0.5 * aside) / math.hypot(1.0, 0.5)
-    across = abs(aside - 0.5 * below) / math.hypot(1.0, 0.5)
+    # the corners of the edge closest to the camera determine the field of view
+    below, lateral = 1.0, 0.5 - width_m / 2
+    distance = (below + 0.5 * lateral) / math.hypot(1.0, 0.5)
+    across = abs(lateral - 0.5 * below) / math.hypot(1.0, 0.5)
     edge = max(width_m / 2, across) / max(distance, 0.1)
     fov = 2 * math.atan(edge * 1.02)
     return tuple(Lens((x, y + side, 1.0), (x, y, 0.0), fov) for side in (-0.5, 0.5))

@@ -1,7 +1,8 @@
-"""Pictures in colour, arm included, drawn by PyBullet's TinyRenderer.
+"""Colour images with the robot, rendered by PyBullet's TinyRenderer.
 
-Its own shadows work only close to where it expects the camera, have hard edges and double the time.
-Pictures for people get theirs from a second, small drawing: the scene as the light sees it.
+TinyRenderer's own shadows are correct only for some camera poses, have hard edges and double the
+time. Images for people use a shadow map instead: a small image of the scene rendered from the
+light.
 """
 
 from __future__ import annotations
@@ -18,18 +19,21 @@ from ba_torchrl.sim.vision.lens import Lens
 from ba_torchrl.sim.world import World
 
 RGBD_RANGE_M = (0.1, 5.0)
-"""Near and far end of what `render_rgbd` shows."""
+"""Near and far plane of `render_rgbd`."""
 
 DEFAULT_FLOOR_RGB = (0.95, 0.95, 0.93)
 
 _LIGHT_DIRECTION: Vector = (0.30, -0.35, 1.0)
-"""Direction towards the light."""
+"""Direction from the scene towards the light."""
 _LIGHT_DISTANCE_M = 4.0
-"""Distance of the lamp; TinyRenderer has no use for one infinitely far."""
+"""Distance of the light; TinyRenderer does not support directional light."""
 _SHADOW_WIDTH_M = 2.0
+"""Edge of the square that the shadow map shows."""
 _SHADOW_PIXELS = 240
 _SHADOW_BLUR = 2
+"""Half width of the blur of the shadow map, pixels."""
 _SHADOW_DEPTH = 0.3
+"""Fraction by which full shadow darkens the floor."""
 _FOV_DEG = 40.0
 
 
@@ -43,19 +47,18 @@ def render_rgb(
     pitch_deg: float = -27.0,
     floor_rgb: tuple[float, float, float] | None = DEFAULT_FLOOR_RGB,
 ) -> np.ndarray:
-    """Return a picture of the whole scene, arm included, for people to look at.
+    """Render the scene with the robot, in colour and with shadows on the floor.
 
     Args:
-        world: what to draw.
-        target_m: the point in the picture's centre.
-        width: pixels across.
-        height: pixels down.
-        distance_m: from the target to the camera; the picture covers 0.73 times that from top to
-            bottom.
-        yaw_deg: camera's turn about z.
-        pitch_deg: camera's pitch; negative looks down.
-        floor_rgb: colour of the floor in the picture, each component from 0 to 1; None leaves it
-            as PyBullet draws it.
+        world: the scene.
+        target_m: point at the centre of the image.
+        width: number of columns.
+        height: number of rows.
+        distance_m: from the target to the camera; the image covers 0.73 times this distance from
+            top to bottom.
+        yaw_deg: yaw of the camera.
+        pitch_deg: pitch of the camera; negative angles look down.
+        floor_rgb: colour of the floor, each component from 0 to 1; None keeps that of PyBullet.
 
     Returns:
         [height, width, 3] uint8.
@@ -64,8 +67,8 @@ def render_rgb(
         target_m, distance_m, yaw_deg, pitch_deg, 0, 2
     )
     projection = pybullet.computeProjectionMatrixFOV(_FOV_DEG, width / height, 0.05, 10.0)
-    rgb, _, parts = _render(world, width, height, view, projection, links=True)
-    owner = np.where(parts >= 0, parts & 0xFFFFFF, -1)
+    rgb, _, segmentation = _render(world, width, height, view, projection, links=True)
+    owner = np.where(segmentation >= 0, segmentation & 0xFFFFFF, -1)
     image = rgb.astype(np.float32)
     floor = owner == world.floor
     if floor_rgb is not None:
@@ -73,22 +76,22 @@ def render_rgb(
     flat = np.isin(owner, [world.floor, *_decals(world)])
     rows, cols = np.nonzero(flat)
     points = _floor_points(view, width, height, rows, cols)
-    shade = _shadow(world, target_m, points)
-    image[rows, cols] *= (1 - _SHADOW_DEPTH * shade)[:, None]
-    return _smooth_edges(image, parts).round().astype(np.uint8)
+    shadow = _shadow(world, target_m, points)
+    image[rows, cols] *= (1 - _SHADOW_DEPTH * shadow)[:, None]
+    return _smooth_edges(image, segmentation).round().astype(np.uint8)
 
 
 def render_rgbd(world: World, lens: Lens, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a camera sees in colour and its depth, arm included, drawn by PyBullet.
+    """Render a colour and a depth image of the scene with the robot.
 
     Args:
-        world: what to draw.
+        world: the scene.
         lens: the camera, such as `ba_torchrl.sim.vision.lens.oblique_lens`.
         pixels: number of rows and columns.
 
     Returns:
-        [pixels, pixels, 3] uint8, and [pixels, pixels] float64 metres along the optical axis, at
-        most the end of `RGBD_RANGE_M`.
+        Colours, [pixels, pixels, 3] uint8, and depths along the optical axis, [pixels, pixels]
+        float64 metres, at most the far plane of `RGBD_RANGE_M`.
     """
     near, far = RGBD_RANGE_M
     view = pybullet.computeViewMatrix(lens.eye_m, lens.target_m, (-lens.axes[0]).tolist())
@@ -106,16 +109,26 @@ def _render(
     *,
     links: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return colours [H, W, 3] uint8, PyBullet's depth buffer [H, W], and what is where [H, W].
+    """Render an image with TinyRenderer.
 
-    The last holds PyBullet's body ids and -1 for none; with ``links``, the link plus one is in
-    its upper eight bits.
+    Args:
+        world: the scene.
+        width: number of columns.
+        height: number of rows.
+        view: PyBullet's view matrix.
+        projection: PyBullet's projection matrix.
+        links: distinguish the links of a body in the segmentation.
+
+    Returns:
+        Colours [H, W, 3] uint8, PyBullet's depth buffer [H, W] and the segmentation [H, W]:
+        PyBullet's body id, or -1 for none. With ``links``, the bits from 24 on are the link index
+        plus one.
     """
     projection = list(projection)
-    # TinyRenderer samples half a pixel off the pixels' centres
+    # TinyRenderer samples pixels half a pixel away from their centres
     projection[8] += 1 / width
     projection[9] += 1 / height
-    _, _, rgba, buffer, parts = pybullet.getCameraImage(
+    _, _, rgba, buffer, segmentation = pybullet.getCameraImage(
         width,
         height,
         view,
@@ -130,7 +143,7 @@ def _render(
         physicsClientId=world.client,
     )
     rgb = np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3].copy()
-    return rgb, np.reshape(buffer, (height, width)), np.reshape(parts, (height, width))
+    return rgb, np.reshape(buffer, (height, width)), np.reshape(segmentation, (height, width))
 
 
 def _decals(world: World) -> list[int]:
@@ -140,33 +153,53 @@ def _decals(world: World) -> list[int]:
 def _floor_points(
     view: Sequence[float], width: int, height: int, rows: np.ndarray, cols: np.ndarray
 ) -> np.ndarray:
-    """Return where on the floor these pixels look, [N, 2] metres."""
+    """Return the points of the floor that pixels show.
+
+    Args:
+        view: PyBullet's view matrix.
+        width: number of columns of the image.
+        height: number of rows of the image.
+        rows: [N] of the pixels.
+        cols: [N] of the pixels.
+
+    Returns:
+        [N, 2] x and y, metres.
+    """
     pose = np.reshape(view, (4, 4)).T
-    turn = pose[:3, :3]  # rows: right, up, backward
-    eye = -turn.T @ pose[:3, 3]
+    rotation = pose[:3, :3]  # rows: right, up, backward
+    eye = -rotation.T @ pose[:3, 3]
     edge = math.tan(math.radians(_FOV_DEG) / 2)
     right = (2 * (cols + 0.5) / width - 1) * edge * width / height
     up = (1 - 2 * (rows + 0.5) / height) * edge
-    rays = right[:, None] * turn[0] + up[:, None] * turn[1] - turn[2]
+    rays = right[:, None] * rotation[0] + up[:, None] * rotation[1] - rotation[2]
     return eye[:2] + rays[:, :2] * (eye[2] / np.maximum(-rays[:, 2:], 1e-6))
 
 
 def _shadow(world: World, target_m: Vector, points: np.ndarray) -> np.ndarray:
-    """Return how much of the light is blocked at points [N, 2] of the floor, 0 to 1."""
-    size, reach = _SHADOW_PIXELS, _SHADOW_WIDTH_M / 2
+    """Return the fraction of the light that is blocked at points of the floor.
+
+    Args:
+        world: the scene.
+        target_m: point at the centre of the image.
+        points: [N, 2] x and y, metres.
+
+    Returns:
+        [N] from 0 (lit) to 1 (full shadow).
+    """
+    size, half = _SHADOW_PIXELS, _SHADOW_WIDTH_M / 2
     toward = np.array(_LIGHT_DIRECTION) / np.linalg.norm(_LIGHT_DIRECTION)
     right = np.cross((1.0, 0.0, 0.0), toward)
     right /= np.linalg.norm(right)
     up = np.cross(toward, right)
-    middle = np.array([target_m[0], target_m[1], 0.0])
-    lamp = middle + _LIGHT_DISTANCE_M * toward
-    view = pybullet.computeViewMatrix(lamp.tolist(), middle.tolist(), up.tolist())
-    fov = 2 * math.degrees(math.atan(reach / _LIGHT_DISTANCE_M))
+    center = np.array([target_m[0], target_m[1], 0.0])
+    light = center + _LIGHT_DISTANCE_M * toward
+    view = pybullet.computeViewMatrix(light.tolist(), center.tolist(), up.tolist())
+    fov = 2 * math.degrees(math.atan(half / _LIGHT_DISTANCE_M))
     projection = pybullet.computeProjectionMatrixFOV(fov, 1.0, 1.0, 2 * _LIGHT_DISTANCE_M)
     _, _, owner = _render(world, size, size, view, projection)
     blocked = ~np.isin(owner, [-1, world.floor, *_decals(world)])
     soft = _blurred(_blurred(blocked.astype(np.float32)))
-    offset = np.pad(points, ((0, 0), (0, 1))) - lamp
+    offset = np.pad(points, ((0, 0), (0, 1))) - light
     scale = size / _SHADOW_WIDTH_M * _LIGHT_DISTANCE_M / -(offset @ toward)
     col = np.clip(size / 2 + offset @ right * scale - 0.5, 0, size - 1.001)
     row = np.clip(size / 2 - offset @ up * scale - 0.5, 0, size - 1.001)
@@ -181,7 +214,7 @@ def _shadow(world: World, target_m: Vector, points: np.ndarray) -> np.ndarray:
 
 
 def _blurred(image: np.ndarray) -> np.ndarray:
-    """Return the mean over a square window around each pixel of an image [H, W]."""
+    """Return an image [H, W] after a box filter of `_SHADOW_BLUR`."""
     size = 2 * _SHADOW_BLUR + 1
     for axis in (0, 1):
         pad = [(0, 0), (0, 0)]
@@ -192,11 +225,16 @@ def _blurred(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _smooth_edges(image: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Return the picture with the borders between its parts blended, as finer pixels would be."""
-    edge = np.zeros(parts.shape, dtype=bool)
+def _smooth_edges(image: np.ndarray, segmentation: np.ndarray) -> np.ndarray:
+    """Return an image with the borders between its segments blurred (anti-aliasing).
+
+    Args:
+        image: [H, W, 3] colours.
+        segmentation: [H, W] from `_render`.
+    """
+    edge = np.zeros(segmentation.shape, dtype=bool)
     for axis in (0, 1):
-        differs = np.diff(parts, axis=axis) != 0
+        differs = np.diff(segmentation, axis=axis) != 0
         low = tuple(slice(None, -1) if a == axis else slice(None) for a in (0, 1))
         high = tuple(slice(1, None) if a == axis else slice(None) for a in (0, 1))
         edge[low] |= differs

@@ -1,22 +1,22 @@
-"""Views: what a close-loop policy sees of the scene, by name.
+"""Views: the images that close-loop policies observe, registered by name.
 
-Values are metres and linear. Of the robot only the fingers appear: as squares in the views from
-above, as two posts in those from the side; `camera_side_rgbd` alone shows the arm. Rows follow +x
-and columns +y, turned with the gripper in the views whose name has an "r".
+Values are linear, in metres. Except in `camera_side_rgbd`, only the fingers of the robot are
+visible: as squares in views from above, as boxes in views from the side. Image rows follow +x and
+columns +y; views with an "r" in their axes rotate with the gripper.
 
-| view | seen from | value |
+| view | camera | value |
 |---|---|---|
-| `camera_center_xyz`, `_xyzr` | straight above the tool, hanging over it | depth below camera |
-| `camera_center_xyr`, `_xy` | straight above the tool, at a fixed height | tool's z - height |
-| `camera_center_z` | above the workspace's centre, hanging over the tool | depth below camera |
-| `camera_fix` | above the workspace's centre, at a fixed height | tool's z - height |
-| `render_center` | the points that two cameras on the sides see, from above | tool's z - height |
-| `pers_center_xyz` | `camera_center_xyz` with a perspective of 70 degrees | depth below camera |
-| `camera_side` | opposite the robot, 0.6 m up, 40 degrees | depth along the optical axis |
+| `camera_center_xyz`, `_xyzr` | above the tool, follows its height | depth below camera |
+| `camera_center_xyr`, `_xy` | above the tool, at a fixed height | z of the tool - height |
+| `camera_center_z` | above the workspace centre, follows the tool's height | depth below camera |
+| `camera_fix` | above the workspace centre, at a fixed height | z of the tool - height |
+| `render_center` | points from two side cameras, projected from above | z of the tool - height |
+| `pers_center_xyz` | `camera_center_xyz` with a field of view of 70 degrees | depth below camera |
+| `camera_side` | opposite the robot, 0.6 m high, 40 degrees | depth along the optical axis |
 | `camera_side_rgbd` | the same | red, green, blue from 0 to 1, and depth |
 
-Those from above and `camera_side` exist with the suffix `_height`: height above the floor of what
-each pixel shows. `view_scale` sets the width of the views without perspective.
+All but `pers_center_xyz` and `camera_side_rgbd` also exist with the suffix `_height`, with heights
+above the floor as values. `view_scale` sets the width of the orthographic views.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.geometry import YawPose, yaw_quaternion
+from ba_torchrl.sim.geometry import Pose, YawPose, yaw_quaternion
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
@@ -47,26 +47,27 @@ from ba_torchrl.sim.world import World
 VIEWS: Registry[View] = Registry("view type", "ba_torchrl.sim")
 
 FINGER_SQUARE_HALF_M = 5 * 0.3 / 128
-"""Half the edge of the square that stands for a finger."""
+"""Half the edge of the square that represents a finger."""
 FINGER_LENGTH_M = 0.1
-"""Height of the post that stands for a finger in oblique views."""
+"""Height of the box that represents a finger in oblique views."""
 MAX_RECESS_M = 0.02
-"""Goal areas appear as dips of this depth."""
+"""Depth of the recesses that represent goal areas."""
 FIXED_CAMERA_CLEARANCE_M = 0.04
-"""Cameras at a fixed height hang this far above the workspace: 0.29 m by default."""
+"""Height of cameras at a fixed height above the top of the workspace; 0.29 m above the floor by
+default."""
 
 
 @dataclass(frozen=True)
 class ViewSetup:
-    """What stays the same from image to image.
+    """Parameters that are the same for all images of an environment.
 
     Args:
-        center_m: x and y of the workspace's centre.
-        z_m: the workspace's range of z.
-        workspace_m: the workspace's width.
-        width_m: width of an image without perspective.
+        center_m: x and y of the workspace centre.
+        z_m: lower and upper bound of z in the workspace.
+        workspace_m: width of the workspace.
+        width_m: width of the square that an orthographic image shows.
         pixels: number of rows and columns.
-        camera_height_m: cameras that follow the tool hang this far above it.
+        camera_height_m: height above the tool of cameras that follow the tool.
         finger_span_m: distance between the squares of the fully open fingers.
     """
 
@@ -86,14 +87,14 @@ class ViewSetup:
 
 @dataclass(frozen=True)
 class ViewInput:
-    """What an image is made from.
+    """The state of the scene from which an image is rendered.
 
     Args:
-        setup: what stays the same.
-        world: for pictures in colour.
-        camera: knows the bodies of the scene.
-        tool: position and yaw of the tool point.
-        opening: how far the gripper is open, 0 to 1.
+        setup: parameters of the view.
+        world: used for colour images.
+        camera: used for depth and height images.
+        tool: position and yaw of the tool.
+        opening: of the gripper, 0 to 1.
     """
 
     setup: ViewSetup
@@ -104,34 +105,34 @@ class ViewInput:
 
     @property
     def finger_offset_m(self) -> float:
-        """Distance of each finger's square from the tool point."""
+        """Distance between the square of each finger and the tool point."""
         return self.setup.finger_span_m * self.opening / 2
 
 
 class View(ABC):
-    """A way to look at the scene."""
+    """A method to render the scene."""
 
     channels: ClassVar[int] = 1
 
     @abstractmethod
     def range_m(self, setup: ViewSetup) -> Range:
-        """Return the least and the greatest value of an image."""
+        """Return the lower and upper bound of the values of an image."""
 
     @abstractmethod
-    def image(self, seen: ViewInput) -> np.ndarray:
+    def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [C, H, W] float64."""
 
 
 @dataclass(frozen=True)
 class TopDown(View):
-    """Orthographic, from straight above.
+    """An orthographic view from straight above.
 
     Args:
-        follows_xy: the image's centre is the tool's, else the workspace's.
-        follows_z: the camera hangs above the tool, else at a fixed height. What is higher than
-            the camera is cut off.
-        turns: the rows run along the line on which the fingers open.
-        shows_height: the values are heights above the floor, else depths.
+        follows_xy: centre the image at the tool instead of the workspace centre.
+        follows_z: place the camera relative to the tool instead of at a fixed height. Surfaces
+            above the camera appear at the height of the camera.
+        follows_yaw: align the image rows with the x axis of the tool.
+        shows_height: use heights above the floor as values instead of depths.
     """
 
     follows_xy: bool
@@ -140,7 +141,7 @@ class TopDown(View):
     shows_height: bool
 
     def range_m(self, setup: ViewSetup) -> Range:
-        """Return the range of depth below camera, of depth below the tool, or of height."""
+        """Return the bounds of the depth below the camera or tool, or of the height."""
         low, high = setup.z_m
         if self.shows_height:
             top = high + setup.camera_height_m if self.follows_z else setup.fixed_camera_z_m
@@ -149,36 +150,36 @@ class TopDown(View):
             return 0.0, high + setup.camera_height_m + MAX_RECESS_M
         return low - setup.fixed_camera_z_m, high + MAX_RECESS_M
 
-    def image(self, seen: ViewInput) -> np.ndarray:
+    def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
-        setup, ((x, y, z), yaw) = seen.setup, seen.tool
+        setup, ((x, y, z), yaw) = scene.setup, scene.tool
         center = (x, y) if self.follows_xy else setup.center_m
         turn = yaw if self.follows_yaw else 0.0
-        heights = seen.camera.heightmap(center, setup.width_m, setup.pixels, turn)
+        heights = scene.camera.heightmap(center, setup.width_m, setup.pixels, turn)
         camera_z = z + setup.camera_height_m if self.follows_z else setup.fixed_camera_z_m
-        return self.to_values(seen, heights, center, turn, camera_z)
+        return self.to_values(scene, heights, center, turn, camera_z)
 
     def to_values(
         self,
-        seen: ViewInput,
+        scene: ViewInput,
         heights: np.ndarray,
         center_m: tuple[float, float],
         turn_rad: float,
         camera_z_m: float,
     ) -> np.ndarray:
-        """Turn heights into values and draw the fingers.
+        """Convert a height image to the values of the view and draw the fingers.
 
         Args:
-            seen: the scene.
+            scene: the scene.
             heights: [H, W] metres.
-            center_m: x and y of the image's centre.
-            turn_rad: turn of the image.
+            center_m: x and y of the centre of the image.
+            turn_rad: heading of the image rows.
             camera_z_m: height of the camera.
 
         Returns:
             [1, H, W] metres.
         """
-        setup, ((x, y, z), yaw) = seen.setup, seen.tool
+        setup, ((x, y, z), yaw) = scene.setup, scene.tool
         low, high = self.range_m(setup)
         if self.shows_height:
             values = np.clip(heights, low, min(camera_z_m, high))
@@ -187,11 +188,11 @@ class TopDown(View):
         else:
             values = np.clip(z - np.minimum(heights, camera_z_m), low, high)
         pixel = setup.width_m / setup.pixels
-        dx, dy = x - center_m[0], y - center_m[1]  # both zero where the image turns
+        dx, dy = x - center_m[0], y - center_m[1]  # both zero in views that rotate
         _draw_fingers(
             values,
             (setup.pixels / 2 + dx / pixel, setup.pixels / 2 + dy / pixel),
-            seen.finger_offset_m / pixel,
+            scene.finger_offset_m / pixel,
             FINGER_SQUARE_HALF_M / pixel,
             yaw - turn_rad,
             z if self.shows_height else 0.0,
@@ -201,42 +202,43 @@ class TopDown(View):
 
 @dataclass(frozen=True)
 class PointSplat(View):
-    """Points that two cameras beside the workspace see, looked at from straight above the tool.
+    """Points seen by two cameras at the sides of the workspace, projected from above the tool.
 
-    Only points below the fingers count, or the arm of a real robot would hide the scene; what
-    neither camera sees takes the nearest pixel's height.
+    Only points below the fingers are used, as the arm of a real robot would occlude others. Pixels
+    without points take the value of the nearest pixel with points.
 
     Args:
-        shows_height: the values are heights above the floor, else depths below the tool.
+        shows_height: use heights above the floor as values instead of depths below the tool.
     """
 
     shows_height: bool
 
-    # the reference's 5 cm are a block's height: a hair decided whether its top was seen
+    # 0.05 m, as in the reference implementation, is the height of a block: rounding errors would
+    # decide whether its top is visible
     _min_ceiling_m: ClassVar[float] = 0.055
     _clearance_m: ClassVar[float] = 0.01
     _camera_pixels_per_pixel: ClassVar[int] = 2  # pixels of the cameras for each pixel of the image
     _max_pixels: ClassVar[int] = 1024
 
     def range_m(self, setup: ViewSetup) -> Range:
-        """Return the range of depth below the tool, or of height."""
+        """Return the bounds of the depth below the tool, or of the height."""
         return self._top_down.range_m(setup)
 
-    def image(self, seen: ViewInput) -> np.ndarray:
+    def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
-        setup, ((x, y, z), _) = seen.setup, seen.tool
+        setup, ((x, y, z), _) = scene.setup, scene.tool
         ceiling = max(z - self._clearance_m, self._min_ceiling_m)
-        # wherever in the workspace the tool is, the image lies in sight
+        # the image is visible for every position of the tool in the workspace
         lenses = side_lenses(setup.center_m, setup.workspace_m + setup.width_m)
         everywhere = (-math.inf, math.inf)
         points = visible_points(
-            [seen.camera.surface],
+            [scene.camera.mesh],
             lenses,
             min(self._camera_pixels_per_pixel * setup.pixels, self._max_pixels),
             (everywhere, everywhere, (-math.inf, ceiling)),
         )
         heights = splat_heightmap(points, (x, y), setup.width_m, setup.pixels)
-        return self._top_down.to_values(seen, heights, (x, y), 0.0, ceiling)
+        return self._top_down.to_values(scene, heights, (x, y), 0.0, ceiling)
 
     @property
     def _top_down(self) -> TopDown:
@@ -247,29 +249,32 @@ class PointSplat(View):
 
 @dataclass(frozen=True)
 class PerspectiveTopDown(View):
-    """A perspective camera that hangs above the tool and looks straight down.
+    """A perspective camera above the tool that looks straight down.
 
-    The values are depths below the camera, the same for all of the floor. The fingers are drawn
-    where the camera sees their tips.
+    The values are depths along the optical axis, so that the floor has a constant value. The
+    fingers are drawn at the projections of their tips.
+
+    Args:
+        fov_rad: field of view.
     """
 
     fov_rad: float
 
     def range_m(self, setup: ViewSetup) -> Range:
-        """Return the range of depth below the camera."""
+        """Return the bounds of the depth below the camera."""
         return 0.0, setup.z_m[1] + setup.camera_height_m + MAX_RECESS_M
 
-    def image(self, seen: ViewInput) -> np.ndarray:
+    def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
-        setup, ((x, y, z), yaw) = seen.setup, seen.tool
+        setup, ((x, y, z), yaw) = scene.setup, scene.tool
         lens = Lens((x, y, z + setup.camera_height_m), (x, y, z), self.fov_rad)
-        depth = depth_image([seen.camera.surface], lens, setup.pixels)
+        depth = depth_image([scene.camera.mesh], lens, setup.pixels)
         values = np.clip(depth, *self.range_m(setup))
         scale = lens.focal_px(setup.pixels) / setup.camera_height_m
         _draw_fingers(
             values,
             (setup.pixels / 2, setup.pixels / 2),
-            seen.finger_offset_m * scale,
+            scene.finger_offset_m * scale,
             FINGER_SQUARE_HALF_M * scale,
             yaw,
             0.0,
@@ -279,16 +284,17 @@ class PerspectiveTopDown(View):
 
 @dataclass(frozen=True)
 class Oblique(View):
-    """A perspective camera opposite the robot that looks at the workspace's centre.
+    """A perspective camera opposite the robot that looks at the workspace centre.
 
     Args:
-        shows_height: the values are heights above the floor, else depths along the optical axis.
+        shows_height: use heights above the floor as values instead of depths along the optical
+            axis.
     """
 
     shows_height: bool
 
     def range_m(self, setup: ViewSetup) -> Range:
-        """Return the range of depth from the workspace's ceiling to the floor, or of height."""
+        """Return the bounds of the depth in the workspace, or of the height."""
         if self.shows_height:
             return -MAX_RECESS_M, setup.fixed_camera_z_m
         lens = oblique_lens(setup.center_m)
@@ -296,12 +302,12 @@ class Oblique(View):
             -MAX_RECESS_M
         )[1]
 
-    def image(self, seen: ViewInput) -> np.ndarray:
+    def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
-        setup = seen.setup
+        setup = scene.setup
         lens = oblique_lens(setup.center_m)
-        fingers = finger_boxes(seen.tool, seen.finger_offset_m)
-        values = depth_image([seen.camera.surface, fingers], lens, setup.pixels)
+        fingers = finger_boxes(scene.tool, scene.finger_offset_m)
+        values = depth_image([scene.camera.mesh, fingers], lens, setup.pixels)
         if self.shows_height:
             values = lens.heights_m(values)
         return np.clip(values, *self.range_m(setup))[None]
@@ -309,35 +315,35 @@ class Oblique(View):
 
 @dataclass(frozen=True)
 class ObliqueRgbd(View):
-    """The oblique view in colour and depth, arm included."""
+    """Colour and depth of the oblique view, with the robot."""
 
     channels: ClassVar[int] = 4
 
     def range_m(self, setup: ViewSetup) -> Range:
-        """Return 0 and the depth of the farthest floor; colours lie between 0 and 1."""
+        """Return the bounds of colours (0 to 1) and depths together."""
         return 0.0, max(1.0, Oblique(shows_height=False).range_m(setup)[1])
 
-    def image(self, seen: ViewInput) -> np.ndarray:
+    def image(self, scene: ViewInput) -> np.ndarray:
         """Return red, green, blue and depth, [4, H, W]."""
-        setup = seen.setup
-        rgb, depth = render_rgbd(seen.world, oblique_lens(setup.center_m), setup.pixels)
+        setup = scene.setup
+        rgb, depth = render_rgbd(scene.world, oblique_lens(setup.center_m), setup.pixels)
         depth = np.clip(depth, *self.range_m(setup))
         return np.concatenate([np.moveaxis(rgb / 255.0, -1, 0), depth[None]])
 
 
 def finger_boxes(tool: YawPose, offset_m: float) -> SceneMesh:
-    """Return two upright posts that stand for the fingers.
+    """Return the mesh of two boxes that represent the fingers.
 
     Args:
-        tool: position and yaw of the tool point, at the height of the posts' lower ends.
-        offset_m: distance of each post's axis from the tool point.
+        tool: position and yaw of the tool, whose height is that of the lower ends of the boxes.
+        offset_m: distance between the axis of each box and the tool point.
     """
     (x, y, z), yaw = tool
-    post = Box(size_m=(2 * FINGER_SQUARE_HALF_M, 2 * FINGER_SQUARE_HALF_M, FINGER_LENGTH_M))
+    box = Box(size_m=(2 * FINGER_SQUARE_HALF_M, 2 * FINGER_SQUARE_HALF_M, FINGER_LENGTH_M))
     return SceneMesh(
         PosedShape(
-            post,
-            (
+            box,
+            Pose(
                 (x + side * math.cos(yaw), y + side * math.sin(yaw), z + FINGER_LENGTH_M / 2),
                 yaw_quaternion(yaw),
             ),
@@ -354,14 +360,23 @@ def _draw_fingers(
     yaw_rad: float,
     value: float,
 ) -> None:
-    """Write two squares on either side of the tool into an image."""
+    """Paint the squares that represent the fingers into an image.
+
+    Args:
+        image: [H, W], modified in place.
+        tool_px: row and column of the tool point.
+        offset_px: distance between each square's centre and the tool point.
+        half_px: half the edge of a square.
+        yaw_rad: heading of the closing axis, from rows towards columns.
+        value: new value of the pixels.
+    """
     for side in (-offset_px, offset_px):
         center = (tool_px[0] + side * math.cos(yaw_rad), tool_px[1] + side * math.sin(yaw_rad))
         paint_square(image, center, half_px, yaw_rad, value)
 
 
 def _register(name: str, kind: type[View], **options: bool) -> None:
-    """File a view under its name, and its heights under the name with a suffix."""
+    """Register a view, and its variant with heights as values under the suffix `_height`."""
     VIEWS.register(name)(kind(**options, shows_height=False))
     VIEWS.register(f"{name}_height")(kind(**options, shows_height=True))
 

@@ -26,6 +26,6 @@ class WristCamera(Observation):
         """Return the image; the robot is not in it."""
         x, y, z = scene.robot.tool_pose()[0]
         lens = Lens((x, y, z + 0.12), (x, y, z), math.radians(60))
-        depth = depth_image([scene.camera.surface], lens, 32)
+        depth = depth_image([scene.camera.mesh], lens, 32)
         image = np.minimum(depth, FARTHEST_M).astype(np.float32)
         return {WRIST: torch.from_numpy(image)[None]}

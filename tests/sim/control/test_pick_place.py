@@ -1,4 +1,4 @@
-"""Picking and placing real blocks, with the kuka unless a robot is named."""
+"""Picks and places of blocks, with the kuka unless stated otherwise."""
 
 import math
 
@@ -6,12 +6,8 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.control.pick_place import (
-    PEAK_ACCELERATION,
-    PickPlace,
-    PickPlaceLimits,
-    quintic_time_scaling,
-)
+from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.pick_place import PEAK_ACCELERATION, PickPlace, quintic_time_scaling
 from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
@@ -23,17 +19,17 @@ PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-
 
 
 class Table:
-    """A robot with blocks, and static things beside them."""
+    """A robot, blocks and static obstacles."""
 
     def __init__(self, count, *, static=(), teleport=True, robot="kuka", top_down=False):
         self.world = World(PHYSICS)
         self.robot = ROBOTS[robot](self.world)
         self.blocks = [self.world.add(Box(size_m=(B, B, B)), f"cube {i}") for i in range(count)]
-        self.things = [
-            self.world.add(Box(size_m=size, mass_kg=0.0), f"thing {i}")
+        self.obstacles = [
+            self.world.add(Box(size_m=size, mass_kg=0.0), f"obstacle {i}")
             for i, (size, _) in enumerate(static)
         ]
-        for body, (_, position) in zip(self.things, static, strict=True):
+        for body, (_, position) in zip(self.obstacles, static, strict=True):
             body.place(position)
         for i, block in enumerate(self.blocks):
             block.place((0.38 + 0.14 * (i // 2), -0.07 + 0.14 * (i % 2), B / 2))
@@ -56,20 +52,20 @@ class Table:
 
 @pytest.fixture
 def table():
-    made = []
+    tables = []
 
     def make(*args, **options):
-        made.append(Table(*args, **options))
-        return made[-1]
+        tables.append(Table(*args, **options))
+        return tables[-1]
 
     yield make
-    for one in made:
-        one.world.close()
+    for table in tables:
+        table.world.close()
 
 
 @pytest.mark.parametrize("offset_m", [0.0, 3e-3])
-def test_a_stack_of_four_stands_every_time(table, offset_m):
-    """Grasped off its middle by 3 mm, a block is placed off by as much, and the stack stands."""
+def test_stacking_four_blocks_succeeds(table, offset_m):
+    """A grasp that is off-centre by 3 mm results in a placement error of 3 mm."""
     t = table(4)
     pristine = t.world.snapshot()
     rng = np.random.default_rng(0)
@@ -100,53 +96,53 @@ def test_a_stack_of_four_stands_every_time(table, offset_m):
 
 
 @pytest.mark.parametrize("tilt_rad", [-math.pi / 8, -math.pi / 16, math.pi / 16, math.pi / 8])
-def test_a_tilted_block_is_picked_along_its_normal(table, tilt_rad):
+def test_a_tilted_block_is_grasped_along_its_normal(table, tilt_rad):
     slope = (0.2, 0.2, 0.02)
     t = table(1, static=[(slope, (0.5, 0.0, 0.06))])
     turn = pybullet.getQuaternionFromEuler((tilt_rad, 0.0, 0.0))
-    t.things[0].set_pose((0.5, 0.0, 0.06), turn)
+    t.obstacles[0].set_pose((0.5, 0.0, 0.06), turn)
     normal = np.reshape(pybullet.getMatrixFromQuaternion(turn), (3, 3))[:, 2]
     block = t.blocks[0]
     block.set_pose(tuple(np.array((0.5, 0.0, 0.06)) + (0.01 + B / 2) * normal), turn)
     t.world.settle()
-    assert block.tilt_rad == pytest.approx(abs(tilt_rad), abs=0.02)  # friction holds it there
+    assert block.tilt_rad == pytest.approx(abs(tilt_rad), abs=0.02)  # held by friction
     assert t.pick(*block.position, 0.0, 0.0, tilt_rad) is block
     assert block.position[2] > HOME_Z_M
 
 
 @pytest.mark.parametrize("top_down", [False, True])
-def test_a_tilted_pick_comes_along_its_axis_or_from_straight_above(table, top_down):
+def test_approach_is_along_the_tool_axis_or_top_down(table, top_down):
     t = table(1, top_down=top_down)
-    block, ways = t.blocks[0], []
+    block, positions = t.blocks[0], []
     solve = t.robot.inverse_kinematics
 
-    def remember(position, *others):
-        ways.append(position)
+    def record(position, *others):
+        positions.append(position)
         return solve(position, *others)
 
-    t.robot.inverse_kinematics = remember
+    t.robot.inverse_kinematics = record
     x, y, z = block.position
     assert t.pick(x, y, z, 0.0, 0.0, 0.35) is block
-    way = np.array([point for point in ways if math.dist(point[:2], (x, y)) < 0.1])
-    aside = np.linalg.norm(way[:, :2] - (x, y), axis=1)
-    assert np.ptp(way[:, 2]) > 0.05
+    path = np.array([point for point in positions if math.dist(point[:2], (x, y)) < 0.1])
+    lateral = np.linalg.norm(path[:, :2] - (x, y), axis=1)
+    assert np.ptp(path[:, 2]) > 0.05
     if top_down:
-        assert aside.max() < 2e-3
-    else:  # along the tool's axis
-        np.testing.assert_allclose(aside, math.tan(0.35) * (way[:, 2] - z), atol=4e-3)
+        assert lateral.max() < 2e-3
+    else:  # along the z axis of the tool
+        np.testing.assert_allclose(lateral, math.tan(0.35) * (path[:, 2] - z), atol=4e-3)
 
 
-def test_out_of_reach_the_block_stays_in_the_gripper(table):
+def test_a_body_stays_held_if_the_target_is_out_of_reach(table):
     t = table(1)
     block = t.blocks[0]
     assert t.pick(*block.position) is block
     t.place(1.4, 0.0, 0.1)
     assert t.hand.held is block
     assert block.position[2] > HOME_Z_M
-    assert t.pick(1.4, 0.0, 0.1) is block  # nor does a pick out there lose it
+    assert t.pick(1.4, 0.0, 0.1) is block  # the body is still held after a pick out of reach
 
 
-def test_a_pick_of_nothing_moves_nothing(table):
+def test_a_pick_at_an_empty_position_changes_nothing(table):
     t = table(2)
     before = [block.pose for block in t.blocks]
     assert t.pick(0.5, 0.15, B / 2) is None
@@ -159,8 +155,8 @@ def test_a_pick_of_nothing_moves_nothing(table):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("teleport", [True, False])
-def test_a_low_pick_holds(table, robot, teleport):
-    """Fingers that swing down as they close do not close against the floor."""
+def test_a_pick_near_the_floor_succeeds(table, robot, teleport):
+    """Fingers that move down as they close stay clear of the floor."""
     t = table(1, robot=robot, teleport=teleport)
     pristine = t.world.snapshot()
     block = t.blocks[0]
@@ -173,8 +169,8 @@ def test_a_low_pick_holds(table, robot, teleport):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.4, 0.0, 0.3), (0.4, -0.3, 0.2)])
-def test_fingertips_close_above_the_floor(table, robot, turn):
-    """Down to its lowest height a tool has its fingers clear, and hardly higher than it must be."""
+def test_lowest_tool_is_tight_for_closing_fingers(table, robot, turn):
+    """At the lowest height of the tool, the clearance of the closing fingers is 1 mm."""
     t = table(1, robot=robot)
     rotation = tool_rotation(*turn)
     lowest = t.robot.gripper.lowest_tool_m(rotation)
@@ -196,51 +192,51 @@ def test_fingertips_close_above_the_floor(table, robot, turn):
     gap = min(gap_m(opening) for opening in np.linspace(0.0, 1.0, 21))
     if turn == (0.0, 0.0, 0.0):
         assert gap == pytest.approx(1e-3, abs=5e-4)
-    else:  # what counts are the fingers' insides, not their thickness and chamfers
+    else:  # only approximate: thickness and chamfers of the fingers are neglected
         assert -0.01 < gap < 3e-3
 
 
-def test_a_pick_that_is_high_enough_goes_where_it_was_sent(table):
+def test_only_picks_below_the_lowest_tool_are_raised(table):
     t = table(1)
     lowest = t.robot.gripper.lowest_tool_m()
     reached = []
     close = t.hand._close_fingers
-    t.hand._close_fingers = lambda: (reached.append(t.robot.tool_frame()[0][2]), close())
+    t.hand._close_fingers = lambda: (reached.append(t.robot.tool_frame().position[2]), close())
     for z in (lowest - 5e-3, lowest, lowest + 5e-3):
         t.pick(0.5, 0.15, z)
     assert reached == pytest.approx([lowest, lowest, lowest + 5e-3], abs=1e-5)
 
 
-def test_something_in_the_way_stops_the_hand(table):
-    """The tool is sent to the floor through a block that does not give way."""
+def test_an_obstacle_stops_the_approach(table):
+    """The target is inside a static block."""
     t = table(1, static=[((0.2, 0.2, 0.1), (0.5, 0.0, 0.05))])
     lowest = []
     step = t.world.step
 
-    def watch(count=1):
+    def recording_step(count=1):
         step(count)
-        lowest.append(t.robot.tool_frame()[0][2])
+        lowest.append(t.robot.tool_frame().position[2])
 
-    t.world.step = watch
+    t.world.step = recording_step
     assert t.pick(0.5, 0.0, 0.02) is None
-    # the fingertips reach a centimetre below the tool point and stop on the block's top
+    # the fingertips, a centimetre below the tool point, stop on top of the block
     assert min(lowest) == pytest.approx(0.1 + 0.011, abs=0.01)
-    np.testing.assert_allclose(t.things[0].position, (0.5, 0.0, 0.05), atol=1e-9)
+    np.testing.assert_allclose(t.obstacles[0].position, (0.5, 0.0, 0.05), atol=1e-9)
 
 
-def test_a_block_is_not_pressed_through_what_it_is_placed_on(table):
+def test_placing_on_an_occupied_position_does_not_penetrate(table):
     t = table(2)
     block, below = t.blocks
     assert t.pick(*block.position) is block
     x, y, _ = below.position
-    t.place(x, y, B / 2)  # where the other block is
+    t.place(x, y, B / 2)  # the position of the other block
     assert t.hand.held is None
     assert below.position[2] == pytest.approx(B / 2, abs=1e-3)
     assert block.position[2] > B / 2 - 1e-3
     assert min(block.position[2], below.position[2]) > B / 2 - 1e-3
 
 
-def test_a_state_is_taken_up_where_it_was_left(table):
+def test_set_state_restores_the_grasp(table):
     t = table(2)
     block, below = t.blocks
     assert t.pick(*block.position) is block
@@ -262,7 +258,7 @@ def test_a_state_is_taken_up_where_it_was_left(table):
     )
 
 
-def test_all_of_it_can_be_simulated(table):
+def test_pick_and_place_without_teleport(table):
     t = table(2, teleport=False)
     block, below = t.blocks
     steps = t.world.steps
@@ -274,7 +270,7 @@ def test_all_of_it_can_be_simulated(table):
     assert math.dist(block.position[:2], below.position[:2]) < 3e-3
 
 
-def test_what_slips_out_is_no_longer_held(table):
+def test_update_grasp_releases_a_lost_body(table):
     t = table(1)
     block = t.blocks[0]
     assert t.pick(*block.position) is block
@@ -284,17 +280,17 @@ def test_what_slips_out_is_no_longer_held(table):
     assert not block.is_hidden
 
 
-def test_simulated_ways_keep_their_acceleration():
+def test_peak_acceleration_of_quintic_time_scaling():
     u = np.linspace(0.0, 1.0, 20001)
-    place = np.array([quintic_time_scaling(x) for x in u.tolist()])
-    acceleration = np.diff(place, n=2) / (u[1] - u[0]) ** 2
-    assert place[0] == 0.0
-    assert place[-1] == 1.0
+    values = np.array([quintic_time_scaling(x) for x in u.tolist()])
+    acceleration = np.diff(values, n=2) / (u[1] - u[0]) ** 2
+    assert values[0] == 0.0
+    assert values[-1] == 1.0
     assert np.abs(acceleration).max() == pytest.approx(PEAK_ACCELERATION, rel=1e-3)
     assert PickPlaceLimits().held_acceleration_m_s2 < PickPlaceLimits().acceleration_m_s2
 
 
-def test_tool_rotation_is_the_product_of_its_turns():
+def test_tool_rotation_is_a_product_of_rotations():
     rz, ry, rx = 0.7, -0.3, 0.4
     turns = [
         np.reshape(

@@ -21,7 +21,7 @@ def rotation_of(quaternion):
     return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
 
 
-def tilted(rng, limit):
+def random_tilt(rng, limit):
     axis = rng.normal(size=3)
     axis *= rng.uniform(0, limit) / np.linalg.norm(axis)
     angle = np.linalg.norm(axis)
@@ -31,13 +31,13 @@ def tilted(rng, limit):
     return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
 
 
-def test_inverse_kinematics_puts_the_tool_where_it_should_be(world):
+def test_inverse_kinematics_agrees_with_forward_kinematics(world):
     robot = Kuka(world)
     rng = np.random.default_rng(0)
     solved = 0
     for _ in range(500):
         position = rng.uniform([0.25, -0.2, 0.01], [0.65, 0.2, 0.4])
-        rotation = tilted(rng, 0.5) @ np.array(downward(rng.uniform(-math.pi, math.pi)))
+        rotation = random_tilt(rng, 0.5) @ np.array(downward(rng.uniform(-math.pi, math.pi)))
         joints = robot.inverse_kinematics(tuple(position), rotation.tolist())
         if joints is None:
             continue
@@ -49,11 +49,11 @@ def test_inverse_kinematics_puts_the_tool_where_it_should_be(world):
     assert solved > 400
 
 
-def test_out_of_reach_is_none(world):
+def test_inverse_kinematics_out_of_reach_returns_none(world):
     assert Kuka(world).inverse_kinematics((1.5, 0.0, 0.2), downward(0.0)) is None
 
 
-def test_tool_pose_reads_the_yaw(world):
+def test_tool_pose_returns_position_and_yaw(world):
     robot = Kuka(world)
     for yaw in np.linspace(-3.1, 3.1, 13):
         robot.teleport(robot.inverse_kinematics((0.45, 0.05, 0.2), downward(yaw)))
@@ -91,14 +91,16 @@ def test_grasp_holds_by_friction_and_releases(world):
         motion.move_to(tuple(target.tolist()), yaw)
         assert robot.held_body() is block
         np.testing.assert_allclose(block.position, robot.tool_pose()[0], atol=5e-3)
-    assert pybullet.getNumConstraints(physicsClientId=world.client) == 1  # the fingers' gear
+    assert (
+        pybullet.getNumConstraints(physicsClientId=world.client) == 1
+    )  # the gear between the fingers
     motion.grip(1.0)
     world.settle()
     assert robot.held_body() is None
     assert block.position[2] == pytest.approx(0.025, abs=1e-3)
 
 
-def test_a_frictionless_block_slips_out(world):
+def test_a_frictionless_block_is_not_held(world):
     robot, block, motion = grasp_scene(world, friction=0.0)
     motion.move_to((0.45, 0.0, 0.025), 0.0)
     motion.grip(0.0)
@@ -108,7 +110,7 @@ def test_a_frictionless_block_slips_out(world):
     assert robot.held_body() is None
 
 
-def test_a_block_pushed_by_its_corner_is_not_held(world):
+def test_a_block_pushed_at_its_corner_is_not_held(world):
     robot, block, motion = grasp_scene(world)
     block.place((0.45, 0.06, 0.025), math.pi / 4)
     motion.grip(0.5)
@@ -119,7 +121,7 @@ def test_a_block_pushed_by_its_corner_is_not_held(world):
     assert block.position[1] > 0.08
 
 
-def test_pushing_moves_the_block_no_further_than_the_finger(world):
+def test_a_pushed_block_stays_at_the_finger(world):
     robot, block, motion = grasp_scene(world)
     motion.grip(0.5)
     motion.move_to((0.45, -0.06, 0.2), 0.0)
@@ -131,7 +133,7 @@ def test_pushing_moves_the_block_no_further_than_the_finger(world):
         assert gap == pytest.approx(0.025 + 0.0095, abs=6e-3)
 
 
-def test_pressing_down_stops_before_it_hurts(world):
+def test_downward_motion_stops_at_the_force_limit(world):
     robot, block, motion = grasp_scene(world)
     motion.grip(0.0)
     for _ in range(3):
@@ -139,11 +141,11 @@ def test_pressing_down_stops_before_it_hurts(world):
     world.settle()
     assert robot.tool_pose()[0][2] > 0.05
     assert math.hypot(block.position[0] - 0.45, block.position[1]) < 5e-3
-    # no deeper than the one stride of 3.3 mm in which the hand meets the block
+    # tolerance: the displacement of 3.3 mm in the step in which the hand touches the block
     assert block.position[2] == pytest.approx(0.025, abs=3e-3)
 
 
-def test_turning_without_end_never_meets_a_joint_limit(world):
+def test_unlimited_rotation_of_the_wrist(world):
     robot, _, motion = grasp_scene(world)
     yaw = 0.0
     for _ in range(60):
@@ -155,7 +157,7 @@ def test_turning_without_end_never_meets_a_joint_limit(world):
     assert abs(robot.joints[-1]) < 2 * math.pi
 
 
-def test_teleporting_and_simulating_free_travel_end_alike():
+def test_teleported_and_simulated_motion_reach_the_same_pose():
     ends = []
     for teleport in (True, False):
         with World() as world:
@@ -174,7 +176,7 @@ def test_teleporting_and_simulating_free_travel_end_alike():
     assert slow_steps > 10
 
 
-def test_every_motion_is_bounded(world):
+def test_number_of_steps_of_a_motion_is_bounded(world):
     _, _, motion = grasp_scene(world)
     rng = np.random.default_rng(0)
     for _ in range(100):
@@ -187,7 +189,7 @@ def test_every_motion_is_bounded(world):
 
 
 @pytest.mark.parametrize("yaw_deg", [0, 15, 28, 40])
-def test_a_diagonal_grasp_is_a_grasp_and_the_fingers_do_not_sink_in(world, yaw_deg):
+def test_a_rotated_block_is_grasped_without_penetration(world, yaw_deg):
     robot, block, motion = grasp_scene(world)
     block.place((0.448, 0.003, 0.025), math.radians(yaw_deg))
     motion.move_to((0.45, 0.0, 0.02), 0.0)

@@ -1,4 +1,4 @@
-"""Every robot keeps the same promises; a new robot is tested here without being named."""
+"""Properties of every registered robot."""
 
 import math
 
@@ -17,7 +17,7 @@ CLOSE_LOOP = ((0.3, -0.15, 0.01), (0.6, 0.15, 0.25))
 OPEN_LOOP = ((0.25, -0.2, 0.0), (0.65, 0.2, 0.4))
 TILT = math.pi / 8
 FLOOR_OVERLAP_M = {"kuka": 4e-3}
-"""The tips of the one closing on an arc from above would dip into the floor of the workspace."""
+"""Penetration of the floor by closing fingertips that move on an arc, at the lowest tool height."""
 
 
 @pytest.fixture(params=list(ROBOTS))
@@ -36,7 +36,7 @@ def world():
         yield world
 
 
-def turned(axis, angle):
+def rotation_about(axis, angle):
     axis = np.eye(3)["xyz".index(axis)]
     cross = np.cross(np.eye(3), axis)
     return np.eye(3) - math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
@@ -61,8 +61,8 @@ def block_scene(world, robot_class, edge=0.05, yaw=0.0, xy=(0.45, 0.0)):
     return robot, block, motion
 
 
-def in_hand(robot, block):
-    """Return the block's position in the frame of the tool."""
+def position_in_hand(robot, block):
+    """Return the position of the block in the tool frame."""
     to_tool = pybullet.invertTransform(*robot.tool_frame())
     return np.array(pybullet.multiplyTransforms(*to_tool, *block.pose)[0])
 
@@ -77,13 +77,15 @@ def in_hand(robot, block):
     ],
     ids=["close loop", "close loop, tilted", "open loop", "open loop, tilted"],
 )
-def test_inverse_kinematics_reaches_the_workspace(world, robot_class, box, tilt, share):
+def test_inverse_kinematics_in_the_workspace(world, robot_class, box, tilt, share):
     robot = robot_class(world)
     rng = np.random.default_rng(0)
     solved = 0
     for _ in range(400):
         position = rng.uniform(*box)
-        rotation = turned("x", rng.uniform(-tilt, tilt)) @ turned("y", rng.uniform(-tilt, tilt))
+        rotation = rotation_about("x", rng.uniform(-tilt, tilt)) @ rotation_about(
+            "y", rng.uniform(-tilt, tilt)
+        )
         rotation = rotation @ np.array(downward(rng.uniform(-math.pi, math.pi)))
         joints = robot.inverse_kinematics(tuple(position.tolist()), rotation.tolist())
         if joints is None:
@@ -96,7 +98,7 @@ def test_inverse_kinematics_reaches_the_workspace(world, robot_class, box, tilt,
     assert solved >= share * 400
 
 
-def test_every_corner_of_the_close_loop_workspace_is_reached(world, robot_class):
+def test_corners_of_the_close_loop_workspace_are_within_reach(world, robot_class):
     robot = robot_class(world)
     for corner in np.stack(np.meshgrid(*zip(*CLOSE_LOOP, strict=True)), -1).reshape(-1, 3):
         for yaw in np.linspace(-math.pi, math.pi, 9):
@@ -107,11 +109,11 @@ def test_every_corner_of_the_close_loop_workspace_is_reached(world, robot_class)
             assert math.cos(measured - yaw) > 1 - 1e-6
 
 
-def test_out_of_reach_is_none(world, robot_class):
+def test_inverse_kinematics_out_of_reach_returns_none(world, robot_class):
     assert robot_class(world).inverse_kinematics((1.5, 0.0, 0.2), downward(0.0)) is None
 
 
-def test_solutions_change_smoothly_along_a_way(world, robot_class):
+def test_inverse_kinematics_is_continuous_along_a_path(world, robot_class):
     robot = robot_class(world)
     rng = np.random.default_rng(1)
     for _ in range(60):
@@ -120,26 +122,28 @@ def test_solutions_change_smoothly_along_a_way(world, robot_class):
         count = math.ceil(math.dist(start, end) / 0.003)
         joints = None
         for i in range(count + 1):
-            place = i / count
+            fraction = i / count
             before = joints
             joints = robot.inverse_kinematics(
-                tuple((start + place * (end - start)).tolist()),
-                downward(yaw + place * turn),
+                tuple((start + fraction * (end - start)).tolist()),
+                downward(yaw + fraction * turn),
                 before,
             )
             if before is not None:
                 assert np.abs(np.subtract(joints, before)).max() < 0.1 + abs(turn) / count
 
 
-def test_a_tilted_approach_does_not_fling_the_arm(world, robot_class):
+def test_inverse_kinematics_is_continuous_along_a_tilted_approach(world, robot_class):
     robot = robot_class(world)
     rng = np.random.default_rng(2)
     for _ in range(200):
         goal = rng.uniform((0.3, -0.15, 0.02), (0.6, 0.15, 0.2))
-        rotation = turned("x", rng.uniform(-TILT, TILT)) @ turned("y", rng.uniform(-TILT, TILT))
+        rotation = rotation_about("x", rng.uniform(-TILT, TILT)) @ rotation_about(
+            "y", rng.uniform(-TILT, TILT)
+        )
         rotation = rotation @ np.array(downward(rng.uniform(0, math.pi)))
         joints = None
-        for height in np.linspace(0.1, 0.0, 41):  # along the tool's axis, in steps of 2.5 mm
+        for height in np.linspace(0.1, 0.0, 41):  # along the approach direction, in steps of 2.5 mm
             before = joints
             point = tuple((goal - height * rotation[:, 2]).tolist())
             joints = robot.inverse_kinematics(point, rotation.tolist(), before)
@@ -147,7 +151,7 @@ def test_a_tilted_approach_does_not_fling_the_arm(world, robot_class):
                 assert np.abs(np.subtract(joints, before)).max() < 1.0
 
 
-def test_simulated_motion_arrives(world, robot_class):
+def test_simulated_motion_reaches_its_target(world, robot_class):
     robot = robot_class(world)
     world.seal()
     motion = CloseLoopController(robot, teleport=False)
@@ -163,8 +167,8 @@ def test_simulated_motion_arrives(world, robot_class):
         assert abs(math.remainder(measured - yaw, 2 * math.pi)) < math.radians(1)
 
 
-def free_width(robot, height):
-    """Return how wide a thing fits between the fingers, ``height`` above the tool point."""
+def gap_width(robot, height):
+    """Return the distance between the fingers at a height above the tool point."""
     (x, y, z), yaw = robot.tool_pose()
     ends = [(x + s * math.cos(yaw), y + s * math.sin(yaw), z + height) for s in (-0.1, 0.1)]
     hits = pybullet.rayTestBatch([(x, y, z + height)] * 2, ends, physicsClientId=robot.world.client)
@@ -172,7 +176,7 @@ def free_width(robot, height):
     return 0.1 * sum(hit[2] for hit in hits)
 
 
-def test_fingers_clear_the_floor_and_open_wide_enough(world, name, robot_class):
+def test_floor_clearance_and_opening_width(world, name, robot_class):
     robot = robot_class(world)
     world.seal()
     for opening in (1.0, 0.5, 0.0):
@@ -182,8 +186,8 @@ def test_fingers_clear_the_floor_and_open_wide_enough(world, name, robot_class):
         assert robot.opening() == pytest.approx(opening, abs=1e-3)
         if opening == 1.0:
             world.detect_collisions()
-            assert 0.07 < free_width(robot, 0.012) < 0.087
-    # closed, the tips end a little below the tool point
+            assert 0.07 < gap_width(robot, 0.012) < 0.087
+    # the closed fingertips are slightly below the tool point
     gap = min(
         point[8]
         for links in robot.finger_links
@@ -197,7 +201,7 @@ def test_fingers_clear_the_floor_and_open_wide_enough(world, name, robot_class):
 
 @pytest.mark.parametrize("edge", [0.05, 0.03])
 @pytest.mark.parametrize("yaw_deg", [0, 30, 77, 90, -45])
-def test_grasp_holds_while_moving_and_turning_and_releases(world, robot_class, edge, yaw_deg):
+def test_grasp_holds_during_motion_and_releases(world, robot_class, edge, yaw_deg):
     yaw = math.radians(yaw_deg)
     robot, block, motion = block_scene(world, robot_class, edge, yaw)
     motion.move_to((0.45, 0.0, 0.2), yaw)
@@ -206,20 +210,20 @@ def test_grasp_holds_while_moving_and_turning_and_releases(world, robot_class, e
     motion.grip(0.0)
     assert robot.held_body() is block
     assert 0.2 < robot.opening() < 0.85
-    start = in_hand(robot, block)
-    way = [(0, 0, 0.05)] * 3 + [
+    start = position_in_hand(robot, block)
+    displacements = [(0, 0, 0.05)] * 3 + [
         (0.05, 0.05, 0),
         (-0.05, 0.05, 0),
         (-0.05, -0.05, 0),
         (0.05, -0.05, 0),
     ]
-    for i, delta in enumerate(way):
+    for i, delta in enumerate(displacements):
         if i >= 3:
             yaw += math.pi / 4
         position = robot.tool_pose()[0]
         motion.move_to(tuple(p + d for p, d in zip(position, delta, strict=True)), yaw)
         assert robot.held_body() is block
-        assert np.abs(in_hand(robot, block) - start).max() < 3e-3
+        assert np.abs(position_in_hand(robot, block) - start).max() < 3e-3
     assert block.position[2] > 0.15
     motion.grip(1.0)
     world.settle()
@@ -228,7 +232,7 @@ def test_grasp_holds_while_moving_and_turning_and_releases(world, robot_class, e
     assert block.position[2] == pytest.approx(edge / 2, abs=1e-3)
 
 
-def test_a_frictionless_block_slips_out(world, robot_class):
+def test_a_frictionless_block_is_not_held(world, robot_class):
     robot = robot_class(world)
     block = world.add(Box(size_m=(0.05, 0.05, 0.05), friction=0.0), "block")
     world.seal()
@@ -243,7 +247,7 @@ def test_a_frictionless_block_slips_out(world, robot_class):
     assert block.position[2] < 0.1
 
 
-def test_closed_on_nothing_holds_nothing(world, robot_class):
+def test_an_empty_closed_gripper_holds_nothing(world, robot_class):
     robot, _, motion = block_scene(world, robot_class)
     motion.move_to((0.45, 0.12, 0.02), 0.5)
     motion.grip(0.0)
@@ -252,9 +256,9 @@ def test_closed_on_nothing_holds_nothing(world, robot_class):
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.5])
-def test_pressing_on_top_holds_nothing_and_hurts_nothing(world, robot_class, opening, request):
+def test_pressing_on_a_block_neither_grasps_nor_displaces_it(world, robot_class, opening, request):
     if robot_class is ROBOTS["kuka"] and opening == 0.5:
-        reason = "its half-open tips sink 4 mm into the block's edges, which looks like a grasp"
+        reason = "its half-open tips penetrate the edges of the block by 4 mm, which is detected as a grasp"
         request.applymarker(pytest.mark.xfail(reason=reason, strict=False))
     robot, block, motion = block_scene(world, robot_class)
     motion.grip(opening)
@@ -264,11 +268,11 @@ def test_pressing_on_top_holds_nothing_and_hurts_nothing(world, robot_class, ope
     world.settle()
     assert robot.tool_pose()[0][2] > 0.045
     assert math.dist(block.position[:2], (0.45, 0.0)) < 5e-3
-    # no deeper than the stride of 3.3 mm in which the hand meets the block and one of creeping
+    # tolerance: the displacement of 3.3 mm in the step of the first contact and one press stride
     assert block.position[2] == pytest.approx(0.025, abs=3.9e-3)
 
 
-def test_pushing_with_a_finger_holds_nothing(world, robot_class):
+def test_a_block_pushed_by_a_finger_is_not_held(world, robot_class):
     robot, block, motion = block_scene(world, robot_class)
     block.place((0.45, 0.06, 0.025), math.pi / 4)
     motion.grip(0.5)
@@ -280,7 +284,7 @@ def test_pushing_with_a_finger_holds_nothing(world, robot_class):
     assert block.position[1] > 0.1
 
 
-def test_turning_without_end_never_meets_a_joint_limit(world, robot_class):
+def test_unlimited_rotation_of_the_wrist(world, robot_class):
     robot, _, motion = block_scene(world, robot_class)
     for i in range(1, 41):
         yaw = i * math.pi / 4
@@ -290,22 +294,22 @@ def test_turning_without_end_never_meets_a_joint_limit(world, robot_class):
         assert math.cos(measured - yaw) > 0.999
 
 
-def test_home_is_out_of_the_picture(world, robot_class):
+def test_home_configuration_is_outside_of_images(world, robot_class):
     robot = robot_class(world)
     robot.teleport(robot.home_joints)
     robot.set_opening(1.0)
     world.detect_collisions()
     for link in (robot.hand_link, *robot.finger_links[0], *robot.finger_links[1]):
         low, high = pybullet.getAABB(robot.id, link, physicsClientId=world.client)
-        beside = high[0] < 0.25 or low[0] > 0.65 or high[1] < -0.2 or low[1] > 0.2
-        assert beside or low[2] > 0.4
+        is_beside = high[0] < 0.25 or low[0] > 0.65 or high[1] < -0.2 or low[1] > 0.2
+        assert is_beside or low[2] > 0.4
     assert robot.tool_pose()[0][2] > 0.4
-    # top-down poses are within a simple swing from home
+    # no joint moves by more than half a turn between home and a top-down pose
     joints = robot.inverse_kinematics((0.45, 0.0, 0.1), downward(0.0), robot.home_joints)
     assert np.abs(np.subtract(joints, robot.home_joints)).max() < math.pi
 
 
-def test_the_arm_passes_through_things(world, robot_class):
+def test_the_arm_does_not_collide(world, robot_class):
     robot = robot_class(world)
     blocks = [
         world.add(Box(size_m=(0.1, 0.1, 0.1)), f"block {i}") for i in range(len(robot.arm_joints))
@@ -322,8 +326,8 @@ def test_the_arm_passes_through_things(world, robot_class):
     assert not {point[3] for point in points} & set(robot.non_colliding_links)
 
 
-def drive(world, robot, blocks, motion):
-    """Play a fixed random sequence and return everything there is to see of it."""
+def trajectory(world, robot, blocks, motion):
+    """Execute a fixed random sequence of actions and return all joints, openings and poses."""
     world.restore_pristine()
     motion.reset(((0.45, 0.0, 0.2), 0.0))
     for block, xy in zip(blocks, ((0.4, -0.06), (0.48, 0.05)), strict=True):
@@ -343,7 +347,7 @@ def drive(world, robot, blocks, motion):
     return trace
 
 
-def test_pokes_are_harmless_and_repeat_bit_by_bit(robot_class):
+def test_random_actions_keep_blocks_in_place_and_repeat_bit_by_bit(robot_class):
     traces = []
     with World() as first, World() as second:
         for world in (first, second):
@@ -351,14 +355,14 @@ def test_pokes_are_harmless_and_repeat_bit_by_bit(robot_class):
             blocks = [world.add(Box(size_m=(0.05, 0.05, 0.05)), name) for name in "ab"]
             world.seal()
             motion = CloseLoopController(robot)
-            traces += [drive(world, robot, blocks, motion) for _ in range(2)]
+            traces += [trajectory(world, robot, blocks, motion) for _ in range(2)]
             assert all(math.dist(block.position[:2], (0.45, 0.0)) < 0.35 for block in blocks)
     assert np.isfinite(traces[0]).all()
     assert all(trace == traces[0] for trace in traces[1:])
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
-def test_a_turned_hand_still_lets_go(world, robot_class, quarter_turns):
+def test_a_rotated_hand_releases(world, robot_class, quarter_turns):
     robot, block, motion = block_scene(world, robot_class)
     motion.move_to((0.45, 0.0, 0.025), 0.0)
     motion.grip(0.0)

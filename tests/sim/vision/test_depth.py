@@ -138,7 +138,7 @@ def test_hidden_bodies_are_left_out_until_they_are_shown_again():
         for body in world.bodies:
             body.is_hidden = True
         assert shown() == [False] * 4
-        assert (depth_image([camera.surface], oblique_lens(CENTER), 16) > 0).all()
+        assert (depth_image([camera.mesh], oblique_lens(CENTER), 16) > 0).all()
         for body in world.bodies:
             body.is_hidden = False
         assert shown() == [True] * 4

@@ -1,4 +1,4 @@
-"""Images of what is held, against arithmetic of their own."""
+"""In-hand images, compared with independent arithmetic."""
 
 import math
 
@@ -25,8 +25,8 @@ def noise():
     return np.random.default_rng(0).uniform(0.0, 0.1, (128, 128))
 
 
-def by_hand(heights, row, column):
-    """Bilinear interpolation at a point in pixels' indices, zero outside; one value at a time."""
+def interpolated(heights, row, column):
+    """Return the bilinear interpolation at a point in pixel indices, zero outside of the image."""
     i, j = math.floor(row), math.floor(column)
     total = 0.0
     for a in (i, i + 1):
@@ -36,15 +36,15 @@ def by_hand(heights, row, column):
     return total
 
 
-def test_without_a_turn_it_is_a_slice(noise):
+def test_crop_without_rotation_is_a_slice(noise):
     np.testing.assert_allclose(
         crop(noise, (64.0, 50.0), SIZE), noise[52:76, 38:62], rtol=0, atol=1e-15
     )
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_a_quarter_turn_is_exact(noise, quarters):
-    """A gripper turned by +90 degrees has its rows along the columns of the picture."""
+def test_crop_rotated_by_quarter_turns(noise, quarters):
+    """At a rotation of +90 degrees, the rows run along the columns of the heightmap."""
     straight = crop(noise, (64.0, 64.0), SIZE)
     turned = crop(noise, (64.0, 64.0), SIZE, quarters * math.pi / 2)
     np.testing.assert_allclose(turned, np.rot90(straight, -quarters), rtol=0, atol=1e-12)
@@ -52,30 +52,30 @@ def test_a_quarter_turn_is_exact(noise, quarters):
 
 @pytest.mark.parametrize("center", [(64.0, 64.0), (63.3, 70.8), (2.0, 126.5), (0.0, 0.0)])
 @pytest.mark.parametrize("rz", [0.0, 0.4, -1.1, 2.9])
-def test_every_pixel_is_interpolated_where_it_lies(noise, center, rz):
+def test_crop_interpolates_bilinearly(noise, center, rz):
     image = crop(noise, center, SIZE, rz)
     middle = (SIZE - 1) / 2
     for k, m in ((0, 0), (0, 23), (23, 0), (11, 12), (5, 17)):
         a, b = k - middle, m - middle
         row = center[0] - 0.5 + math.cos(rz) * a - math.sin(rz) * b
         column = center[1] - 0.5 + math.sin(rz) * a + math.cos(rz) * b
-        assert image[k, m] == pytest.approx(by_hand(noise, row, column), abs=1e-9)
+        assert image[k, m] == pytest.approx(interpolated(noise, row, column), abs=1e-9)
 
 
-def test_beyond_the_border_there_is_nothing():
+def test_crop_is_zero_outside_of_the_heightmap():
     image = crop(np.ones((128, 128)), (0.0, 64.0), SIZE)
     np.testing.assert_array_equal(image[:12], 0.0)
     np.testing.assert_allclose(image[12:], 1.0)
     np.testing.assert_array_equal(crop(np.ones((128, 128)), (-40.0, 200.0), SIZE), 0.0)
 
 
-def test_raw_shows_what_was_there_before(noise):
+def test_raw_is_a_crop_of_the_heightmap_before_the_pick(noise):
     image = draw("raw", noise, np.zeros_like(noise), rz=0.3)
     np.testing.assert_array_equal(image[0], crop(noise, (64.0, 64.0), SIZE, 0.3))
 
 
-def test_sub_measures_from_what_was_left():
-    """A block of 3 cm on another one; the floor beside them stays the floor."""
+def test_sub_subtracts_the_remaining_height():
+    """A block of 3 cm is picked from another block; the height of the floor is unchanged."""
     before, after = np.zeros((128, 128)), np.zeros((128, 128))
     before[60:68, 60:68] = 0.06
     after[60:68, 60:68] = 0.03
@@ -83,20 +83,20 @@ def test_sub_measures_from_what_was_left():
     image = draw("sub", before, after)[0]
     expected = np.zeros((SIZE, SIZE))
     expected[8:16, 8:16] = 0.03
-    expected[0:3] = 0.02  # lower than what was left: as it is
+    expected[0:3] = 0.02  # lower than the remaining height: unchanged
     np.testing.assert_allclose(image, expected, atol=1e-12)
 
 
-def test_sub_looks_around_the_tool_only():
+def test_sub_ignores_heights_far_from_the_tool():
     before = np.full((128, 128), 0.0)
     before[60:68, 60:68] = 0.03
     after = np.zeros((128, 128))
-    after[:10, :10] = 0.2  # far away
+    after[:10, :10] = 0.2  # outside of the crop
     np.testing.assert_array_equal(draw("sub", before, after), draw("raw", before))
 
 
 def test_proj_counts_the_voxels_of_a_box():
-    """Sums along each axis of a box, with its edge cells moved by the median as defined."""
+    """Sums along each axis of the voxels of a box after the median filter."""
     rows, columns, height = 8, 6, 0.03
     before = np.zeros((128, 128))
     before[60 : 60 + rows, 61 : 61 + columns] = height
@@ -104,7 +104,7 @@ def test_proj_counts_the_voxels_of_a_box():
     levels = z_m + (np.arange(SIZE) - (SIZE - 1) / 2) * PIXEL_M
     filled = np.zeros((SIZE, SIZE, SIZE), dtype=bool)
     filled[8:16, 9:15, :] = levels < height
-    filled[:, :, :] |= levels < 0.0  # the floor is solid below
+    filled[:, :, :] |= levels < 0.0  # below the floor
     smooth = np.zeros_like(filled)
     for i in range(SIZE):
         for j in range(SIZE):
@@ -120,22 +120,22 @@ def test_proj_counts_the_voxels_of_a_box():
     assert image.shape == (3, SIZE, SIZE)
     for axis in range(3):
         np.testing.assert_array_equal(image[axis], smooth.sum(axis=axis))
-    # half of the eight cells suffice: one level more than is filled
+    # a tie of the median counts as filled, which adds one level
     np.testing.assert_array_equal(image[2][10:14, 11:13], (levels < height).sum() + 1)
 
 
-def test_proj_turns_with_the_gripper():
+def test_proj_rotates_with_the_gripper():
     before = np.zeros((128, 128))
     before[58:70, 62:66] = 0.03
     straight, turned = draw("proj", before), draw("proj", before, rz=math.pi / 2)
-    # along z the bar lies across; counted as seen along x and along y it changes places
+    # the rotation exchanges the projections along x and y
     assert straight[2].sum() == pytest.approx(turned[2].sum(), rel=0.05)
     np.testing.assert_allclose(straight[0].max(), turned[1].max(), atol=1)
     np.testing.assert_allclose(straight[1].max(), turned[0].max(), atol=1)
 
 
 @pytest.mark.parametrize("mode", sorted(IN_HAND_MODES))
-def test_every_mode_keeps_its_promise(mode, noise):
+def test_shape_and_values_of_every_mode(mode, noise):
     kind = IN_HAND_MODES[mode]()
     image = kind.draw(view(noise, noise, center=(3.0, 125.0), rz=0.5, ry=0.2, rx=-0.2), SIZE)
     assert image.shape == (kind.channels, SIZE, SIZE)

@@ -37,7 +37,7 @@ TOOL = ((0.40, 0.05, 0.15), 0.5)
 
 @pytest.fixture(scope="module")
 def world():
-    """A world with a robot's stand-in, so that pictures in colour have something to draw."""
+    """Return a world with a block, for colour images."""
     with World() as world:
         world.add(Box(size_m=(0.05, 0.05, 0.05)), "block").place((0.45, -0.05, 0.025), 0.4)
         yield world
@@ -52,16 +52,16 @@ def goal(x=0.52, y=0.03, yaw=0.2):
     return PosedShape(shape, ((x, y, 0.0), yaw_quaternion(yaw)))
 
 
-def seen(world, bodies, tool=TOOL, opening=1.0, **setup):
+def view_input(world, bodies, tool=TOOL, opening=1.0, **setup):
     setup = dataclasses.replace(SETUP, **setup)
     return ViewInput(setup, world, HeightCamera(bodies), tool, opening)
 
 
 def image(name, *args, **options):
-    return VIEWS[name].image(seen(*args, **options))[-1]
+    return VIEWS[name].image(view_input(*args, **options))[-1]
 
 
-def test_the_views_are_those_of_the_reference():
+def test_registered_views():
     assert set(VIEWS) == {
         *TOP_DOWN,
         *(f"{name}_height" for name in TOP_DOWN),
@@ -74,13 +74,13 @@ def test_the_views_are_those_of_the_reference():
     }
 
 
-def test_an_unknown_view_is_an_error_that_lists_the_known():
+def test_an_unknown_view_raises_and_lists_known_names():
     with pytest.raises(UnknownNameError, match=r"camera_centre_xyz.*Did you mean.*camera_fix"):
         VIEWS["camera_centre_xyz"]
 
 
-def test_the_default_view_is_depth_below_the_camera_with_fingers_of_zero(world):
-    """The same arithmetic, written out: equal in every bit."""
+def test_default_view_equals_explicit_arithmetic(world):
+    """The images are equal bit by bit."""
     rng = np.random.default_rng(0)
     for pixels in (64, 128):
         for _ in range(5):
@@ -95,14 +95,14 @@ def test_the_default_view_is_depth_below_the_camera_with_fingers_of_zero(world):
             for side in (-apart, apart):
                 center = (pixels / 2 + side * math.cos(yaw), pixels / 2 + side * math.sin(yaw))
                 paint_square(expected, center, 5 * 0.3 / 128 / pixel, yaw, 0.0)
-            scene = seen(world, bodies, ((x, y, z), yaw), opening, pixels=pixels)
+            scene = view_input(world, bodies, ((x, y, z), yaw), opening, pixels=pixels)
             view = VIEWS["camera_center_xyz"]
             np.testing.assert_array_equal(view.image(scene), expected[None])
             assert view.range_m(scene.setup) == (0.0, 0.25 + 0.12 + 0.02)
 
 
 @pytest.mark.parametrize("task", ["block_picking", "block_pushing"])
-def test_the_default_view_is_what_environments_observe(task):
+def test_environments_observe_the_default_view(task):
     env = ba_torchrl.make(f"close_loop/{task}", seed=2)
     state = env.reset()
     scene, workspace = env.scene, env.workspace
@@ -124,7 +124,7 @@ def test_the_default_view_is_what_environments_observe(task):
 
 
 @pytest.mark.parametrize("name", sorted(VIEWS))
-def test_values_stay_in_their_range_wherever_the_tool_is(name, world):
+def test_values_are_within_range_m(name, world):
     rng = np.random.default_rng(1)
     view = VIEWS[name]
     low, high = view.range_m(SETUP)
@@ -135,7 +135,7 @@ def test_values_stay_in_their_range_wherever_the_tool_is(name, world):
             block(*rng.uniform((0.3, -0.15), (0.6, 0.15)), size=(0.04, 0.05, rng.uniform(0, 0.4))),
         ]
         tool = (tuple(rng.uniform((0.3, -0.15, 0.0), (0.6, 0.15, 0.26))), rng.uniform(-3, 3))
-        scene = seen(world, bodies, tool, rng.uniform(), pixels=48)
+        scene = view_input(world, bodies, tool, rng.uniform(), pixels=48)
         values = view.image(scene)
         assert values.shape == (view.channels, 48, 48)
         assert values.dtype == np.float64
@@ -148,7 +148,7 @@ def test_values_stay_in_their_range_wherever_the_tool_is(name, world):
 
 
 @pytest.mark.parametrize("name", sorted(set(VIEWS) - {IN_COLOR}))
-def test_every_view_shows_blocks_goals_and_fingers(name, world):
+def test_blocks_goals_and_fingers_are_visible(name, world):
     def changed(one, other):
         return (np.abs(one - other) > 1e-3).sum()
 
@@ -161,7 +161,7 @@ def test_every_view_shows_blocks_goals_and_fingers(name, world):
 
 
 @pytest.mark.parametrize("name", TOP_DOWN)
-def test_heights_and_depths_belong_together(name, world):
+def test_heights_and_depths_are_consistent(name, world):
     depth = image(name, world, [block(), goal()], opening=0.0)
     heights = image(f"{name}_height", world, [block(), goal()], opening=0.0)
     origin = 0.15 + (0.12 if "z" in name.removeprefix("camera_center_") else 0.0)
@@ -172,28 +172,28 @@ def test_heights_and_depths_belong_together(name, world):
 
 
 @pytest.mark.parametrize("name", ["camera_center_xyzr", "camera_center_xyr"])
-def test_views_that_turn_show_the_world_turned_back_about_the_tool(name, world):
+def test_rotating_views_follow_the_yaw_of_the_tool(name, world):
     yaw, (x, y, _) = TOOL[1], TOOL[0]
     cos, sin = math.cos(yaw), math.sin(yaw)
 
-    def back(thing, px, py, heading):
+    def inverse(create, px, py, heading):
         dx, dy = px - x, py - y
-        return thing(x + cos * dx + sin * dy, y + cos * dy - sin * dx, heading - yaw)
+        return create(x + cos * dx + sin * dy, y + cos * dy - sin * dx, heading - yaw)
 
     there = [goal(), block()]
-    here = [back(goal, 0.52, 0.03, 0.2), back(block, 0.45, -0.05, 0.4)]
+    here = [inverse(goal, 0.52, 0.03, 0.2), inverse(block, 0.45, -0.05, 0.4)]
     turned = image(name, world, there)
     np.testing.assert_allclose(turned, image(name, world, here, (TOOL[0], 0.0)), atol=1e-12)
     still = image(name.removesuffix("r"), world, here, (TOOL[0], 0.0))
     np.testing.assert_allclose(turned, still, atol=1e-12)
     rows, cols = np.nonzero(turned == 0)
-    assert set(cols) == {127 - c for c in cols}  # the fingers lie along the rows
+    assert set(cols) == {127 - c for c in cols}  # the fingers are aligned with the rows
     assert rows.max() - rows.min() > 3 * (cols.max() - cols.min())
 
 
 @pytest.mark.parametrize("name", [*TOP_DOWN, "render_center"])
 @pytest.mark.parametrize("opening", [0.4, 1.0])
-def test_fingers_are_drawn_where_they_are(name, opening, world):
+def test_position_and_size_of_finger_squares(name, opening, world):
     (x, y, _), yaw = TOOL
     values = image(name, world, [], opening=opening)
     centered = "center_z" not in name and name != "camera_fix"
@@ -219,7 +219,7 @@ def test_fingers_are_drawn_where_they_are(name, opening, world):
     assert len(rows) == pytest.approx(2 * (2 * FINGER_SQUARE_HALF_M * 128 / 0.45) ** 2, rel=0.2)
 
 
-def test_views_of_the_workspace_stay_when_the_tool_moves(world):
+def test_fixed_view_is_independent_of_the_tool(world):
     bodies = [goal(), block()]
     here, there = (
         image("camera_fix_height", world, bodies, (position, 0.0))
@@ -231,7 +231,7 @@ def test_views_of_the_workspace_stay_when_the_tool_moves(world):
     np.testing.assert_array_equal(there[~fingers], without[~fingers])
 
 
-def test_what_is_higher_than_the_camera_is_cut_off_there(world):
+def test_surfaces_above_the_camera_are_clipped(world):
     tower = [block(0.45, -0.05, 0.0, (0.05, 0.05, 0.5))]
     tops = {
         name: image(f"{name}_height", world, tower, opening=0.0).max()
@@ -240,12 +240,12 @@ def test_what_is_higher_than_the_camera_is_cut_off_there(world):
     assert tops["camera_center_xyz"] == pytest.approx(0.15 + 0.12)
     assert tops["camera_center_xy"] == pytest.approx(0.25 + 0.04)
     assert image("camera_center_xyz", world, tower).min() == 0.0
-    # only points below the fingers count, and the fingers themselves
+    # only points below the fingers, and the fingers themselves
     assert 0.13 < image("render_center_height", world, tower, (TOOL[0], 0.0))[:, :40].max() <= 0.14
 
 
 @pytest.mark.parametrize("z", [0.03, 0.2])
-def test_points_from_the_sides_give_the_heights_from_above(z, world):
+def test_render_center_agrees_with_the_orthographic_view(z, world):
     bodies = [goal(0.55, 0.1), block(0.40, 0.0), block(0.47, -0.06, 1.0)]
     tool = ((0.45, 0.02, z), 0.3)
     splatted = image("render_center_height", world, bodies, tool)
@@ -260,13 +260,13 @@ def test_points_from_the_sides_give_the_heights_from_above(z, world):
     assert (np.abs(splatted - above) > 5e-3).sum() < 0.2 * (above != 0).sum()
 
 
-def test_perspective_from_above_has_the_tools_depth_in_the_middle(world):
+def test_geometry_of_the_perspective_view(world):
     bodies = [block(0.45, -0.05, 0.0)]
     tool = ((0.45, -0.05, 0.1), 0.0)
     values = image("pers_center_xyz", world, bodies, tool)
     assert values[64, 64] == pytest.approx(0.22 - 0.05)
     assert values[0, 0] == pytest.approx(0.22)
-    # 5 cm at 17 cm, under 70 degrees
+    # an edge of 5 cm at a depth of 17 cm with a field of view of 70 degrees
     edge = 0.025 / 0.17 / math.tan(math.radians(35)) * 64
     cols = np.nonzero(np.isclose(values[64], 0.17))[0]
     assert (cols.min(), cols.max()) == (math.ceil(64 - edge - 0.5), math.floor(64 + edge - 0.5))
@@ -277,7 +277,7 @@ def test_perspective_from_above_has_the_tools_depth_in_the_middle(world):
     assert np.ptp(cols) + 1 == pytest.approx(2 * FINGER_SQUARE_HALF_M * scale, abs=1)
 
 
-def test_the_side_view_looks_from_opposite_the_robot(world):
+def test_geometry_of_the_side_view(world):
     lens = oblique_lens(SETUP.center_m)
     assert lens.eye_m == (1.0, 0.0, 0.6)
 
@@ -292,7 +292,7 @@ def test_the_side_view_looks_from_opposite_the_robot(world):
     assert i > 64 > j  # nearer to the camera is lower, smaller y to the left
     assert values[i, j] == pytest.approx(depth, abs=4e-3)
     assert heights[i, j] == pytest.approx(0.05, abs=1e-9)
-    # both fingers, by their outer faces
+    # both fingers: the depth of their front faces
     (x, y, z), yaw = TOOL
     for side in (-0.0525, 0.0525):
         i, j, depth = pixel(x + side * math.cos(yaw), y + side * math.sin(yaw), z + 0.03)
@@ -300,18 +300,18 @@ def test_the_side_view_looks_from_opposite_the_robot(world):
         assert heights[i, j] == pytest.approx(z + 0.03, abs=0.02)
 
 
-def test_colour_and_depth_of_the_side_view_come_from_the_picture(world):
-    values = VIEWS[IN_COLOR].image(seen(world, world.bodies))
+def test_rgbd_side_view_agrees_with_the_depth_view(world):
+    values = VIEWS[IN_COLOR].image(view_input(world, world.bodies))
     assert values.shape == (4, 128, 128)
     depth = image("camera_side", world, world.bodies, ((0.45, 0.0, 0.25), 0.0))
     heights = image("camera_side_height", world, world.bodies, ((0.45, 0.0, 0.25), 0.0))
-    low = heights < 0.2  # without the fingers, which no robot shows here
+    low = heights < 0.2  # without the fingers: the world contains no robot
     assert np.quantile(np.abs(values[3] - depth)[low], 0.99) < 1e-4
     on_block = (heights > 0.01) & low
     assert values[0][on_block].mean() > 2 * values[2][on_block].mean()
 
 
-def test_the_view_widths_follow_the_setup(world):
+def test_image_width_follows_the_setup(world):
     tile = [block(0.45, 0.0, 0.0, size=(0.2, 0.2, 0.05))]
     for width in (0.45, 0.9):
         heights = image("camera_fix_height", world, tile, width_m=width, opening=0.0)
