@@ -111,6 +111,34 @@ def test_imports_go_one_way(module):
     assert violations(source, module, MODULES, path.name == "__init__.py") == []
 
 
+SIM = (
+    {"geometry"},
+    {"contacts", "meshes"},
+    {"shapes"},
+    {"assets", "bodies"},
+    {"articulated"},
+    {"world"},
+    {"robots", "vision"},
+    {"control"},
+)
+"""Layers of the simulator: each imports those before it."""
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("ba_torchrl.sim.")])
+def test_imports_inside_the_simulator_go_one_way(module):
+    def layer(name):
+        part = name.split(".")[2]
+        return next(i for i, parts in enumerate(SIM) if part in parts), part
+
+    path = MODULES[module]
+    found = imported_modules(
+        path.read_text(encoding="utf-8"), module, path.name == "__init__.py", set(MODULES)
+    )
+    own, part = layer(module)
+    inside = [name for _, name in found if name.startswith("ba_torchrl.sim.")]
+    assert [name for name in inside if layer(name)[0] >= own and layer(name)[1] != part] == []
+
+
 def circles(imports):
     """Return the sets of modules that import each other, directly or through others.
 
