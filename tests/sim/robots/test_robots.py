@@ -258,7 +258,7 @@ def test_an_empty_closed_gripper_holds_nothing(world, robot_class):
 @pytest.mark.parametrize("opening", [0.0, 0.5])
 def test_pressing_on_a_block_neither_grasps_nor_displaces_it(world, robot_class, opening, request):
     if robot_class is ROBOTS["kuka"] and opening == 0.5:
-        reason = "its half-open tips penetrate the edges of the block by 4 mm, which is detected as a grasp"
+        reason = "half-open tips penetrate the block by 4 mm, which is detected as a grasp"
         request.applymarker(pytest.mark.xfail(reason=reason, strict=False))
     robot, block, motion = block_scene(world, robot_class)
     motion.grip(opening)
