@@ -8,7 +8,7 @@ import numpy as np
 
 from ba_torchrl.sim.assets import cache
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
-from ba_torchrl.sim.meshes import Mesh, box_mesh, moved
+from ba_torchrl.sim.meshes import Mesh, box_mesh, transform_mesh
 
 
 def test_parts_are_computed_once(own_cache):
@@ -16,7 +16,10 @@ def test_parts_are_computed_once(own_cache):
 
     def make():
         made.append(1)
-        return [box_mesh((1.0, 2.0, 3.0)), moved(box_mesh((1.0, 1.0, 1.0)), (5.0, 0.0, 0.0))]
+        return [
+            box_mesh((1.0, 2.0, 3.0)),
+            transform_mesh(box_mesh((1.0, 1.0, 1.0)), (5.0, 0.0, 0.0)),
+        ]
 
     first, second = (cached_parts(b"content", "recipe", make) for _ in range(2))
     assert len(made) == 1
@@ -41,7 +44,7 @@ def test_a_damaged_entry_is_computed_again(own_cache, caplog):
             (part,) = cached_parts(b"content", "recipe", make)
         np.testing.assert_array_equal(part.vertices, box_mesh((1.0, 1.0, 1.0)).vertices)
         assert path.read_bytes() == whole
-    assert "made anew" in caplog.text
+    assert "computed again" in caplog.text
 
 
 def test_a_cache_that_cannot_be_written_is_reported_and_not_used(monkeypatch, tmp_path, caplog):

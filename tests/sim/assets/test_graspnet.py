@@ -12,7 +12,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.assets import graspnet, hulls
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.assets.graspnet import graspable_scale
-from ba_torchrl.sim.meshes import Mesh, box_mesh, joined, moved, write_obj
+from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, transform_mesh, write_obj
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.clutter.tray import profile
 
@@ -26,10 +26,10 @@ def write_objects(root, **meshes):
 
 def angle_iron(size=0.08):
     """Return an L of two slabs, which fills half of its convex hull."""
-    return joined(
+    return merge_meshes(
         [
-            moved(box_mesh((size, 0.03, 0.02)), (size / 2, 0, 0.01)),
-            moved(box_mesh((0.02, 0.03, size)), (0.01, 0, size / 2)),
+            transform_mesh(box_mesh((size, 0.03, 0.02)), (size / 2, 0, 0.01)),
+            transform_mesh(box_mesh((0.02, 0.03, size)), (0.01, 0, size / 2)),
         ]
     )
 
@@ -242,7 +242,7 @@ def test_meshes_at_the_size_limits_are_accepted(tmp_path, size):
 def test_the_longest_object_lies_across_the_smaller_tray():
     inner = 2 * profile(CloseLoopTask.workspace.width)[0][0]
     assert inner == pytest.approx(0.25)
-    assert 0.98 < graspnet.LONGEST_M / math.hypot(inner, inner) <= 1
+    assert 0.98 < graspnet.MAX_LENGTH_M / math.hypot(inner, inner) <= 1
 
 
 def test_scales_follow_the_rules():
@@ -254,6 +254,11 @@ def test_scales_follow_the_rules():
 
 
 def test_the_recipe_contains_every_parameter_of_the_decomposition():
-    for value in (graspnet.CONVEX_FILL, graspnet.LENGTHS_M, graspnet.LONGEST_M, graspnet.FLATTEST):
+    for value in (
+        graspnet.CONVEX_FILL,
+        graspnet.MESH_LENGTHS_M,
+        graspnet.MAX_LENGTH_M,
+        graspnet.MIN_FLATNESS,
+    ):
         assert str(value) in graspnet.RECIPE
     assert all(str(value) in graspnet.RECIPE for value in graspnet.VHACD.values())

@@ -31,30 +31,30 @@ def test_points_without_volume_have_no_hull(points):
 
 def test_rests_of_a_box_are_its_six_faces():
     size = (0.03, 0.05, 0.07)
-    found = hulls.rests(hulls.convex_hull(box_mesh(size).vertices))
+    found = hulls.stable_poses(hulls.convex_hull(box_mesh(size).vertices))
     assert sorted(round(rest.height_m, 6) for rest in found) == sorted(size * 2)
     for rest in found:
         least = min(set(size) - {round(rest.height_m, 6)})
         assert rest.width_m == pytest.approx(least, abs=1e-6)
-        assert rest.squareness > 0.9
+        assert rest.antipodal_score > 0.9
         # in this pose the fingers close along x, and the height is along z
-        extents = np.ptp(box_mesh(size).vertices @ rest.turn.T, axis=0)
+        extents = np.ptp(box_mesh(size).vertices @ rest.rotation.T, axis=0)
         assert extents[2] == pytest.approx(rest.height_m)
-        assert extents[0] <= hulls.GAP_M + 1e-3
-        assert np.linalg.det(rest.turn) == pytest.approx(1)
+        assert extents[0] <= hulls.MAX_GAP_M + 1e-3
+        assert np.linalg.det(rest.rotation) == pytest.approx(1)
 
 
 def test_a_wedge_is_less_square_than_a_box():
     wedge = np.array([(x, y, z) for x, y in ((0, -0.03), (0, 0.03), (0.04, 0)) for z in (0, 0.03)])
-    flat = [rest for rest in hulls.rests(hulls.convex_hull(wedge)) if rest.height_m < 0.031]
+    flat = [rest for rest in hulls.stable_poses(hulls.convex_hull(wedge)) if rest.height_m < 0.031]
     assert flat
-    assert all(rest.squareness < 0.8 for rest in flat)
+    assert all(rest.antipodal_score < 0.8 for rest in flat)
 
 
 def test_a_body_does_not_rest_on_an_end_it_would_topple_from():
     leaning = box_mesh((0.02, 0.02, 0.1)).vertices.copy()
     leaning[leaning[:, 2] > 0, 0] += 0.06
-    heights = [rest.height_m for rest in hulls.rests(hulls.convex_hull(leaning))]
+    heights = [rest.height_m for rest in hulls.stable_poses(hulls.convex_hull(leaning))]
     assert heights
     assert max(heights) < 0.05
 

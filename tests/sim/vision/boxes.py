@@ -5,14 +5,14 @@ import math
 import numpy as np
 
 from ba_torchrl.sim.shapes import Box
-from ba_torchrl.sim.vision.depth import Placed
+from ba_torchrl.sim.vision.depth import PosedShape
 from ba_torchrl.sim.vision.lens import FAR_M
 
 CENTER = (0.45, 0.0)
 
 
 def placed(size, position, turn=(0.0, 0.0, 0.0, 1.0)):
-    return Placed(Box(size_m=size), (position, turn))
+    return PosedShape(Box(size_m=size), (position, turn))
 
 
 def random_boxes(rng, count, span=0.15):

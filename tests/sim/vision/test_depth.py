@@ -8,7 +8,13 @@ import pytest
 
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
-from ba_torchrl.sim.vision.depth import HeightCamera, Placed, Surface, depth_image, paint_square
+from ba_torchrl.sim.vision.depth import (
+    HeightCamera,
+    PosedShape,
+    SceneMesh,
+    depth_image,
+    paint_square,
+)
 from ba_torchrl.sim.vision.lens import Lens, oblique_lens, side_lenses
 from ba_torchrl.sim.world import World
 from tests.sim.vision.boxes import CENTER, placed, random_boxes, ray_depths, rays_of
@@ -63,7 +69,7 @@ def test_a_tilted_box_shows_its_slope():
 def test_recesses_appear_only_where_the_floor_is_visible():
     with World() as world:
         box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
-        goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02), "goal")
+        goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), "goal")
         box.place((0.02, 0.0, 0.025))
         goal.place((0.0, 0.0, 0.0))
         image = HeightCamera([box, goal]).heightmap((0.0, 0.0), 0.2, 100)
@@ -96,10 +102,10 @@ def test_a_rotated_camera_equals_a_world_rotated_the_other_way():
             shape = (
                 Box(size_m=(0.1, 0.04, 0.05))
                 if number
-                else Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02)
+                else Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02)
             )
             z = 0.025 if number else 0.0
-            bodies.append(Placed(shape, ((cx + dx, cy + dy, z), yaw_quaternion(heading))))
+            bodies.append(PosedShape(shape, ((cx + dx, cy + dy, z), yaw_quaternion(heading))))
         camera = HeightCamera(bodies)
         images.append(camera.heightmap((cx, cy), 0.3, 96, yaw if turned else 0.0))
     np.testing.assert_allclose(images[0], images[1], atol=1e-12)
@@ -119,7 +125,7 @@ def test_a_rotated_camera_equals_analytic_boxes():
 def test_hidden_bodies_are_left_out_until_they_are_shown_again():
     with World() as world:
         boxes = [world.add(Box(size_m=(0.05, 0.05, 0.05)), str(n)) for n in range(3)]
-        goal = world.add(Decal(size_m=(0.05, 0.05, 1e-3), depth_m=0.02), "goal")
+        goal = world.add(Decal(size_m=(0.05, 0.05, 1e-3), recess_depth_m=0.02), "goal")
         for n, body in enumerate((*boxes, goal)):
             body.place((0.1 * n, 0.0, 0.025))
         camera = HeightCamera(world.bodies)
@@ -157,7 +163,7 @@ def test_perspective_depth_equals_rays_cast_at_boxes(lens):
     rng = np.random.default_rng(1)
     for _ in range(3):
         boxes = random_boxes(rng, 5)
-        image = depth_image([Surface(boxes[:2]), Surface(boxes[2:])], lens, 80)
+        image = depth_image([SceneMesh(boxes[:2]), SceneMesh(boxes[2:])], lens, 80)
         expected = ray_depths(boxes, lens, 80)
         assert (expected < ray_depths([], lens, 80)).sum() > 100
         np.testing.assert_allclose(image, expected, atol=1e-9)
@@ -170,19 +176,20 @@ def test_bodies_that_extend_behind_the_camera_are_clipped():
         placed((0.05, 0.05, 0.1), (0.45, 0.0, 0.5)),  # entirely behind the camera
         placed((0.2, 0.1, 0.3), (0.3, 0.3, 0.35), yaw_quaternion(0.4)),
     ]
-    image = depth_image([Surface(boxes)], lens, 64)
+    image = depth_image([SceneMesh(boxes)], lens, 64)
     expected = ray_depths(boxes, lens, 64)
     assert (expected < 0.299).sum() > 100
     np.testing.assert_allclose(image, expected, atol=1e-9)
 
 
 def test_a_recess_shows_a_lower_floor():
-    goal = Placed(
-        Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02), ((0.5, 0.04, 0.0), yaw_quaternion(0.3))
+    goal = PosedShape(
+        Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02),
+        ((0.5, 0.04, 0.0), yaw_quaternion(0.3)),
     )
     block = placed((0.05, 0.05, 0.05), (0.5, 0.09, 0.025))
     lens = oblique_lens(CENTER)
-    image = depth_image([Surface([goal, block])], lens, 80)
+    image = depth_image([SceneMesh([goal, block])], lens, 80)
     rays = rays_of(lens, 80)
     floor = np.array(lens.eye_m) + rays * (-lens.eye_m[2] / rays[..., 2])[..., None]
     dx, dy = floor[..., 0] - 0.5, floor[..., 1] - 0.04

@@ -7,8 +7,8 @@ import pytest
 
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.depth import (
-    Placed,
-    Surface,
+    PosedShape,
+    SceneMesh,
     point_cloud,
     splat_heightmap,
     visible_points,
@@ -29,7 +29,7 @@ def distance_to_box(points, box):
 def test_points_lie_on_the_surfaces_inside_the_bounds():
     boxes = random_boxes(np.random.default_rng(2), 4, span=0.1)
     lenses = side_lenses(CENTER, 0.3)
-    cloud = point_cloud([Surface(boxes)], lenses, 3000, WORKSPACE)
+    cloud = point_cloud([SceneMesh(boxes)], lenses, 3000, WORKSPACE)
     assert cloud.shape == (3000, 3)
     assert cloud.dtype == np.float32
     distances = np.stack([distance_to_box(cloud, box) for box in boxes] + [np.abs(cloud[:, 2])])
@@ -41,7 +41,7 @@ def test_points_lie_on_the_surfaces_inside_the_bounds():
 
 
 def test_a_point_cloud_depends_on_the_scene_and_the_generator_only():
-    surfaces = [Surface(random_boxes(np.random.default_rng(3), 3))]
+    surfaces = [SceneMesh(random_boxes(np.random.default_rng(3), 3))]
     lenses = side_lenses(CENTER, 0.3)
     clouds = [
         point_cloud(surfaces, lenses, 500, WORKSPACE, rng)
@@ -56,8 +56,8 @@ def test_a_point_cloud_depends_on_the_scene_and_the_generator_only():
 def test_a_point_cloud_larger_than_the_visible_points_repeats_them_evenly():
     narrow = ((0.44, 0.46), (-0.01, 0.01), (0.0, 0.2))
     lenses = side_lenses(CENTER, 0.3)
-    seen = visible_points([Surface([])], lenses, 200, (*narrow[:2], (-1.0, 1.0)))
-    cloud = point_cloud([Surface([])], lenses, 20_000, narrow)
+    seen = visible_points([SceneMesh([])], lenses, 200, (*narrow[:2], (-1.0, 1.0)))
+    cloud = point_cloud([SceneMesh([])], lenses, 20_000, narrow)
     assert 0 < len(seen) < 5000
     unique, counts = np.unique(cloud, axis=0, return_counts=True)
     assert len(cloud) == 20_000
@@ -67,13 +67,15 @@ def test_a_point_cloud_larger_than_the_visible_points_repeats_them_evenly():
 
 def test_a_point_cloud_without_visible_points_is_an_error():
     with pytest.raises(ValueError, match="see nothing"):
-        point_cloud([Surface([])], side_lenses(CENTER, 0.3), 10, ((5, 6), (5, 6), (0, 1)))
+        point_cloud([SceneMesh([])], side_lenses(CENTER, 0.3), 10, ((5, 6), (5, 6), (0, 1)))
 
 
 def test_points_of_the_floor_are_lower_in_a_recess():
-    goal = Placed(Decal(size_m=(0.09, 0.09, 1e-3), depth_m=0.02), ((0.5, 0.04, 0), (0, 0, 0, 1)))
+    goal = PosedShape(
+        Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), ((0.5, 0.04, 0), (0, 0, 0, 1))
+    )
     points = visible_points(
-        [Surface([goal])], side_lenses(CENTER, 0.3), 100, (*WORKSPACE[:2], (-1.0, 1.0))
+        [SceneMesh([goal])], side_lenses(CENTER, 0.3), 100, (*WORKSPACE[:2], (-1.0, 1.0))
     )
     inside = (np.abs(points[:, 0] - 0.5) < 0.045) & (np.abs(points[:, 1] - 0.04) < 0.045)
     assert 100 < inside.sum() < len(points)

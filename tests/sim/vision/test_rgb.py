@@ -3,7 +3,7 @@
 import numpy as np
 
 from ba_torchrl.sim.shapes import Box
-from ba_torchrl.sim.vision.depth import Surface, depth_image
+from ba_torchrl.sim.vision.depth import SceneMesh, depth_image
 from ba_torchrl.sim.vision.lens import oblique_lens
 from ba_torchrl.sim.vision.rgb import render_rgb, render_rgbd
 from ba_torchrl.sim.world import World
@@ -20,8 +20,8 @@ def test_rgbd_depth_equals_the_depth_camera():
         boxes[1].place((0.5, -0.06, 0.025), 0.9)
         lens = oblique_lens(CENTER)
         rgb, depth = render_rgbd(world, lens, 96)
-        expected = depth_image([Surface(boxes)], lens, 96)
-        owner = depth_image([Surface(boxes[:1])], lens, 96) < ray_depths([], lens, 96) - 1e-6
+        expected = depth_image([SceneMesh(boxes)], lens, 96)
+        owner = depth_image([SceneMesh(boxes[:1])], lens, 96) < ray_depths([], lens, 96) - 1e-6
     assert rgb.shape == (96, 96, 3)
     assert rgb.dtype == np.uint8
     off = np.abs(depth - expected)

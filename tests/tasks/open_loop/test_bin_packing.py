@@ -24,7 +24,7 @@ def filled_bin(make_env, count=4):
             turn = yaw_quaternion(bin_yaw)
             x, y, _, w = QUARTER_TURN
             sz, cz = turn[2], turn[3]
-            body.move_to(
+            body.set_pose(
                 (*inside.frame.to_world(*cell), 0.044),
                 (cz * x - sz * y, cz * y + sz * x, sz * w, cz * w),
             )

@@ -31,7 +31,7 @@ def test_a_bottle_lying_in_the_tray_ends_the_episode(make_env):
     _, task, tray = arranged_bottles(make_env)
     body = task.objects[1]
     lying = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
-    body.move_to((*tray.frame.to_world(0.0, 0.0), 0.2), lying)
+    body.set_pose((*tray.frame.to_world(0.0, 0.0), 0.2), lying)
     assert not task.is_success()
     assert not task.is_valid()
 
@@ -66,6 +66,6 @@ def test_tilted_bottles_return_upright(make_env):
         x, y, _ = body.position
         lean = math.radians(15)
         base = 0.026 * math.sin(lean)  # the lower edge stays above the surface
-        body.move_to((x, y, base), (math.sin(lean / 2), 0.0, 0.0, math.cos(lean / 2)))
+        body.set_pose((x, y, base), (math.sin(lean / 2), 0.0, 0.0, math.cos(lean / 2)))
     env.scene.world.settle(600)
     assert all(body.tilt_rad < 0.02 for body in task.objects)

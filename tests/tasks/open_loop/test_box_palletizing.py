@@ -114,7 +114,7 @@ def test_a_box_may_lie_on_any_long_side_but_not_on_its_end(make_env):
     rolled = [(0.0, half), (half, 0.0)]  # about its length (y), about its width (x)
     for (x, y), counts in zip(rolled, (True, False), strict=True):
         # the yaw after the quarter turn
-        body.move_to(position, (w * x - z * y, w * y + z * x, z * half, w * half))
+        body.set_pose(position, (w * x - z * y, w * y + z * x, z * half, w * half))
         assert (body in pallet.task.filled().values()) is counts
 
 
@@ -189,7 +189,7 @@ def test_the_expert_tips_over_a_box_that_stands_on_its_end(make_env):
     state = env.step(env.reset().set("action", nothing))["next"]
     body = env.scene.task.objects[0]
     x, y, _ = body.position
-    body.move_to((x, y, BOX_M[1] / 2), QUARTER_TURN)
+    body.set_pose((x, y, BOX_M[1] / 2), QUARTER_TURN)
     state = env.step(state.set("action", nothing))["next"]
     assert body.tilt_rad > 1.5
     seen = follow(env, state)

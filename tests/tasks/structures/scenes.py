@@ -97,4 +97,4 @@ def rotate(body, axis, angle_rad, yaw_rad):
     (x, y, z), w = (a * math.sin(half) for a in axis), math.cos(half)
     c, s = math.cos(yaw), math.sin(yaw)
     # product of the two quaternions, the yaw first
-    body.move_to((0.4, 0.0, 0.1), (x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s))
+    body.set_pose((0.4, 0.0, 0.1), (x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s))

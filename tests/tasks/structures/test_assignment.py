@@ -88,7 +88,7 @@ def test_the_triangle_must_be_upright_on_top(scene):
     slope = math.pi - math.atan2(B, B / 2)
     rotate(triangle, (0.0, 1.0, 0.0), slope, 0.0)
     depth = triangle.position[2] - vertical_extent(triangle)[0]
-    triangle.move_to((0.4, 0.0, 2 * B + depth), triangle.pose[1])
+    triangle.set_pose((0.4, 0.0, 2 * B + depth), triangle.pose[1])
     s.settle()
     assert triangle.touches(second)
     assert not s.planner.is_built()

@@ -91,7 +91,7 @@ def test_a_held_object_above_the_test_area_is_not_presented(make):
     assert held in task.tubes
     x, y = task._to_world(task.test_area, (0.0, 0.0))
     joints = task.robot.inverse_kinematics((x, y, 0.1), downward(0.0))
-    env.scene.controller._carry(joints)
+    env.scene.controller._teleport(joints)
     env.scene.world.step(2)
     assert math.dist(held.position[:2], (x, y)) < 0.02
     assert task.robot.held_body() is held

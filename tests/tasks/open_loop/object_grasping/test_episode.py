@@ -85,11 +85,11 @@ def test_a_released_object_is_not_a_success(make):
 
 def test_the_pick_height_is_below_the_highest_point_between_the_fingers(make):
     task = with_brick(make)[0].scene.task
-    palm_m = task.robot.gripper.palm_m
+    palm_height_m = task.robot.gripper.palm_height_m
     # the fingers around the object, the palm above it
-    assert 0.005 < 0.1 - task.pick_height_m(0.1, (0.45, 0.0)) < palm_m
+    assert 0.005 < 0.1 - task.pick_height_m(0.1, (0.45, 0.0)) < palm_height_m
     # neither the tool nor the fingertips reach the floor of the tray
-    assert task.pick_height_m(0.0, (0.45, 0.0)) + task.robot.gripper.tip_m(0.02) > FLOOR_Z_M
+    assert task.pick_height_m(0.0, (0.45, 0.0)) + task.robot.gripper.tip_height_m(0.02) > FLOOR_Z_M
     assert task.window_m(None) == pytest.approx(task.robot.gripper.half_width_m, abs=4e-3)
 
 
