@@ -156,9 +156,8 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
     assert undo.rz_rad == pytest.approx(math.pi / 2)
     assert held.undo_command(None, None, lowest_tool_m=lambda _: 0.014) == undo
     assert held.undo_command(None, None, lowest_tool_m=lambda _: 0.017) == undo._replace(z_m=0.017)
-    assert before.undo_command(body, grasp, lowest_tool_m=lambda _: 0.2).z_m == pytest.approx(
-        0.05
-    )  # a place
+    place = before.undo_command(body, grasp, lowest_tool_m=lambda _: 0.2)
+    assert place.z_m == pytest.approx(0.05)
 
 
 def test_nothing_undoes_an_action_that_moved_nothing_or_two_things():

@@ -262,9 +262,7 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noq
                     if highest - low + CLEARANCE_M <= z or peak - (z + tip) < SHALLOWEST_M:
                         break
                     inside = jaws.outline_u[m] - jaws.depth
-                    if (
-                        inside <= half_gap <= jaws.outline_u[m]
-                    ):  # closing fingertips move down along an arc
+                    if inside <= half_gap <= jaws.outline_u[m]:  # tips descend as they close
                         last = np.interp(max(half_width, inside), jaws.arc_u, jaws.arc_z)
                         low = min(low, last)
                     for fu in (-jaws.outline_u[m], jaws.outline_u[m]):

@@ -34,7 +34,7 @@ NEAR_M = 0.018
 """Largest offset of fingers that are at the start of a push."""
 
 OFFSET_SHARES = (-0.9, -0.6, -0.3, 0.0, 0.3, 0.6, 0.9)
-OFFSET_SHARES_TURNING = (0.0, -0.7, 0.7)
+TURNING_OFFSET_SHARES = (0.0, -0.7, 0.7)
 """Offsets of a push from the centre of an object, as a multiple of its half width, without and with
 yaw actions."""
 SLIDING_RADIUS_M = 0.02
@@ -105,9 +105,8 @@ class PushPlanner:
         samples = self._grasps.placed_samples(body)
         center = samples[:, :2].mean(axis=0)
         low, band_half = self._low_m, self._grasps.band_half_m
-        shares, lengths = (
-            ((0.0, -0.7, 0.7), (1.0,)) if limits.turn_rad else (OFFSET_SHARES, (0.5, 1.0))
-        )
+        shares = TURNING_OFFSET_SHARES if limits.turn_rad else OFFSET_SHARES
+        lengths = (1.0,) if limits.turn_rad else (0.5, 1.0)
         for bearing in np.arange(8) * np.pi / 4:
             ahead = np.array([math.cos(bearing), math.sin(bearing)])
             side = np.array([-ahead[1], ahead[0]])
