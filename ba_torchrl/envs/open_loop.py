@@ -24,7 +24,7 @@ from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics
 from ba_torchrl.tasks.base import Task
-from ba_torchrl.tasks.structures.deconstruction import Watch, watch
+from ba_torchrl.tasks.structures.undo import UndoRecorder
 from ba_torchrl.tasks.workspace import ActionLimits
 
 
@@ -126,7 +126,7 @@ class OpenLoopEnv(ManipulationEnv):
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         command = self.actions.decode(action)
         controller = scene.controller
-        watched = self._watch(scene)
+        before_action = self._record_undo(scene)
         holding = controller.held is not None
         primitive = command.primitive
         if primitive is None:
@@ -146,8 +146,8 @@ class OpenLoopEnv(ManipulationEnv):
         controller.update_grasp()
         if controller.held is None:
             self._memory = {}
-        if watched is not None:
-            self._memory = self._remember_undo(scene, *watched)
+        if before_action is not None:
+            self._memory = self._remember_undo(scene, *before_action)
 
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         size = self.config.in_hand_size
@@ -177,24 +177,26 @@ class OpenLoopEnv(ManipulationEnv):
 
     # ----------------------------------------------------------------------------------------
 
-    def _watch(self, scene: Scene) -> tuple[Watch, np.ndarray] | None:
-        """Return how things lie before an action, if it will be asked what undoes it."""
+    def _record_undo(self, scene: Scene) -> tuple[UndoRecorder, np.ndarray] | None:
+        """Return the recorder and the heightmap before an action; None without deconstruction."""
         if not self.config.deconstruct:
             return None
-        return watch(
-            scene.task.objects, scene.controller.held, scene.controller.grasp
-        ), self._heightmap(scene)
+        controller = scene.controller
+        recorder = UndoRecorder.record(scene.task.objects, controller.held, controller.grasp)
+        return recorder, self._heightmap(scene)
 
-    def _remember_undo(self, scene: Scene, before: Watch, heights: np.ndarray) -> dict[str, Any]:
-        """Return the memory with what undoes an action that has just settled.
+    def _remember_undo(
+        self, scene: Scene, before: UndoRecorder, heights: np.ndarray
+    ) -> dict[str, Any]:
+        """Return the memory with the action that undoes the last one.
 
         Args:
-            scene: as it is now.
-            before: how things lay before it.
-            heights: the heightmap before it.
+            scene: the scene after the action.
+            before: the recorder before the action.
+            heights: the heightmap before the action.
         """
         memory = {name: value for name, value in self._memory.items() if name != "undo"}
-        command = before.undo(
+        command = before.undo_command(
             scene.controller.held, scene.controller.grasp, scene.task.lowest_tool_m
         )
         if command is None:

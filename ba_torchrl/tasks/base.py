@@ -18,7 +18,7 @@ from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain import Flat, Terrain
-from ba_torchrl.tasks.workspace import ActionLimits, Spot, Workspace
+from ba_torchrl.tasks.workspace import ActionLimits, Spacing, Workspace
 
 TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks")
 
@@ -26,16 +26,19 @@ BLOCK_M = 0.05
 """Edge of a block at scale 1."""
 
 SCALE_STEP = 0.02
+"""Step of the scales between the ends of `object_scale_range`."""
 
 
 @dataclass(frozen=True)
 class TaskSettings:
-    """The part of the configuration that a task needs, with defaults filled in."""
+    """The part of the environment's configuration that a task uses, with defaults filled in."""
 
     workspace: Workspace
     scale: float
+    """Size of the objects as a multiple of their size at scale 1."""
     random_orientation: bool
     bounding_box_check: bool
+    """Whether an object is inside the workspace if its bounding box is, instead of its centre."""
     action_limits: ActionLimits
     num_objects: int
     parameters: TaskParameters = field(default_factory=TaskParameters)
@@ -45,43 +48,46 @@ class TaskSettings:
 class Task(ABC):
     """Bodies, their random poses, the goal, and an expert that reaches it.
 
-    The constructor loads the bodies, once per world; every episode calls `initialize_episode`. The
-    goal is tested in `evaluate` and nowhere else.
+    The constructor loads the bodies, once per world; every episode calls `initialize_episode`.
+    Only `evaluate` tests the goal.
 
     Args:
         settings: the resolved configuration.
         world: not sealed yet.
         robot: loaded in this world.
-        terrain: what the objects stand on; made by `make_terrain` if None.
+        terrain: support surface of the objects; made by `make_terrain` if None.
     """
 
     control: ClassVar[Literal["open_loop", "close_loop"]]
     max_steps: ClassVar[int]
+    """Default number of steps after which an episode is truncated."""
     workspace: ClassVar[Workspace]
+    """Default workspace."""
     scale_range: ClassVar[tuple[float, float]]
-    """Default scale of the objects."""
+    """Default range of the scale of the objects."""
     scale_limits: ClassVar[tuple[float, float]]
-    """Allowed scales, for every robot: the fingers neither meet the floor at smaller objects nor
-    fail to close on larger ones."""
+    """Allowed scales. Within them the fingers of every robot close on the objects, above the
+    floor."""
     num_objects: ClassVar[int] = 1
     """Default number of objects."""
     num_objects_range: ClassVar[tuple[int, int]] = (1, 1)
     """Allowed numbers of objects."""
     num_objects_step: ClassVar[int] = 1
-    """Difference between allowed numbers of objects, counted from the least."""
+    """Difference between two allowed numbers of objects."""
     required_action_components: ClassVar[frozenset[str]] = frozenset()
-    """Action components, as named by the action space, without which the task has no solution."""
+    """Components of the action, as named by the action space, that every solution needs."""
     default_action_sequence: ClassVar[str | None] = None
-    """Default `action_sequence`; None stands for that of the control."""
+    """Default `action_sequence`; None for the default of the control."""
     terminates_at_limit: ClassVar[bool] = False
-    """Whether the step limit is part of the task, so that reaching it terminates the episode."""
+    """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False
     """Whether the objects fit the tray of `close_loop_tray`."""
     can_be_deconstructed: ClassVar[bool] = False
     """Whether `deconstruction` returns the reversed task."""
     needs_fresh_world: ClassVar[bool] = False
-    """Whether exact repetition needs a newly built world. Where many bodies collide, the future
-    also depends on the order of the engine's contact pairs, which no saved state holds."""
+    """Whether exact repetition of an episode needs a new world. When many bodies collide, their
+    motion depends on the order of PyBullet's contact pairs, which a saved state does not
+    contain."""
 
     Parameters: ClassVar[type[TaskParameters]] = TaskParameters
     """Model of the task's own parameters; its fields are keywords of `ba_torchrl.make`."""
@@ -100,7 +106,7 @@ class Task(ABC):
         self.load_scene()
 
     def make_terrain(self) -> Terrain:
-        """Load what the objects stand on: the floor, unless a task overrides this."""
+        """Load the support surface of the objects and return it; by default the floor."""
         return Flat(self.world, self.settings.workspace)
 
     @classmethod
@@ -114,32 +120,35 @@ class Task(ABC):
 
     @abstractmethod
     def load_scene(self) -> None:
-        """Load the task's bodies into `world`; called by the constructor."""
+        """Load the bodies into `world`; called by the constructor."""
 
     @abstractmethod
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Give the bodies new random poses.
+        """Set new random poses of the bodies.
+
+        Args:
+            rng: random generator of the episode.
 
         Raises:
-            PlacementError: the workspace has no room.
+            PlacementError: the workspace is too small for them.
         """
 
     @abstractmethod
     def evaluate(self) -> dict[str, bool]:
-        """Return the named conditions of success, as the scene is now."""
+        """Return the named conditions of success in the present scene."""
 
     @abstractmethod
     def expert_command(self) -> GripperCommand | PickPlaceCommand:
-        """Return the expert's command for the scene as it is now, whatever led to it."""
+        """Return the expert's command; it depends on the present scene only."""
 
     @property
     @abstractmethod
     def objects(self) -> Sequence[Body]:
-        """The bodies that must stay in the workspace."""
+        """The bodies that must stay inside the workspace."""
 
     @property
     def landmarks(self) -> Sequence[YawPose]:
-        """Positions and yaws in the vector observation: by default those of the objects."""
+        """The poses in the vector observation; by default those of the objects."""
         return [(body.position, body.yaw_rad) for body in self.objects]
 
     def is_success(self) -> bool:
@@ -147,41 +156,41 @@ class Task(ABC):
         return all(self.evaluate().values())
 
     def is_valid(self) -> bool:
-        """Whether every object that is not in the gripper is inside the workspace."""
+        """Whether every object is inside the workspace or held."""
         held = self.robot.held_body()
         return all(self._is_inside(body) for body in self.objects if body is not held)
 
     def is_valid_start(self) -> bool:
-        """Whether an episode may start from the scene as it is now."""
+        """Whether an episode may start from the present scene."""
         return self.is_valid() and not self.is_success()
 
     @property
     def continues(self) -> bool:
-        """Whether the next episode keeps the objects where they are now."""
+        """Whether the next episode starts with the objects where they are."""
         return False
 
     def resume(self) -> None:  # noqa: B027 -- most tasks never continue
-        """Start an episode that keeps the objects, the arm still where the last one ended.
+        """Start an episode with the objects where they are.
 
-        Called in place of `initialize_episode` if `continues` holds.
+        Called instead of `initialize_episode` if `continues` holds, before the arm moves back.
         """
 
     def after_action(self) -> None:  # noqa: B027 -- most tasks have no events
-        """Carry out the task's own events, such as the arrival of an object.
+        """Carry out events of the task, such as the arrival of an object.
 
-        Called once an action has settled, before the scene is evaluated and observed.
+        Called when the bodies are at rest after an action, before `evaluate` and the observation.
         """
 
     def deconstruction(self) -> Task:
-        """Return the task that takes apart what this one builds, in the same world.
+        """Return the task that takes this task's structure apart, in the same world.
 
         Raises:
-            NotImplementedError: there is none; see `can_be_deconstructed`.
+            NotImplementedError: the task has none; see `can_be_deconstructed`.
         """
         raise NotImplementedError(f"{type(self).__name__} has no deconstruction")
 
     def get_state(self) -> Any:
-        """Return the task's state beyond the poses of its bodies."""
+        """Return the state of the task besides the poses of its bodies."""
         return None
 
     def set_state(self, state: Any) -> None:
@@ -195,12 +204,12 @@ class Task(ABC):
 
     @property
     def block_m(self) -> float:
-        """Edge of this episode's block."""
+        """Edge of a block at the scale of the task, metres."""
         return BLOCK_M * self.settings.scale
 
     @property
     def action_limits(self) -> ActionLimits:
-        """Displacement and rotation of one action."""
+        """Limits of the displacement and rotation of one action."""
         return self.settings.action_limits
 
     def _is_inside(self, body: Body) -> bool:
@@ -208,13 +217,13 @@ class Task(ABC):
         if not self.settings.bounding_box_check:
             return workspace.contains(body.position)
         (x0, y0, _), (x1, y1, top) = body.bounding_box()
-        # only the top corners: a resting body penetrates its support by micrometres
+        # not the bottom corners: a resting body penetrates its support by micrometres
         return workspace.contains((x0, y0, top)) and workspace.contains((x1, y1, top))
 
     # -- random poses ------------------------------------------------------------------------
 
     def random_point(self, rng: np.random.Generator, padding_m: float) -> tuple[float, float]:
-        """Return a point of the ground that keeps half of ``padding_m`` from the border.
+        """Return a random point of the ground at least half of ``padding_m`` from the border.
 
         Raises:
             PlacementError: the workspace is too small.
@@ -222,35 +231,39 @@ class Task(ABC):
         return self.terrain.random_point(rng, padding_m)
 
     def random_points(
-        self, rng: np.random.Generator, spots: Sequence[Spot]
+        self, rng: np.random.Generator, spacings: Sequence[Spacing]
     ) -> list[tuple[float, float]]:
-        """Return points of the ground, one for each spot, apart from each other.
+        """Return random points of the ground, one for each object, that keep their distances.
+
+        Args:
+            rng: random generator.
+            spacings: space that each object needs.
 
         Raises:
-            PlacementError: the workspace has no room for them.
+            PlacementError: the workspace is too small for them.
         """
-        return self.terrain.random_points(rng, spots)
+        return self.terrain.random_points(rng, spacings)
 
     def random_yaw(self, rng: np.random.Generator, span_rad: float) -> float:
-        """Return a yaw uniform over ``span_rad`` about zero, or zero for fixed orientations."""
+        """Return a random yaw from a range of ``span_rad`` about 0; 0 with fixed orientations."""
         if not self.settings.random_orientation:
             return 0.0
         return float(rng.uniform(-span_rad / 2, span_rad / 2))
 
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
-        """Put a body at rest on the ground."""
+        """Place a body on the ground."""
         self.terrain.stand(body, xy, yaw_rad)
 
 
 def check_scales(task_id: str, scales: tuple[float, float]) -> None:
-    """Check that a task can be solved with objects of these scales.
+    """Check that scales are within the limits of a task.
 
     Args:
-        task_id: as listed by `ba_torchrl.list_tasks`.
-        scales: the smallest and the largest.
+        task_id: id of the task.
+        scales: the smallest and the largest scale.
 
     Raises:
-        ConfigError: they are outside the task's limits.
+        ConfigError: a scale is outside the limits.
     """
     least, most = TASKS[task_id].scale_limits
     low, high = scales

@@ -1,4 +1,4 @@
-"""Pool: bodies that are loaded once, some of them in the scene, the others out of the way."""
+"""A pool of bodies that are loaded once, of which every episode uses some."""
 
 from __future__ import annotations
 
@@ -8,65 +8,70 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.shapes import Shape
 from ba_torchrl.sim.world import World
 
-ASIDE_Z_M = 1e6
-ASIDE_SPACING_M = 0.3
-ASIDE_X_M = 5.0
+INACTIVE_Z_M = 1e6
+"""Height at which inactive bodies start to fall."""
+INACTIVE_X_M = 5.0
+"""Least x of inactive bodies, outside every workspace."""
+INACTIVE_SPACING_M = 0.3
+"""Distance between inactive bodies."""
 COLUMNS = 10
+"""Inactive bodies per row."""
 
 
 class BodyPool:
-    """The bodies of a task that brings some of them only, or not all at once.
+    """Bodies of which only some are in the scene at a time.
 
-    Those put aside fall freely, each in its own column, for seven simulated minutes at least.
-    That costs less than anything that rests, and nothing about a body ever changes but its pose:
-    changed masses or collision filters would give it a new place in PyBullet's lists, and a
-    restored state another future.
+    Inactive bodies are hidden and fall freely from a great height, for at least seven simulated
+    minutes. A falling body costs less simulation time than a resting one. Only its pose changes:
+    a change of its mass or collision filter would change the order of PyBullet's internal lists, so
+    that the simulation from a restored state would differ.
 
     Args:
         world: not sealed yet.
-        shapes: of the bodies.
-        names: of the bodies.
+        shapes: shapes of the bodies.
+        names: names of the bodies.
     """
 
     def __init__(self, world: World, shapes: Sequence[Shape], names: Sequence[str]) -> None:
         self.bodies = [world.add(shape, n) for shape, n in zip(shapes, names, strict=True)]
-        """All of them."""
-        self.present: list[Body] = []
-        """Those in the scene, in the order in which they came."""
+        """All bodies."""
+        self.active: list[Body] = []
+        """The bodies in the scene, in the order of their activation."""
         self.clear()
 
     def clear(self) -> None:
-        """Put all bodies aside."""
-        self.present = []
+        """Deactivate all bodies."""
+        self.active = []
         for i, body in enumerate(self.bodies):
-            move_out_of_scene(body, i)
+            deactivate_body(body, i)
 
     def activate(self, body: Body) -> None:
-        """Take a body into the scene; the caller gives it its pose."""
+        """Add a body to the scene; the caller sets its pose."""
         body.is_hidden = False
-        self.present.append(body)
+        self.active.append(body)
 
     def deactivate(self, body: Body) -> None:
-        """Take a body out of the scene."""
-        self.present.remove(body)
-        move_out_of_scene(body, self.bodies.index(body))
+        """Remove a body from the scene."""
+        self.active.remove(body)
+        deactivate_body(body, self.bodies.index(body))
 
     def get_state(self) -> tuple[int, ...]:
-        """Return which bodies are in the scene."""
-        return tuple(self.bodies.index(body) for body in self.present)
+        """Return the indices of the active bodies."""
+        return tuple(self.bodies.index(body) for body in self.active)
 
     def set_state(self, state: tuple[int, ...]) -> None:
-        """Take up what `get_state` returned; poses and visibility are the scene's to restore."""
-        self.present = [self.bodies[i] for i in state]
+        """Set the active bodies by their indices; the world restores poses and visibility."""
+        self.active = [self.bodies[i] for i in state]
 
 
-def move_out_of_scene(body: Body, place: int) -> None:
-    """Put a body out of the way; see `BodyPool`.
+def deactivate_body(body: Body, index: int) -> None:
+    """Hide a body and let it fall outside the workspace; see `BodyPool`.
 
     Args:
-        body: gets hidden, too.
-        place: number of its column, of which each body has its own.
+        body: the body.
+        index: number of its position, different for every inactive body.
     """
-    row, column = divmod(place, COLUMNS)
-    body.place((ASIDE_X_M + ASIDE_SPACING_M * column, ASIDE_SPACING_M * row, ASIDE_Z_M))
+    row, column = divmod(index, COLUMNS)
+    x_m, y_m = INACTIVE_X_M + INACTIVE_SPACING_M * column, INACTIVE_SPACING_M * row
+    body.place((x_m, y_m, INACTIVE_Z_M))
     body.is_hidden = True

@@ -1,8 +1,7 @@
-"""Clearance: how much room a gripper needs, from its measured outline.
+"""Clearance of a gripper, from its measured outline.
 
-Clearances are gaps in metres, negative where something is in the way and infinite where nothing is
-near. Distances along x are along the line on which the fingers close. Other bodies are in the
-fingers' way if they reach higher than the fingertips.
+Clearances are gaps in metres: negative in collision, infinite if no body is near. The x axis is the
+direction in which the fingers close. Only bodies higher than the fingertips count.
 """
 
 from __future__ import annotations
@@ -19,81 +18,86 @@ from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.tasks.footprints import Rectangle, gap_m
 
 Range = tuple[float, float]
-"""Ends of an interval along the line on which the fingers close."""
+"""Ends of an interval along the direction in which the fingers close."""
 
-INSIDE_M = 3e-3
-"""Margin between open fingers and the gap that they leave."""
-OUTSIDE_M = 7.5e-3
-"""Margin beyond the outside of the fingers on their way down."""
-ASIDE_M = 2.5e-3
-"""Margin on both sides of a finger that stands between neighbours."""
-OVER_M = 0.03
-"""Height of the tool above what it passes over; more for fingers that end deeper."""
-UNDER_TIPS_M = 0.012
-"""Gap below fingertips that pass over something, at least."""
+INNER_MARGIN_M = 3e-3
+"""Margin on the inner side of each finger."""
+OUTER_MARGIN_M = 7.5e-3
+"""Margin on the outer side of each descending finger."""
+SIDE_MARGIN_M = 2.5e-3
+"""Margin on both flanks of a finger."""
+PASSING_HEIGHT_M = 0.03
+"""Height of the tool above bodies that it passes over; more for grippers with longer fingers."""
+PASSING_GAP_M = 0.012
+"""Least gap between the fingertips and bodies that they pass over."""
 
 
 # -- parts of a gripper ------------------------------------------------------------------------
 
 
 def half_gap_m(gripper: Gripper, opening: float = 1.0) -> float:
-    """Return the distance from the tool point that is surely between the open fingers.
+    """Return half the width of the gap between the fingers, less a margin.
 
     Args:
         gripper: the gripper.
-        opening: 0 to 1.
+        opening: opening of the gripper, 0 to 1.
     """
-    return opening * (gripper.half_gap_m - INSIDE_M)
+    return opening * (gripper.half_gap_m - INNER_MARGIN_M)
 
 
-def reach_m(gripper: Gripper, opening: float = 1.0) -> float:
-    """Return how far the fingers reach from the tool point, with a margin.
+def finger_extent_m(gripper: Gripper, opening: float = 1.0) -> float:
+    """Return the distance of the fingers' outer sides from the tool point, plus a margin.
 
     Args:
         gripper: the gripper.
-        opening: 0 to 1.
+        opening: opening of the gripper, 0 to 1.
     """
-    return gripper.finger_reach_m - (1 - opening) * gripper.half_gap_m + OUTSIDE_M
+    return gripper.finger_reach_m - (1 - opening) * gripper.half_gap_m + OUTER_MARGIN_M
 
 
 def finger_ranges_m(gripper: Gripper, opening: float = 1.0) -> tuple[Range, Range]:
-    """Return the ranges that the two fingers take up, from the tool point."""
-    inner, outer = half_gap_m(gripper, opening), reach_m(gripper, opening)
+    """Return the ranges that the two fingers occupy, relative to the tool point.
+
+    Args:
+        gripper: the gripper.
+        opening: opening of the gripper, 0 to 1.
+    """
+    inner, outer = half_gap_m(gripper, opening), finger_extent_m(gripper, opening)
     return (-outer, -inner), (inner, outer)
 
 
 def finger_rectangles(
     gripper: Gripper, tool: PlanarFrame, half_opening_m: float
 ) -> tuple[Rectangle, Rectangle]:
-    """Return the two fingers as seen from above.
+    """Return the footprints of the two fingers.
 
     Args:
         gripper: the gripper.
         tool: frame of the tool.
-        half_opening_m: from the tool point to a finger's inner side.
+        half_opening_m: distance between the tool point and the inner side of a finger.
     """
     along = gripper.finger_reach_m - gripper.half_gap_m
-    middle, half_across = half_opening_m + along / 2, gripper.half_width_m + ASIDE_M
+    center, half_across = half_opening_m + along / 2, gripper.half_width_m + SIDE_MARGIN_M
     left, right = (
-        Rectangle(*tool.to_world(side * middle, 0.0), tool.yaw_rad, along / 2, half_across)
+        Rectangle(*tool.to_world(side * center, 0.0), tool.yaw_rad, along / 2, half_across)
         for side in (-1.0, 1.0)
     )
     return left, right
 
 
 def hand_rectangle(robot: Robot, tool: PlanarFrame) -> Rectangle:
-    """Return the whole hand as seen from above; it begins at the height of the palm."""
+    """Return the footprint of the hand above the height of the palm."""
     return Rectangle(*tool, *robot.hand_half_extents_m)
 
 
 def tips_below_tool_m(robot: Robot) -> float:
-    """Return how far below the tool point the fingers end as they are opened now."""
+    """Return the distance of the fingertips below the tool point at the present opening."""
     return -robot.gripper.tip_height_m(robot.opening() * robot.gripper.half_gap_m)
 
 
 def passing_height_m(gripper: Gripper) -> float:
-    """Return the height of the tool above a body at which the fingertips pass over it."""
-    return max(OVER_M, UNDER_TIPS_M - gripper.lowest_tip_m)
+    """Return the height of the tool above a body that the gripper passes over."""
+    return max(PASSING_HEIGHT_M, PASSING_GAP_M - gripper.lowest_tip_m)
 
 
 # -- clearances --------------------------------------------------------------------------------
@@ -107,15 +111,15 @@ def path_clearance_m(
     others: Sequence[Body],
     at: Vector | None = None,
 ) -> float:
-    """Return the gap between fingertips on their way down beside a body, and other bodies.
+    """Return the clearance between the fingertips on their path to a body, and other bodies.
 
     Args:
         gripper: the gripper.
-        body: what the fingers are to close on.
-        yaw_rad: of the gripper.
-        ranges_m: what the fingers take up, from the body's origin.
-        others: bodies that may be in the way.
-        at: position of the body, if not where it is now.
+        body: the body to grasp.
+        yaw_rad: yaw of the gripper.
+        ranges_m: ranges that the fingers occupy, relative to the origin of the body.
+        others: the other bodies.
+        at: assumed position of the body; its present one if None.
     """
     bx, by, bz = body.position if at is None else at
     frame = PlanarFrame(bx, by, yaw_rad)
@@ -125,9 +129,9 @@ def path_clearance_m(
         if corners[:, 2].max() < bz + gripper.lowest_tip_m:
             continue
         along, across = frame.to_local(corners[:, 0], corners[:, 1])
-        aside = max(across.min(), -across.max()) - gripper.half_width_m
+        gap_across = max(across.min(), -across.max()) - gripper.half_width_m
         for low, high in ranges_m:
-            gap = min(gap, max(along.min() - high, low - along.max(), aside))
+            gap = min(gap, max(along.min() - high, low - along.max(), gap_across))
     return float(gap)
 
 
@@ -139,15 +143,15 @@ def grasp_clearance_m(
     opening: float = 1.0,
     at: Vector | None = None,
 ) -> float:
-    """Return the gap between the fingers, open around the middle of a body, and other bodies.
+    """Return the clearance between the fingers, opened around a body's origin, and other bodies.
 
     Args:
         gripper: the gripper.
-        body: what the fingers are to close on.
-        yaw_rad: of the gripper.
-        others: bodies that may be in the way.
-        opening: of the gripper, 0 to 1.
-        at: position of the body, if not where it is now.
+        body: the body to grasp.
+        yaw_rad: yaw of the gripper.
+        others: the other bodies.
+        opening: opening of the gripper, 0 to 1.
+        at: assumed position of the body; its present one if None.
     """
     ranges = finger_ranges_m(gripper, opening)
     return path_clearance_m(gripper, body, yaw_rad, ranges, others, at)
@@ -156,13 +160,13 @@ def grasp_clearance_m(
 def hand_clearance_m(
     robot: Robot, tool: PlanarFrame, tool_z_m: float, others: Sequence[Body]
 ) -> float:
-    """Return the gap between the hand above the fingers and other bodies.
+    """Return the clearance between the hand above the palm and other bodies.
 
     Args:
         robot: the robot.
         tool: frame of the tool.
         tool_z_m: height of the tool.
-        others: bodies that may be in the way if they reach up to the palm.
+        others: the other bodies; only those higher than the palm count.
     """
     gap = math.inf
     for other in others:
@@ -177,13 +181,13 @@ def hand_clearance_m(
 def outline_clearance_m(
     gripper: Gripper, tool: PlanarFrame, half_opening_m: float, others: Iterable[Rectangle]
 ) -> float:
-    """Return the gap between the fingers and the outlines of what stands beside them.
+    """Return the clearance between the fingers and outlines.
 
     Args:
         gripper: the gripper.
         tool: frame of the tool.
-        half_opening_m: from the tool point to a finger's inner side.
-        others: outlines of what is higher than the fingertips.
+        half_opening_m: distance between the tool point and the inner side of a finger.
+        others: outlines of bodies that are higher than the fingertips.
     """
     fingers = finger_rectangles(gripper, tool, half_opening_m)
     return min((gap_m(finger, other) for other in others for finger in fingers), default=math.inf)

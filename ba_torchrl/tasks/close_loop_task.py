@@ -1,4 +1,4 @@
-"""The base of the close-loop tasks."""
+"""Base of the close-loop tasks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ BLUE: Color = (0.2, 0.4, 0.8, 1.0)
 GREEN: Color = (0.35, 0.7, 0.35, 1.0)
 
 PAIR_ATTEMPTS = 2000
-"""Layouts tried before giving up; the rarest, two pulling blocks in line, come up in 1 of 30."""
+"""Random layouts before a `PlacementError`. The least likely one, that of two pulling blocks with
+fixed orientations, is found in 1 of 30 attempts."""
 
 
 class CloseLoopControl:
@@ -31,7 +32,7 @@ class CloseLoopControl:
 
 
 class CloseLoopTask(CloseLoopControl, Task):
-    """A task controlled by small displacements of the gripper (appendix A.2, G.2)."""
+    """A task whose actions are small displacements of the gripper (appendix A.2, G.2)."""
 
     def cube(self, color: Color = RED) -> Box:
         """Return the shape of a cubic block."""
@@ -39,23 +40,28 @@ class CloseLoopTask(CloseLoopControl, Task):
         return Box(size_m=(edge, edge, edge), color=color)
 
     def random_pair(
-        self, rng: np.random.Generator, paddings_m: tuple[float, float], apart_m: float
+        self, rng: np.random.Generator, paddings_m: tuple[float, float], distance_m: float
     ) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return two random points at least ``apart_m`` apart, for two things on the floor.
+        """Return two random points of the ground at least ``distance_m`` apart.
 
-        With fixed orientations they share one x and are apart along y, so that a gripper that
-        cannot turn can push one towards the other.
+        With fixed orientations both have the same x, so that a gripper that cannot turn can push an
+        object from one to the other.
+
+        Args:
+            rng: random generator.
+            paddings_m: twice the least distance of each point from the border.
+            distance_m: least distance between the points.
 
         Raises:
-            PlacementError: the workspace has no room for them.
+            PlacementError: the workspace is too small for them.
         """
         for _ in range(PAIR_ATTEMPTS):
             first, second = (self.random_point(rng, padding) for padding in paddings_m)
             if not self.settings.random_orientation:
                 second = (first[0], second[1])
-            if math.dist(first, second) >= apart_m:
+            if math.dist(first, second) >= distance_m:
                 return first, second
         raise PlacementError(
-            f"no room for two things {apart_m:.3f} m apart: enlarge `workspace` or lower "
+            f"no room for two objects {distance_m:.3f} m apart: enlarge `workspace` or lower "
             "`object_scale_range`"
         )

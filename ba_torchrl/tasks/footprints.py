@@ -1,4 +1,4 @@
-"""Rectangles in the plane: where containers, bodies and fingers are, and whether they meet."""
+"""Footprints of containers, bodies and fingers as rectangles, and the gaps between them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.tasks.workspace import Workspace
 
 WIDTH_YAWS = 12
-"""Directions in which an object is measured."""
-AS_NARROW_M = 5e-4
+"""Directions per half turn in which the width of a body is compared."""
+WIDTH_TOLERANCE_M = 5e-4
+"""Half widths within this of the least one count as equal."""
 
 
 class Rectangle(NamedTuple):
-    """A rectangle in the plane, metres and radians."""
+    """A rectangle in the horizontal plane, metres and radians."""
 
     x: float
     y: float
@@ -25,23 +26,24 @@ class Rectangle(NamedTuple):
     half_x: float
     """Half its extent along its own x axis."""
     half_y: float
+    """Half its extent along its own y axis."""
 
     @property
     def frame(self) -> PlanarFrame:
-        """Frame of its centre, x along its first side."""
+        """Frame of its centre, its axes along the sides."""
         return PlanarFrame(self.x, self.y, self.yaw_rad)
 
     def resized(self, half_x: float, half_y: float) -> Rectangle:
-        """Return one of another size about the same centre."""
+        """Return a rectangle of another size with the same centre and yaw."""
         return self._replace(half_x=half_x, half_y=half_y)
 
     def contains(self, points: np.ndarray) -> bool:
-        """Whether all points [N, 2 or more] lie in it, whatever their height."""
+        """Whether x and y of all points [N, 2 or more] lie in it."""
         along, across = map(np.abs, self.frame.to_local(points[:, 0], points[:, 1]))
         return bool(along.max() <= self.half_x and across.max() <= self.half_y)
 
     def is_inside(self, workspace: Workspace) -> bool:
-        """Whether its corners lie in the workspace's floor area."""
+        """Whether x and y of its corners lie in a workspace."""
         ex, ey = self.extents_m(0.0)
         return all(
             low <= center - extent and center + extent <= high
@@ -59,9 +61,9 @@ class Rectangle(NamedTuple):
 
 
 def gap_m(first: Rectangle, second: Rectangle) -> float:
-    """Return how far apart two rectangles are along the sides of either; negative if they overlap.
+    """Return the largest gap between two rectangles along a side of either; negative in overlap.
 
-    It is the distance where a side faces the other, and less than that across corners.
+    It is a lower bound of their distance, and equal to it unless their corners are nearest.
     """
     gap = -math.inf
     for a, b in ((first, second), (second, first)):
@@ -72,41 +74,41 @@ def gap_m(first: Rectangle, second: Rectangle) -> float:
 
 
 def outline(body: Body, yaw_rad: float | None = None) -> Rectangle:
-    """Return the rectangle around a body, as it lies, seen from above.
+    """Return the bounding rectangle of a body's footprint.
 
     Args:
         body: the body.
-        yaw_rad: of the rectangle; the body's own unless given.
+        yaw_rad: yaw of the rectangle; that of the body if None.
     """
     yaw = body.yaw_rad if yaw_rad is None else yaw_rad
-    return _around(world_vertices(body), yaw)
+    return _bounding_rectangle(world_vertices(body), yaw)
 
 
 def narrowest(body: Body, yaw_rad: float | None = None) -> list[Rectangle]:
-    """Return the rectangles around a body along whose x axis it is narrowest.
+    """Return the bounding rectangles of a body's footprint with the least extent along x.
 
     Args:
         body: the body.
-        yaw_rad: measure along this direction only.
+        yaw_rad: the only yaw to consider; `WIDTH_YAWS` yaws if None.
 
     Returns:
-        One, or as many as there are directions in which the body is as narrow.
+        One rectangle for each yaw at which the extent is least.
     """
     corners = world_vertices(body)
     if yaw_rad is not None:
-        return [_around(corners, yaw_rad)]
-    # its own axes first: they fit best
+        return [_bounding_rectangle(corners, yaw_rad)]
+    # the axes of the body first: their rectangles are the tightest
     yaws = [body.yaw_rad + math.pi * i / WIDTH_YAWS for i in range(WIDTH_YAWS)]
     yaws.sort(key=lambda yaw: round((yaw - body.yaw_rad) / (math.pi / 2), 6) % 1 > 0)
-    found = [_around(corners, yaw) for yaw in yaws]
+    found = [_bounding_rectangle(corners, yaw) for yaw in yaws]
     least = min(rectangle.half_x for rectangle in found)
-    return [rectangle for rectangle in found if rectangle.half_x <= least + AS_NARROW_M]
+    return [rectangle for rectangle in found if rectangle.half_x <= least + WIDTH_TOLERANCE_M]
 
 
-def _around(corners: np.ndarray, yaw_rad: float) -> Rectangle:
-    """Return the rectangle with this yaw around points [N, 3] seen from above."""
+def _bounding_rectangle(corners: np.ndarray, yaw_rad: float) -> Rectangle:
+    """Return the bounding rectangle with a yaw of x and y of points [N, 3]."""
     frame = PlanarFrame(0.0, 0.0, yaw_rad)
     along, across = frame.to_local(corners[:, 0], corners[:, 1])
     (x0, x1), (y0, y1) = ((float(values.min()), float(values.max())) for values in (along, across))
-    middle = frame.to_world((x0 + x1) / 2, (y0 + y1) / 2)
-    return Rectangle(*middle, yaw_rad, (x1 - x0) / 2, (y1 - y0) / 2)
+    center = frame.to_world((x0 + x1) / 2, (y0 + y1) / 2)
+    return Rectangle(*center, yaw_rad, (x1 - x0) / 2, (y1 - y0) / 2)

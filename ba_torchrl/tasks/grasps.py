@@ -10,18 +10,18 @@ from ba_torchrl.sim.geometry import Pose, Vector, downward_pose
 
 
 class TopDownGrasp(NamedTuple):
-    """A pose of a tool that points down, at which its fingers close on a body."""
+    """A pose of the tool, pointing down, at which the fingers close on a body."""
 
     body: Body
     position: Vector
-    """Of the tool, metres."""
+    """Position of the tool, metres."""
     yaw_rad: float
     clearance_m: float = math.inf
-    """Gap between the open fingers and what stands beside them."""
+    """Clearance between the open fingers and other bodies."""
     risk: float = 0.0
-    """0 for parallel sides in easy reach; above 1, the grasp is better avoided."""
+    """Risk of failure as a score: 0 is best, above 1 the grasp is avoided."""
     cost: float = 0.0
-    """Number of actions, expected failures included."""
+    """Expected number of actions, with those after failures."""
 
     @property
     def tool(self) -> Pose:

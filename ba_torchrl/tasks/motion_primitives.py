@@ -1,37 +1,46 @@
-"""Parts that experts are made of: each is a function of the scene, none keeps time.
+"""Motion primitives of the close-loop experts.
 
-An expert reads where things are and says what to do next, so it can be asked in any state: at the
-start, half-way through somebody else's episode, or after the scene was disturbed. Its commands go
-through the same bounded action space as anybody's.
+Each returns the next command as a function of the present scene, without memory, so an expert can
+be queried in any state. The environment clips the commands to the action limits.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.clearance import (
-    grasp_clearance_m,
     passing_height_m,
-    reach_m,
-    tips_below_tool_m,
 )
-from ba_torchrl.tasks.pick_place_commands import carrying_pose
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
+"""Openings of the gripper."""
+IS_OPEN = 0.9
+"""Least opening of an open gripper."""
 ALIGNED_M = 4e-3
+"""Largest horizontal offset, along each axis, of a gripper that is aligned with its target."""
 ALIGNED_RAD = 0.08
+"""Largest yaw error of a gripper that is aligned with its target."""
+LOW_M = 0.02
+"""Height of the tool above the lower bound of the workspace during a push."""
+STANDOFF_M = 0.08
+"""Distance from a body to the point from which it is pushed."""
 
 
 def move_toward(
     robot: Robot, target: tuple[float, float, float], yaw_rad: float, opening: float
 ) -> GripperCommand:
-    """Return the command that goes to a pose; the environment bounds each component."""
+    """Return the command towards a pose; the environment clips each component.
+
+    Args:
+        robot: the robot.
+        target: target position of the tool, metres.
+        yaw_rad: target yaw of the gripper.
+        opening: opening of the gripper, 0 to 1.
+    """
     position, yaw = robot.tool_pose()
     dx, dy, dz = (t - p for t, p in zip(target, position, strict=True))
     return GripperCommand(opening, dx, dy, dz, wrap_angle(yaw_rad - yaw))
@@ -40,13 +49,13 @@ def move_toward(
 def nearest_equivalent_yaw(
     yaw_rad: float, target_rad: float, limits: ActionLimits, period_rad: float = 2 * math.pi
 ) -> float:
-    """Return the yaw to turn to.
+    """Return the yaw nearest to the present one that is equivalent to a target yaw.
 
     Args:
-        yaw_rad: the gripper's.
-        target_rad: wanted, up to multiples of the period.
-        limits: of an action; a gripper that cannot turn keeps its yaw.
-        period_rad: yaws this far apart serve alike.
+        yaw_rad: present yaw of the gripper.
+        target_rad: target yaw.
+        limits: limits of an action; a gripper that cannot turn keeps its yaw.
+        period_rad: yaws that differ by a multiple of this are equivalent.
     """
     if not limits.turn_rad:
         return yaw_rad
@@ -61,30 +70,40 @@ def nearest_equivalent_yaw(
 
 
 def lift(height_m: float, opening: float = CLOSED) -> GripperCommand:
-    """Return the command that goes straight up."""
+    """Return the command of a vertical displacement.
+
+    Args:
+        height_m: displacement.
+        opening: opening of the gripper, 0 to 1.
+    """
     return GripperCommand(opening, 0.0, 0.0, height_m, 0.0)
 
 
 def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
-    """Grasp a block with four-fold symmetry that stands free.
+    """Return the next command to grasp a block with four-fold symmetry and no obstacles near it.
 
-    The gripper goes sideways, turns and comes down at once, but stays above the block until the
-    action that finds it aligned; the action that arrives closes the fingers.
+    The gripper moves above the block, descends once it is aligned, and closes the fingers with the
+    action that reaches the grasp height.
+
+    Args:
+        robot: the robot.
+        body: the block.
+        limits: limits of an action.
     """
     (x, y, z), yaw = robot.tool_pose()
     bx, by, bz = body.position
     target_yaw = nearest_equivalent_yaw(yaw, body.yaw_rad, limits, math.pi / 2)
     above_z = bz + body.shape.height_m / 2 + passing_height_m(robot.gripper)
-    is_beside = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
-    is_aligned = is_beside and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
-    if robot.opening() < 0.9:
-        return lift(above_z - z if z < above_z and not is_beside else 0.0, OPEN)
+    is_centered = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
+    is_aligned = is_centered and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
+    if robot.opening() < IS_OPEN:
+        return lift(above_z - z if z < above_z and not is_centered else 0.0, OPEN)
     if is_aligned:
         return move_toward(
             robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= limits.step_m else OPEN
         )
-    if z < above_z - 1e-3 and not is_beside:
-        return lift(above_z - z, OPEN)  # the fingers may stand beside the block
+    if z < above_z - 1e-3 and not is_centered:
+        return lift(above_z - z, OPEN)  # a horizontal motion could push the block
     return move_toward(robot, (bx, by, above_z), target_yaw, OPEN)
 
 
@@ -98,11 +117,21 @@ def push(
     opening: float,
     stop_short_m: float,
 ) -> GripperCommand:
-    """Push a body along the straight line to a goal, the fingers standing across the line.
+    """Return the next command to push a body along the straight line to a goal.
 
-    On the line behind the body the gripper pushes; anywhere else it goes behind the body first,
-    over its top if the body is in the way. Leaving the line by a few millimetres is tolerated
-    while pushing and corrected while approaching, so that the two never alternate.
+    The line between the fingers is perpendicular to the line of the push. On the line behind the
+    body the gripper pushes. Elsewhere it first moves behind the body, over its top if the body is
+    an obstacle. The tolerance of the line is larger during the push than at the end of the
+    approach, so that the two phases do not alternate.
+
+    Args:
+        robot: the robot.
+        body: the body.
+        goal: goal of the tool, metres.
+        workspace: the workspace.
+        limits: limits of an action.
+        opening: opening of the gripper, 0 to 1.
+        stop_short_m: distance before the goal at which the tool stops.
     """
     position, yaw = robot.tool_pose()
     x, y, z = position
@@ -110,17 +139,17 @@ def push(
     length = math.dist((bx, by), goal)
     ux, uy = ((goal[0] - bx) / length, (goal[1] - by) / length) if length > 1e-6 else (1.0, 0.0)
     along = (x - bx) * ux + (y - by) * uy
-    aside = abs((y - by) * ux - (x - bx) * uy)
+    offset = abs((y - by) * ux - (x - bx) * uy)
     across = math.atan2(uy, ux) + math.pi / 2
     target_yaw = nearest_equivalent_yaw(yaw, across, limits, math.pi)
     turn = abs(wrap_angle(target_yaw - yaw))
-    low_z = workspace.z[0] + 0.02
+    low_z = workspace.z[0] + LOW_M
 
     half = body.shape.height_m / 2
-    if z < low_z + 0.015 and along < -half + 0.01 and aside < 0.015 and turn < 0.4:
+    if z < low_z + 0.015 and along < -half + 0.01 and offset < 0.015 and turn < 0.4:
         distance = math.dist((x, y), goal) - stop_short_m
         travel = max(min(distance, limits.step_m / max(abs(ux), abs(uy))), 0.0)
-        # aim along the line from the gripper's own place, so that the offset shrinks
+        # towards the goal from the tool, so that its offset from the line decreases
         gx, gy = goal[0] - x, goal[1] - y
         norm = math.hypot(gx, gy) or 1.0
         target = (x + travel * gx / norm, y + travel * gy / norm, low_z)
@@ -128,13 +157,13 @@ def push(
 
     behind = behind_point(robot, body, (ux, uy), workspace)
     over_z = body.position[2] + half + passing_height_m(robot.gripper)
-    arrived = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
-    in_the_way = not arrived and _distance_to_segment((bx, by), (x, y), behind) < 0.9 * math.dist(
-        behind, (bx, by)
-    )
-    if in_the_way and z < over_z - 1e-3:
+    is_behind = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
+    is_obstacle = not is_behind and _distance_to_segment(
+        (bx, by), (x, y), behind
+    ) < 0.9 * math.dist(behind, (bx, by))
+    if is_obstacle and z < over_z - 1e-3:
         return lift(over_z - z, opening)
-    return move_toward(robot, (*behind, over_z if in_the_way else low_z), target_yaw, opening)
+    return move_toward(robot, (*behind, over_z if is_obstacle else low_z), target_yaw, opening)
 
 
 def behind_point(
@@ -142,11 +171,17 @@ def behind_point(
     body: Body,
     direction: tuple[float, float],
     workspace: Workspace,
-    standoff_m: float = 0.08,
+    standoff_m: float = STANDOFF_M,
 ) -> tuple[float, float]:
-    """Return the point from which to push a body along ``direction``, inside the workspace.
+    """Return the point of the workspace from which to push a body.
 
-    Near the border the point moves up to the body, along the line, until the gripper fits.
+    Args:
+        robot: the robot.
+        body: the body.
+        direction: unit vector of the push.
+        workspace: the workspace.
+        standoff_m: distance from the origin of the body; less near the border, but never so little
+            that the gripper touches the body.
     """
     bx, by, _ = body.position
     inner = body.shape.mesh().vertices[:, :2]
@@ -164,185 +199,9 @@ def behind_point(
 def _distance_to_segment(
     point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]
 ) -> float:
+    """Return the distance between a point and a line segment."""
     ex, ey = end[0] - start[0], end[1] - start[1]
     px, py = point[0] - start[0], point[1] - start[1]
     square = ex * ex + ey * ey
-    place = min(max((px * ex + py * ey) / square, 0.0), 1.0) if square > 0 else 0.0
-    return math.hypot(px - place * ex, py - place * ey)
-
-
-HOVER_M = 0.012
-"""Gap under a body, or under the fingertips, that passes over another."""
-SLACK_M = 8e-3
-"""Part of that gap that may be missing on the way."""
-RELEASE_GAP_M = 1e-3
-"""A body is let go this far above what it will rest on."""
-
-
-def carry_to(
-    robot: Robot,
-    body: Body,
-    position: Vector,
-    limits: ActionLimits,
-    *,
-    yaw_rad: float | None = None,
-    obstacles: Sequence[Body] = (),
-    ceiling_m: float = math.inf,
-    hover_m: float = HOVER_M,
-) -> GripperCommand:
-    """Carry the body in the gripper to where it is to lie, and let go of it there.
-
-    It goes over everything in its way, comes down once it is above its place, and the action that
-    arrives opens the fingers.
-
-    Args:
-        robot: it holds the body.
-        body: what is held.
-        position: where the body's origin is to be.
-        limits: of an action.
-        yaw_rad: final yaw of the gripper; None keeps the present one.
-        obstacles: bodies to pass over, with what the body is to rest on.
-        ceiling_m: the tool never goes higher.
-        hover_m: gap that the body keeps to what it passes over, and to its place before it comes
-            down; more is needed where its place has a rim.
-    """
-    tool_pose, pose = robot.tool_frame(), body.pose
-    tool, yaw = tool_pose.position, tool_pose.yaw_rad
-    turn = 0.0 if yaw_rad is None else wrap_angle(yaw_rad - yaw)
-    x, y, _ = pose.position
-    released = (*position[:2], position[2] + RELEASE_GAP_M)
-    target = carrying_pose(tool_pose, pose, pose.moved_to(released, turn)).position
-    is_beside = max(abs(position[0] - x), abs(position[1] - y)) <= ALIGNED_M
-    if is_beside and abs(turn) <= ALIGNED_RAD:
-        arrives = tool[2] - target[2] <= limits.step_m
-        return move_toward(robot, target, yaw + turn, OPEN if arrives else CLOSED)
-    over = (*target[:2], min(target[2] + hover_m, ceiling_m))
-    return travel(
-        robot,
-        over,
-        yaw + turn,
-        CLOSED,
-        limits,
-        below_m=max(tool[2] - vertical_extent(body)[0], tips_below_tool_m(robot)),
-        obstacles=[other for other in obstacles if other is not body],
-        ceiling_m=ceiling_m,
-        hover_m=hover_m,
-    )
-
-
-def pick_up(
-    robot: Robot,
-    body: Body,
-    limits: ActionLimits,
-    *,
-    yaws_rad: Sequence[float],
-    obstacles: Sequence[Body] = (),
-    ceiling_m: float = math.inf,
-) -> GripperCommand:
-    """Go over everything in the way to a body and close the fingers on it.
-
-    Args:
-        robot: its gripper is empty.
-        body: what to grasp, at its origin.
-        limits: of an action.
-        yaws_rad: yaws of the gripper at which the fingers close on it; each stands for its
-            reverse too. Of these the nearest one at which nothing stands where the fingers go.
-        obstacles: bodies to keep clear of.
-        ceiling_m: the tool never goes higher.
-    """
-    (x, y, z), yaw = robot.tool_pose()
-    bx, by, bz = body.position
-    others = [other for other in obstacles if other is not body]
-    target_yaw = min(
-        (nearest_equivalent_yaw(yaw, wanted, limits, math.pi) for wanted in yaws_rad),
-        key=lambda wanted: (
-            grasp_clearance_m(robot.gripper, body, wanted, others) <= 0,
-            abs(wrap_angle(wanted - yaw)),
-        ),
-    )
-    is_beside = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
-    is_aligned = is_beside and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
-    if robot.opening() < 0.9 and math.dist((x, y), (bx, by)) < footprint_radius_m(body):
-        return lift(5e-3, OPEN)  # the body may stand between the fingers
-    if is_aligned and robot.opening() >= 0.9:
-        return move_toward(
-            robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= limits.step_m else OPEN
-        )
-    below_m = tips_below_tool_m(robot)
-    over_z = min(vertical_extent(body)[1] + below_m + HOVER_M, ceiling_m)
-    return travel(
-        robot,
-        (bx, by, over_z),
-        target_yaw,
-        OPEN,
-        limits,
-        below_m=below_m,
-        obstacles=[body, *others],
-        ceiling_m=ceiling_m,
-    )
-
-
-def travel(
-    robot: Robot,
-    target: Vector,
-    yaw_rad: float,
-    opening: float,
-    limits: ActionLimits,
-    *,
-    below_m: float,
-    obstacles: Sequence[Body],
-    ceiling_m: float = math.inf,
-    hover_m: float = HOVER_M,
-) -> GripperCommand:
-    """Go to a pose: straight where the next action touches nothing, else level, else up first.
-
-    Args:
-        robot: the robot.
-        target: where the tool goes.
-        yaw_rad: yaw in the end.
-        opening: of the gripper on the way.
-        limits: of an action.
-        below_m: how far hand and load hang below the tool.
-        obstacles: bodies to pass over.
-        ceiling_m: the tool never goes higher.
-        hover_m: gap kept above the obstacles.
-    """
-    start = robot.tool_pose()[0]
-    end = tuple(
-        s + min(max(t - s, -limits.step_m), limits.step_m)
-        for s, t in zip(start, target, strict=True)
-    )
-    hand = reach_m(robot.gripper)
-    zones = [
-        (
-            body.position,
-            hand + footprint_radius_m(body),
-            vertical_extent(body)[1] + below_m + hover_m,
-        )
-        for body in obstacles
-    ]
-    if _height_needed(start, end, zones) is None:
-        return move_toward(robot, target, yaw_rad, opening)
-    needed = _height_needed(start, (end[0], end[1], start[2]), zones)
-    if needed is None or start[2] >= ceiling_m - 1e-3:
-        return move_toward(robot, (target[0], target[1], start[2]), yaw_rad, opening)
-    return lift(min(needed + 1e-3, ceiling_m) - start[2], opening)
-
-
-def _height_needed(
-    start: Vector, end: Vector, zones: Sequence[tuple[Vector, float, float]]
-) -> float | None:
-    """Return how high the tool must be on a straight way, or None if it is high enough.
-
-    Args:
-        start: the tool's place now.
-        end: its next place.
-        zones: center, radius and least height of what the way may lead over.
-    """
-    needed = None
-    for i in range(5):
-        x, y, z = (s + (e - s) * i / 4 for s, e in zip(start, end, strict=True))
-        for center, radius, height in zones:
-            if z < height - SLACK_M and math.dist((x, y), center[:2]) < radius:
-                needed = height if needed is None else max(needed, height)
-    return needed
+    share = min(max((px * ex + py * ey) / square, 0.0), 1.0) if square > 0 else 0.0
+    return math.hypot(px - share * ex, py - share * ey)

@@ -1,4 +1,4 @@
-"""The base of the open-loop tasks."""
+"""Base of the open-loop tasks."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ba_torchrl.tasks.workspace import Workspace
 class OpenLoopControl:
     """Defaults of open-loop control, and heights of picks and places (appendix A.1, G.1).
 
-    A mixin of `Task`: `pick_height_m`, `place_height_m` and `window_m` give the height of the tool
-    where an action has no z component.
+    A mixin of `Task`. Without a z component in the action, `pick_height_m` and `place_height_m`
+    return the height of the tool from the highest point in a window around the target.
     """
 
     control: ClassVar[Literal["open_loop", "close_loop"]] = "open_loop"
@@ -23,36 +23,46 @@ class OpenLoopControl:
     scale_range = (0.6, 0.6)
     scale_limits = (0.55, 1.1)
     finger_opening: ClassVar[float] = 1.0
-    """Opening of the fingers before a pick, 0 to 1."""
+    """Opening of the gripper before a pick, 0 to 1."""
 
     settings: TaskSettings
     robot: Robot
     terrain: Terrain
 
     def lowest_tool_m(self, xy: tuple[float, float]) -> float:
-        """Return the least height of the tool at which the fingers close above the ground.
+        """Return the least height of a pick, at which the fingers close above the ground, metres.
 
-        A lower pick is raised to it.
+        Args:
+            xy: position of the tool, metres.
         """
         return self.terrain.lowest_tool_m(self.robot.gripper, xy)
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a pick, metres.
+        """Return the height of the tool for a pick without z, metres.
 
         Args:
-            top_m: height of the highest point around the target.
-            xy: of the target.
+            top_m: height of the highest point in the window around the target.
+            xy: position of the target.
         """
         return max(top_m - BLOCK_M * self.settings.scale / 2, self.lowest_tool_m(xy))
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a place, metres; arguments as for `pick_height_m`."""
+        """Return the height of the tool for a place without z, metres.
+
+        Args:
+            top_m: height of the highest point in the window around the target.
+            xy: position of the target.
+        """
         return top_m + BLOCK_M * self.settings.scale / 2
 
     def window_m(self, held: Body | None) -> float:
-        """Return half the width of the square that is searched for the highest point, metres."""
+        """Return half the width of the square window around the target, metres.
+
+        Args:
+            held: the body in the gripper.
+        """
         return BLOCK_M * self.settings.scale / 2
 
 
 class OpenLoopTask(OpenLoopControl, Task):
-    """A task of picks and places (appendix A.1, G.1)."""
+    """A task whose actions are picks and places (appendix A.1, G.1)."""

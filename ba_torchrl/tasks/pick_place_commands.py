@@ -1,4 +1,4 @@
-"""Open-loop commands from poses in SE(3)."""
+"""Pick and place commands from poses in SE(3)."""
 
 from __future__ import annotations
 
@@ -7,53 +7,53 @@ from ba_torchrl.sim.geometry import Pose, tool_angles
 from ba_torchrl.tasks.workspace import Workspace
 
 LEVEL_RAD = 0.02
-"""A tool that leans less than this points straight down: the home pose leans by up to 1e-3."""
+"""A tilt below this counts as zero; the home pose is tilted by up to 1e-3."""
 ROUNDING_RAD = 1e-9
-"""A yaw this small is zero: rounded below it, it would wrap to half a turn."""
+"""A yaw below this counts as zero. A tiny negative yaw would wrap to half a turn."""
 NO_OP_Z_M = 0.1
-"""Height of the tool, where nothing is."""
+"""Height of the tool of a no-op."""
 
 
 def pick_command(tool: Pose) -> PickPlaceCommand:
-    """Return the pick with the tool at a pose."""
+    """Return the pick at a pose of the tool."""
     return _command(PICK, tool)
 
 
 def place_command(tool: Pose, held: Pose, target: Pose) -> PickPlaceCommand:
-    """Return the place that brings what is held to a pose.
+    """Return the place that brings the held body to a pose.
 
     Args:
-        tool: pose of the tool now.
-        held: pose of what is held now.
-        target: pose of what is held as it is let go.
+        tool: present pose of the tool.
+        held: present pose of the held body.
+        target: pose of the held body at its release.
     """
     return _command(PLACE, carrying_pose(tool, held, target))
 
 
 def carrying_pose(tool: Pose, held: Pose, target: Pose) -> Pose:
-    """Return the pose of the tool that brings what it holds to a pose.
+    """Return the pose of the tool that brings the held body to a pose.
 
     Args:
-        tool: pose of the tool now.
-        held: pose of what is held now.
-        target: wanted pose of what is held.
+        tool: present pose of the tool.
+        held: present pose of the held body.
+        target: target pose of the held body.
     """
     return target.compose(held.inverse().compose(tool))
 
 
 def no_op(workspace: Workspace, is_holding: bool) -> PickPlaceCommand:
-    """Return a command that changes nothing: there is nothing left to do.
+    """Return the command of an expert that has nothing left to do.
 
     Args:
-        workspace: a pick from its corner, where nothing is, changes nothing.
-        is_holding: whether something is held; then it is put down there.
+        workspace: the pick or place is in its corner, above the ground.
+        is_holding: whether a body is held; it is placed there. A pick there grasps nothing.
     """
     primitive = PLACE if is_holding else PICK
     return PickPlaceCommand(primitive, workspace.x[0], workspace.y[0], NO_OP_Z_M)
 
 
 def _command(primitive: int, tool: Pose) -> PickPlaceCommand:
-    """Return the command with the tool at a pose."""
+    """Return the command of a primitive at a pose of the tool."""
     rz, ry, rx = tool_angles(tool.orientation)
     rz = 0.0 if abs(rz) < ROUNDING_RAD else rz
     ry, rx = (0.0 if abs(angle) < LEVEL_RAD else angle for angle in (ry, rx))

@@ -1,12 +1,13 @@
-"""Terrain: the support surface that the objects of a task stand on.
+"""Terrain: the support surface of the objects of a task.
 
-Every question about heights of the ground is answered here: where an object stands, whether a body
-is on the ground, how low the tool may go. A terrain may be drawn anew in every episode.
+A terrain answers all questions about heights of the ground: where an object stands, whether a body
+is on the ground, how low the tool may go. A terrain may change between episodes.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import Matrix, Pose, yaw_quaternion
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.workspace import Area, Spot, Workspace
+from ba_torchrl.tasks.workspace import Area, Spacing, Workspace
 
 
 class Terrain(ABC):
@@ -47,64 +48,68 @@ class Terrain(ABC):
 
         Args:
             xy: point of the workspace, metres.
-            yaw_rad: heading of the frame's x axis in the horizontal plane.
+            yaw_rad: yaw of the frame's x axis in the horizontal plane.
         """
 
     @property
     def spawn_area(self) -> Area:
-        """Where objects start."""
+        """The area where objects start."""
         return Area(self.workspace.x, self.workspace.y)
 
     @property
     def build_area(self) -> Area:
-        """Where experts put objects down and build."""
+        """The area where experts place objects on the ground."""
         return Area(self.workspace.x, self.workspace.y)
 
     def can_hold(self, xy: tuple[float, float], radius_m: float) -> bool:
-        """Whether an object of a radius lies flush on the surface if it is centred at a point."""
+        """Whether an object with this radius is in full contact with the surface at a point."""
         return True
 
     def initialize_episode(self, rng: np.random.Generator) -> None:  # noqa: B027 -- optional
-        """Draw the terrain of an episode, before the objects are placed."""
+        """Draw the random parts of the terrain, before the objects are placed."""
 
     def get_state(self) -> Any:
-        """Return what `initialize_episode` has drawn."""
+        """Return the random parts that `initialize_episode` has drawn."""
         return None
 
     def set_state(self, state: Any) -> None:  # noqa: B027 -- flat ones have none
-        """Restore what `get_state` returned; the poses of bodies are restored by the world."""
+        """Restore the random parts; the world restores the poses of bodies."""
 
     # -- placements --------------------------------------------------------------------------
 
     def random_point(self, rng: np.random.Generator, padding_m: float) -> tuple[float, float]:
-        """Return a uniform point that keeps half of ``padding_m`` from the border.
+        """Return a random point at least half of ``padding_m`` from the border.
 
         Raises:
             PlacementError: the area is too small.
         """
-        return self.random_points(rng, [Spot(padding_m, 0.0)])[0]
+        return self.random_points(rng, [Spacing(padding_m, 0.0)])[0]
 
     def random_points(
-        self, rng: np.random.Generator, spots: list[Spot]
+        self, rng: np.random.Generator, spacings: Sequence[Spacing]
     ) -> list[tuple[float, float]]:
-        """Return uniform points of the spawn area, apart from each other.
+        """Return random points of the spawn area that keep their distances.
+
+        Args:
+            rng: random generator.
+            spacings: space that each object needs.
 
         Raises:
             PlacementError: no layout was found.
         """
         return self.spawn_area.random_points(
-            rng, spots, lambda point, spot: self.can_hold(point, spot.padding_m / 2)
+            rng, spacings, lambda point, spacing: self.can_hold(point, spacing.padding_m / 2)
         )
 
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
-        """Put a body at rest on the surface, upright with respect to it."""
+        """Place a body on the surface, its z axis along the normal."""
         offset = Pose((0.0, 0.0, -body.shape.bounds_m[0][2]))
         body.set_pose(*self.surface_pose(xy, yaw_rad).compose(offset))
 
     # -- heights -----------------------------------------------------------------------------
 
     def gap_below_m(self, body: Body) -> float:
-        """Return how far the lowest point of a body is above the surface under its origin."""
+        """Return the height of the lowest point of a body above the surface below its origin."""
         return vertical_extent(body)[0] - self.height_m(body.position[:2])
 
     def lowest_tool_m(
@@ -118,19 +123,19 @@ class Terrain(ABC):
 
         Args:
             gripper: the gripper.
-            xy: of the tool, metres.
-            rotation: of the tool; if None, it points down.
-            opening: of the gripper before it closes, 0 to 1.
+            xy: position of the tool, metres.
+            rotation: rotation of the tool; None if it points down.
+            opening: opening of the gripper before it closes, 0 to 1.
         """
         return self.height_m(xy) + gripper.lowest_tool_m(rotation, opening)
 
 
 class Flat(Terrain):
-    """The world's floor, level at height zero."""
+    """The floor of the world, horizontal at height zero."""
 
     @property
     def support_ids(self) -> frozenset[int]:
-        """The floor."""
+        """PyBullet id of the floor."""
         return frozenset((self.world.floor,))
 
     def height_m(self, xy: tuple[float, float]) -> float:

@@ -1,4 +1,4 @@
-"""The workspace, the reach of one action, and random placements."""
+"""The workspace, the limits of one action, and random placements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.geometry import Vector
 
 LAYOUT_ATTEMPTS = 2000
-"""Random layouts tried before giving up; bowl and block fit in about one of ten."""
+"""Random layouts before a `PlacementError`; bowl and block fit in about one of ten."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Workspace:
 
     @property
     def center(self) -> tuple[float, float]:
-        """x and y of the middle."""
+        """x and y of the centre."""
         return (sum(self.x) / 2, sum(self.y) / 2)
 
     @property
@@ -42,7 +42,7 @@ class Workspace:
         )
 
     def clip(self, point: Sequence[float]) -> Vector:
-        """Return the nearest point of the box."""
+        """Return the point of the box that is nearest to a point."""
         return tuple(
             min(max(value, low), high)
             for value, (low, high) in zip(point, (self.x, self.y, self.z), strict=True)
@@ -54,34 +54,34 @@ class ActionLimits:
     """The largest displacement and rotation of one action."""
 
     step_m: float
-    """Along each axis; infinite in open loop."""
+    """Displacement along each axis, metres; infinite in open loop."""
     turn_rad: float
-    """About the vertical; 0 if the gripper cannot turn."""
+    """Rotation about the vertical; 0 if the gripper cannot turn."""
     yaw_range_rad: tuple[float, float] | None = None
-    """Range that the gripper's yaw is clipped to; None if it is unbounded."""
+    """Range to which the yaw of the gripper is clipped; None without bounds."""
 
 
-class Spot(NamedTuple):
-    """Space that an object needs where it is placed at random."""
+class Spacing(NamedTuple):
+    """The space that an object needs where it is placed at random."""
 
     padding_m: float
-    """Twice the least distance of its centre from the border."""
+    """Twice the least distance between its centre and the border."""
     distance_m: float
-    """Least distance of its centre from those placed before it."""
+    """Least distance between its centre and those of the objects placed before it."""
 
 
 class Area(NamedTuple):
-    """A rectangle of the horizontal plane along the axes, metres."""
+    """An axis-aligned rectangle of the horizontal plane, metres."""
 
     x: tuple[float, float]
     y: tuple[float, float]
 
     def shrunk(self, border_m: float) -> Area:
-        """Return the area without a border of this width."""
+        """Return the area less a border of this width."""
         return Area(*((low + border_m, high - border_m) for low, high in self))
 
     def random_point(self, rng: np.random.Generator, padding_m: float) -> tuple[float, float]:
-        """Return a uniform point that keeps half of ``padding_m`` from the border.
+        """Return a uniformly random point at least half of ``padding_m`` from the border.
 
         Raises:
             PlacementError: the area is smaller than the padding.
@@ -100,31 +100,31 @@ class Area(NamedTuple):
     def random_points(
         self,
         rng: np.random.Generator,
-        spots: Sequence[Spot],
-        is_free: Callable[[tuple[float, float], Spot], bool] = lambda point, spot: True,
+        spacings: Sequence[Spacing],
+        is_allowed: Callable[[tuple[float, float], Spacing], bool] = lambda point, spacing: True,
     ) -> list[tuple[float, float]]:
-        """Return uniform points, one for each spot, that keep their distances from each other.
+        """Return uniformly random points, one for each object, that keep their distances.
 
         Args:
-            rng: draws the points.
-            spots: space that each object needs.
-            is_free: whether an object may be centred at a point.
+            rng: random generator.
+            spacings: space that each object needs.
+            is_allowed: whether an object with a spacing may be centred at a point.
 
         Raises:
             PlacementError: no layout was found.
         """
         for _ in range(LAYOUT_ATTEMPTS):
             points: list[tuple[float, float]] = []
-            for spot in spots:
-                point = self.random_point(rng, spot.padding_m)
-                if not is_free(point, spot) or any(
-                    math.dist(point, other) < spot.distance_m for other in points
+            for spacing in spacings:
+                point = self.random_point(rng, spacing.padding_m)
+                if not is_allowed(point, spacing) or any(
+                    math.dist(point, other) < spacing.distance_m for other in points
                 ):
                     break
                 points.append(point)
             else:
                 return points
         raise PlacementError(
-            f"no room for {len(spots)} objects apart from each other: enlarge `workspace`, or "
+            f"no room for {len(spacings)} objects apart from each other: enlarge `workspace`, or "
             "lower `num_objects` or `object_scale_range`"
         )

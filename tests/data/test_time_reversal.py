@@ -14,7 +14,7 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import Pose
-from ba_torchrl.tasks.structures.deconstruction import Watch
+from ba_torchrl.tasks.structures.undo import UndoRecorder
 
 TASK = "open_loop/house_building_2"
 STRUCTURES = [
@@ -140,34 +140,35 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
     # held 4 mm beside its middle, along the tool's x axis
     grasp = Pose((0.004, 0.0, 0.0), pybullet.invertTransform((0, 0, 0), down)[1])
-    before = Watch({body: body.pose, other: other.pose}, None, None)
+    before = UndoRecorder({body: body.pose, other: other.pose}, None, None)
     body.pose = Pose((0.6, 0.0, 0.4), body.pose[1])
-    undo = before.undo(body, grasp)
+    undo = before.undo_command(body, grasp)
     assert undo.primitive == PLACE
     assert undo[1:4] == pytest.approx((0.396, 0.1, 0.05))
     assert undo.angles_rad == pytest.approx((0.0, 0.0, 0.0))
 
-    held = Watch({body: body.pose, other: other.pose}, body, grasp)
+    held = UndoRecorder({body: body.pose, other: other.pose}, body, grasp)
     quarter = pybullet.getQuaternionFromEuler((0.0, 0.0, math.pi / 2))
     body.pose = Pose((0.3, -0.1, 0.015), quarter)
-    undo = held.undo(None, None)
+    undo = held.undo_command(None, None)
     assert undo.primitive == PICK
     assert undo[1:4] == pytest.approx((0.3, -0.104, 0.015))
     assert undo.rz_rad == pytest.approx(math.pi / 2)
-    assert held.undo(None, None, lowest_m=lambda _: 0.014) == undo
-    assert held.undo(None, None, lowest_m=lambda _: 0.017) == undo._replace(z_m=0.017)
-    assert before.undo(body, grasp, lowest_m=lambda _: 0.2).z_m == pytest.approx(0.05)  # a place
+    assert held.undo_command(None, None, lowest_tool_m=lambda _: 0.014) == undo
+    assert held.undo_command(None, None, lowest_tool_m=lambda _: 0.017) == undo._replace(z_m=0.017)
+    place = before.undo_command(body, grasp, lowest_tool_m=lambda _: 0.2)
+    assert place.z_m == pytest.approx(0.05)
 
 
 def test_nothing_undoes_an_action_that_moved_nothing_or_two_things():
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
     grasp = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-    before = Watch({body: body.pose, other: other.pose}, None, None)
-    assert before.undo(None, None) is None
+    before = UndoRecorder({body: body.pose, other: other.pose}, None, None)
+    assert before.undo_command(None, None) is None
     other.pose = Pose((0.5, 0.004, 0.015), other.pose[1])
-    assert before.undo(body, grasp) is not None
+    assert before.undo_command(body, grasp) is not None
     other.pose = Pose((0.5, 0.006, 0.015), other.pose[1])
-    assert before.undo(body, grasp) is None
+    assert before.undo_command(body, grasp) is None
 
 
 @pytest.mark.parametrize("task", STRUCTURES)

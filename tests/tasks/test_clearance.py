@@ -11,9 +11,9 @@ from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.clearance import (
-    ASIDE_M,
-    INSIDE_M,
-    OUTSIDE_M,
+    INNER_MARGIN_M,
+    OUTER_MARGIN_M,
+    SIDE_MARGIN_M,
     finger_ranges_m,
     finger_rectangles,
     grasp_clearance_m,
@@ -57,8 +57,8 @@ def test_a_gripper_reaches_as_far_as_its_x():
 @pytest.mark.parametrize("opening", [0.5, 1.0])
 def test_the_ranges_of_the_fingers(opening):
     left, right = finger_ranges_m(GRIPPER, opening)
-    inner = opening * (0.04 - INSIDE_M)
-    assert right == pytest.approx((inner, 0.06 - (1 - opening) * 0.04 + OUTSIDE_M))
+    inner = opening * (0.04 - INNER_MARGIN_M)
+    assert right == pytest.approx((inner, 0.06 - (1 - opening) * 0.04 + OUTER_MARGIN_M))
     assert left == (-right[1], -right[0])
 
 
@@ -99,7 +99,7 @@ def test_fingers_from_above_and_their_gap_to_an_outline():
     tool = PlanarFrame(0.4, 0.1, math.pi / 2)
     left, right = finger_rectangles(GRIPPER, tool, 0.03)
     assert left[:2] == pytest.approx((0.4, 0.1 - 0.04))
-    assert right == pytest.approx((0.4, 0.1 + 0.04, math.pi / 2, 0.01, 0.01 + ASIDE_M))
+    assert right == pytest.approx((0.4, 0.1 + 0.04, math.pi / 2, 0.01, 0.01 + SIDE_MARGIN_M))
     wall = Rectangle(0.4, 0.2, 0.0, 0.1, 0.01)
     gap = outline_clearance_m(GRIPPER, tool, 0.03, [wall])
     assert gap == pytest.approx(0.2 - 0.01 - (0.1 + 0.05))

@@ -14,33 +14,42 @@ from ba_torchrl.sim.meshes import bowl_parts, centroid
 from ba_torchrl.sim.shapes import Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import BLUE, CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import CLOSED, OPEN, move_toward, pick_up, travel
-from ba_torchrl.tasks.workspace import Spot
+from ba_torchrl.tasks.motion_primitives import CLOSED, IS_OPEN, OPEN, move_toward
+from ba_torchrl.tasks.transport import pick_up, travel
+from ba_torchrl.tasks.workspace import Spacing
 
 RELEASE_GAP_M = 4e-3
-"""The block is let go of this far above the bowl's floor; it lands before the action ends."""
+"""Height of the block above the floor of the bowl at its release; it lands before the action
+ends."""
 
 
 @TASKS.register("close_loop/block_in_bowl")
 class BlockInBowl(CloseLoopTask):
-    """A 5 cm block and a bowl of 16 x 16 x 7 cm; success when the block lies inside the bowl.
+    """Objects: a cubic block of 5 cm and a bowl of 16 x 16 x 7 cm.
 
-    Placing includes letting go: a block that the gripper still holds inside the bowl could leave
-    it with the next action. A bowl that has tipped over ends the episode.
+    Goal: the block lies inside the upright bowl, released. The episode ends early when the bowl
+    tips over or an object leaves the workspace. Appendix A.2.
     """
 
     scale_limits = (0.75, 1.0)
     bowl_radius_m: ClassVar[float] = 0.08
+    """Outer radius of the bowl at scale 1, metres."""
     bowl_height_m: ClassVar[float] = 0.07
+    """Height of the bowl at scale 1, metres."""
     floor_m: ClassVar[float] = 0.016
+    """Height of the inner floor above the lower end of the bowl at scale 1, metres."""
     inside_m: ClassVar[float] = 0.03
+    """Largest horizontal distance between a block inside the bowl and its axis at scale 1,
+    metres."""
     upright_rad: ClassVar[float] = math.pi / 9
+    """Largest tilt of an upright bowl, radians."""
     tipped_rad: ClassVar[float] = math.pi / 3
-    """Beyond this the bowl does not fall back onto its foot."""
+    """Tilt above which the bowl does not fall back onto its foot, radians."""
     clearance_m: ClassVar[float] = 8e-3
-    """Gap between the block and the rim that it passes over."""
+    """Gap between the block and the rim that it passes over, metres."""
     within_rim_m: ClassVar[float] = 0.03
-    """This close to the bowl's axis, a block at any yaw has room between the walls."""
+    """Distance from the axis of the bowl within which a block at any yaw fits between the walls, at
+    scale 1, metres."""
 
     def load_scene(self) -> None:
         """Load the block and the bowl."""
@@ -60,33 +69,33 @@ class BlockInBowl(CloseLoopTask):
         )
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put block and bowl anywhere, 17 cm apart or more."""
+        """Place block and bowl at random poses, at least 17 cm apart."""
         block = 2.4 * self.block_m
         bowl = 0.17 * self.settings.scale
-        points = self.random_points(rng, (Spot(block, block), Spot(bowl, bowl)))
+        points = self.random_points(rng, (Spacing(block, block), Spacing(bowl, bowl)))
         for body, xy in zip((self.block, self.bowl), points, strict=True):
             self.stand(body, xy, self.random_yaw(rng, math.pi))
 
     def evaluate(self) -> dict[str, bool]:
-        """Return whether the block lies near the middle of the upright bowl, released."""
+        """Return whether the block lies inside the upright bowl, released."""
         (x, y, z), (bowl_x, bowl_y, bowl_z) = self.block.position, self.bowl.position
         floor_z = bowl_z - self.bowl.shape.height_m / 2 + self.floor_m * self.settings.scale
         return {
             "is_over_bowl": math.dist((x, y), (bowl_x, bowl_y))
             < self.inside_m * self.settings.scale,
-            "is_above_bowl_floor": z > floor_z,  # an overturned bowl may cover the block
+            "is_above_bowl_floor": z > floor_z,  # false below an overturned bowl
             "is_bowl_upright": self.bowl.tilt_rad < self.upright_rad,
             "is_touching_bowl": self.bowl.touches(self.block),
             "is_released": self.robot.held_body() is not self.block,
         }
 
     def is_valid(self) -> bool:
-        """Whether both are inside the workspace and the bowl has not tipped over."""
+        """Whether block and bowl are inside the workspace and the bowl has not tipped over."""
         return super().is_valid() and self.bowl.tilt_rad < self.tipped_rad
 
     def expert_command(self) -> GripperCommand:
-        """Grasp the block, carry it over the rim and let go of it inside."""
-        if self.robot.held_body() is self.block and self.robot.opening() < 0.9:
+        """Grasp the block, carry it over the rim and release it inside."""
+        if self.robot.held_body() is self.block and self.robot.opening() < IS_OPEN:
             return self._carry()
         return pick_up(
             self.robot,
@@ -98,7 +107,7 @@ class BlockInBowl(CloseLoopTask):
         )
 
     def _carry(self) -> GripperCommand:
-        """Carry the block over the rim, lower it between the walls and let go of it."""
+        """Carry the block over the rim, lower it between the walls and release it."""
         (x, y, z), yaw = self.robot.tool_pose()
         block_x, block_y, _ = self.block.position
         bowl_x, bowl_y, bowl_z = self.bowl.position
@@ -107,9 +116,9 @@ class BlockInBowl(CloseLoopTask):
         floor_z = bowl_z - self.bowl.shape.height_m / 2 + self.floor_m * self.settings.scale
         if math.hypot(dx, dy) <= self.within_rim_m * self.settings.scale:
             down = low - floor_z - RELEASE_GAP_M
-            arrives = max(down, abs(dx), abs(dy)) <= self.action_limits.step_m
+            is_last = max(down, abs(dx), abs(dy)) <= self.action_limits.step_m
             return move_toward(
-                self.robot, (x + dx, y + dy, z - down), yaw, OPEN if arrives else CLOSED
+                self.robot, (x + dx, y + dy, z - down), yaw, OPEN if is_last else CLOSED
             )
         top = vertical_extent(self.bowl)[1]
         return travel(
@@ -121,7 +130,7 @@ class BlockInBowl(CloseLoopTask):
             below_m=z - low,
             obstacles=(self.bowl,),
             ceiling_m=self.settings.workspace.z[1],
-            hover_m=self.clearance_m,
+            clearance_m=self.clearance_m,
         )
 
     @property

@@ -12,36 +12,41 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import grasp, lift
+from ba_torchrl.tasks.motion_primitives import IS_OPEN, grasp, lift
 
 
 @TASKS.register("close_loop/block_picking")
 class BlockPicking(CloseLoopTask):
-    """A 5 cm block at a random pose; success when it is held with the tool 15 cm above ground."""
+    """Objects: a cubic block of 5 cm.
+
+    Goal: the block is held and the tool is higher than 15 cm. The episode ends early when the block
+    leaves the workspace. Appendix A.2.
+    """
 
     scale_limits = (0.6, 1.4)
     fits_tray = True
     lift_height_m: ClassVar[float] = 0.15
+    """Least height of the tool at success, metres."""
 
     def load_scene(self) -> None:
         """Load the block."""
         self.block = self.world.add(self.cube(), "block")
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put the block anywhere, 1.2 blocks from the border."""
+        """Place the block at a random pose, at least 1.2 blocks from the border."""
         xy = self.random_point(rng, 2.4 * self.block_m)
         self.stand(self.block, xy, self.random_yaw(rng, math.pi / 2))
 
     def evaluate(self) -> dict[str, bool]:
-        """Return whether the block is held and the tool higher than 15 cm."""
+        """Return whether the block is held and whether the tool is higher than 15 cm."""
         return {
             "is_grasped": self.robot.held_body() is self.block,
             "is_lifted": self.robot.tool_pose()[0][2] > self.lift_height_m,
         }
 
     def expert_command(self) -> GripperCommand:
-        """Grasp the block, then go up."""
-        if self.robot.held_body() is self.block and self.robot.opening() < 0.9:
+        """Grasp the block, then lift it."""
+        if self.robot.held_body() is self.block and self.robot.opening() < IS_OPEN:
             return lift(self.action_limits.step_m)
         return grasp(self.robot, self.block, self.action_limits)
 

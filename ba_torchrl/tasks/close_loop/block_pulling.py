@@ -12,12 +12,15 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import BLUE, RED, CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import behind_point, push
+from ba_torchrl.tasks.motion_primitives import STANDOFF_M, behind_point, push
 
 
 @TASKS.register("close_loop/block_pulling")
 class BlockPulling(CloseLoopTask):
-    """Two blocks of 8 x 8 x 5 cm; success when they touch."""
+    """Objects: two blocks of 8 x 8 x 5 cm.
+
+    Goal: the blocks touch. The episode ends early when a block leaves the workspace. Appendix A.2.
+    """
 
     scale_limits = (0.6, 1.1)
 
@@ -30,7 +33,7 @@ class BlockPulling(CloseLoopTask):
         ]
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put the blocks 13.6 cm apart or more; with fixed orientations, along y."""
+        """Place the blocks at least 13.6 cm apart; with fixed orientations, on a line along y."""
         spacing = 3.4 * 0.04 * self.settings.scale
         points = self.random_pair(rng, (spacing, spacing), spacing)
         for block, xy in zip(self.blocks, points, strict=True):
@@ -41,7 +44,7 @@ class BlockPulling(CloseLoopTask):
         return {"is_touching": self.blocks[0].touches(self.blocks[1])}
 
     def expert_command(self) -> GripperCommand:
-        """Go beyond the block that is handier and pull it to the other."""
+        """Move behind the block with the lower cost and pull it to the other."""
         pulled, other = min(
             (tuple(self.blocks), tuple(reversed(self.blocks))), key=lambda pair: self._cost(*pair)
         )
@@ -51,18 +54,21 @@ class BlockPulling(CloseLoopTask):
             other.position[:2],
             workspace=self.settings.workspace,
             limits=self.action_limits,
-            opening=0.5,  # wide open, the fingers would straddle a corner
+            opening=0.5,  # a corner of the block would fit between fully open fingers
             stop_short_m=0.0,
         )
 
     def _cost(self, pulled: Body, other: Body) -> float:
-        """Distance to the place to pull from; close once there, so the choice holds."""
+        """Return the distance to the start of the pull, plus a cost for a start near the border.
+
+        The distance decreases on the approach, so the choice of the block does not change.
+        """
         (px, py, _), (ox, oy, _) = pulled.position, other.position
         length = math.hypot(ox - px, oy - py) or 1.0
         direction = ((ox - px) / length, (oy - py) / length)
-        place = behind_point(self.robot, pulled, direction, self.settings.workspace)
-        cramped = 0.08 - math.dist(place, (px, py))
-        return math.dist(place, self.robot.tool_pose()[0][:2]) + 2 * cramped
+        start = behind_point(self.robot, pulled, direction, self.settings.workspace)
+        missing_m = STANDOFF_M - math.dist(start, (px, py))
+        return math.dist(start, self.robot.tool_pose()[0][:2]) + 2 * missing_m
 
     @property
     def objects(self) -> Sequence[Body]:

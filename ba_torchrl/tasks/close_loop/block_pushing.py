@@ -19,15 +19,19 @@ from ba_torchrl.tasks.motion_primitives import push
 
 @TASKS.register("close_loop/block_pushing")
 class BlockPushing(CloseLoopTask):
-    """A 5 cm block and a 9 cm goal area; success when their centres are within 5 cm.
+    """Objects: a cubic block of 5 cm and a square goal area of 9 cm, a recess of 2 cm in the image.
 
-    The depth image shows the goal area as a dip of 2 cm in the floor.
+    Goal: the centre of the block is within 5 cm of that of the goal area. The episode ends early
+    when the block leaves the workspace. Appendix A.2.
     """
 
     scale_limits = (0.5, 1.6)
     goal_size_m: ClassVar[float] = 0.09
+    """Edge of the goal area, metres."""
     goal_radius_m: ClassVar[float] = 0.05
+    """Largest distance between the centres of block and goal area at success, metres."""
     least_distance_m: ClassVar[float] = 0.09
+    """Least distance between the centres of block and goal area at the start, metres."""
 
     def load_scene(self) -> None:
         """Load the block and the goal area."""
@@ -36,20 +40,20 @@ class BlockPushing(CloseLoopTask):
         self.goal = self.world.add(Decal(size_m=size, color=GREEN, recess_depth_m=0.02), "goal")
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put block and goal at least 9 cm apart; with fixed orientations, along y."""
+        """Place block and goal area at least 9 cm apart; with fixed orientations, along y."""
         block, goal = self.random_pair(rng, (2.4 * self.block_m, 0.13), self.least_distance_m)
         self.stand(self.block, block, self.random_yaw(rng, math.pi))
         self.stand(self.goal, goal, self.random_yaw(rng, math.pi / 2))
 
     def evaluate(self) -> dict[str, bool]:
-        """Return whether the block's centre is within 5 cm of the goal's."""
+        """Return whether the block is within 5 cm of the goal area."""
         distance_m = math.dist(self.block.position[:2], self.goal.position[:2])
         return {"is_at_goal": distance_m < self.goal_radius_m}
 
     def expert_command(self) -> GripperCommand:
-        """Go behind the block and push it with half-open fingers.
+        """Move behind the block and push it with half-open fingers.
 
-        They are as much nearer to each other as it is smaller, or they would straddle it.
+        The gap between them decreases with the size of the block, so that it never fits in between.
         """
         return push(
             self.robot,
@@ -63,10 +67,10 @@ class BlockPushing(CloseLoopTask):
 
     @property
     def landmarks(self) -> Sequence[YawPose]:
-        """Block and goal."""
+        """Poses of block and goal area."""
         return [(body.position, body.yaw_rad) for body in (self.block, self.goal)]
 
     @property
     def objects(self) -> Sequence[Body]:
-        """The block; the goal is painted on the floor."""
+        """The block; the goal area is a marking on the floor."""
         return (self.block,)

@@ -17,18 +17,23 @@ from ba_torchrl.tasks.motion_primitives import OPEN, grasp
 
 @TASKS.register("close_loop/block_reaching")
 class BlockReaching(CloseLoopTask):
-    """A 5 cm block at a random pose; success when the tool point is within 3 cm of its centre."""
+    """Objects: a cubic block of 5 cm.
+
+    Goal: the tool point is within 3 cm of the centre of the block. The episode ends early when the
+    block leaves the workspace. Appendix A.2.
+    """
 
     scale_limits = (0.5, 1.6)
     fits_tray = True
     goal_distance_m: ClassVar[float] = 0.03
+    """Largest distance between tool point and centre of the block at success, metres."""
 
     def load_scene(self) -> None:
         """Load the block."""
         self.block = self.world.add(self.cube(), "block")
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put the block anywhere, 1.2 blocks from the border."""
+        """Place the block at a random pose, at least 1.2 blocks from the border."""
         xy = self.random_point(rng, 2.4 * self.block_m)
         self.stand(self.block, xy, self.random_yaw(rng, math.pi))
 
@@ -38,7 +43,7 @@ class BlockReaching(CloseLoopTask):
         return {"is_reached": distance_m < self.goal_distance_m}
 
     def expert_command(self) -> GripperCommand:
-        """Go down around the block, without closing the fingers."""
+        """Descend around the block with open fingers."""
         return grasp(self.robot, self.block, self.action_limits)._replace(opening=OPEN)
 
     @property

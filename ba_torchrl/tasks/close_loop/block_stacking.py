@@ -10,13 +10,14 @@ from ba_torchrl.tasks.structures.parts import cube
 
 @TASKS.register("close_loop/block_stacking")
 class BlockStacking(CloseLoopStructureTask):
-    """Cubes of 5 cm, two by default; success when they stand in a stack, released.
+    """Objects: two to four cubes of 5 cm, two by default.
 
-    Five cubes would fit the workspace, but not the 50 steps.
+    Goal: the cubes form a stack, released. The episode ends early when a cube leaves the workspace.
+    Appendix A.2.
     """
 
     num_objects = 2
-    num_objects_range = (2, 4)
+    num_objects_range = (2, 4)  # a stack of five takes more than 50 steps
 
     def blueprint(self) -> Blueprint:
         """Return the stack."""

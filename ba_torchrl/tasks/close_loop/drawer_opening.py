@@ -29,45 +29,56 @@ from ba_torchrl.tasks.motion_primitives import (
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS
 
 CABINET_M: Vector = (0.22, 0.23, 0.11)
-"""Depth along x, width, height; the open front looks towards +x."""
+"""Depth along x, width and height; the open front faces +x."""
 WALL_M = 0.01
+"""Thickness of the walls of the cabinet and of the front of the drawer."""
 DRAWER_WALL_M = 0.006
+"""Thickness of the other walls of the drawer."""
 PLAY_M = 0.003
 """Gap between drawer and cabinet on each side."""
 RIM_M = 0.085
-"""Height of the drawer's sides above the floor."""
+"""Height of the upper edge of the drawer's sides above the floor."""
 ROD_LENGTH_M, ROD_DIAMETER_M = 0.1, 0.015
+"""The handle is a rod on two posts."""
 ROD_OFFSET_M, ROD_HEIGHT_M = 0.05, 0.08
-"""Of the rod's axis: off the front, and above the floor."""
+"""Distance of the rod's axis from the front, and its height above the floor."""
 POST_M = 0.008
+"""Width and height of the posts."""
 POST_GAP_M = 0.07
-"""Free width between the handle's posts; closed fingers are 6 cm wide where they pass it."""
+"""Gap between the posts, in which the closed fingers are up to 6 cm wide."""
 
 WOOD: Color = (0.72, 0.55, 0.38, 1.0)
 LIGHT_WOOD: Color = (0.9, 0.78, 0.6, 1.0)
 
 HOOK_DEPTH_M = 0.01
-"""The expert's tool below the rod's axis; the fingertips reach another 1.5 cm down."""
-PLAY_BEHIND_M = 0.0085
-"""Gap between rod and fingers when they come down behind it; less for fingers that nearly fill the
-room there."""
-SLIGHT_TURN_RAD = 0.4
-"""Turned farther than this, the gripper needs room for its open fingers in front of the cabinet."""
+"""Depth of the tool below the rod's axis during the pull; the fingertips are 1.5 cm lower."""
+DESCENT_GAP_M = 0.0085
+"""Gap between rod and fingers that descend behind it; less for fingers that nearly fill the space
+between rod and front."""
+HOOK_YAW_RAD = 0.4
+"""Largest yaw error of fingers that pull. Beyond it the gripper is wider in front of the
+cabinet."""
 BEHIND_ROD_M = 0.0095
-"""The workspace reaches at least this far behind the rod on its way, for the middle of fingers."""
-MARGIN_M = 0.01
-"""The expert pulls this much farther than the goal asks."""
+"""Distance behind the rod up to which the workspace must contain the path of the tool."""
+OVERSHOOT_M = 0.01
+"""Distance by which the expert opens the drawer beyond the goal."""
 
 
 @TASKS.register("close_loop/drawer_opening")
 class DrawerOpening(CloseLoopTask):
-    """A cabinet with one drawer at a random pose; success when it is open by more than 15 cm."""
+    """Objects: a cabinet of 22 x 23 x 11 cm with one drawer, at a random pose beside the workspace.
+
+    Goal: the drawer is open by more than 15 cm. Nothing ends the episode early. Appendix A.2.
+    """
 
     scale_limits = (0.85, 1.4)
     goal_travel_m: ClassVar[float] = 0.15
+    """Least travel of the drawer at success, at scale 1, metres."""
     travel_range_m: ClassVar[tuple[float, float]] = (0.0, 0.2)
+    """Range of the travel at scale 1, metres."""
     friction_n: ClassVar[float] = 3.0
-    """Stops the drawer, 0.5 kg, faster than the fingers that pull it slow down."""
+    """Friction of the rail, newtons. The drawer of 0.5 kg decelerates faster than the fingers, so
+    it stays in contact with them."""
 
     def load_scene(self) -> None:
         """Load the cabinet with its drawer."""
@@ -85,13 +96,12 @@ class DrawerOpening(CloseLoopTask):
         )
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put the cabinet beside the workspace, opening towards its centre.
+        """Place the cabinet beside the workspace, with its front towards the centre.
 
-        Layouts whose handle leaves the workspace on the way to the goal, where no gripper can
-        follow it, are drawn again: one in five.
+        One layout in five is rejected, as its handle leaves the workspace before the goal.
 
         Raises:
-            PlacementError: no layout suits the workspace.
+            PlacementError: no layout was found.
         """
         scale = self.settings.scale
         x, y = self.settings.workspace.center
@@ -115,17 +125,16 @@ class DrawerOpening(CloseLoopTask):
         return {"is_open": self.cabinet.travel_m > self._goal_m}
 
     def expert_command(self) -> GripperCommand:
-        """Come down behind the handle with closed fingers and pull it along.
+        """Descend behind the handle with closed fingers and pull it.
 
-        Behind and below the rod, between the posts, the fingers pull; straight above that place
-        they go down; from anywhere else they go there, over whatever stands in the way.
+        Behind and below the rod, between the posts, the fingers pull. Directly above, they descend.
+        Elsewhere they move above that point, over the cabinet and the rod.
         """
         robot, limits, scale = self.robot, self.action_limits, self.settings.scale
         (x, y, z), yaw = robot.tool_pose()
         (rx, ry, rz), heading = self.handle_pose
         handle = PlanarFrame(rx, ry, heading)
-        ahead, aside = handle.to_local(x, y)
-        aside = abs(aside)
+        ahead, across = handle.to_local(x, y)
         target_yaw = nearest_equivalent_yaw(yaw, heading + math.pi / 2, limits, math.pi)
         turn = abs(wrap_angle(target_yaw - yaw))
         radius = ROD_DIAMETER_M / 2 * scale
@@ -137,24 +146,24 @@ class DrawerOpening(CloseLoopTask):
         if (
             z < rz
             and front < ahead < -radius
-            and aside < POST_GAP_M / 2 * scale - finger
-            and turn < SLIGHT_TURN_RAD
+            and abs(across) < POST_GAP_M / 2 * scale - finger
+            and turn < HOOK_YAW_RAD
             and is_closed
         ):
-            slack = -ahead - radius - finger
-            farther = self._goal_m + MARGIN_M - self.cabinet.travel_m + slack
+            gap = -ahead - radius - finger
+            remaining = self._goal_m + OVERSHOOT_M - self.cabinet.travel_m + gap
             longest = limits.step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
-            target = handle.to_world(ahead + min(farther, longest), 0.0)
+            target = handle.to_world(ahead + min(remaining, longest), 0.0)
             return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
 
-        play = min(PLAY_BEHIND_M, (-radius - front) / 2 - finger)
-        behind = -radius - finger - play
+        descent_gap = min(DESCENT_GAP_M, (-radius - front) / 2 - finger)
+        behind = -radius - finger - descent_gap
         hx, hy = handle.to_world(behind, 0.0)
-        is_beside = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
-        if is_beside and turn <= ALIGNED_RAD and is_closed:
+        is_centered = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
+        if is_centered and turn <= ALIGNED_RAD and is_closed:
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
-        across = 2 * finger if turn < SLIGHT_TURN_RAD else robot.hand_half_extents_m[0]
-        is_over_cabinet = ahead < front + across
+        extent = 2 * finger if turn < HOOK_YAW_RAD else robot.hand_half_extents_m[0]
+        is_over_cabinet = ahead < front + extent
         top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
         over_z = top + passing_height_m(robot.gripper)
         if z < over_z - 1e-3:
@@ -163,22 +172,22 @@ class DrawerOpening(CloseLoopTask):
 
     @property
     def handle_pose(self) -> YawPose:
-        """Middle of the handle's rod, and the direction in which the drawer opens."""
+        """Centre of the handle's rod, and yaw of the direction in which the drawer opens."""
         slider, scale = self.cabinet.slider, self.settings.scale
         (x, y, z), heading = slider.position, slider.yaw_rad
         out = (CABINET_M[0] / 2 + ROD_OFFSET_M) * scale
-        middle = PlanarFrame(x, y, heading).to_world(out, 0.0)
-        return (*middle, z + ROD_HEIGHT_M * scale), heading
+        center = PlanarFrame(x, y, heading).to_world(out, 0.0)
+        return (*center, z + ROD_HEIGHT_M * scale), heading
 
     @property
     def landmarks(self) -> Sequence[YawPose]:
-        """Cabinet and handle."""
+        """Poses of cabinet and handle."""
         base = self.cabinet.base
         return [(base.position, base.yaw_rad), self.handle_pose]
 
     @property
     def objects(self) -> Sequence[Body]:
-        """None: what moves here stays on its rail."""
+        """None; the drawer cannot leave its rail."""
         return ()
 
     @property
@@ -186,7 +195,7 @@ class DrawerOpening(CloseLoopTask):
         return self.goal_travel_m * self.settings.scale
 
     def _can_be_opened(self) -> bool:
-        """Whether the handle of the closed drawer stays in the workspace on its way to the goal."""
+        """Whether the workspace contains the path of the tool up to the goal."""
         (x, y, z), heading = self.handle_pose
         ux, uy = math.cos(heading), math.sin(heading)
         behind = -ROD_DIAMETER_M - BEHIND_ROD_M
@@ -197,7 +206,7 @@ class DrawerOpening(CloseLoopTask):
 
 
 def cabinet_parts() -> tuple[Mesh, ...]:
-    """Return the cabinet's five walls; the origin is on the floor below its middle."""
+    """Return the five walls of the cabinet; the origin is on the floor below its centre."""
     depth, width, height = CABINET_M
     side = (depth, WALL_M, height - 2 * WALL_M)
     y = (width - WALL_M) / 2
@@ -214,27 +223,27 @@ def cabinet_parts() -> tuple[Mesh, ...]:
 
 
 def drawer_parts() -> tuple[Mesh, ...]:
-    """Return the closed drawer in the cabinet's frame: floor, sides, front, and the handle."""
+    """Return the parts of the closed drawer and its handle, in the frame of the cabinet."""
     depth, width, height = CABINET_M
     front_x = depth / 2
     back_x = -depth / 2 + WALL_M + PLAY_M
     low, high = WALL_M + PLAY_M, height - WALL_M - PLAY_M
     outer = width - 2 * WALL_M - 2 * PLAY_M
     length = front_x - WALL_M - back_x
-    middle = (back_x + front_x - WALL_M) / 2
+    center_x = (back_x + front_x - WALL_M) / 2
     rise = RIM_M - low - DRAWER_WALL_M
     rim_z = low + DRAWER_WALL_M + rise / 2
     side_y = (outer - DRAWER_WALL_M) / 2
-    limits = ROD_OFFSET_M
+    post_length = ROD_OFFSET_M
     post_y = (POST_GAP_M + POST_M) / 2
-    post = box_mesh((limits, POST_M, POST_M))
+    post = box_mesh((post_length, POST_M, POST_M))
     rod = rod_mesh(ROD_LENGTH_M, ROD_DIAMETER_M)
     return (
         transform_mesh(
-            box_mesh((length, outer, DRAWER_WALL_M)), (middle, 0.0, low + DRAWER_WALL_M / 2)
+            box_mesh((length, outer, DRAWER_WALL_M)), (center_x, 0.0, low + DRAWER_WALL_M / 2)
         ),
-        transform_mesh(box_mesh((length, DRAWER_WALL_M, rise)), (middle, side_y, rim_z)),
-        transform_mesh(box_mesh((length, DRAWER_WALL_M, rise)), (middle, -side_y, rim_z)),
+        transform_mesh(box_mesh((length, DRAWER_WALL_M, rise)), (center_x, side_y, rim_z)),
+        transform_mesh(box_mesh((length, DRAWER_WALL_M, rise)), (center_x, -side_y, rim_z)),
         transform_mesh(
             box_mesh((DRAWER_WALL_M, outer - 2 * DRAWER_WALL_M, rise)),
             (back_x + DRAWER_WALL_M / 2, 0.0, rim_z),
@@ -242,9 +251,9 @@ def drawer_parts() -> tuple[Mesh, ...]:
         transform_mesh(
             box_mesh((WALL_M, outer, high - low)), (front_x - WALL_M / 2, 0.0, (low + high) / 2)
         ),
-        transform_mesh(post, (front_x + limits / 2, post_y, ROD_HEIGHT_M)),
-        transform_mesh(post, (front_x + limits / 2, -post_y, ROD_HEIGHT_M)),
-        transform_mesh(rod, (front_x + limits, 0.0, ROD_HEIGHT_M)),
+        transform_mesh(post, (front_x + post_length / 2, post_y, ROD_HEIGHT_M)),
+        transform_mesh(post, (front_x + post_length / 2, -post_y, ROD_HEIGHT_M)),
+        transform_mesh(rod, (front_x + post_length, 0.0, ROD_HEIGHT_M)),
     )
 
 

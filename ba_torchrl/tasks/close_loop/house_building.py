@@ -10,7 +10,11 @@ from ba_torchrl.tasks.structures.parts import cube, triangle
 
 @TASKS.register("close_loop/house_building")
 class HouseBuilding(CloseLoopStructureTask):
-    """Cubes of 5 cm and a triangle of that size; success when it tops the stack, released."""
+    """Objects: one to three cubes of 5 cm, one by default, and a triangle of 5 cm.
+
+    Goal: the cubes form a stack with the triangle on top, released. The episode ends early when the
+    triangle tips over or a piece leaves the workspace. Appendix A.2.
+    """
 
     num_objects = 2
     num_objects_range = (2, 4)

@@ -1,4 +1,4 @@
-"""Object Grasping: take any object out of a heap in a tray (appendix A.2)."""
+"""Object Grasping: grasp and lift any object from a heap in a tray (appendix A.2)."""
 
 from __future__ import annotations
 
@@ -18,67 +18,74 @@ from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
     CLOSED,
+    IS_OPEN,
     OPEN,
     lift,
     move_toward,
 )
 
 WALL_PIXELS = 25
-"""Border of the planner's height image that shows the tray's walls."""
+"""Width of the border of the planner's height image that shows the walls of the tray."""
 
 
 @TASKS.register("close_loop/object_grasping")
 class ObjectGrasping(ClutterTask, CloseLoopControl):
-    """Random objects in a tray; success when one is held with the tool 15 cm above ground."""
+    """Objects: 1 to 15 random objects in a tray, five by default.
+
+    Goal: an object is held and the tool is higher than 15 cm. The episode ends early when an object
+    leaves the workspace. Appendix A.2.
+    """
 
     num_objects = 5
     num_objects_range = (1, 15)
     fits_tray = True
 
     lift_height_m: ClassVar[float] = 0.15
+    """Least height of the tool at success, metres."""
     risk_allowed: ClassVar[float] = 1.0
-    """Where a grasp is riskier, the expert pushes the object first."""
+    """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
+    first."""
 
     def evaluate(self) -> dict[str, bool]:
-        """Return whether any object is held and the tool higher than 15 cm."""
+        """Return whether an object is held and whether the tool is higher than 15 cm."""
         return {"is_grasped": self.robot.held_body() is not None, "is_lifted": self._is_lifted()}
 
     def expert_command(self) -> GripperCommand:
-        """Close the fingers around the object that takes fewest actions, then go up.
+        """Grasp the object with the lowest cost and lift it.
 
-        What cannot be grasped as it lies is pushed until it can.
+        If no object can be grasped, push one until it can.
         """
         robot, limits, planner = self.robot, self.action_limits, self.planner
-        if robot.opening() < 0.9 and robot.held_body() is not None:
+        if robot.opening() < IS_OPEN and robot.held_body() is not None:
             return lift(limits.step_m)
         heights = planner.heights()
         tool = robot.tool_pose()
-        # above everything, the walls' upper parts left out, which the way never crosses
+        # above all objects; the upper parts of the walls are never crossed
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
-        grasp = planner.plan(self.clutter.pool.present, tool, limits, heights, self._slip_cost)
+        grasp = planner.plan(self.clutter.pool.active, tool, limits, heights, self._slip_cost)
         if grasp is None or grasp.risk > self.risk_allowed:
             push = PushPlanner(planner, self.terrain).plan(
-                self.clutter.pool.present, tool, limits, heights
+                self.clutter.pool.active, tool, limits, heights
             )
             if push is not None:
                 return self._push(push, over_z)
-        if grasp is None or robot.opening() < 0.9:
+        if grasp is None or robot.opening() < IS_OPEN:
             return lift(limits.step_m, OPEN)
         return self._grasp(grasp, over_z)
 
     def _slip_cost(self, grasps: np.ndarray) -> np.ndarray:
-        """Return the actions [N] that it is worth to have an object turn less in the fingers."""
+        """Return the slip scores [N] of grasps as additional costs."""
         return grasps[:, 5]
 
     def _grasp(self, grasp: TopDownGrasp, over_z: float) -> GripperCommand:
-        """Go above the object with open fingers, down, and close them on arrival."""
+        """Move above the object with open fingers, descend, and close the fingers at the end."""
         robot, limits = self.robot, self.action_limits
         (x, y, z), yaw = robot.tool_pose()
         gx, gy, gz = grasp.position
-        aside = max(abs(gx - x), abs(gy - y))
+        offset = max(abs(gx - x), abs(gy - y))
         turn = abs(wrap_angle(grasp.yaw_rad - yaw))
-        if aside <= ALIGNED_M and turn <= ALIGNED_RAD:
+        if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
             opening = CLOSED if z - gz <= limits.step_m else OPEN
             return move_toward(robot, grasp.position, grasp.yaw_rad, opening)
         if z < over_z - 1e-3:
@@ -86,15 +93,15 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
         return move_toward(robot, (gx, gy, over_z), grasp.yaw_rad, OPEN)
 
     def _push(self, push: Push, over_z: float) -> GripperCommand:
-        """Go down beside an object with closed fingers, then against it."""
+        """Descend beside an object with closed fingers, then push it."""
         robot = self.robot
         (x, y, z), yaw = robot.tool_pose()
         sx, sy, sz = push.start
-        aside = max(abs(sx - x), abs(sy - y))
+        offset = max(abs(sx - x), abs(sy - y))
         is_closed = robot.opening() < 0.1
-        if is_closed and z <= sz + push.slack_m and aside <= NEAR_M:
+        if is_closed and z <= sz + push.height_tolerance_m and offset <= NEAR_M:
             return move_toward(robot, push.end, yaw, CLOSED)
-        if is_closed and aside <= ALIGNED_M:
+        if is_closed and offset <= ALIGNED_M:
             return move_toward(robot, push.start, yaw, CLOSED)
         if z < over_z - 1e-3:
             return lift(over_z - z, CLOSED)
@@ -108,7 +115,7 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
         return self.robot.tool_pose()[0][2] > self.lift_height_m
 
     def _is_inside(self, body: Body) -> bool:
-        # thin objects lie lower than the workspace begins: the floor bounds them
+        # without the lower bound of z: thin objects lie below it
         workspace = self.settings.workspace
         if self.settings.bounding_box_check:
             (x0, y0, _), (x1, y1, top) = body.bounding_box()

@@ -1,1 +1,1 @@
-"""Tasks that take objects out of a heap in a tray."""
+"""What the tasks share that grasp objects from a heap in a tray."""

@@ -1,4 +1,4 @@
-"""Clutter: a heap of objects in a tray that lasts from one episode to the next."""
+"""A heap of objects in a tray, which persists over several episodes."""
 
 from __future__ import annotations
 
@@ -20,36 +20,42 @@ from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clutter.grasp_planner import GraspPlanner
 from ba_torchrl.tasks.clutter.tray import Tray
 
-FAILURES_ALLOWED = 3
-"""Episodes in a row that take nothing, until new objects fall."""
+MAX_FAILURES = 3
+"""Consecutive episodes without a grasped object after which new objects are dropped."""
 
 DROP_Z_M = 0.2
+"""Height from which objects with random orientations are dropped."""
 DROP_INTERVAL_S = 0.15
-"""Time between objects: each falls 11 cm, out of the next one's way."""
-WALL_M = 0.03
-"""Objects start this far from the edge of the tray's floor at least."""
+"""Time between two drops, in which an object falls 11 cm and clears the next one's start."""
+DROP_MARGIN_M = 0.03
+"""Least distance between the start of a drop and the edge of the tray's floor."""
 SETTLE_S = 4.0
+"""Time limit for the objects to come to rest."""
 LOW_DROP_M = 5e-3
-APART_M = 5e-3
+"""Height above the floor from which upright objects are dropped."""
+GAP_M = 5e-3
+"""Least gap between upright objects."""
 LAYOUTS = 20
+"""Random layouts of upright objects that are compared."""
 TRIES = 50
+"""Random points that are compared for each upright object."""
 DROP_ATTEMPTS = 3
-"""Heaps tried until one comes to rest inside its area; round objects may roll for long."""
+"""Heaps that are dropped until one comes to rest within the time limit."""
 
 RETREAT_Z_M = (0.55, 0.5, 0.45, 0.4, 0.35)
-"""Heights to which the arm retreats while objects fall: the first that is in its reach."""
+"""Heights of the tool during the drop; the first with a solution of the inverse kinematics."""
 
 
 class Clutter:
-    """A tray, every shape of an object set, and the heap that some of them form.
+    """All objects of an object set, and the heap that some of them form in a tray.
 
-    A heap lasts until all of it was taken out or too many episodes in a row took nothing.
+    A heap persists until it is empty or `MAX_FAILURES` consecutive episodes grasped nothing.
 
     Args:
         world: not sealed yet.
-        robot: keeps away while objects fall.
-        tray: where they fall.
-        settings: of the task; their `parameters` name the object set.
+        robot: the robot; its arm retreats during a drop.
+        tray: the tray.
+        settings: settings of the task; `parameters` names the object set.
     """
 
     def __init__(self, world: World, robot: Robot, tray: Tray, settings: TaskSettings) -> None:
@@ -57,7 +63,7 @@ class Clutter:
         self.robot = robot
         self.settings = settings
         self.failures = 0
-        """Episodes in a row that took nothing."""
+        """Consecutive episodes without a grasped object."""
         self.tray = tray
         parameters = settings.parameters
         shapes = load_object_set(parameters.object_set, parameters.asset_root)
@@ -70,17 +76,21 @@ class Clutter:
         )
 
     def should_continue(self, grasped_object: Body | None) -> bool:
-        """Whether the next episode goes on with the heap.
+        """Whether the next episode continues with the present heap.
 
         Args:
-            taken: what the last one took out, if anything.
+            grasped_object: the object that the last episode grasped, if any.
         """
         if grasped_object is not None:
-            return len(self.pool.present) > 1
-        return bool(self.pool.present) and self.failures + 1 < FAILURES_ALLOWED
+            return len(self.pool.active) > 1
+        return bool(self.pool.active) and self.failures + 1 < MAX_FAILURES
 
     def advance(self, grasped_object: Body | None) -> None:
-        """Put aside what an episode took out, and count those that took nothing."""
+        """Remove the grasped object from the scene, or count a failure.
+
+        Args:
+            grasped_object: the object that the last episode grasped, if any.
+        """
         if grasped_object is None:
             self.failures += 1
         else:
@@ -88,14 +98,14 @@ class Clutter:
             self.failures = 0
 
     def drop(self, rng: np.random.Generator) -> None:
-        """Let new objects fall one by one and come to rest.
+        """Drop new objects one by one until they are at rest.
 
-        Their orientation is any; or, where the settings ask for fixed ones, upright with yaw 0.
-        These come down apart and from close above, so that they stay so, and last those for which
-        there is no room any more.
+        Orientations are random. With fixed orientations, objects are upright at yaw 0 and dropped
+        from a low height, apart from each other; those that do not fit are dropped last, from the
+        full height.
 
         Args:
-            rng: draws objects and poses.
+            rng: random generator.
         """
         self.failures = 0
         settings, world, pool = self.settings, self.world, self.pool
@@ -109,35 +119,37 @@ class Clutter:
             pool.clear()
             chosen = rng.choice(len(pool.bodies), size=count, replace=False)
             bodies = [pool.bodies[i] for i in chosen]
-            apart = {} if settings.random_orientation else _apart(rng, bodies, half_m)
-            for i, (x, y) in apart.items():
-                place = (x + center[0], y + center[1])
-                z = self.tray.height_m(place) + LOW_DROP_M - bodies[i].shape.bounds_m[0][2]
+            points = {} if settings.random_orientation else _layout(rng, bodies, half_m)
+            for i, (x, y) in points.items():
+                xy = (x + center[0], y + center[1])
+                z = self.tray.height_m(xy) + LOW_DROP_M - bodies[i].shape.bounds_m[0][2]
                 pool.activate(bodies[i])
-                bodies[i].place((*place, z))
-            for i in sorted(set(range(count)) - set(apart)):
-                x, y = center + rng.uniform(WALL_M - half_m, half_m - WALL_M, 2)
-                turn = _random_turn(rng) if settings.random_orientation else (0.0, 0.0, 0.0, 1.0)
+                bodies[i].place((*xy, z))
+            for i in sorted(set(range(count)) - set(points)):
+                x, y = center + rng.uniform(DROP_MARGIN_M - half_m, half_m - DROP_MARGIN_M, 2)
+                is_random = settings.random_orientation
+                orientation = _random_orientation(rng) if is_random else (0.0, 0.0, 0.0, 1.0)
                 pool.activate(bodies[i])
-                bodies[i].set_pose((x, y, DROP_Z_M), turn)
+                bodies[i].set_pose((x, y, DROP_Z_M), orientation)
                 world.step(pause)
             if world.settle(round(SETTLE_S / world.physics.time_step_s)):
                 break
         self.robot.teleport(joints)
 
     def _retreat(self) -> None:
-        """Put the arm high above the heap, as high as it reaches."""
+        """Move the arm to the highest pose above the heap that it can reach."""
         robot, center_xy = self.robot, self.settings.workspace.center
-        ways = (robot.inverse_kinematics((*center_xy, z), downward(0.0)) for z in RETREAT_Z_M)
-        joints = next((found for found in ways if found is not None), robot.joints)
+        solutions = (robot.inverse_kinematics((*center_xy, z), downward(0.0)) for z in RETREAT_Z_M)
+        joints = next((found for found in solutions if found is not None), robot.joints)
         robot.teleport(joints)
 
 
 class ClutterTask(Task):
-    """A task whose episodes each take something out of a heap, and go on with what is left.
+    """A task of grasping an object from a heap, in which the next episode continues with the rest.
 
-    New objects fall in once the tray is empty, an object left the workspace, or three episodes in a
-    row came to nothing, such as those that are reset before they end.
+    New objects are dropped when the tray is empty, when an object has left the workspace, and after
+    three consecutive episodes without a grasped object; an episode that is reset early counts as
+    one of these.
     """
 
     needs_fresh_world = True
@@ -147,92 +159,92 @@ class ClutterTask(Task):
         """The objects of the heap."""
 
         object_set: str = "random"
-        """The set that the objects are drawn from; see `ba_torchrl.sim.assets`."""
+        """Name of the object set; see `ba_torchrl.sim.assets`."""
         asset_root: str | None = None
-        """Folder of a set of objects that does not ship with the package."""
+        """Folder of an object set that is not part of the package."""
 
     @abstractmethod
     def grasped_object(self) -> Body | None:
-        """Return what this episode took out, if anything."""
+        """Return the object that this episode has grasped, if any."""
 
     def load_scene(self) -> None:
-        """Load every shape of the object set."""
+        """Load all objects of the object set."""
         self.clutter = Clutter(self.world, self.robot, self.terrain, self.settings)
 
     def make_terrain(self) -> Tray:
-        """Load the tray."""
+        """Load the tray and return it."""
         return Tray(self.world, self.settings.workspace)
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Let new objects fall into the tray."""
+        """Drop new objects into the tray."""
         self.clutter.drop(rng)
 
     @property
     def continues(self) -> bool:
-        """Whether something is left that is worth another try."""
+        """Whether the next episode continues with the present heap."""
         return self.clutter.should_continue(self.grasped_object())
 
     def resume(self) -> None:
-        """Put aside what was taken."""
+        """Remove the grasped object from the scene, or count a failure."""
         self.clutter.advance(self.grasped_object())
 
     @cached_property
     def planner(self) -> GraspPlanner:
-        """What finds grasps; made when an expert is first asked."""
+        """The grasp planner of the expert, made at its first use."""
         camera = HeightCamera(self.world.bodies)
         bodies = self.clutter.pool.bodies
         return GraspPlanner(bodies, camera, self.settings.workspace, self.robot.gripper)
 
     @property
     def objects(self) -> Sequence[Body]:
-        """What is in the tray, and what was taken last."""
-        return self.clutter.pool.present
+        """The objects in the tray, and the grasped one."""
+        return self.clutter.pool.active
 
     @property
     def landmarks(self) -> list[YawPose]:
-        """Poses of the objects; for those that are gone, the workspace's upper corner."""
+        """Poses of the objects; the upper corner of the workspace for each removed one."""
         workspace = self.settings.workspace
         corner = (workspace.x[1], workspace.y[1], workspace.z[1])
         poses = [(body.position, body.yaw_rad) for body in self.objects]
         return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
 
     def get_state(self) -> tuple[tuple[int, ...], int]:
-        """Return which objects are in use, and the failures in a row."""
+        """Return the indices of the active objects and the number of consecutive failures."""
         return self.clutter.pool.get_state(), self.clutter.failures
 
     def set_state(self, state: tuple[tuple[int, ...], int]) -> None:
-        """Take up what `get_state` returned."""
-        present, self.clutter.failures = state
-        self.clutter.pool.set_state(present)
+        """Restore the active objects and the number of consecutive failures."""
+        active, self.clutter.failures = state
+        self.clutter.pool.set_state(active)
 
 
-def _apart(
+def _layout(
     rng: np.random.Generator, bodies: Sequence[Body], half_m: float
 ) -> dict[int, tuple[float, float]]:
-    """Return random points of a square about zero at which upright bodies do not touch, by index.
+    """Return random points at which upright bodies keep a gap to each other, by their index.
 
-    Where there is no room for all of them, some are missing.
+    Bodies that do not fit have no point. Larger bodies are placed first.
 
     Args:
-        rng: draws the points.
-        bodies: to be placed; large ones come first.
-        half_m: half the width of the square, which they do not leave.
+        rng: random generator.
+        bodies: the bodies.
+        half_m: half the width of the square around the origin in which they are placed.
     """
     bounds = np.array([np.array(body.shape.bounds_m)[:, :2] for body in bodies])
     order = np.argsort(-np.prod(bounds[:, 1] - bounds[:, 0], axis=1))
     best: dict[int, tuple[float, float]] = {}
     for _ in range(LAYOUTS):
         points: dict[int, tuple[float, float]] = {}
-        taken = np.empty((0, 2, 2))
+        placed = np.empty((0, 2, 2))
         for i in order.tolist():
             low, high = bounds[i]
             tries = rng.uniform(-half_m - low, half_m - high, (TRIES, 1, 2))
-            gaps = np.maximum(low + tries - taken[:, 1], taken[:, 0] - high - tries)
-            free = np.flatnonzero((gaps.max(axis=2) > APART_M).all(axis=1))
+            gaps = np.maximum(low + tries - placed[:, 1], placed[:, 0] - high - tries)
+            free = np.flatnonzero((gaps.max(axis=2) > GAP_M).all(axis=1))
             if len(free):
                 point = tries[free[0], 0]
                 points[i] = tuple(point.tolist())
-                taken = np.concatenate([taken, [bounds[i] + point]])
+                placed = np.concatenate([placed, [bounds[i] + point]])
         if len(points) > len(best):
             best = points
         if len(best) == len(bodies):
@@ -240,7 +252,7 @@ def _apart(
     return best
 
 
-def _random_turn(rng: np.random.Generator) -> Quaternion:
-    """Return an orientation uniform over all there are."""
+def _random_orientation(rng: np.random.Generator) -> Quaternion:
+    """Return an orientation uniform over SO(3)."""
     quaternion = rng.normal(size=4)
     return tuple((quaternion / np.linalg.norm(quaternion)).tolist())

@@ -1,4 +1,4 @@
-"""Top-down grasps of objects in a heap, planned from their shapes and a height image."""
+"""Top-down grasps of objects in a heap, from their shapes and a height image."""
 
 from __future__ import annotations
 
@@ -19,45 +19,50 @@ from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.motion_primitives import nearest_equivalent_yaw
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
-SPARE_M = 0.007
-"""Room between an open finger and what it closes on; less is a risk."""
-LEAST_SPARE_M = 0.002
-BESIDE_M = 3e-3
-"""Room on either side of the fingers' width: a pixel of the height image."""
+SIDE_GAP_M = 0.007
+"""Gap between an open finger and the object below which the risk increases."""
+LEAST_SIDE_GAP_M = 0.002
+"""Least gap between an open finger and the object."""
+FLANK_MARGIN_M = 3e-3
+"""Margin on both flanks of a finger: a pixel of the height image."""
 CLEARANCE_M = 4.5e-3
+"""Gap between fingers or palm and what is below them."""
 DEEPEST_M = 0.047
-"""Height of what is grasped above the fingers' tips at most: deeper holds no better."""
-CROWD_M = 0.012
-"""Closing fingers press on what is this much higher than their tips."""
+"""Largest height of the top of an object above the fingertips; deeper grasps are no better."""
+OBSTACLE_M = 0.012
+"""Height above the fingertips from which an object obstructs the closing fingers."""
 SHALLOWEST_M = 0.006
-"""Least height of what is between the fingers above their tips."""
-LEAST_SQUARE = 0.3
-"""How nearly opposite the surfaces that the fingers meet are at least."""
+"""Least height of the top of an object above the fingertips."""
+LEAST_COSINE = 0.3
+"""Least cosine between a contact surface and the opposite one, or the finger."""
 
 PATCH_M = 0.01
-"""Fingers that meet a face over this width, across the line on which they close, keep it from
-turning; on an edge or a corner it turns until it slips out."""
+"""Width of a contact patch that prevents rotation of the object between the fingers. On an edge or
+a corner it rotates until it slips out."""
 
 WORST_RISK = 4.0
-"""Stands for no grasp at all."""
-MET_M = 3e-3
-"""Fingers meet what is this near to the outermost point between them."""
+"""Risk of a body without a grasp."""
+CONTACT_DEPTH_M = 3e-3
+"""Depth behind the outermost point in which surface points touch a finger."""
 
 YAWS = 16
+"""Yaws per half turn that are compared."""
 SAMPLES = 256
+"""Number of sampled points of a surface."""
 PIXEL_M = 0.003
+"""Width of a pixel of the height image."""
 BORDER_M = 0.06
-"""The height image reaches this far beyond the workspace."""
+"""Width of the border of the height image around the workspace."""
 
 
 class GraspPlanner:
-    """Finds the cheapest grasp in a heap.
+    """Finds the grasp with the lowest cost in a heap.
 
     Args:
-        pool: everything that may have to be grasped.
-        camera: sees everything that may be in the way.
-        workspace: where the tool may go.
-        gripper: what is to grasp.
+        pool: all bodies that may be grasped.
+        camera: camera of the height image, in which all obstacles are visible.
+        workspace: bounds of the tool.
+        gripper: the gripper.
     """
 
     def __init__(
@@ -66,8 +71,8 @@ class GraspPlanner:
         self._camera = camera
         self.workspace = workspace
         self.gripper = gripper
-        self.band_half_m = gripper.half_width_m + BESIDE_M
-        """Half the width of what the fingers meet or pass."""
+        self.band_half_m = gripper.half_width_m + FLANK_MARGIN_M
+        """Half the width of the band that the fingers occupy, with margins."""
         outline = np.array(sorted(gripper.outline, key=lambda point: point[1]))
         self._jaws = _Jaws(
             half_gap=gripper.half_gap_m,
@@ -85,9 +90,10 @@ class GraspPlanner:
         self._side_m = max(workspace.x[1] - workspace.x[0], workspace.y[1] - workspace.y[0])
         self._side_m += 2 * BORDER_M
         self.corner = (x - self._side_m / 2, y - self._side_m / 2)
+        """Corner of the height image with the least x and y."""
 
         pixels = round(self._side_m / PIXEL_M)
-        self._plain = np.zeros((pixels, pixels))
+        self._empty_image = np.zeros((pixels, pixels))
 
     def heights(self) -> np.ndarray:
         """Return the height image that grasps are checked against, metres."""
@@ -102,14 +108,14 @@ class GraspPlanner:
         heights: np.ndarray,
         penalty: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> TopDownGrasp | None:
-        """Return the cheapest grasp of any of the bodies, or None if there is none.
+        """Return the grasp of any of the bodies with the lowest cost; None without a grasp.
 
         Args:
-            bodies: to choose from.
-            tool: where the gripper is.
-            limits: of one action.
-            heights: from `heights`.
-            penalty: from grasps [N, 6] (x, y, z, yaw, risk, slip) to what they cost besides [N].
+            bodies: the bodies.
+            tool: position and yaw of the tool.
+            limits: limits of an action.
+            heights: height image of `heights`.
+            penalty: returns the additional costs [N] of grasps [N, 6]: x, y, z, yaw, risk, slip.
         """
         (x, y, z), yaw = tool
         yaws = np.arange(YAWS) * np.pi / YAWS if limits.turn_rad else np.array([yaw])
@@ -126,8 +132,8 @@ class GraspPlanner:
                 high,
                 self._jaws,
             )
-            extra = np.zeros(len(found)) if penalty is None else penalty(found)
-            for row, more in zip(found, extra.tolist(), strict=True):
+            penalties = np.zeros(len(found)) if penalty is None else penalty(found)
+            for row, added_cost in zip(found, penalties.tolist(), strict=True):
                 gx, gy, gz, risk = row[0], row[1], row[2], row[4]
                 if not (
                     self.workspace.x[0] <= gx <= self.workspace.x[1]
@@ -136,14 +142,14 @@ class GraspPlanner:
                     continue
                 target_yaw = nearest_equivalent_yaw(yaw, row[3], limits, math.pi)
                 turn = abs(wrap_angle(target_yaw - yaw))
-                aside = max(abs(gx - x), abs(gy - y))
+                distance = max(abs(gx - x), abs(gy - y))
                 travel = max(
-                    aside / limits.step_m, turn / limits.turn_rad if limits.turn_rad else 0
+                    distance / limits.step_m, turn / limits.turn_rad if limits.turn_rad else 0
                 )
                 travel += max(z - gz, 0.0) / limits.step_m
-                if aside > 0.015 or turn > 0.3:
-                    travel += max(0.1 - z, 0.0) / limits.step_m  # up first
-                cost = travel + 12 * risk + more
+                if distance > 0.015 or turn > 0.3:
+                    travel += max(0.1 - z, 0.0) / limits.step_m  # the tool moves up first
+                cost = travel + 12 * risk + added_cost
                 if best is None or cost < best.cost:
                     best = TopDownGrasp(
                         body, (gx, gy, gz), target_yaw, risk=float(risk), cost=float(cost)
@@ -151,18 +157,18 @@ class GraspPlanner:
         return best
 
     def risk_alone(self, samples: np.ndarray, tool: YawPose) -> float:
-        """Return the least risk of a grasp, at the gripper's yaw, of a body with nothing near.
+        """Return the least risk of a grasp, at the present yaw, of a body without obstacles.
 
         Args:
-            samples: from `placed_samples`, or moved from there.
-            tool: where the gripper is.
+            samples: [N, 6] surface points and normals of the body.
+            tool: position and yaw of the tool.
         """
         low, high = self.workspace.z
         found = _search(
             samples,
             samples[:, :3].mean(axis=0),
             np.array([tool[1]]),
-            self._plain,
+            self._empty_image,
             np.array(self.corner),
             low,
             high,
@@ -171,7 +177,7 @@ class GraspPlanner:
         return min(float(found[:, 4].min()), WORST_RISK) if len(found) else WORST_RISK
 
     def placed_samples(self, body: Body) -> np.ndarray:
-        """Return points on a body's surface and their normals as it lies now, [N, 6]."""
+        """Return surface points and normals [N, 6] of a body at its present pose."""
         key = id(body.shape)
         if key not in self._samples:
             self._samples[key] = np.hstack(surface_samples(body.shape.mesh(), SAMPLES))
@@ -181,18 +187,18 @@ class GraspPlanner:
 
 
 class _Jaws(NamedTuple):
-    """A gripper's outline for compiled code, metres."""
+    """The outline of a gripper for compiled code, metres."""
 
     half_gap: float
     band_half: float
     palm: float
     depth: float
-    """Extent of a fingertip along the line on which it closes."""
+    """Extent of a fingertip along the direction in which it closes."""
     arc_u: np.ndarray
     arc_z: np.ndarray
     outline_u: np.ndarray
     outline_z: np.ndarray
-    """Ascending, so that a search may stop."""
+    """In ascending order."""
 
 
 _OFFSETS_V = np.array([0.0, -0.012, 0.012, -0.024, 0.024])
@@ -210,17 +216,18 @@ def _height(heights, corner, x, y):  # noqa: ANN001, ANN202 -- compiled
 
 @numba.njit(cache=True)
 def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noqa: ANN001, ANN202
-    """Return the feasible grasps of one body, [N, 6]: x, y, z, yaw, risk between 0 and 1, slip.
+    """Return the feasible grasps of one body, [N, 6]: x, y, z, yaw, risk, slip.
 
-    Slip is the odds, as a logarithm from zero up, that the object turns between the fingers and
-    comes out: fitted to picks of random grasps of random shapes.
+    Risk is a score of 0 for the best grasps. Slip is the logarithm of the odds, shifted to 0 or
+    more, that the object rotates between the fingers and slips out; it is fitted to picks of random
+    grasps of random shapes.
     """
     found = np.empty((yaws.shape[0] * _OFFSETS_V.shape[0] * _OFFSETS_U.shape[0], 6))
     count = 0
     n = samples.shape[0]
     u = np.empty(n)
     v = np.empty(n)
-    met = np.empty(n, dtype=np.bool_)
+    is_between = np.empty(n, dtype=np.bool_)
     left_n, right_n = np.empty(4), np.empty(4)
     top, highest = samples[:, 2].max(), heights.max()
     half_gap, band_half = jaws.half_gap, jaws.band_half
@@ -233,29 +240,29 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noq
             v[k] = cos * dy - sin * dx
         for v0 in _OFFSETS_V:
             for u0 in _OFFSETS_U:
-                # what the fingers would close on, and how high it is
+                # extent and height of the surface between the open fingers
                 lowest_u, highest_u, peak = 1.0, -1.0, 0.0
                 for k in range(n):
                     if abs(v[k] - v0) <= band_half and abs(u[k] - u0) < half_gap:
                         lowest_u, highest_u = min(lowest_u, u[k]), max(highest_u, u[k])
                         peak = max(peak, samples[k, 2])
-                if highest_u < lowest_u or highest_u - lowest_u > 2 * (half_gap - LEAST_SPARE_M):
+                if highest_u < lowest_u or highest_u - lowest_u > 2 * (half_gap - LEAST_SIDE_GAP_M):
                     continue
                 middle = (highest_u + lowest_u) / 2
                 if u0 != 0.0 and abs(middle - u0) > 0.012:
-                    continue  # another offset finds the same
+                    continue  # another offset gives the same grasp
                 x = center[0] + cos * middle - sin * v0
                 y = center[1] + sin * middle + cos * v0
                 half_width = (highest_u - lowest_u) / 2
                 tip = np.interp(half_width, jaws.arc_u, jaws.arc_z)
-                # as low as floor, neighbours and palm allow
+                # the least height that floor, neighbours and palm allow
                 z = max(low_z + 0.002, peak - min(jaws.palm - CLEARANCE_M, DEEPEST_M + tip))
                 for m in range(jaws.outline_u.shape[0]):
                     low = jaws.outline_z[m]
                     if highest - low + CLEARANCE_M <= z or peak - (z + tip) < SHALLOWEST_M:
                         break
                     inside = jaws.outline_u[m] - jaws.depth
-                    if inside <= half_gap <= jaws.outline_u[m]:  # fingers may swing down here
+                    if inside <= half_gap <= jaws.outline_u[m]:  # tips descend as they close
                         last = np.interp(max(half_width, inside), jaws.arc_u, jaws.arc_z)
                         low = min(low, last)
                     for fu in (-jaws.outline_u[m], jaws.outline_u[m]):
@@ -275,27 +282,27 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noq
                         covered = covered or h > peak + 0.01
                 if covered:
                     continue
-                # what the fingers would close on besides
-                crowd = 0
+                # number of pixels that obstruct the closing fingers
+                obstacles = 0
                 edge = half_width + 0.006
                 for m in range(3):
                     beside = edge + (half_gap - edge) * m / 3
-                    end = z + np.interp(beside, jaws.arc_u, jaws.arc_z) + CROWD_M
+                    end = z + np.interp(beside, jaws.arc_u, jaws.arc_z) + OBSTACLE_M
                     for fu in (-beside, beside):
                         for w in band:
                             h = _height(
                                 heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w
                             )
-                            crowd += h > end
-                # surfaces that the fingers meet
+                            obstacles += h > end
+                # contact surfaces
                 left, right = 1.0, -1.0
                 for k in range(n):
-                    met[k] = (
+                    is_between[k] = (
                         abs(v[k] - v0) <= band_half
                         and abs(u[k] - middle) < half_gap
                         and samples[k, 2] > z + tip
                     )
-                    if met[k]:
+                    if is_between[k]:
                         left, right = min(left, u[k]), max(right, u[k])
                 if right < left:
                     continue
@@ -303,33 +310,35 @@ def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noq
                 right_n[:] = 0.0
                 left_v0, left_v1, right_v0, right_v1 = 1.0, -1.0, 1.0, -1.0
                 for k in range(n):
-                    if met[k] and u[k] < left + MET_M:
+                    if is_between[k] and u[k] < left + CONTACT_DEPTH_M:
                         left_n[:3] += samples[k, 3:]
                         left_n[3] += 1.0
                         left_v0, left_v1 = min(left_v0, v[k]), max(left_v1, v[k])
-                    if met[k] and u[k] > right - MET_M:
+                    if is_between[k] and u[k] > right - CONTACT_DEPTH_M:
                         right_n[:3] += samples[k, 3:]
                         right_n[3] += 1.0
                         right_v0, right_v1 = min(right_v0, v[k]), max(right_v1, v[k])
                 left_n /= left_n[3]
                 right_n /= right_n[3]
-                square = -(left_n[0] * right_n[0] + left_n[1] * right_n[1] + left_n[2] * right_n[2])
+                opposition = -(
+                    left_n[0] * right_n[0] + left_n[1] * right_n[1] + left_n[2] * right_n[2]
+                )
                 facing = min(
                     cos * right_n[0] + sin * right_n[1], -cos * left_n[0] - sin * left_n[1]
                 )
-                if square < LEAST_SQUARE or facing < LEAST_SQUARE:
+                if opposition < LEAST_COSINE or facing < LEAST_COSINE:
                     continue
-                risk = 2.5 * (1 - square) + 1.5 * max(0.0, 0.75 - facing)
-                spare = half_gap - half_width
-                risk += 0.4 * max(0.0, SPARE_M - spare) / SPARE_M
-                risk += 0.1 * crowd
+                risk = 2.5 * (1 - opposition) + 1.5 * max(0.0, 0.75 - facing)
+                side_gap = half_gap - half_width
+                risk += 0.4 * max(0.0, SIDE_GAP_M - side_gap) / SIDE_GAP_M
+                risk += 0.1 * obstacles
                 risk += 0.3 * max(0.0, 0.025 - depth) / 0.015
                 risk += 6 * (abs(v0) + 0.5 * abs(middle))
                 risk += 0.5 * max(0.0, top - peak) / 0.02
                 found[count, 0], found[count, 1], found[count, 2] = x, y, z
                 patch = min(left_v1 - left_v0, right_v1 - right_v0, PATCH_M)
-                askew = cos * (left_n[1] + right_n[1]) - sin * (left_n[0] + right_n[0])
-                slip = 2.3 * (1 - patch / PATCH_M) + 3.4 * abs(askew) + 60 * abs(v0)
+                obliqueness = cos * (left_n[1] + right_n[1]) - sin * (left_n[0] + right_n[0])
+                slip = 2.3 * (1 - patch / PATCH_M) + 3.4 * abs(obliqueness) + 60 * abs(v0)
                 found[count, 3], found[count, 4], found[count, 5] = yaw, risk, slip
                 count += 1
     return found[:count]

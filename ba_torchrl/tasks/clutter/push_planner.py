@@ -1,4 +1,4 @@
-"""Pushes and pulls at objects of a heap that cannot be grasped as they lie."""
+"""Pushes and pulls of objects in a heap that cannot be grasped in their present pose."""
 
 from __future__ import annotations
 
@@ -14,46 +14,54 @@ from ba_torchrl.tasks.clutter.grasp_planner import PIXEL_M, GraspPlanner
 from ba_torchrl.tasks.clutter.tray import Tray
 from ba_torchrl.tasks.workspace import ActionLimits
 
-BEHIND_M = 5.5e-3
-"""Room between a surface and the closed fingers that are about to push it."""
+STANDOFF_M = 5.5e-3
+"""Gap between an object and the closed fingers at the start of a push."""
 PRESS_M = 1.5e-3
-DIG_M = 0.006
+"""Depth of the fingertips below the top of an object at the start of a pull."""
+PULL_DEPTH_M = 0.006
+"""Depth of the fingertips below the top of an object at the end of a pull."""
 OBJECT_HALF_M = 0.045
-WALL_ROOM_M = 0.05
-"""Objects this near to a wall leave no room for a finger behind them."""
-OVER_FLOOR_M = 4.4e-3
-"""Height of the fingertips above the floor while they push."""
-HAND_ROOM_M = 3e-3
-"""Room under the hand, beside the fingers."""
-FLAT_M = 0.01
-"""Where the height image is lower, the floor is free."""
+"""Least distance between the centre of a pushed object and the walls."""
+WALL_CLEARANCE_M = 0.05
+"""Distance from a wall below which a finger does not fit behind an object."""
+FLOOR_CLEARANCE_M = 4.4e-3
+"""Height of the fingertips above the floor during a push."""
+HAND_CLEARANCE_M = 3e-3
+"""Gap between the hand, beside the fingers, and objects and walls."""
+FREE_FLOOR_M = 0.01
+"""Height below which a pixel of the height image shows free floor."""
 NEAR_M = 0.018
-"""Fingers this near to the start of a push are there."""
+"""Largest offset of fingers that are at the start of a push."""
 
-ENDS = (-0.9, -0.6, -0.3, 0.0, 0.3, 0.6, 0.9)
+OFFSET_SHARES = (-0.9, -0.6, -0.3, 0.0, 0.3, 0.6, 0.9)
+TURNING_OFFSET_SHARES = (0.0, -0.7, 0.7)
+"""Offsets of a push from the centre of an object, as a multiple of its half width, without and with
+yaw actions."""
 SLIDING_RADIUS_M = 0.02
-"""Mean distance from its centre of the friction under an object."""
-DRAG_COST = 8.0
-CRAMPED_COST = 12.0
-"""Of a nudge that takes the hand into a wall or another object: better than none."""
+"""Mean distance of the friction forces below an object from its centre."""
+PULL_COST = 8.0
+"""Cost of a pull, in actions."""
+COLLISION_COST = 12.0
+"""Cost of a push or pull in which the hand touches a wall or another object, in actions."""
 
 
 class Push(NamedTuple):
-    """A way with closed fingers that turns or moves an object, pushing its side or its top."""
+    """A straight motion of closed fingers that moves or turns an object by its side or top."""
 
     start: Vector
     end: Vector
-    slack_m: float
-    """Fingers this far above the start are there."""
+    height_tolerance_m: float
+    """Largest height above the start of fingers that are at the start."""
     cost: float
+    """Expected number of actions, plus penalties."""
 
 
 class PushPlanner:
-    """Finds the handiest nudge in a heap.
+    """Finds the push or pull with the lowest cost in a heap.
 
     Args:
-        grasps: knows the objects, and how well they can be grasped.
-        tray: holds them.
+        grasps: the grasp planner of the objects.
+        tray: the tray.
     """
 
     def __init__(self, grasps: GraspPlanner, tray: Tray) -> None:
@@ -61,24 +69,25 @@ class PushPlanner:
         self._tray = tray
         gripper = grasps.gripper
         self._tip_m = gripper.tip_height_m(0.0)
-        """Height at which the closed fingers end, above the tool point."""
-        self._standoff_m = gripper.closed_half_m + BEHIND_M
-        """A push starts this far from the surface."""
+        """Height of the closed fingertips above the tool point."""
+        self._standoff_m = gripper.closed_half_m + STANDOFF_M
+        """Distance between the surface of an object and the tool at the start of a push."""
         self._hand = np.array([p for p in gripper.closed_outline if p[0] > self._standoff_m])
-        """Distances from the tool and heights above it of what is wider than the fingers."""
+        """Distances from the tool, and heights above it, of the parts wider than the fingers."""
         floor_m = tray.height_m(grasps.workspace.center)
-        self._low_m = max(grasps.workspace.z[0], floor_m + OVER_FLOOR_M - self._tip_m)
+        self._low_m = max(grasps.workspace.z[0], floor_m + FLOOR_CLEARANCE_M - self._tip_m)
+        """Height of the tool during a push."""
 
     def plan(
         self, bodies: Sequence[Body], tool: YawPose, limits: ActionLimits, heights: np.ndarray
     ) -> Push | None:
-        """Return the handiest nudge of any of the bodies, or None if there is none.
+        """Return the push or pull of any of the bodies with the lowest cost; None without any.
 
         Args:
-            bodies: to choose from.
-            tool: where the gripper is.
-            limits: of one action.
-            heights: from `GraspPlanner.heights`.
+            bodies: the bodies.
+            tool: position and yaw of the tool.
+            limits: limits of an action.
+            heights: height image of `GraspPlanner.heights`.
         """
         pushes = [push for body in bodies for push in self._pushes(body, tool, limits, heights)]
         pushes += [push for body in bodies for push in self._pulls(body, tool, limits, heights)]
@@ -87,99 +96,104 @@ class PushPlanner:
     def _pushes(
         self, body: Body, tool: YawPose, limits: ActionLimits, heights: np.ndarray
     ) -> Iterator[Push]:
-        """Yield pushes against a body's side, away from the walls.
+        """Yield pushes against the sides of a body.
 
-        For a gripper that cannot turn, those that turn the body into its grasp.
+        For a gripper that cannot turn, the cost is lower for pushes that turn the body to a better
+        grasp.
         """
-        middle = np.array(self._grasps.workspace.center)
+        tray_center = np.array(self._grasps.workspace.center)
         samples = self._grasps.placed_samples(body)
         center = samples[:, :2].mean(axis=0)
         low, band_half = self._low_m, self._grasps.band_half_m
-        shares, lengths = ((0.0, -0.7, 0.7), (1.0,)) if limits.turn_rad else (ENDS, (0.5, 1.0))
-        for turn in np.arange(8) * np.pi / 4:
-            ahead = np.array([math.cos(turn), math.sin(turn)])
+        shares = TURNING_OFFSET_SHARES if limits.turn_rad else OFFSET_SHARES
+        lengths = (1.0,) if limits.turn_rad else (0.5, 1.0)
+        for bearing in np.arange(8) * np.pi / 4:
+            ahead = np.array([math.cos(bearing), math.sin(bearing)])
             side = np.array([-ahead[1], ahead[0]])
             along, across = ((samples[:, :2] - center) @ axis for axis in (ahead, side))
             for offset in np.array(shares) * np.abs(across).max():
-                met = np.abs(across - offset) < band_half
-                if not met.any():
+                in_band = np.abs(across - offset) < band_half
+                if not in_band.any():
                     continue
-                start = center + (along[met].min() - self._standoff_m) * ahead + offset * side
+                start = center + (along[in_band].min() - self._standoff_m) * ahead + offset * side
                 if not self._is_free(start, heights):
                     continue
                 travel = _travel(start, low + NEAR_M, tool, limits)
                 for length in lengths:
                     end = start + length * limits.step_m * ahead
-                    # a body that slides flat turns about a point beyond its centre
+                    # planar sliding: a push off the centre both moves and turns the body
                     push = length * limits.step_m - (self._standoff_m - band_half)
                     share = SLIDING_RADIUS_M**2 / (SLIDING_RADIUS_M**2 + offset**2)
                     pushed = center + share * push * ahead
                     if not self._is_on_floor(pushed, OBJECT_HALF_M):
                         continue
-                    cost = travel - (math.dist(center, middle) - math.dist(pushed, middle)) / 0.05
+                    inwards_m = math.dist(center, tray_center) - math.dist(pushed, tray_center)
+                    cost = travel - inwards_m / 0.05
                     if not limits.turn_rad:
                         angle = -offset * push / (SLIDING_RADIUS_M**2 + offset**2)
-                        moved = _turned_about(samples, center, angle)
+                        moved = _rotated_about(samples, center, angle)
                         cost += 3 * self._grasps.risk_alone(moved, tool)
                     if not all(self._hand_fits(p, low, tool[1], heights) for p in (start, end)):
-                        cost += CRAMPED_COST
+                        cost += COLLISION_COST
                     yield Push((*start, low), (*end, low), NEAR_M, cost)
 
     def _pulls(
         self, body: Body, tool: YawPose, limits: ActionLimits, heights: np.ndarray
     ) -> Iterator[Push]:
-        """Yield a pull at the top of a body by a wall towards the middle.
+        """Yield a pull of a body near a wall, by its top, towards the centre of the tray.
 
-        Fingers stick better than the floor, and the walls are without friction.
+        The friction of the fingers exceeds that of the floor, and the walls have none.
         """
-        middle = np.array(self._grasps.workspace.center)
+        tray_center = np.array(self._grasps.workspace.center)
         points = self._grasps.placed_samples(body)
         center = points[:, :2].mean(axis=0)
-        if self._is_on_floor(center, WALL_ROOM_M):
+        if self._is_on_floor(center, WALL_CLEARANCE_M):
             return
         near = np.linalg.norm(points[:, :2] - center, axis=1) < 0.01
         top = float(points[near, 2].max() if near.any() else points[:, 2].max())
         if self._height_at(center, heights) > top + 0.005:
-            return  # something lies on it
-        touching = top - self._tip_m
-        start = (*center, touching - PRESS_M)
-        way = (middle - center) / np.abs(middle - center).max() * limits.step_m
-        cost = DRAG_COST + _travel(center, touching + PRESS_M, tool, limits)
-        if not self._hand_fits(center, touching - DIG_M, tool[1], heights):
-            cost += CRAMPED_COST
-        yield Push(start, (*(center + way), touching - DIG_M), 3 * PRESS_M, cost)
+            return  # another object lies on it
+        contact_z = top - self._tip_m
+        start = (*center, contact_z - PRESS_M)
+        inwards = tray_center - center
+        displacement = inwards / np.abs(inwards).max() * limits.step_m
+        cost = PULL_COST + _travel(center, contact_z + PRESS_M, tool, limits)
+        if not self._hand_fits(center, contact_z - PULL_DEPTH_M, tool[1], heights):
+            cost += COLLISION_COST
+        end = (*(center + displacement), contact_z - PULL_DEPTH_M)
+        yield Push(start, end, 3 * PRESS_M, cost)
 
     def _height_at(self, point: np.ndarray, heights: np.ndarray) -> float:
         i, j = ((point - self._grasps.corner) / PIXEL_M).astype(int)
         return float(heights[i, j])
 
     def _is_free(self, point: np.ndarray, heights: np.ndarray) -> bool:
-        """Whether closed fingers fit at a point of the floor."""
+        """Whether the floor at a point is free for the closed fingers."""
         if not self._is_on_floor(point, self._grasps.band_half_m):
             return False
         i, j = ((point - self._grasps.corner) / PIXEL_M).astype(int)
         half = round(self._standoff_m / PIXEL_M) - 2
         window = heights[i - half : i + half + 1, j - half : j + half + 1]
-        return float(window.max()) < FLAT_M
+        return float(window.max()) < FREE_FLOOR_M
 
     def _hand_fits(
         self, point: np.ndarray, z_m: float, yaw_rad: float, heights: np.ndarray
     ) -> bool:
-        """Whether the hand stays above walls and others with the tool at a place."""
+        """Whether the hand is above walls and objects with the tool at a point."""
         beside = np.outer(self._hand[:, 0], (math.cos(yaw_rad), math.sin(yaw_rad)))
-        places = point + np.concatenate([beside, -beside])
-        pixels = ((places - self._grasps.corner) / PIXEL_M).astype(int)
+        points = point + np.concatenate([beside, -beside])
+        pixels = ((points - self._grasps.corner) / PIXEL_M).astype(int)
         i, j = np.clip(pixels, 0, len(heights) - 1).T
-        return bool((heights[i, j] + HAND_ROOM_M < z_m + np.tile(self._hand[:, 1], 2)).all())
+        return bool((heights[i, j] + HAND_CLEARANCE_M < z_m + np.tile(self._hand[:, 1], 2)).all())
 
     def _is_on_floor(self, point: np.ndarray, margin_m: float) -> bool:
-        """Whether a point is off the tray's walls by a margin."""
+        """Whether a point is on the base of the tray, at least a margin from its edge."""
         half = self._tray.half_m - margin_m
         return float(np.abs(point - self._grasps.workspace.center).max()) < half
 
 
-def _turned_about(samples: np.ndarray, center_xy: np.ndarray, angle_rad: float) -> np.ndarray:
-    """Return points and normals [N, 6] turned about a vertical line."""
+def _rotated_about(samples: np.ndarray, center_xy: np.ndarray, angle_rad: float) -> np.ndarray:
+    """Return points and normals [N, 6] rotated about a vertical axis."""
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
     out = samples.copy()
@@ -189,7 +203,7 @@ def _turned_about(samples: np.ndarray, center_xy: np.ndarray, angle_rad: float) 
 
 
 def _travel(start: np.ndarray, low_z: float, tool: YawPose, limits: ActionLimits) -> float:
-    """Return about how many actions it takes to get closed fingers to the start of a nudge."""
+    """Return the estimated number of actions to the start of a push."""
     (x, y, z), _ = tool
-    aside = float(np.abs(start - (x, y)).max())
-    return 0.0 if aside <= NEAR_M and z <= low_z else 2.0 + aside / limits.step_m
+    distance = float(np.abs(start - (x, y)).max())
+    return 0.0 if distance <= NEAR_M and z <= low_z else 2.0 + distance / limits.step_m

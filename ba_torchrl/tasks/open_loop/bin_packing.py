@@ -1,4 +1,4 @@
-"""Bin Packing: put all objects into a bin (appendix A.1)."""
+"""Bin Packing: place all objects in a bin (appendix A.1)."""
 
 from __future__ import annotations
 
@@ -23,42 +23,50 @@ from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 
 BIN_M = (0.176, 0.144, 0.08)
+"""Outer extents of the bin, at the appendix's size."""
 WALL_M = 0.004
+"""Thickness of the bin's walls, at the appendix's size."""
 FLOOR_M = 0.004
-OVER_RIM_M = 0.012
-"""The tool lets go this far above the bin's rim, so that the fingers stay out of it."""
-INSIDE_M = 1e-3
-"""An object may lean out of the bin's inside by this much."""
-PICK_BELOW_M = 0.011
-"""Objects are held this far below their top: the fingers stay out of what a flat one lies on."""
+"""Thickness of the bin's floor, at the appendix's size."""
+RELEASE_HEIGHT_M = 0.012
+"""Height of the tool above the rim at a release, with the fingers outside the bin."""
+TOLERANCE_M = 1e-3
+"""Distance by which a packed object may extend beyond the inner walls."""
+GRASP_DEPTH_M = 0.011
+"""Depth of a grasp below the top of an object, above the support of a flat one."""
 EAVES_M = 0.026
+"""Height of the vertical sides of a gable, at the appendix's size."""
 FREE_HALF_M = (0.06, 0.016)
-"""Half the extents of the area around an object that is free at the start, for the pick."""
+"""Half the extents of the free area around an object at the start, at the appendix's size."""
 LAYOUTS = 20
+"""Random positions of the bin before a `PlacementError`."""
 
 PIXEL_M = 0.001
+"""Width of a pixel of the bin's height image."""
 GAP_M = 0.0015
-"""Room left around an object in the bin."""
+"""Gap around an object in the bin."""
 RING_M = 0.008
+"""Width of the surroundings of a site."""
 TALLER_M = 0.01
-"""What surrounds a place is within this distance and this much higher."""
+"""Height above a site from which its surroundings enclose it."""
 LEVEL_M = 0.004
-"""Steps in which heights are compared with their surroundings."""
+"""Step to which the heights of sites are rounded for that comparison."""
 UNEVEN_COST = 0.5
+"""Cost of the height of a site above its mean height."""
 OPEN_COST_M = 0.01
-"""What is lost by a place that nothing surrounds, as a height."""
+"""Cost of a site without enclosing surroundings, as a height."""
 
 
-def pieces(unit: float) -> dict[str, Shape]:
-    """Return the kinds of objects, their length along y, centred on the origin.
+def object_shapes(unit: float) -> dict[str, Shape]:
+    """Return the shapes of all kinds of objects, centred on the origin, longest along y.
 
     Args:
-        unit: sizes as a multiple of the appendix's.
+        unit: sizes as a multiple of those in the appendix.
     """
     wide, long, flat = 0.04 * unit, 0.08 * unit, 0.02 * unit
     angles = 2 * np.pi * np.arange(16) / 16
     circle = (wide / 2 * np.stack([np.cos(angles), np.sin(angles)], axis=1)).tolist()
-    turn = 2 * np.pi / 16  # a rod of eight sides that lies on one of them
+    turn = 2 * np.pi / 16  # an octagonal rod that lies on a side
     rod = rod_mesh(long, wide / math.cos(np.pi / 8), sides=8)
     cos, sin = math.cos(turn), math.sin(turn)
     x, y, z = rod.vertices.T
@@ -82,8 +90,10 @@ def pieces(unit: float) -> dict[str, Shape]:
 
 @TASKS.register("open_loop/bin_packing")
 class BinPacking(PackingTask):
-    """Objects of seven shapes, from 4 x 4 x 2 to 8 x 4 x 4 cm, and a bin; success when all lie in
-    the bin, none of them over its rim.
+    """Objects: one to ten of seven shapes, 4 x 4 x 2 to 8 x 4 x 4 cm, eight by default, and a bin.
+
+    Goal: all objects lie in the bin of 17.6 x 14.4 x 8 cm, their centres below its rim, released.
+    The episode ends early when an object leaves the workspace. Appendix A.1.
     """
 
     scale_limits = (0.78, 0.86)
@@ -93,11 +103,11 @@ class BinPacking(PackingTask):
     needs_fresh_world = True
 
     def load_scene(self) -> None:
-        """Load the bin, and as many objects of each shape as may be drawn."""
+        """Load the bin, and as many objects of each shape as an episode may draw."""
         size = tuple(extent * self.unit for extent in BIN_M)
         wall, floor = WALL_M * self.unit, FLOOR_M * self.unit
         self.container = self.world.add(open_box(size, wall, floor, (0.6, 0.62, 0.66, 1.0)), "bin")
-        kinds = pieces(self.unit)
+        kinds = object_shapes(self.unit)
         copies = self.settings.num_objects
         self.pool = BodyPool(
             self.world,
@@ -107,12 +117,12 @@ class BinPacking(PackingTask):
         self._camera = HeightCamera(self.world.bodies)
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put the bin anywhere, and random objects around it."""
+        """Place the bin at a random pose, and random objects around it."""
         count = self.settings.num_objects
         half_x, half_y, _ = (size * self.unit / 2 for size in BIN_M)
         hand = tuple(size * self.unit for size in FREE_HALF_M)
         for attempt in range(LAYOUTS):
-            # fixed orientations: two by three of the largest objects lie side by side
+            # fixed orientations: two by three of the largest objects fit side by side
             around = random_rectangle(self, rng, half_x, half_y, fixed_yaw_rad=math.pi / 2)
             kinds = rng.integers(len(self.pool.bodies) // count, size=count).tolist()
             chosen = [self.pool.bodies[kind * count + i] for i, kind in enumerate(kinds)]
@@ -130,40 +140,40 @@ class BinPacking(PackingTask):
             self.stand(body, xy, yaw)
 
     def evaluate(self) -> dict[str, bool]:
-        """Return whether every object lies in the bin, released."""
+        """Return whether all objects lie in the bin and whether none is held."""
         return {
             "is_released": self.robot.held_body() not in self.objects,
             "is_packed": all(map(self.is_packed, self.objects)),
         }
 
     def is_packed(self, body: Body) -> bool:
-        """Whether an object is within the bin's walls, its middle lower than the rim."""
-        return body.position[2] < self._rim_m() and self._inside(-INSIDE_M).contains(
+        """Whether an object is within the walls of the bin and its centre below the rim."""
+        return body.position[2] < self._rim_m() and self._inside(-TOLERANCE_M).contains(
             world_vertices(body)
         )
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height at which an object is held: just below its top."""
-        return max(top_m - PICK_BELOW_M * self.unit, self.lowest_tool_m(xy))
+        """Return the height of the tool for a pick without z, just below the highest point."""
+        return max(top_m - GRASP_DEPTH_M * self.unit, self.lowest_tool_m(xy))
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height at which to let go: over the bin's rim, or gently on the ground."""
+        """Return the height of the tool for a place without z: above the rim, or on the ground."""
         if top_m - self.terrain.height_m(xy) < FLOOR_M * self.unit / 2:
             return super().place_height_m(top_m, xy)
         return max(super().place_height_m(top_m, xy), self._release_m())
 
     def obstacles(self, body: Body | None, above_m: float) -> list[Rectangle]:
-        """Return the outlines of what fingers may meet at a height, the bin's walls one by one."""
+        """Return the outlines of the obstacles of the fingers, with one outline for each wall."""
         held = self.robot.held_body()
         found = [
             outline(other)
-            for other in self.pool.present
+            for other in self.pool.active
             if other is not body and other is not held and vertical_extent(other)[1] > above_m
         ]
         return found + self._walls() if self._rim_m() > above_m else found
 
     def expert_command(self) -> PickPlaceCommand:
-        """Drop the largest object that can be grasped to the lowest place that has room for it."""
+        """Pick the largest object that can be grasped, and drop it at the best site in the bin."""
         held = self.robot.held_body()
         if held is not None:
             return self._drop(held)
@@ -173,9 +183,9 @@ class BinPacking(PackingTask):
         grasps = {body: self.grasp(body) for body in outside}
 
         def order(body: Body) -> tuple[bool, float, float]:
-            room = grasps[body].clearance_m
-            size = float(np.ptp(body.shape.vertices, axis=0).prod()) if room > 0 else 0.0
-            return room > 0, round(size, 7), room
+            clearance = grasps[body].clearance_m
+            size = float(np.ptp(body.shape.vertices, axis=0).prod()) if clearance > 0 else 0.0
+            return clearance > 0, round(size, 7), clearance
 
         body = max(outside, key=order)
         return pick_command(grasps[body].tool)
@@ -183,20 +193,22 @@ class BinPacking(PackingTask):
     # ----------------------------------------------------------------------------------------
 
     def _rim_m(self) -> float:
+        """Return the height of the bin's rim."""
         return self.container.position[2] + BIN_M[2] * self.unit / 2
 
     def _release_m(self) -> float:
         """Return the height of the tool as it releases an object."""
-        return self._rim_m() + OVER_RIM_M
+        return self._rim_m() + RELEASE_HEIGHT_M
 
     def _inside(self, margin_m: float = 0.0) -> Rectangle:
-        """Return the bin's inside, less a margin."""
+        """Return the inner outline of the bin, less a margin."""
         x, y, _ = self.container.position
         length, width, _ = (size * self.unit / 2 for size in BIN_M)
         margin = WALL_M * self.unit + margin_m
         return Rectangle(x, y, self.container.yaw_rad, length - margin, width - margin)
 
     def _walls(self) -> list[Rectangle]:
+        """Return the outlines of the bin's walls."""
         inside, thin = self._inside(), WALL_M * self.unit / 2
         x, y = inside.half_x + thin, inside.half_y + thin
         ends = [(side * x, 0.0, thin, y) for side in (-1, 1)]
@@ -207,7 +219,7 @@ class BinPacking(PackingTask):
         ]
 
     def _drop(self, held: Body) -> PickPlaceCommand:
-        """Return the place that lets an object fall where it comes to lie lowest."""
+        """Return the place that drops an object at the site with the lowest cost."""
         tool_yaw = self.robot.tool_pose()[1]
         own = narrowest(held, None if self.action_limits.turn_rad else tool_yaw)[0]
         heights = self._heights()
@@ -217,42 +229,42 @@ class BinPacking(PackingTask):
             turn = self._inside().yaw_rad + quarter * math.pi / 2 - own.yaw_rad
             if not self.action_limits.turn_rad:
                 if abs(wrap_angle(turn + tool_yaw, math.pi)) > math.pi / 4:
-                    continue  # the nearest of the two is what a gripper that does not turn has
+                    continue  # without yaw only the nearest of the two orientations is possible
                 turn = -tool_yaw
-            found = _lowest(heights, half)
+            found = _best_site(heights, half)
             if found is not None and (best is None or found[0] < best[0]):
                 best = (*found, turn)
-        if best is None:  # too large for the bin as it is held
+        if best is None:  # the held object is too large for the bin
             best = (0.0, (0.0, 0.0), 0.0, 0.0)
-        _, spot, top, turn = best
-        x, y = self._inside().frame.to_world(*spot)
+        _, site, top, turn = best
+        x, y = self._inside().frame.to_world(*site)
         depth = self.depth_m(held)
         z = max(self._release_m(), top + depth + RELEASE_GAP_M)
-        # the middle of the outline goes there, which need not be the body's origin
+        # the centre of the outline is placed at the site, not the origin of the object
         ox, oy = held.position[0] - own.x, held.position[1] - own.y
         at = PlanarFrame(x, y, turn).to_world(ox, oy)
         command = self.place(held, (*at, held.position[2]), turn)
         return command._replace(z_m=z)
 
     def _heights(self) -> np.ndarray:
-        """Return the height of what is in the bin, rows along its length, walls included."""
+        """Return the height image of the bin with its walls, rows along its length."""
         inside = self._inside()
         count = round(2 * inside.half_x / PIXEL_M) + 2
         return self._camera.heightmap((inside.x, inside.y), count * PIXEL_M, count, inside.yaw_rad)
 
 
-def _lowest(
+def _best_site(
     heights: np.ndarray, half_m: tuple[float, float]
 ) -> tuple[float, tuple[float, float], float] | None:
-    """Return the place where a box comes to lie lowest, flattest and best surrounded.
+    """Return the site for a box with the lowest cost: low, even and enclosed by its surroundings.
 
     Args:
-        heights: [N, N] in metres, pixels of `PIXEL_M`.
+        heights: [N, N] height image in metres, with pixels of `PIXEL_M`.
         half_m: half the extents of the box along rows and columns.
 
     Returns:
-        Its cost, the middle of the place from the middle of the image, and the height of what
-        the box comes to rest on; None if the box is larger than the image.
+        Cost, centre of the site relative to the centre of the image, and height of its highest
+        point; None if the box is larger than the image.
     """
     size = [round(2 * (half + GAP_M) / PIXEL_M) for half in half_m]
     ring = round(RING_M / PIXEL_M)
@@ -270,18 +282,18 @@ def _lowest(
         is_taller = around > level * LEVEL_M + TALLER_M
         at = levels == level
         taller[at] = _window_sums(is_taller, wide)[at]
-    surrounded = taller / (wide[0] * wide[1] - size[0] * size[1])
-    costs = tops + UNEVEN_COST * (tops - means) + OPEN_COST_M * (1 - surrounded)
+    enclosed = taller / (wide[0] * wide[1] - size[0] * size[1])
+    costs = tops + UNEVEN_COST * (tops - means) + OPEN_COST_M * (1 - enclosed)
     row, column = np.unravel_index(int(costs.argmin()), costs.shape)
-    middle = [
+    center = [
         (first + extent / 2 - count / 2) * PIXEL_M
         for first, extent, count in zip((row, column), size, heights.shape, strict=True)
     ]
-    return float(costs[row, column]), tuple(map(float, middle)), float(tops[row, column])
+    return float(costs[row, column]), tuple(map(float, center)), float(tops[row, column])
 
 
 def _window_sums(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
-    """Return the sum over each window [size] of an array [N, M]."""
+    """Return the sum over every window of a size in an array [N, M]."""
     sums = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
     sums[1:, 1:] = values.cumsum(axis=0).cumsum(axis=1)
     rows, columns = size

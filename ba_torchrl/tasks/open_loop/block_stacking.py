@@ -11,20 +11,22 @@ from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, cylinder
 
 BLOCKS = {"cube": cube, "cylinder": cylinder}
+"""Pieces by `object_type`."""
 
 
 @TASKS.register("open_loop/block_stacking")
 class BlockStacking(StructureTask):
-    """Blocks of 3 cm, four by default; success when they stand in a stack.
+    """Objects: two to eight cubes or cylinders of 3 cm, four by default.
 
-    They are cubes, or cylinders, which must not tip over.
+    Goal: the blocks form a stack, released. The episode ends early when a cylinder tips over or a
+    block leaves the workspace. Appendix A.1.
     """
 
     class Parameters(TaskParameters):
         """The shape of the blocks."""
 
         object_type: Literal["cube", "cylinder"] = "cube"
-        """The shape of all blocks."""
+        """Shape of all blocks."""
 
     max_steps = 10
     num_objects = 4
@@ -33,7 +35,7 @@ class BlockStacking(StructureTask):
 
     @classmethod
     def step_limit(cls, num_objects: int) -> int:
-        """Return 10, or the least number of picks and places if that is more."""
+        """Return 10, or the optimal number of steps if that is larger."""
         return max(cls.max_steps, 2 * (num_objects - 1))
 
     def blueprint(self) -> Blueprint:

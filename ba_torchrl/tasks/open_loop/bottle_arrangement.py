@@ -1,4 +1,4 @@
-"""Bottle Arrangement: stand six bottles in a tray (appendix A.1)."""
+"""Bottle Arrangement: place six bottles upright in a tray (appendix A.1)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,11 @@ from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)
+"""Outer extents of the tray, at the appendix's size."""
 WALL_M = 0.01
+"""Thickness of the tray's walls, at the appendix's size."""
 FLOOR_M = 0.005
+"""Thickness of the tray's floor, at the appendix's size."""
 
 BOTTLES_CM: dict[str, tuple[tuple[float, float], ...]] = {
     "wine bottle": ((2.4, 0), (2.4, 7.5), (1.3, 10), (1.3, 14)),
@@ -37,8 +40,8 @@ BOTTLES_CM: dict[str, tuple[tuple[float, float], ...]] = {
     "carafe": ((1.9, 0), (2.5, 2.5), (2.5, 5), (1.2, 9.6), (1.2, 13.6)),
     "flagon": ((2.45, 0), (2.45, 9.3), (1.15, 10.4), (1.15, 14.4)),
 }
-"""Radius and height of the corners of each bottle's profile, centimetres at the appendix's size;
-the uppermost part is straight, for fingers to close on."""
+"""Radius and height of the corners of each bottle's profile, centimetres at the appendix's size.
+The fingers close on the straight uppermost part."""
 COLORS: tuple[Color, ...] = (
     (0.25, 0.45, 0.3, 1.0),
     (0.8, 0.25, 0.2, 1.0),
@@ -51,30 +54,35 @@ COLORS: tuple[Color, ...] = (
 )
 MASS_KG = 0.15
 CENTER_OF_MASS_M = 0.02
-"""Height of a bottle's centre of mass: it rights itself from a lean of 45 degrees."""
+"""Height of a bottle's centre of mass. From a tilt of up to 45 degrees it returns to upright."""
 BOTTLE_M = 0.05
-APART_M = 0.096
-"""Between the middles of bottles, and of bottles and slots, at the start."""
-STANDING_M = 0.003
-"""A bottle stands in the tray if it is no farther above its floor."""
+"""Largest diameter of a bottle, at the appendix's size."""
+DISTANCE_M = 0.096
+"""Least distance between the axes of bottles, and of bottles and slots, at the start."""
+FLOOR_TOLERANCE_M = 0.003
+"""Largest height above the tray's floor of a bottle that stands on it."""
 GRASP_YAWS = 8
-CLEARANCE_M = 0.003
-"""Gap wanted between a bottle in the tray and its neighbours."""
-SEARCH_M = 0.01
+"""Yaws per half turn that are compared."""
+NEIGHBOR_GAP_M = 0.003
+"""Gap wanted between bottles in the tray."""
+SEARCH_STEP_M = 0.01
+"""Grid spacing of the sites outside the slots."""
 LAYOUTS = 20
+"""Random positions of the tray before a `PlacementError`."""
 
 
 def slots() -> list[tuple[float, float]]:
-    """Return where bottles go in the tray's frame, at the appendix's size."""
+    """Return the positions of the slots in the tray's frame, at the appendix's size."""
     length, width, _ = TRAY_M
     return [(x, y) for y in (-width / 4, width / 4) for x in (-length / 3, 0.0, length / 3)]
 
 
 @TASKS.register("open_loop/bottle_arrangement")
 class BottleArrangement(PackingTask):
-    """Six of eight kinds of bottles and a tray; success when all stand in it, let go of.
+    """Objects: six bottles of eight kinds, 5 cm wide and 13 to 14.4 cm high, and a tray.
 
-    A bottle that falls over ends the episode.
+    Goal: all bottles stand in the tray of 24 x 16 x 5 cm, released. The episode ends early when a
+    bottle tips over or leaves the workspace. Appendix A.1.
     """
 
     scale_limits = (0.4, 0.8)
@@ -84,7 +92,7 @@ class BottleArrangement(PackingTask):
     finger_opening = 0.8
 
     def load_scene(self) -> None:
-        """Load the tray, and as many bottles of each kind as may be drawn."""
+        """Load the tray, and as many bottles of each kind as an episode may draw."""
         tray = open_box(
             tuple(size * self.unit for size in TRAY_M),
             WALL_M * self.unit,
@@ -111,17 +119,17 @@ class BottleArrangement(PackingTask):
         )
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put the tray anywhere, and random bottles around it."""
+        """Place the tray at a random pose, and random bottles around it."""
         count = self.settings.num_objects
         length, width, _ = (size * self.unit for size in TRAY_M)
         half = BOTTLE_M * self.unit / 2
-        room = Footprint(half, half, margin_m=(APART_M - BOTTLE_M) * self.unit)
+        footprint = Footprint(half, half, margin_m=(DISTANCE_M - BOTTLE_M) * self.unit)
         for attempt in range(LAYOUTS):
             tray = random_rectangle(self, rng, length / 2, width / 2)
-            # no bottle starts closer to the tray than to a bottle in it
+            # bottles start as far from the slots as from each other
             reserved = tray.resized(length / 3 + half, width / 4 + half)
             try:
-                places = scatter(self, rng, [room] * count, [reserved])
+                places = scatter(self, rng, [footprint] * count, [reserved])
                 break
             except PlacementError:
                 if attempt == LAYOUTS - 1:
@@ -135,41 +143,43 @@ class BottleArrangement(PackingTask):
             self.stand(bottle, xy, yaw)
 
     def evaluate(self) -> dict[str, bool]:
-        """Return whether every bottle stands in the tray, released."""
+        """Return whether all bottles stand in the tray and whether none is held."""
         return {
             "is_released": self.robot.held_body() not in self.objects,
             "is_arranged": all(map(self.stands_in_tray, self.objects)),
         }
 
     def is_valid(self) -> bool:
-        """Whether all is inside the workspace, and no bottle fell over."""
+        """Whether all bottles are inside the workspace, and upright or held."""
         held = self.robot.held_body()
         return super().is_valid() and all(
             body is held or body.tilt_rad < UPRIGHT_RAD for body in self.objects
         )
 
     def stands_in_tray(self, body: Body) -> bool:
-        """Whether a bottle stands on the tray's floor."""
+        """Whether a bottle stands on the floor of the tray."""
         floor = self._floor_z_m()
         return (
             body.tilt_rad < UPRIGHT_RAD
-            and abs(body.position[2] - floor) <= STANDING_M
+            and abs(body.position[2] - floor) <= FLOOR_TOLERANCE_M
             and self._inside().contains(np.array([body.position]))
         )
 
     def expert_command(self) -> PickPlaceCommand:
-        """Stand a bottle that is not in the tray in its next free slot."""
+        """Place a bottle that is not in the tray in the first free slot."""
         held = self.robot.held_body()
         if held is not None:
-            x, y = self._free_place(held)
+            x, y = self._free_site(held)
             floor = self._floor_z_m()
             yaw = self.robot.tool_pose()[1]
             if self.action_limits.turn_rad:
-                others = self.obstacles(held, floor + self.depth_m(held) + self.tips_m)
+                obstacles = self.obstacles(held, floor + self.depth_m(held) + self.tips_m)
                 half = self.release_half_m(held)
                 yaw = max(
                     self._yaws(),
-                    key=lambda option: round(self._finger_gap_m((x, y), option, half, others), 4),
+                    key=lambda yaw: round(
+                        self._finger_clearance_m((x, y), yaw, half, obstacles), 4
+                    ),
                 )
             turn = yaw - self.robot.tool_pose()[1]
             return self.place(held, (x, y, floor + RELEASE_GAP_M), turn)
@@ -177,92 +187,99 @@ class BottleArrangement(PackingTask):
         if not outside:
             return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in outside}
-        place = self._free_place(None)
-        if self._clearance(place, None) < CLEARANCE_M:
-            # bottles stand where there is no room left: one of them goes to a better place
+        if self._neighbor_gap_m(self._free_site(None), None) < NEIGHBOR_GAP_M:
+            # bottles outside the slots leave no free site: one of them is moved to a slot
             grasps = {body: self.grasp(body) for body in self.objects if body not in grasps}
-            body = max(grasps, key=lambda body: (grasps[body].clearance_m > 0, self._offset(body)))
+            body = max(
+                grasps, key=lambda body: (grasps[body].clearance_m > 0, self._slot_offset_m(body))
+            )
             return pick_command(grasps[body].tool)
         body = max(outside, key=lambda body: round(grasps[body].clearance_m, 4))
         return pick_command(grasps[body].tool)
 
     def grasp(self, body: Body) -> TopDownGrasp:
-        """Return where to grasp a bottle: by its neck, from the side with most room."""
+        """Return the grasp of a bottle by its neck, at the yaw with the largest clearance."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
-        others = self.obstacles(body, height + self.tips_m)
+        obstacles = self.obstacles(body, height + self.tips_m)
         x, y, _ = body.position
         half = half_gap_m(self.robot.gripper, self.finger_opening)
         choices = [
-            TopDownGrasp(body, (x, y, height), yaw, self._finger_gap_m((x, y), yaw, half, others))
+            TopDownGrasp(
+                body,
+                (x, y, height),
+                yaw,
+                self._finger_clearance_m((x, y), yaw, half, obstacles),
+            )
             for yaw in self._yaws()
         ]
         return max(choices, key=lambda choice: round(choice.clearance_m, 4))
 
     # ----------------------------------------------------------------------------------------
 
-    def _finger_gap_m(
+    def _finger_clearance_m(
         self,
         xy: tuple[float, float],
         yaw_rad: float,
         half_opening_m: float,
-        others: Sequence[Rectangle],
+        obstacles: Sequence[Rectangle],
     ) -> float:
-        """Return the gap between the fingers at a place and the outlines of others."""
+        """Return the clearance between the fingers at a tool position and obstacles."""
         tool = PlanarFrame(*xy, yaw_rad)
-        return outline_clearance_m(self.robot.gripper, tool, half_opening_m, others)
+        return outline_clearance_m(self.robot.gripper, tool, half_opening_m, obstacles)
 
     def _yaws(self) -> list[float]:
-        """Return the yaws to grasp or let go of a bottle at, a diagonal of the tray first."""
+        """Return the yaws to grasp or release a bottle at, a diagonal of the tray first."""
         if not self.action_limits.turn_rad:
             return [0.0]
         first = self.container.yaw_rad + math.pi / 4
         return [first + math.pi * i / GRASP_YAWS for i in range(GRASP_YAWS)]
 
     def _tray(self) -> Rectangle:
+        """Return the outline of the tray."""
         x, y, _ = self.container.position
         length, width, _ = (size * self.unit for size in TRAY_M)
         return Rectangle(x, y, self.container.yaw_rad, length / 2, width / 2)
 
     def _floor_z_m(self) -> float:
-        """Return the height of the tray's floor."""
+        """Return the height of the floor of the tray."""
         return self.container.position[2] + (FLOOR_M - TRAY_M[2] / 2) * self.unit
 
     def _inside(self) -> Rectangle:
-        """Return the tray's floor."""
+        """Return the inner outline of the tray."""
         tray, wall = self._tray(), WALL_M * self.unit
         return tray.resized(tray.half_x - wall, tray.half_y - wall)
 
-    def _offset(self, body: Body) -> float:
-        """Return how far a bottle is from the nearest slot."""
+    def _slot_offset_m(self, body: Body) -> float:
+        """Return the distance between a bottle and the nearest slot."""
         tray = self._tray()
         return min(
             math.dist(body.position[:2], tray.frame.to_world(x * self.unit, y * self.unit))
             for x, y in slots()
         )
 
-    def _clearance(self, place: tuple[float, float], held: Body | None) -> float:
-        """Return the gap between a bottle in the tray and those that stand there."""
+    def _neighbor_gap_m(self, site: tuple[float, float], held: Body | None) -> float:
+        """Return the gap between a bottle at a site and all others but the held one."""
         return min(
             (
-                math.dist(place, body.position[:2]) - BOTTLE_M * self.unit
+                math.dist(site, body.position[:2]) - BOTTLE_M * self.unit
                 for body in self.objects
                 if body is not held
             ),
             default=math.inf,
         )
 
-    def _free_place(self, held: Body | None) -> tuple[float, float]:
-        """Return the first free slot, or the place in the tray with most room."""
+    def _free_site(self, held: Body | None) -> tuple[float, float]:
+        """Return the first free slot, or the site in the tray with the largest gap."""
         tray = self._tray()
-        places = [tray.frame.to_world(x * self.unit, y * self.unit) for x, y in slots()]
-        for place in places:
-            if self._clearance(place, held) >= CLEARANCE_M:
-                return place
-        inside, half = self._inside(), BOTTLE_M * self.unit / 2 + CLEARANCE_M
+        sites = [tray.frame.to_world(x * self.unit, y * self.unit) for x, y in slots()]
+        for site in sites:
+            if self._neighbor_gap_m(site, held) >= NEIGHBOR_GAP_M:
+                return site
+        inside, half = self._inside(), BOTTLE_M * self.unit / 2 + NEIGHBOR_GAP_M
         along, across = inside.half_x - half, inside.half_y - half
-        places += [
+        sites += [
             tray.frame.to_world(x, y)
-            for x in np.arange(-along, along + 1e-9, SEARCH_M).tolist()
-            for y in np.arange(-across, across + 1e-9, SEARCH_M).tolist()
+            for x in np.arange(-along, along + 1e-9, SEARCH_STEP_M).tolist()
+            for y in np.arange(-across, across + 1e-9, SEARCH_STEP_M).tolist()
         ]
-        return max(places, key=lambda place: self._clearance(place, held))
+        return max(sites, key=lambda site: self._neighbor_gap_m(site, held))

@@ -10,7 +10,11 @@ from ba_torchrl.tasks.structures.parts import cube, triangle
 
 @TASKS.register("open_loop/house_building_1")
 class HouseBuilding1(StructureTask):
-    """Cubes of 3 cm and a triangle of that size; success when it tops their stack."""
+    """Objects: one to five cubes of 3 cm, three by default, and a triangle of 3 cm.
+
+    Goal: the cubes form a stack with the triangle on top, released. The episode ends early when the
+    triangle tips over or a piece leaves the workspace. Appendix A.1.
+    """
 
     max_steps = 10
     num_objects = 4

@@ -10,9 +10,11 @@ from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof
 
 @TASKS.register("open_loop/house_building_3")
 class HouseBuilding3(StructureTask):
-    """Two cubes of 3 cm, a cuboid and a roof 12 cm long; success when roof, cuboid and cubes stand.
+    """Objects: two cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
 
-    The cuboid lies across the cubes, the roof on the cuboid, both above the middle of the cubes.
+    Goal: the cuboid lies on both cubes and the roof on the cuboid, both centred over the cubes,
+    released. The episode ends early when the roof tips over or a piece leaves the workspace.
+    Appendix A.1.
     """
 
     scale_limits = (0.55, 0.9)
@@ -21,13 +23,13 @@ class HouseBuilding3(StructureTask):
     num_objects_range = (4, 4)
 
     def blueprint(self) -> Blueprint:
-        """Return two cubes with cuboid and roof across."""
+        """Return two cubes that support the cuboid, which supports the roof."""
         block = cube(self.block_m)
         return Blueprint(
             (
                 Slot(block),
                 Slot(block),
                 Slot(cuboid(self.block_m), on=(0, 1), span=pair_span(self.block_m, 2.2)),
-                Slot(roof(self.block_m), on=(2,), over=(0, 1)),
+                Slot(roof(self.block_m), on=(2,), centered_over=(0, 1)),
             )
         )

@@ -10,9 +10,11 @@ from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof
 
 @TASKS.register("open_loop/house_building_4")
 class HouseBuilding4(StructureTask):
-    """Four cubes of 3 cm, a cuboid and a roof 12 cm long; success when the house stands.
+    """Objects: four cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
 
-    Two cubes carry the cuboid, which carries the other two, which carry the roof.
+    Goal: two cubes support the cuboid, which supports the other two cubes, which support the roof,
+    released. The episode ends early when the roof tips over or a piece leaves the workspace.
+    Appendix A.1.
     """
 
     scale_limits = (0.55, 0.66)

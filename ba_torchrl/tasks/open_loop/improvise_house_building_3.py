@@ -9,7 +9,7 @@ from ba_torchrl.tasks.structures.improvise import (
     any_cuboid,
     any_shape,
     shape_span,
-    spread,
+    with_circular_spacing,
 )
 from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import roof
@@ -17,9 +17,11 @@ from ba_torchrl.tasks.structures.parts import roof
 
 @TASKS.register("open_loop/improvise_house_building_3")
 class ImproviseHouseBuilding3(StructureTask):
-    """Two random shapes, a random cuboid and a roof 12 cm long; success when they stand.
+    """Objects: two random shapes, 2.5 to 3 cm high, a random cuboid and a roof of 3 x 12 x 3 cm.
 
-    The cuboid lies across the shapes, the roof on the cuboid, both above the middle of the shapes.
+    Goal: the cuboid lies on both shapes and the roof on the cuboid, both centred over the shapes,
+    released. The episode ends early when a shape or the roof tips over, or a piece leaves the
+    workspace. Appendix A.1.
     """
 
     scale_limits = (0.55, 0.9)
@@ -30,13 +32,13 @@ class ImproviseHouseBuilding3(StructureTask):
     least_pick_blocks = 0.0
 
     def blueprint(self) -> Blueprint:
-        """Return two shapes with cuboid and roof across."""
+        """Return two shapes that support the cuboid, which supports the roof."""
         shape = any_shape()
         return Blueprint(
             (
                 Slot(shape),
                 Slot(shape),
                 Slot(any_cuboid(), on=(0, 1), span=shape_span()),
-                Slot(spread(roof(self.block_m)), on=(2,), over=(0, 1)),
+                Slot(with_circular_spacing(roof(self.block_m)), on=(2,), centered_over=(0, 1)),
             )
         )

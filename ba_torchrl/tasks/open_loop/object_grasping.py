@@ -1,4 +1,4 @@
-"""Object Grasping: take any object out of a heap in a tray (appendix A.1)."""
+"""Object Grasping: pick any object from a heap in a tray (appendix A.1)."""
 
 from __future__ import annotations
 
@@ -16,26 +16,28 @@ from ba_torchrl.tasks.clutter.grasp_planner import DEEPEST_M, PIXEL_M, YAWS
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.pick_place_commands import pick_command
 
-USUAL_WIDTH_M = 0.045
-"""Of an object between the fingers, where an action leaves the height open."""
+OBJECT_WIDTH_M = 0.045
+"""Assumed width of the object between the fingers, for picks without z."""
 PALM_GAP_M = 5e-3
+"""Least gap between the palm and the highest point, for picks without z."""
 FLOOR_GAP_M = 1.5e-3
-"""Distances that palm and fingertips then keep."""
+"""Least gap between the fingertips and the floor of the tray, for picks without z."""
 WINDOW_M = 0.0125
-"""Half the fingers' width: what is searched for the highest point lies between them."""
+"""Half the width of the window that is searched for the highest point: that of a finger."""
 SLIP_COST = 30.0
-MISFIT_COST_PER_M = 4500.0
-"""What the expert fears: that an object turns and slips out, and a height, where the action leaves
-it open, that is not the one which the grasp was found for. Fitted to picks of random grasps."""
-NEAR_COST = 60.0
-"""After a failure the expert takes the next grasp, unless it costs this much more."""
+"""Cost of the slip score of a grasp; fitted to picks of random grasps."""
+HEIGHT_ERROR_COST_PER_M = 4500.0
+"""Cost of the difference between the height of a grasp and that of a pick without z at its
+position; fitted to picks of random grasps."""
+COST_TOLERANCE = 60.0
+"""After failures the expert chooses among the grasps within this cost of the best one."""
 
 
 @TASKS.register("open_loop/object_grasping")
 class ObjectGrasping(ClutterTask, OpenLoopControl):
-    """Random objects in a tray, 15 unless told otherwise; success when a pick took one.
+    """Objects: 1 to 20 random objects in a tray, 15 by default.
 
-    An episode is one pick.
+    Goal: an object is held. An episode is a single pick, after which it ends. Appendix A.1.
     """
 
     max_steps = 1
@@ -49,50 +51,48 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
         return {"is_grasped": self.robot.held_body() is not None}
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a pick, where an action leaves it open.
+        """Return the height of the tool for a pick without z, metres.
 
-        The fingers reach around the object as far as they are of use; the palm stays above it, and
-        the fingertips above the tray's floor when they meet an object of usual width: some swing
-        down as they close.
+        The pick is as deep as it improves the grasp. The palm stays above the highest point, and
+        the fingertips, which move down as the fingers close, above the floor of the tray when they
+        touch an object of the assumed width.
 
         Args:
-            top_m: height of the highest point around the target, metres.
-            xy: of the target.
+            top_m: height of the highest point in the window around the target.
+            xy: position of the target.
         """
         gripper = self.robot.gripper
-        tips_m = gripper.tip_height_m(USUAL_WIDTH_M / 2)
+        tips_m = gripper.tip_height_m(OBJECT_WIDTH_M / 2)
         depth_m = min(gripper.palm_height_m - PALM_GAP_M, DEEPEST_M + tips_m)
         return max(top_m - depth_m, self.terrain.height_m(xy) + FLOOR_GAP_M - tips_m)
 
     def window_m(self, held: Body | None) -> float:
-        """Return half the width of the square that is searched for the highest point."""
+        """Return half the width of the square window around the target, metres."""
         return WINDOW_M
 
     def expert_command(self) -> PickPlaceCommand:
-        """Pick what is least likely to slip; after failures, what comes next if it is near."""
+        """Return the pick with the lowest cost; after failures one with the next lowest costs."""
         workspace = self.settings.workspace
         x, y = workspace.center
-        if (
-            self.grasped_object() is not None
-        ):  # the episode is over: all that is left is to put it back
+        if self.grasped_object() is not None:  # the episode is over; the object is placed back
             return PickPlaceCommand(PLACE, x, y, workspace.z[1] / 2)
-        planner, present = self.planner, self.clutter.pool.present
+        planner, objects = self.planner, self.clutter.pool.active
         heights, tool = planner.heights(), ((x, y, workspace.z[1]), 0.0)
         penalty = partial(self._penalty, _highest(heights))
-        grasps = [planner.plan([b], tool, self.action_limits, heights, penalty) for b in present]
+        grasps = [planner.plan([b], tool, self.action_limits, heights, penalty) for b in objects]
         found = sorted(filter(None, grasps), key=lambda grasp: grasp.cost)
         if not found:
-            return self._squeeze()
-        near = [grasp for grasp in found if grasp.cost < found[0].cost + NEAR_COST]
-        grasp = near[self.clutter.failures % len(near)]
+            return self._fallback_pick()
+        best = [grasp for grasp in found if grasp.cost < found[0].cost + COST_TOLERANCE]
+        grasp = best[self.clutter.failures % len(best)]
         return pick_command(grasp.tool)
 
     def _penalty(self, highest: np.ndarray, grasps: np.ndarray) -> np.ndarray:
-        """Return what speaks against grasps [N, 6] as the planner lists them, [N].
+        """Return the additional costs [N] of grasps.
 
         Args:
-            highest: from `_highest`.
-            grasps: x, y, z, yaw, risk and slip.
+            highest: result of `_highest`.
+            grasps: [N, 6] x, y, z, yaw, risk and slip of the planner's grasps.
         """
         pixels = ((grasps[:, :2] - self.planner.corner) / PIXEL_M).astype(int)
         i, j = np.clip(pixels, 0, len(highest) - 1).T
@@ -102,15 +102,15 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
                 for top, (x, y) in zip(highest[i, j], grasps[:, :2], strict=True)
             ]
         )
-        misfit = np.abs(heights - grasps[:, 2])
-        return SLIP_COST * grasps[:, 5] + MISFIT_COST_PER_M * misfit
+        errors = np.abs(heights - grasps[:, 2])
+        return SLIP_COST * grasps[:, 5] + HEIGHT_ERROR_COST_PER_M * errors
 
-    def _squeeze(self) -> PickPlaceCommand:
-        """Close on what reaches highest, after failures on what comes next: held or not, it moves.
+    def _fallback_pick(self) -> PickPlaceCommand:
+        """Return a pick of the highest object, after failures of the next, across its least width.
 
-        The fingers close across its narrowest side.
+        Even if the grasp fails, the object moves, and may be graspable afterwards.
         """
-        samples = [self.planner.placed_samples(body)[:, :3] for body in self.clutter.pool.present]
+        samples = [self.planner.placed_samples(body)[:, :3] for body in self.clutter.pool.active]
         samples.sort(key=lambda points: points[:, 2].max(), reverse=True)
         points = samples[self.clutter.failures % len(samples)]
         yaws = np.arange(YAWS) * np.pi / YAWS if self.action_limits.turn_rad else np.zeros(1)
@@ -121,12 +121,13 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
         return pick_command(downward_pose((float(x), float(y), float(z)), float(yaw)))
 
     def grasped_object(self) -> Body | None:
-        """Return what the last pick took: cameras do not see it; contacts wait for a step."""
-        return next((body for body in self.clutter.pool.present if body.is_hidden), None)
+        """Return the object that the last pick lifted; it is hidden from the cameras."""
+        # not by its contacts, which are known only after a physics step
+        return next((body for body in self.clutter.pool.active if body.is_hidden), None)
 
 
 def _highest(heights: np.ndarray) -> np.ndarray:
-    """Return for each pixel of the planner's image the highest within `WINDOW_M`, metres."""
+    """Return the largest of a height image within `WINDOW_M` of each pixel, metres."""
     half = round(WINDOW_M / PIXEL_M)
     for axis in (0, 1):
         padding = [(0, 0), (0, 0)]

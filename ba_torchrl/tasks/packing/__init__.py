@@ -1,1 +1,1 @@
-"""Tasks that bring objects into a container."""
+"""What the tasks share that place objects in a container."""

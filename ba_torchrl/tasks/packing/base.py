@@ -1,4 +1,4 @@
-"""What the open-loop tasks share that bring objects from the floor to a container."""
+"""Base of the open-loop tasks that place objects in a container."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.pick_place_commands import place_command
 
 SCALE = 0.8
-"""At this scale, objects have the sizes of appendix A.1."""
+"""Scale at which the objects have the sizes of appendix A.1."""
 RELEASE_M = 0.004
-"""How far a finger opens to let go."""
+"""Displacement of each finger at a release."""
 RELEASE_GAP_M = 1e-3
-"""What is held is let go this far above what it will rest on."""
-ENOUGH_M = 4e-3
-"""More room beside the fingers than this is worth nothing."""
-TURN_MARGIN_RAD = 1e-4
+"""Height of an object above its support at its release."""
+SUFFICIENT_CLEARANCE_M = 4e-3
+"""Clearances above this are equally good."""
+YAW_MARGIN_RAD = 1e-4
+"""Yaws within this of half a turn count as zero, so that rounding does not matter."""
 UNDERGROUND_M = 0.02
-"""A container's floor goes on below the ground: what falls fast passes through a thin sheet."""
+"""Depth of a container's floor below the ground. Fast objects would pass through a thin sheet."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blocks(Solid):
-    """A body whose parts are boxes along its axes: collisions with boxes cost less than hulls."""
+    """A solid of axis-aligned boxes; collision detection is faster with boxes than with hulls."""
 
     collision_margin_m: ClassVar[float | None] = None
 
@@ -53,12 +54,12 @@ class Blocks(Solid):
 
 
 def open_box(size_m: Vector, wall_m: float, floor_m: float, color: Color) -> Blocks:
-    """Return a static box without a lid, its bounding box centred on the origin.
+    """Return a static box without a lid; the origin is the centre of its bounding box.
 
     Args:
         size_m: outer extents.
         wall_m: thickness of the walls.
-        floor_m: thickness of the floor, as far as it is above ground.
+        floor_m: thickness of the floor above the ground.
         color: red, green, blue, alpha.
     """
     x, y, z = size_m
@@ -73,13 +74,13 @@ def open_box(size_m: Vector, wall_m: float, floor_m: float, color: Color) -> Blo
 
 
 class PackingTask(OpenLoopControl, Task):
-    """Objects from a pool on the floor, and a container that does not move."""
+    """A task with objects of a pool on the floor, and a static container."""
 
     scale_range = (SCALE, SCALE)
     finger_opening = 0.7
 
     grasp_offsets_m: ClassVar[tuple[float, ...]] = (0.0, 0.008, -0.008, 0.022, -0.022)
-    """How far from its middle a long object may be held, at scale `SCALE`."""
+    """Distances of the grasps of a long object from its centre at scale `SCALE`, metres."""
 
     container: Body
     pool: BodyPool
@@ -92,58 +93,58 @@ class PackingTask(OpenLoopControl, Task):
     @property
     def objects(self) -> Sequence[Body]:
         """The objects in the scene."""
-        return self.pool.present
+        return self.pool.active
 
     @property
     def landmarks(self) -> Sequence[YawPose]:
-        """Objects and container; for objects yet to come, the workspace's upper corner."""
+        """Poses of objects and container; the workspace's upper corner for inactive objects."""
         workspace = self.settings.workspace
         corner = (workspace.x[1], workspace.y[1], workspace.z[1])
-        bodies = [*self.pool.present, self.container]
-        missing = self.settings.num_objects - len(self.pool.present)
+        bodies = [*self.pool.active, self.container]
+        missing = self.settings.num_objects - len(self.pool.active)
         return [(body.position, body.yaw_rad) for body in bodies] + [(corner, 0.0)] * missing
 
     def get_state(self) -> Any:
-        """Return which objects are in the scene."""
+        """Return the indices of the active objects."""
         return self.pool.get_state()
 
     def set_state(self, state: Any) -> None:
-        """Take up what `get_state` returned."""
+        """Restore the active objects."""
         self.pool.set_state(state)
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height at which what is held comes to rest on what is highest there."""
+        """Return the height of the tool at which the held body is just above the highest point."""
         held = self.robot.held_body()
         if held is None:
             return super().place_height_m(top_m, xy)
         return top_m + self.depth_m(held) + RELEASE_GAP_M
 
     def depth_m(self, held: Body) -> float:
-        """Return how far what is held reaches down below the tool point."""
+        """Return the distance of the lowest point of the held body below the tool point."""
         return self.robot.tool_pose()[0][2] - vertical_extent(held)[0]
 
     # -- parts of the experts ----------------------------------------------------------------
 
     def obstacles(self, body: Body | None, above_m: float) -> list[Rectangle]:
-        """Return the outlines of what fingers may meet at a height.
+        """Return the outlines of the obstacles of the fingers.
 
         Args:
-            body: that they are about to grasp.
-            above_m: lower things are not in their way.
+            body: the body to grasp or release, which is no obstacle.
+            above_m: height of the fingertips; lower bodies are no obstacles.
         """
         held = self.robot.held_body()
         return [
             outline(other)
-            for other in (*self.pool.present, self.container)
+            for other in (*self.pool.active, self.container)
             if other is not body and other is not held and vertical_extent(other)[1] > above_m
         ]
 
     def grasp(self, body: Body) -> TopDownGrasp:
-        """Return where to grasp an object: in its middle, or where the fingers have more room."""
+        """Return the grasp of an object, off its centre if that increases the clearance."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         gripper = self.robot.gripper
-        others = self.obstacles(body, height + self.tips_m)
-        tall = self.obstacles(body, height + gripper.palm_height_m)
+        obstacles = self.obstacles(body, height + self.tips_m)
+        hand_obstacles = self.obstacles(body, height + gripper.palm_height_m)
         half_open = half_gap_m(gripper, self.finger_opening)
         choices = []
         for side in narrowest(body, None if self.action_limits.turn_rad else 0.0):
@@ -152,34 +153,34 @@ class PackingTask(OpenLoopControl, Task):
                     continue
                 xy = side.frame.to_world(0.0, offset * self.unit)
                 tool = PlanarFrame(*xy, side.yaw_rad)
-                room = outline_clearance_m(gripper, tool, half_open, others)
+                clearance = outline_clearance_m(gripper, tool, half_open, obstacles)
                 hand = hand_rectangle(self.robot, tool)
-                room = min([room, *(gap_m(hand, other) for other in tall)])
-                choices.append(TopDownGrasp(body, (*xy, height), side.yaw_rad, room))
-        return max(choices, key=lambda choice: min(choice.clearance_m, ENOUGH_M))
+                clearance = min([clearance, *(gap_m(hand, other) for other in hand_obstacles)])
+                choices.append(TopDownGrasp(body, (*xy, height), side.yaw_rad, clearance))
+        return max(choices, key=lambda choice: min(choice.clearance_m, SUFFICIENT_CLEARANCE_M))
 
     def place(self, held: Body, position: Vector, turn_rad: float) -> PickPlaceCommand:
-        """Return the place that brings what is held somewhere, up to half turns.
+        """Return the place of the held body at a position and a yaw up to half turns.
 
         Args:
-            held: what is held.
-            position: of its origin.
-            turn_rad: about the vertical, from how it is held now.
+            held: the held body.
+            position: final position of its origin.
+            turn_rad: rotation about the vertical from its present yaw.
         """
         tool = self.robot.tool_frame()
         yaw = (tool.yaw_rad + turn_rad) % math.pi if self.action_limits.turn_rad else 0.0
-        if yaw > math.pi - TURN_MARGIN_RAD:
+        if yaw > math.pi - YAW_MARGIN_RAD:
             yaw = 0.0
         return place_command(tool, held.pose, held.pose.moved_to(position, yaw - tool.yaw_rad))
 
     @property
     def tips_m(self) -> float:
-        """Height above the tool point at which the open fingers end."""
+        """Height of the open fingertips above the tool point, metres."""
         gripper = self.robot.gripper
         return gripper.tip_height_m(self.finger_opening * gripper.half_gap_m)
 
     def release_half_m(self, held: Body) -> float:
-        """Return how far from the tool point the fingers' inner sides are as they let go."""
+        """Return the distance between the tool point and a finger's inner side at the release."""
         tool, yaw = self.robot.tool_pose()
         around = outline(held, yaw)
         return abs(around.frame.to_local(*tool[:2])[0]) + around.half_x + RELEASE_M

@@ -13,19 +13,22 @@ from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.footprints import Rectangle, gap_m
 
 LAYOUTS = 10
+"""Random layouts before a `PlacementError`."""
 TRIES = 100
-"""Random layouts, and places for each thing in one, before giving up."""
+"""Random poses of each object in a layout."""
 
 
 class Footprint(NamedTuple):
-    """The room that an upright object needs on the floor, metres."""
+    """The space that an upright object needs on the floor, metres."""
 
     half_x: float
-    """Half its extents."""
+    """Half its extent along its own x axis."""
     half_y: float
+    """Half its extent along its own y axis."""
     hand_x: float = 0.0
-    """Half the extents of the hand that grasps it at its own yaw; objects keep out of it."""
+    """Half the extent along x of the hand that grasps it, which stays free; 0 for none."""
     hand_y: float = 0.0
+    """Half the extent along y of the hand that grasps it."""
     margin_m: float = 0.005
     """Gap to other objects."""
 
@@ -37,20 +40,20 @@ def scatter(
     fixed: Sequence[Rectangle] = (),
     clear_of: Rectangle | None = None,
 ) -> list[tuple[tuple[float, float], float]]:
-    """Return random places and yaws, inside the workspace and apart from each other.
+    """Return random points and yaws inside the workspace at which footprints do not overlap.
 
     Args:
-        task: its workspace, and whether orientations are random.
-        rng: draws them.
-        footprints: one for each object.
-        fixed: what stands there already.
-        clear_of: something tall, which the hand above the fingers must not meet.
+        task: gives the workspace, the robot, and whether orientations are random.
+        rng: random generator.
+        footprints: footprint of each object.
+        fixed: outlines of bodies that are in the scene already.
+        clear_of: outline of a tall body, which the hand that grasps an object must not overlap.
 
     Raises:
-        PlacementError: there is no room.
+        PlacementError: no layout was found.
     """
     for _ in range(LAYOUTS):
-        taken: list[tuple[Rectangle, Rectangle | None]] = [(other, None) for other in fixed]
+        placed: list[tuple[Rectangle, Rectangle | None]] = [(other, None) for other in fixed]
         found: list[tuple[tuple[float, float], float]] = []
         for footprint in footprints:
             for _ in range(TRIES):
@@ -68,12 +71,12 @@ def scatter(
                     gap_m(body, other) >= footprint.margin_m
                     and (hand is None or gap_m(hand, other) >= 0)
                     and (other_hand is None or gap_m(body, other_hand) >= 0)
-                    for other, other_hand in taken
+                    for other, other_hand in placed
                 ):
                     break
             else:
                 break
-            taken.append((body, hand))
+            placed.append((body, hand))
             found.append((xy, yaw))
         else:
             return found
@@ -86,14 +89,14 @@ def scatter(
 def random_rectangle(
     task: Task, rng: np.random.Generator, half_x: float, half_y: float, fixed_yaw_rad: float = 0.0
 ) -> Rectangle:
-    """Return a rectangle with a random place and yaw, its corners inside the workspace.
+    """Return a rectangle with a random centre and yaw, its corners inside the workspace.
 
     Args:
-        task: its workspace, and whether orientations are random.
-        rng: draws place and yaw.
+        task: gives the workspace, and whether orientations are random.
+        rng: random generator.
         half_x: half its extent along its x axis.
         half_y: half its extent along its y axis.
-        fixed_yaw_rad: its yaw where orientations are not random.
+        fixed_yaw_rad: its yaw with fixed orientations.
 
     Raises:
         PlacementError: the workspace is too small.
@@ -107,7 +110,7 @@ def random_rectangle(
     ):
         if low + extent > high - extent:
             raise PlacementError(
-                f"something {2 * half_x:.3g} m by {2 * half_y:.3g} m does not fit: enlarge "
+                f"a container of {2 * half_x:.3g} m by {2 * half_y:.3g} m does not fit: enlarge "
                 "`workspace` or lower `object_scale_range`"
             )
         point.append(float(rng.uniform(low + extent, high - extent)))

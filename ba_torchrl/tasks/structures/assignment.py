@@ -1,4 +1,4 @@
-"""Standing: how the pieces of a blueprint lie, and which of them fills which slot."""
+"""The states of the pieces of a blueprint, and their assignment to its slots."""
 
 from __future__ import annotations
 
@@ -15,40 +15,40 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
 from ba_torchrl.tasks.structures.free_space import extent_along_m
 
-LYING_COSINE = 0.5
-"""A piece lies on another if the surfaces that touch are within 60 degrees of level."""
+SUPPORT_COSINE = 0.5
+"""A contact supports a piece if its normal is within 60 degrees of the vertical."""
 
 
 class PieceState(NamedTuple):
-    """A piece as it lies now."""
+    """Position, tilt and supports of a piece."""
 
     position: Vector
     tilt_rad: float
     on_ground: bool
-    below: frozenset[Body]
+    supports: frozenset[Body]
     """The pieces that it rests on."""
 
 
 Assignment = tuple[Body | None, ...]
-"""The body in each slot."""
+"""The body in each slot; None for an empty slot."""
 
 
 def read_piece_states(
     world: World, pieces: Mapping[Body, Piece], ground: frozenset[int], block_m: float
 ) -> dict[Body, PieceState]:
-    """Return how every piece lies; contacts are those of the last step.
+    """Return the state of every piece, with the contacts of the last physics step.
 
     Args:
-        world: holds them.
-        pieces: what each body is.
-        ground: PyBullet ids of what the lowest pieces stand on.
-        block_m: edge of a block, the measure of what counts as on top.
+        world: the world of the bodies.
+        pieces: the kind of each body.
+        ground: PyBullet ids of the bodies that form the ground.
+        block_m: edge of a block. A support is at least half of it lower than the piece.
     """
     by_id = {body.id: body for body in pieces}
     heights = {body: body.position[2] for body in pieces}
     states = {}
     for body, piece in pieces.items():
-        touched, below = set(), set()
+        touched, supports = set(), set()
         for point in contacts(world.client, body.id):
             if point.distance_m >= CONTACT_DISTANCE_M:
                 continue
@@ -56,28 +56,28 @@ def read_piece_states(
             other = by_id.get(point.other_id)
             if (
                 other is not None
-                and point.normal[2] > LYING_COSINE
+                and point.normal[2] > SUPPORT_COSINE
                 and heights[body] - heights[other] >= block_m / 2
             ):
-                below.add(other)
+                supports.add(other)
         states[body] = PieceState(
             body.position,
             piece.tilt_rad(body),
             not ground.isdisjoint(touched),
-            frozenset(below),
+            frozenset(supports),
         )
     return states
 
 
 class SlotAssigner:
-    """The pieces as they lie now, matched to the slots of a blueprint by their kind.
+    """Finds the assignments of the pieces, in their present states, to the slots of a blueprint.
 
     Args:
-        blueprint: what is to be built.
-        pieces: what each body is.
-        states: how each lies.
-        block_m: edge of a block, the measure of what counts as on top.
-        held: what the gripper holds.
+        blueprint: the structure.
+        pieces: the kind of each body.
+        states: the state of each body.
+        block_m: edge of a block, which bounds how far a piece may be off the centre of its slot.
+        held: the body in the gripper; it fills no slot.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class SlotAssigner:
         self.held = held
 
     def assignments(self) -> Iterator[Assignment]:
-        """Yield every way to see a body in each of the slots."""
+        """Yield every assignment that fills all slots."""
 
         def fill(assignment: Assignment) -> Iterator[Assignment]:
             if len(assignment) == len(self.blueprint.slots):
@@ -107,7 +107,7 @@ class SlotAssigner:
         return fill(())
 
     def largest_assignments(self) -> tuple[list[Assignment], int]:
-        """Return all ways to see bodies in as many slots as possible, and how many these are."""
+        """Return all assignments that fill as many slots as possible, and that number of slots."""
         count = len(self.blueprint.slots)
         found: list[Assignment] = []
         most = 0
@@ -129,38 +129,42 @@ class SlotAssigner:
         return found, most
 
     def misplaced(self, assignment: Assignment, numbers: Sequence[int] | None = None) -> list[Body]:
-        """Return what lies on the bodies in some slots and does not belong there.
+        """Return the pieces that rest on bodies in slots where the blueprint places none of them.
 
         Args:
             assignment: the body in each slot.
-            numbers: the slots; those that must stay free if not given.
+            numbers: numbers of the slots to check; by default those that must stay clear.
         """
         slots = self.blueprint.slots
         if numbers is None:
-            numbers = [i for i, slot in enumerate(slots) if slot.stays_free]
+            numbers = [i for i, slot in enumerate(slots) if slot.stays_clear]
         misplaced = []
         for number in numbers:
-            own = {assignment[i] for i, slot in enumerate(slots) if number in slot.on}
+            belonging = {assignment[i] for i, slot in enumerate(slots) if number in slot.on}
             misplaced += [
                 body
-                for body, view in self.states.items()
-                if assignment[number] in view.below and body not in own
+                for body, state in self.states.items()
+                if assignment[number] in state.supports and body not in belonging
             ]
         return misplaced
 
     def bodies_above(self) -> dict[Body, frozenset[Body]]:
-        """Return all that lies on each piece, right on it or on what does."""
+        """Return for each piece all pieces that it supports, directly or through others."""
         bodies_above: dict[Body, frozenset[Body]] = {}
-        # from the top down: what lies on a piece is higher than it
+        # from the top down: a piece is higher than its supports
         for body in sorted(self.pieces, key=lambda piece: -self.states[piece].position[2]):
-            upon = {
-                b for b, view in self.states.items() if b is not self.held and body in view.below
+            supported = {
+                other
+                for other, state in self.states.items()
+                if other is not self.held and body in state.supports
             }
-            bodies_above[body] = frozenset(upon.union(*(bodies_above[b] for b in upon)))
+            bodies_above[body] = frozenset(
+                supported.union(*(bodies_above[other] for other in supported))
+            )
         return bodies_above
 
     def _candidates(self, assignment: Assignment) -> Iterator[Body]:
-        """Yield the bodies that lie as they must for the next slot."""
+        """Yield the bodies that can fill the next slot of a partial assignment."""
         number = len(assignment)
         slot = self.blueprint.slots[number]
         if any(assignment[i] is None for i in slot.on):
@@ -175,58 +179,58 @@ class SlotAssigner:
                 yield body
 
     def _fits(self, body: Body, number: int, assignment: Assignment) -> bool:
-        """Whether a body lies as it must to fill a slot."""
-        slot, view = self.blueprint.slots[number], self.states[body]
+        """Whether the state of a body is that of a piece in a slot."""
+        slot, state = self.blueprint.slots[number], self.states[body]
         supports = [assignment[i] for i in slot.on]
-        if view.tilt_rad >= UPRIGHT_RAD:
+        if state.tilt_rad >= UPRIGHT_RAD:
             return False
         partner = self.blueprint.partner(number)
         if supports:
-            if view.on_ground or not view.below.issuperset(supports):
+            if state.on_ground or not state.supports.issuperset(supports):
                 return False
-        elif not view.on_ground or view.below:
+        elif not state.on_ground or state.supports:
             return False
         if partner is not None:
             return partner > number or self._is_pair(body, number, partner, assignment)
         if not supports:
             return True
-        over = [assignment[i] for i in slot.over or slot.on]
-        if None in over:
+        below = [assignment[i] for i in slot.centered_over or slot.on]
+        if None in below:
             return False
-        dx, dy = (
-            view.position[i] - middle(self.states[o].position for o in over)[i] for i in (0, 1)
-        )
-        if len(over) == 1:
+        center = mean_position(self.states[other].position for other in below)
+        dx, dy = (state.position[i] - center[i] for i in (0, 1))
+        if len(below) == 1:
             return max(abs(dx), abs(dy)) <= self.block_m / 2
         return math.hypot(dx, dy) < self.block_m
 
     def _is_pair(self, body: Body, number: int, partner: int, assignment: Assignment) -> bool:
-        """Whether a body stands right beside the one in a slot for a bridge to lie on both."""
+        """Whether a body and the body in the partner slot are where they can support a bridge."""
         other = assignment[partner]
         if other is None:
             return False
         on = self.blueprint.slots[number].on
-        here, there = self.states[body].position, self.states[other].position
+        first, second = self.states[body].position, self.states[other].position
         if on:
-            below = self.states[assignment[on[0]]].position
-            if math.dist(middle((here, there))[:2], below[:2]) >= self.block_m:
+            support = self.states[assignment[on[0]]].position
+            if math.dist(mean_position((first, second))[:2], support[:2]) >= self.block_m:
                 return False
         bridge = self.blueprint.slots[self.blueprint.bridge_on(number)]
-        apart = math.dist(here[:2], there[:2])
+        distance = math.dist(first[:2], second[:2])
         if bridge.span.gap_m is not None:
-            way = (np.array(there[:2]) - here[:2]) / max(apart, 1e-9)
-            apart -= float(
-                extent_along_m(body, way[None])[0] + extent_along_m(other, -way[None])[0]
+            direction = (np.array(second[:2]) - first[:2]) / max(distance, 1e-9)
+            distance -= float(
+                extent_along_m(body, direction[None])[0]
+                + extent_along_m(other, -direction[None])[0]
             )
-        if bridge.span.least_m <= apart <= bridge.span.most_m:
+        if bridge.span.least_m <= distance <= bridge.span.most_m:
             return True
         return any(
             piece.kind == bridge.piece.kind
-            and self.states[candidate].below.issuperset((body, other))
+            and self.states[candidate].supports.issuperset((body, other))
             for candidate, piece in self.pieces.items()
         )
 
 
-def middle(points: Iterable[Vector]) -> Vector:
-    """Return the mean of some points."""
+def mean_position(points: Iterable[Vector]) -> Vector:
+    """Return the mean of points."""
     return tuple(sum(values) / len(values) for values in zip(*points, strict=True))

@@ -1,4 +1,4 @@
-"""Access: whether the hand can reach a piece between others, and what would have to go first."""
+"""Blocked grasps: which pieces prevent a grasp, and which of them to remove first."""
 
 from __future__ import annotations
 
@@ -14,82 +14,82 @@ from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.tasks.structures.blueprint import Piece
 from ba_torchrl.tasks.structures.free_space import extent_along_m
 
-SPARE_M = 2e-3
-"""Room between a piece and a finger that comes down close by it."""
+EDGE_CLEARANCE_M = 2e-3
+"""Clearance between a piece and the finger that descends close to it."""
 
 
 class GraspQueries:
-    """What the planner asks about the gripper; here, that of a gripper that needs no room."""
+    """What `StructurePlanner` asks about the gripper; by default every grasp is free."""
 
     clears_blocked_pieces: bool = False
-    """Whether pieces that block the grasp of another are removed."""
+    """Whether pieces that block the grasp of another piece are removed."""
 
-    def pick_effort_m(self, body: Body) -> float:
-        """Return what to add to the way of a piece for picking it, to choose among equals."""
+    def pick_cost_m(self, body: Body) -> float:
+        """Return the cost of picking a piece, as a distance that is added to that of its move."""
         return 0.0
 
     def site_deficit_m(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
-        """Return how much clearance is missing at sites to pick the other pieces later, [S].
+        """Return the clearance [S] that structures at sites lack for picking the remaining pieces.
 
         Args:
-            sites: [S, P, 2] points on the ground that a structure will stand on.
-            rest: pieces that will still have to be picked.
+            sites: [S, P, 2] points of the ground that a structure at each site occupies, metres.
+            rest: the pieces that remain to be picked.
         """
         return np.zeros(len(sites))
 
-    def blocks_grasp(self, body: Body, other: Body, place: Vector | None) -> Sequence[bool]:
-        """Return whether a piece is in the hand's way, for each of the ways to grasp another.
+    def blocks_grasp(self, body: Body, other: Body, position: Vector | None) -> Sequence[bool]:
+        """Return for each grasp candidate of a piece whether another piece blocks it.
 
         Args:
-            body: to be grasped.
-            other: the piece.
-            place: its position then; None where it is now.
+            body: the piece to grasp.
+            other: the other piece.
+            position: assumed position of the other piece; its present one if None.
         """
         return (False,)
 
 
 class Move(NamedTuple):
-    """What to pick and where to place it."""
+    """A piece to pick, and where to place it."""
 
     body: Body
     piece: Piece
     position: Vector
-    """Where its origin goes."""
+    """Final position of its origin."""
     yaw_rad: float | None
-    """Its heading up to multiples of the period; None if any will do."""
+    """Final yaw up to multiples of the period; None if any yaw is allowed."""
     yaw_period_rad: float
     onto: tuple[Body, ...]
-    """What it will rest on; nothing stands for the ground."""
+    """The bodies that will support it; empty for the ground."""
 
 
 class GraspCandidate(NamedTuple):
-    """A way to grasp a piece; distances are from its origin, along the gripper's x axis."""
+    """A grasp of a piece; distances are from its origin along the gripper's x axis."""
 
     yaw_rad: float
     shift_m: float = 0.0
-    """Where the tool is; in the middle of the piece if zero."""
+    """Position of the tool; 0 for a centred grasp."""
     far_finger_range_m: tuple[float, float] = (0.0, 0.0)
-    """What one finger sweeps on its way to the piece if the tool is off the middle."""
+    """Range that the far finger sweeps as it closes, for a grasp with a shift."""
     near_finger_range_m: tuple[float, float] = (0.0, 0.0)
-    """Where the other one comes down then, close by the piece."""
+    """Range in which the near finger descends beside the piece, for a grasp with a shift."""
 
 
 def edge_grasps(
     gripper: Gripper, body: Body, yaw_rad: float, opening: float = 1.0
 ) -> list[GraspCandidate]:
-    """Return the ways to come down with one finger close by a body, the other far from it.
+    """Return the grasps at which one finger descends close to a body and the other far from it.
 
-    The first needs no more room than its own width. Where that is wanting it wedges itself in all
-    the same: between the fingers the body can give way.
+    The near finger needs no more clearance than its own depth. Even with less the grasp may
+    succeed, as the body can slide into the gap between the fingers.
 
     Args:
-        gripper: what is to grasp.
-        body: stands on the ground, so that it may slide.
-        yaw_rad: the gripper's, or its reverse.
-        opening: of the gripper, 0 to 1.
+        gripper: the gripper.
+        body: a body on the ground, on which it can slide.
+        yaw_rad: yaw of the gripper, up to half a turn.
+        opening: opening of the gripper, 0 to 1.
 
     Returns:
-        One for each finger; none if the body nearly fills the gripper.
+        One grasp for each finger; none if the body nearly fills the gap between the fingers.
     """
     half_gap_m = opening * gripper.half_gap_m
     finger_m = gripper.finger_depth_m
@@ -97,25 +97,22 @@ def edge_grasps(
     for yaw in (yaw_rad, yaw_rad + math.pi):
         ahead = np.array([math.cos(yaw), math.sin(yaw)])
         far_m, near_m = extent_along_m(body, np.stack([ahead, -ahead])).tolist()
-        shift_m = half_gap_m - near_m - SPARE_M
-        if shift_m > SPARE_M:
+        shift_m = half_gap_m - near_m - EDGE_CLEARANCE_M
+        if shift_m > EDGE_CLEARANCE_M:
             far_finger_range_m = (far_m, shift_m + half_gap_m + finger_m)
-            candidates.append(
-                GraspCandidate(
-                    yaw, shift_m, far_finger_range_m, (-near_m - SPARE_M - finger_m, -near_m)
-                )
-            )
+            near_finger_range_m = (-near_m - EDGE_CLEARANCE_M - finger_m, -near_m)
+            candidates.append(GraspCandidate(yaw, shift_m, far_finger_range_m, near_finger_range_m))
     return candidates
 
 
 class GraspBlocking:
-    """The room that pieces leave the hand to grasp each other.
+    """Which pieces block the grasps of which others.
 
     Args:
-        pieces: what each body is.
-        bodies_above: all that lies on each, right on it or on what does.
-        held: what the gripper holds: it is in no one's way.
-        queries: about the gripper.
+        pieces: the kind of each body.
+        bodies_above: for each body all that it supports, directly or through others.
+        held: the body in the gripper; it blocks no grasp.
+        queries: answers about the gripper.
     """
 
     def __init__(
@@ -132,7 +129,7 @@ class GraspBlocking:
         self._obstacles: dict[Body, list[frozenset[Body]]] = {}
 
     def obstacles(self, body: Body) -> list[frozenset[Body]]:
-        """Return what is in the hand's way, for each of the ways to grasp a body."""
+        """Return for each grasp candidate of a body the pieces that block it."""
         if not self.queries.clears_blocked_pieces:
             return [frozenset()]
         if body not in self._obstacles:
@@ -141,39 +138,39 @@ class GraspBlocking:
             self._obstacles[body] = [
                 frozenset(
                     other
-                    for other, blocks in zip(others, way, strict=True)
-                    if blocks and other is not self.held
+                    for other, is_blocking in zip(others, column, strict=True)
+                    if is_blocking and other is not self.held
                 )
-                for way in zip(*rows, strict=True)
+                for column in zip(*rows, strict=True)
             ] or [frozenset()]
         return self._obstacles[body]
 
     def is_blocked(self, body: Body) -> bool:
-        """Whether no way to grasp a body is free."""
+        """Whether every grasp candidate of a body is blocked."""
         return all(self.obstacles(body))
 
     def removals(self, assignment: Sequence[Body | None]) -> Iterator[tuple[int, Body, None]]:
-        """Yield what could go to the ground to make room for the hand at a piece.
+        """Yield the pieces to place on the ground to free the grasp of another piece.
 
         Args:
-            assignment: the body in each slot; these need not be picked.
+            assignment: the body in each slot; these pieces are not picked.
 
         Yields:
-            How many pieces must go, the one to go first, and None for the ground.
+            Number of pieces to remove, the piece to remove first, and None for the ground.
         """
         for body in self.pieces:
             if body not in assignment and body is not self.held:
-                gone = self._in_the_way(body) or ()
-                for top in gone:
-                    if self.bodies_above[top].isdisjoint(gone):
-                        yield len(gone), top, None
+                removed = self._fewest_removals(body) or ()
+                for top in removed:
+                    if self.bodies_above[top].isdisjoint(removed):
+                        yield len(removed), top, None
 
     def added_removals(self, move: Move, assignment: Sequence[Body | None]) -> int:
-        """Return the detours that a move brings: what it builds up beside a piece not yet fetched.
+        """Return the number of moves that a move adds, as its piece blocks others.
 
         Args:
-            move: to judge.
-            assignment: the body in each slot.
+            move: the move.
+            assignment: the body in each slot; these pieces are not picked.
         """
         if not self.queries.clears_blocked_pieces:
             return 0
@@ -181,33 +178,33 @@ class GraspBlocking:
         for other in self.pieces:
             if other in assignment or other is move.body or other is self.held:
                 continue
-            gone = after._in_the_way(other)
-            if gone is None and self._in_the_way(other) is not None:
+            removed = after._fewest_removals(other)
+            if removed is None and self._fewest_removals(other) is not None:
                 most = len(self.pieces)
-            elif gone is not None and move.body in gone:
-                most = max(most, len(gone))
-        return most + 2 if most else 0  # taken down, and put up again
+            elif removed is not None and move.body in removed:
+                most = max(most, len(removed))
+        return most + 2 if most else 0  # the piece is removed and placed again
 
-    def _in_the_way(self, body: Body) -> frozenset[Body] | None:
-        """Return the fewest pieces that must go for the hand to reach a body, None if that fails.
+    def _fewest_removals(self, body: Body) -> frozenset[Body] | None:
+        """Return the smallest set of pieces whose removal frees a grasp of a body; None if none is.
 
-        What is in the way must itself be within reach, if not for the others that go.
+        Each of them must have a grasp that nothing but the others in the set blocks.
         """
         found = []
-        for way in self.obstacles(body):
-            gone = way.union(*(self.bodies_above[other] for other in way))
-            if body not in gone and all(
-                any(way <= gone for way in self.obstacles(other)) for other in gone
+        for obstacles in self.obstacles(body):
+            removed = obstacles.union(*(self.bodies_above[other] for other in obstacles))
+            if body not in removed and all(
+                any(others <= removed for others in self.obstacles(other)) for other in removed
             ):
-                found.append(gone)
+                found.append(removed)
         return min(found, key=len, default=None)
 
     def _after(self, move: Move) -> GraspBlocking:
-        """Return how things will be after a move, whose body will be within reach."""
+        """Return the blocking after a move; the moved piece itself counts as free to grasp."""
         body, bodies_above = move.body, dict(self.bodies_above)
-        for other, pile in self.bodies_above.items():
-            if other in move.onto or not pile.isdisjoint(move.onto):
-                bodies_above[other] = pile | {body}
+        for other, above in self.bodies_above.items():
+            if other in move.onto or not above.isdisjoint(move.onto):
+                bodies_above[other] = above | {body}
         held = None if self.held is body else self.held
         after = GraspBlocking(self.pieces, bodies_above, held, self.queries)
         for other in self.pieces:
@@ -216,7 +213,7 @@ class GraspBlocking:
                 continue
             blocks = self.queries.blocks_grasp(other, body, move.position)
             after._obstacles[other] = [
-                way | {body} if is_there else way - {body}
-                for way, is_there in zip(self.obstacles(other), blocks, strict=True)
+                obstacles | {body} if is_blocking else obstacles - {body}
+                for obstacles, is_blocking in zip(self.obstacles(other), blocks, strict=True)
             ]
         return after

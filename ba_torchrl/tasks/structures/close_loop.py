@@ -16,41 +16,36 @@ from ba_torchrl.sim.shapes import Color
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.clearance import grasp_clearance_m
 from ba_torchrl.tasks.close_loop_task import BLUE, GREEN, RED, CloseLoopControl
-from ba_torchrl.tasks.motion_primitives import (
-    OPEN,
-    carry_to,
-    lift,
-    nearest_equivalent_yaw,
-    pick_up,
-)
+from ba_torchrl.tasks.motion_primitives import IS_OPEN, OPEN, lift, nearest_equivalent_yaw
 from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.terrain import Terrain
-from ba_torchrl.tasks.workspace import ActionLimits, Spot
+from ba_torchrl.tasks.transport import carry_to, pick_up
+from ba_torchrl.tasks.workspace import ActionLimits, Spacing
 
-NO_ROOM_M = 1.0
-"""Cost of a piece that no grasp reaches, in metres of detour."""
+BLOCKED_COST_M = 1.0
+"""Cost of picking a piece whose grasps all lack clearance."""
 
 COLORS: tuple[Color, ...] = (RED, BLUE, (0.9, 0.6, 0.2, 1.0), GREEN)
-"""Of the cubes, from the bottom up."""
+"""Colors of the cubes, from the bottom up."""
 
 
 class CloseLoopStructureTask(CloseLoopControl, Task):
-    """Pieces scattered on the ground; success when they stand as the blueprint says, released.
+    """Pieces at random poses on the ground; success when they form the blueprint's structure.
 
-    A piece that must stay upright and has tipped over ends the episode: a gripper that points down
-    can lift it, but not turn it upright.
+    The episode ends when a piece that must stay upright tips over: a gripper that points down
+    cannot turn it upright.
     """
 
-    spot_blocks: ClassVar[dict[int, Spot]] = {
-        2: Spot(2.4, 2.4),
-        3: Spot(2.4, 2.4),
-        4: Spot(1.6, 2.0),
+    spacing_blocks: ClassVar[dict[int, Spacing]] = {
+        2: Spacing(2.4, 2.4),
+        3: Spacing(2.4, 2.4),
+        4: Spacing(1.6, 2.0),
     }
-    """Space around each piece at the start in blocks, by the number of pieces: four are closer."""
+    """Space around each piece at the start, in blocks, by the number of pieces."""
 
     @abstractmethod
     def blueprint(self) -> Blueprint:
@@ -67,21 +62,22 @@ class CloseLoopStructureTask(CloseLoopControl, Task):
         )
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Put the pieces anywhere, with room for the fingers between them.
+        """Place the pieces at random poses, with clearance for the fingers.
 
-        With fixed orientations a gripper at yaw 0 closes on each of them.
+        With fixed orientations, a gripper at yaw 0 can grasp each of them.
         """
         self.structure.draw(rng)
         pieces = self.structure.pieces
-        padding, distance = self.spot_blocks[len(pieces)]
-        spots = [Spot(padding * self.block_m, distance * self.block_m)] * len(pieces)
-        for (body, piece), xy in zip(pieces.items(), self.random_points(rng, spots), strict=True):
+        padding, distance = self.spacing_blocks[len(pieces)]
+        spacing = Spacing(padding * self.block_m, distance * self.block_m)
+        points = self.random_points(rng, [spacing] * len(pieces))
+        for (body, piece), xy in zip(pieces.items(), points, strict=True):
             fixed_yaw = -piece.grasp_yaws_rad[0] % math.pi
             self.stand(body, xy, fixed_yaw + self.random_yaw(rng, piece.yaw_period_rad))
 
     @property
     def planner(self) -> StructurePlanner:
-        """Compares the pieces with the blueprint."""
+        """The planner that compares the pieces with the blueprint."""
         return self.structure.planner
 
     @property
@@ -90,15 +86,15 @@ class CloseLoopStructureTask(CloseLoopControl, Task):
         return list(self.structure.pieces)
 
     def evaluate(self) -> dict[str, bool]:
-        """Return whether the structure stands, with none of its pieces in the gripper."""
+        """Return whether the structure stands and whether no piece is held."""
         return self.planner.evaluate(self.robot.held_body())
 
     def is_valid(self) -> bool:
-        """Whether all pieces are inside the workspace, and upright where they must be."""
+        """Whether all pieces are inside the workspace, and upright where required."""
         return super().is_valid() and not self.planner.has_tipped(self.robot.held_body())
 
     def expert_command(self) -> GripperCommand:
-        """Move the piece that comes next."""
+        """Return the command of the planner's next move."""
         return assemble(self.robot, self.planner, self.terrain, self.action_limits)
 
 
@@ -108,30 +104,31 @@ def assemble(
     terrain: Terrain,
     limits: ActionLimits,
 ) -> GripperCommand:
-    """Pick the piece that comes next and place it; a function of the scene, from any state.
+    """Return the command of the planner's next move, from any state of the scene.
 
     Args:
         robot: the robot.
         planner: compares the pieces with the blueprint.
-        terrain: where pieces may be put down.
-        limits: of an action.
+        terrain: the ground.
+        limits: limits of an action.
     """
     (x, y, _), yaw = robot.tool_pose()
-    held = robot.held_body() if robot.opening() < 0.9 else None
+    held = robot.held_body() if robot.opening() < IS_OPEN else None
     pieces = list(planner.pieces)
 
     def yaws(body: Body) -> list[float]:
         return planner.pieces[body].grasp_yaws(body) if limits.turn_rad else [yaw]
 
     class Queries(GraspQueries):
-        """The nearest piece first, those that no grasp reaches last."""
+        """Prefers the nearest piece, and pieces with a free grasp to all others."""
 
-        def pick_effort_m(self, body: Body) -> float:
+        def pick_cost_m(self, body: Body) -> float:
             others = [other for other in pieces if other is not body]
-            room = max(
+            clearance = max(
                 grasp_clearance_m(robot.gripper, body, option, others) for option in yaws(body)
             )
-            return math.dist((x, y), body.position[:2]) + (0.0 if room > 0 else NO_ROOM_M)
+            distance = math.dist((x, y), body.position[:2])
+            return distance + (0.0 if clearance > 0 else BLOCKED_COST_M)
 
     area = PlacementArea(
         *terrain.build_area.shrunk(1.2 * planner.block_m),
@@ -153,8 +150,8 @@ def assemble(
         )
     target_yaw = None
     if move.yaw_rad is not None:
-        ahead = move.yaw_rad - move.piece.yaw_rad(held)
-        target_yaw = nearest_equivalent_yaw(yaw, yaw + ahead, limits, move.yaw_period_rad)
+        turn = move.yaw_rad - move.piece.yaw_rad(held)
+        target_yaw = nearest_equivalent_yaw(yaw, yaw + turn, limits, move.yaw_period_rad)
     return carry_to(
         robot,
         held,

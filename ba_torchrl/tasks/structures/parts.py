@@ -1,42 +1,71 @@
-"""The pieces of the structures; sizes are multiples of a block's edge (appendix A.1)."""
+"""The pieces of the structures: their kinds, and their shapes in multiples of a block's edge.
+
+Appendix A.1.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 
+from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, transform_mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
-from ba_torchrl.tasks.structures.blueprint import (
-    CUBE,
-    CUBOID,
-    CYLINDER,
-    CYLINDER_SIDES,
-    ROOF,
-    TRIANGLE,
-    Piece,
-    Span,
-)
-from ba_torchrl.tasks.workspace import Spot
+from ba_torchrl.tasks.structures.blueprint import Piece, Span
+from ba_torchrl.tasks.workspace import Spacing
 
 LENGTH = 4.0
-"""Length of roof and cuboid."""
+"""Length of roof and cuboid, in blocks."""
 EAVES = 0.2
-"""Height of a roof's upright sides: on slopes alone no two fingers hold it."""
+"""Height of a roof's vertical sides, in blocks. Fingers cannot hold it by its slopes alone."""
+CYLINDER_SIDES = 16
+"""Number of sides of the polygon that approximates the circle."""
 
 RED: Color = (0.82, 0.22, 0.2, 1.0)
 BLUE: Color = (0.2, 0.4, 0.8, 1.0)
 GREEN: Color = (0.35, 0.7, 0.35, 1.0)
 ORANGE: Color = (0.9, 0.55, 0.15, 1.0)
 
-SHORT_SPOT, LONG_SPOT = 2.4, 3.4
-"""Space at the start around pieces as long as a block, and around roof and cuboid."""
+SHORT_SPACING, LONG_SPACING = 2.4, 3.4
+"""Space at the start, in blocks, around pieces one block long, and around roof and cuboid."""
+
+
+# -- kinds -------------------------------------------------------------------------------------
+
+
+def _both(*axes: Vector) -> tuple[Vector, ...]:
+    """Return each axis and its reverse."""
+    return tuple(tuple(sign * x for x in axis) for axis in axes for sign in (1.0, -1.0))
+
+
+_X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+CUBE = Piece("cube", math.pi / 2, (0.0, math.pi / 2), _both(_X, _Y, _Z))
+CUBOID = Piece("cuboid", math.pi, (0.0,), _both(_X, _Z))
+"""A box, longest along y."""
+ROOF = Piece("roof", math.pi, (0.0,), stays_upright=True)
+"""A long gable with its ridge along y. The fingers close on its eaves."""
+TRIANGLE = Piece("triangle", math.pi, (math.pi / 2,), stays_upright=True)
+"""A short gable with its ridge along y. The fingers close on its vertical ends."""
+CYLINDER = Piece(
+    "cylinder",
+    2 * math.pi / CYLINDER_SIDES,
+    tuple(2 * math.pi * i / CYLINDER_SIDES for i in range(CYLINDER_SIDES // 2)),
+    _both(_Z),
+    stays_upright=True,
+)
+"""An upright cylinder with two of its sides perpendicular to x. On its side it rolls."""
+
+
+# -- pieces with a shape -----------------------------------------------------------------------
 
 
 def cube(block_m: float, color: Color = RED) -> Piece:
     """Return a cube."""
     return replace(
-        CUBE, shape=Box(size_m=(block_m,) * 3, color=color), spot=_spot(SHORT_SPOT * block_m)
+        CUBE,
+        shape=Box(size_m=(block_m,) * 3, color=color),
+        spacing=_spacing(SHORT_SPACING * block_m),
     )
 
 
@@ -44,44 +73,44 @@ def cylinder(block_m: float) -> Piece:
     """Return an upright cylinder, as high as it is wide."""
     radius, half = block_m / 2, block_m / 2
     (upright,) = lathe_parts(((radius, -half), (radius, half)), CYLINDER_SIDES)
-    mesh = transform_mesh(
-        upright, (0.0, 0.0, 0.0), math.pi / CYLINDER_SIDES
-    )  # sides, not edges, across x
+    # rotated by half a side, so that sides and not edges are perpendicular to x
+    mesh = transform_mesh(upright, (0.0, 0.0, 0.0), math.pi / CYLINDER_SIDES)
     shape = Solid(parts=(mesh,), color=ORANGE)
-    return replace(CYLINDER, shape=shape, spot=_spot(SHORT_SPOT * block_m))
+    return replace(CYLINDER, shape=shape, spacing=_spacing(SHORT_SPACING * block_m))
 
 
 def cuboid(block_m: float) -> Piece:
-    """Return a cuboid, its length along y."""
+    """Return a cuboid, longest along y."""
     shape = Box(size_m=(block_m, LENGTH * block_m, block_m), color=BLUE)
-    return replace(CUBOID, shape=shape, spot=_spot(LONG_SPOT * block_m))
+    return replace(CUBOID, shape=shape, spacing=_spacing(LONG_SPACING * block_m))
 
 
 def roof(block_m: float) -> Piece:
-    """Return a roof, its ridge along y."""
-    size_m = (block_m, LENGTH * block_m, block_m)
-    return replace(ROOF, shape=_gable(size_m, EAVES * block_m), spot=_spot(LONG_SPOT * block_m))
+    """Return a roof with its ridge along y."""
+    shape = _gable((block_m, LENGTH * block_m, block_m), EAVES * block_m)
+    return replace(ROOF, shape=shape, spacing=_spacing(LONG_SPACING * block_m))
 
 
 def triangle(block_m: float) -> Piece:
-    """Return a triangle, its ridge along y."""
-    return replace(TRIANGLE, shape=_gable((block_m,) * 3, 0.0), spot=_spot(SHORT_SPOT * block_m))
+    """Return a triangle with its ridge along y."""
+    shape = _gable((block_m,) * 3, 0.0)
+    return replace(TRIANGLE, shape=shape, spacing=_spacing(SHORT_SPACING * block_m))
 
 
 def pair_span(block_m: float, most: float) -> Span:
-    """Return how far apart two supports of a bridge stand.
+    """Return the distance between the two supports of a bridge.
 
     Args:
         block_m: edge of a block.
-        most: greatest distance of their centres, in blocks.
+        most: largest distance of their centres, in blocks.
     """
     return Span(0.0, 1.75 * block_m, most * block_m)
 
 
-def _spot(space_m: float) -> Spot:
-    return Spot(space_m, space_m)
+def _spacing(width_m: float) -> Spacing:
+    return Spacing(width_m, width_m)
 
 
-def _gable(size_m: tuple[float, float, float], eaves_m: float) -> Solid:
+def _gable(size_m: Vector, eaves_m: float) -> Solid:
     mesh = gable_mesh(size_m, eaves_m)
     return Solid(parts=(mesh,), color=GREEN, center_of_mass_m=centroid([mesh]))

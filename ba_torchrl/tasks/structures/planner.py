@@ -1,7 +1,7 @@
-"""Building: the pieces of a blueprint in a world, whether they stand as they should, what is next.
+"""Planner of structures: whether the structure stands, and which piece to move next and where.
 
-The bodies are matched to the slots by their kind, in whatever way suits the scene best, so that
-every question is answered from any state.
+Bodies are matched to slots by their kind, in the assignment that needs the fewest moves, so both
+answers depend on the present scene only.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.assignment import (
     Assignment,
     SlotAssigner,
-    middle,
+    mean_position,
     read_piece_states,
 )
 from ba_torchrl.tasks.structures.blocking import GraspBlocking, GraspQueries, Move
@@ -26,29 +26,29 @@ from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece,
 from ba_torchrl.tasks.structures.free_space import (
     PlacementArea,
     extent_along_m,
-    nearest_spot,
+    nearest_free_position,
     placement_deficit_m,
 )
 
 BEARINGS = 16
-"""Spots beside a piece are looked for in this many directions of a half turn."""
+"""Directions per half turn in which sites beside a piece are compared."""
 SITE_POINTS = 7
-"""What a structure will take up on the ground is told by this many points along a bridge."""
-CROWDED = 10.0
-"""What a metre too near is worth in metres of way."""
-STUCK = 100
-"""What it is worth in detours that the hand can reach what it is to pick."""
+"""Points along a bridge that represent the footprint of a structure."""
+DEFICIT_WEIGHT = 10.0
+"""Cost of a metre of missing clearance, as a multiple of the cost of a metre of distance."""
+BLOCKED_MOVES = 100
+"""Cost, in moves, of picking a piece whose grasps are all blocked."""
 
 
 class StructurePlanner:
-    """The pieces of a blueprint in a world; contacts are those of the last step.
+    """Compares the pieces in a world with a blueprint; contacts are those of the last step.
 
     Args:
-        blueprint: what is to be built.
-        world: where.
-        pieces: the bodies and what each of them is; there may be more than the blueprint needs.
-        block_m: edge of a block, the scale of what counts as on top.
-        support_ids: PyBullet ids of what the lowest pieces stand on; the floor if None.
+        blueprint: the structure.
+        world: the world of the bodies.
+        pieces: the kind of each body; there may be more bodies than slots.
+        block_m: edge of a block, the scale of the tolerances.
+        support_ids: PyBullet ids of the bodies that form the ground; the floor if None.
 
     Raises:
         ValueError: there are too few bodies of a kind.
@@ -74,7 +74,7 @@ class StructurePlanner:
                 raise ValueError(f"the blueprint needs {count} of {kind!r}, not {found[kind]}")
 
     def evaluate(self, held: Body | None = None) -> dict[str, bool]:
-        """Return whether the structure stands and no piece of it is held.
+        """Return whether the structure stands and whether no piece is held.
 
         Args:
             held: the body in the gripper.
@@ -92,7 +92,11 @@ class StructurePlanner:
         return all(self.evaluate(held).values())
 
     def has_tipped(self, held: Body | None = None) -> bool:
-        """Whether a piece that must stay upright does not, and is not in the gripper either."""
+        """Whether a piece that must stay upright has tipped over and is not held.
+
+        Args:
+            held: the body in the gripper.
+        """
         return any(
             piece.stays_upright and body is not held and piece.tilt_rad(body) >= UPRIGHT_RAD
             for body, piece in self.pieces.items()
@@ -104,25 +108,25 @@ class StructurePlanner:
         held: Body | None = None,
         queries: GraspQueries | None = None,
     ) -> Move | None:
-        """Return the move that brings the structure on, or None if it stands.
+        """Return the next move towards the structure; None if it stands.
 
-        What lies where it belongs stays; what is in the way, or on a piece that is needed, goes
-        to the ground first, from the top down. So does what keeps the hand from a piece.
+        Pieces in their slots stay. Pieces that rest on a slot or on a piece that is needed next,
+        and pieces that block its grasp, are placed on the ground first, from the top down.
 
         Args:
-            area: where on the ground there is room.
-            held: what the gripper holds: it is placed before anything else is picked.
-            queries: about the gripper; one that needs no room if not given.
+            area: where pieces may be placed on the ground.
+            held: the body in the gripper; a held piece is placed before another is picked.
+            queries: answers about the gripper; by default every grasp is free.
         """
         queries = queries or GraspQueries()
-        effort = cache(queries.pick_effort_m)
+        pick_cost_m = cache(queries.pick_cost_m)
         assigner = self._assigner(held)
         assignments, most = assigner.largest_assignments()
         if most == len(self.blueprint.slots):
             if held in self.pieces:
                 return self._to_ground(held, area)
             misplaced = min(map(assigner.misplaced, assignments), key=len)
-            return self._to_ground(min(misplaced, key=effort), area) if misplaced else None
+            return self._to_ground(min(misplaced, key=pick_cost_m), area) if misplaced else None
         bodies_above = assigner.bodies_above()
         blocking = GraspBlocking(self.pieces, bodies_above, held, queries)
         holds_piece = held in self.pieces
@@ -132,35 +136,36 @@ class StructurePlanner:
                 *self._choices(assignment, assigner, bodies_above),
                 *blocking.removals(assignment),
             ]
-            # what is cheap at first sight spares the others a closer look
-            for detour, body, number in sorted(
+            # cheap lower bounds first, so that most of the others are skipped
+            for extra_moves, body, number in sorted(
                 choices, key=lambda choice: choice[0] + (holds_piece and choice[1] is not held)
             ):
-                first = (
-                    holds_piece and body is not held
-                )  # what is held goes to the ground before that
-                detour += first + (STUCK if body is not held and blocking.is_blocked(body) else 0)
-                if best is not None and detour > best[0][0]:
+                # another held piece is placed on the ground before this choice
+                places_held = holds_piece and body is not held
+                extra_moves += places_held
+                if body is not held and blocking.is_blocked(body):
+                    extra_moves += BLOCKED_MOVES
+                if best is not None and extra_moves > best[0][0]:
                     continue
-                move, way = body, 0.0
-                if number is not None and not (first and not queries.clears_blocked_pieces):
-                    move, crowd_m = self._into_slot(body, number, assignment, area, queries)
-                    detour += blocking.added_removals(move, assignment)
-                    way = math.dist(assigner.states[body].position[:2], move.position[:2])
-                    way += CROWDED * crowd_m
-                if first:
-                    move, way = held, 0.0
-                cost = (detour, way + (0.0 if holds_piece else effort(body)))
+                move, distance_m = body, 0.0
+                if number is not None and not (places_held and not queries.clears_blocked_pieces):
+                    move, deficit_m = self._to_slot(body, number, assignment, area, queries)
+                    extra_moves += blocking.added_removals(move, assignment)
+                    distance_m = math.dist(assigner.states[body].position[:2], move.position[:2])
+                    distance_m += DEFICIT_WEIGHT * deficit_m
+                if places_held:
+                    move, distance_m = held, 0.0
+                cost = (extra_moves, distance_m + (0.0 if holds_piece else pick_cost_m(body)))
                 if best is None or cost < best[0]:
                     best = cost, move
-        assert best is not None  # the lowest empty slot can always be worked at
+        assert best is not None  # the lowest empty slot always has a choice
         move = best[1]
         return move if isinstance(move, Move) else self._to_ground(move, area)
 
     # ----------------------------------------------------------------------------------------
 
     def _assigner(self, held: Body | None) -> SlotAssigner:
-        """Return how the pieces lie."""
+        """Return the assigner for the present states of the pieces."""
         states = read_piece_states(self.world, self.pieces, self.support_ids, self.block_m)
         return SlotAssigner(self.blueprint, self.pieces, states, self.block_m, held)
 
@@ -170,11 +175,11 @@ class StructurePlanner:
         assigner: SlotAssigner,
         bodies_above: Mapping[Body, frozenset[Body]],
     ) -> Iterator[tuple[int, Body, int | None]]:
-        """Yield what could be done next.
+        """Yield the moves that fill an empty slot, or remove a piece so that one can be filled.
 
         Yields:
-            How many pieces must go to the ground first, the body to move, and the slot that it
-            goes to; None for the ground.
+            Number of pieces to place on the ground first, the body to move, and the number of its
+            slot; None for the ground.
         """
         for number, slot in enumerate(self.blueprint.slots):
             partner = self.blueprint.partner(number)
@@ -182,23 +187,23 @@ class StructurePlanner:
                 continue
             if partner is not None and partner < number and assignment[partner] is None:
                 continue
-            beside = () if partner is None or assignment[partner] is None else (partner,)
-            misplaced = assigner.misplaced(assignment, (*slot.on, *beside))
+            filled_partner = () if partner is None or assignment[partner] is None else (partner,)
+            misplaced = assigner.misplaced(assignment, (*slot.on, *filled_partner))
             for body, piece in self.pieces.items():
                 if piece.kind != slot.piece.kind or body in assignment:
                     continue
-                others = [stray for stray in misplaced if stray is not body]
-                in_the_way = set(others).union(
-                    bodies_above[body], *(bodies_above[stray] for stray in others)
+                others = [other for other in misplaced if other is not body]
+                removed = set(others).union(
+                    bodies_above[body], *(bodies_above[other] for other in others)
                 )
-                in_the_way -= {body, assigner.held}
-                if not in_the_way:
+                removed -= {body, assigner.held}
+                if not removed:
                     yield 0, body, number
-                for top in in_the_way:
-                    if not any(top in assigner.states[other].below for other in in_the_way):
-                        yield len(in_the_way), top, None
+                for top in removed:
+                    if not any(top in assigner.states[other].supports for other in removed):
+                        yield len(removed), top, None
 
-    def _into_slot(
+    def _to_slot(
         self,
         body: Body,
         number: int,
@@ -206,18 +211,26 @@ class StructurePlanner:
         area: PlacementArea,
         queries: GraspQueries,
     ) -> tuple[Move, float]:
-        """Return the move that fills a slot, and by how much its place is too near to others."""
+        """Return the move of a body to a slot, and the clearance that its position lacks, metres.
+
+        Args:
+            body: the body to move.
+            number: number of the slot.
+            assignment: the body in each slot.
+            area: where pieces may be placed on the ground.
+            queries: answers about the gripper.
+        """
         slots, slot, piece = self.blueprint.slots, self.blueprint.slots[number], self.pieces[body]
         supports = [assignment[i] for i in slot.on]
         partner = self.blueprint.partner(number)
-        beside = None if partner is None else assignment[partner]
+        neighbor = None if partner is None else assignment[partner]
         bridge = None if partner is None else slots[self.blueprint.bridge_on(number)]
         rest = [other for other in self.pieces if other is not body and other not in assignment]
         if not supports:
-            if beside is None:
+            if neighbor is None:
                 return self._to_ground(body, area), 0.0
-            return self._beside(body, beside, bridge, area, rest, queries)
-        x, y, _ = middle(assignment[i].position for i in self._over(number))
+            return self._to_ground_beside(body, neighbor, bridge, area, rest, queries)
+        x, y, _ = mean_position(assignment[i].position for i in self._centering_slots(number))
         z = max(vertical_extent(support)[1] for support in supports)
         z += body.position[2] - vertical_extent(body)[0]
         yaw, period = None, piece.yaw_period_rad
@@ -228,103 +241,112 @@ class StructurePlanner:
             support = self.pieces[supports[0]]
             yaw = support.yaw_rad(supports[0])
             if bridge is not None:
-                x, y = self._along(body, supports[0], beside, bridge.span.aim_m)
+                x, y = self._point_on_support(body, supports[0], neighbor, bridge.span.aim_m)
             period = min(period, support.yaw_period_rad)
         if not slot.inherits_yaw:
             yaw = None
-        crowd_m = 0.0
+        deficit_m = 0.0
         if sum(other is not None for other in assignment) == 1:
-            crowd_m = float(queries.site_deficit_m(np.array([[(x, y)]]), rest)[0])
-        return Move(body, piece, (x, y, z), yaw, period, tuple(supports)), crowd_m
+            deficit_m = float(queries.site_deficit_m(np.array([[(x, y)]]), rest)[0])
+        return Move(body, piece, (x, y, z), yaw, period, tuple(supports)), deficit_m
 
-    def _over(self, number: int) -> tuple[int, ...]:
-        """Return the slots over whose middle a piece goes: in a tower, the two beneath it.
+    def _centering_slots(self, number: int) -> tuple[int, ...]:
+        """Return the slots over whose mean position a piece is placed; in a tower, the two below.
 
-        Where these lean, the middle of the upper one alone would bring the tower down.
+        Centred over the upper one only, a piece would tip over a tower that leans.
         """
         slots = self.blueprint.slots
-        on = slots[number].over or slots[number].on
+        on = slots[number].centered_over or slots[number].on
         below = slots[on[0]].on if len(on) == 1 else ()
         return (*on, *below) if len(below) == 1 else on
 
-    def _along(
-        self, body: Body, support: Body, beside: Body | None, apart_m: float
+    def _point_on_support(
+        self, body: Body, support: Body, neighbor: Body | None, distance_m: float
     ) -> tuple[float, float]:
-        """Return where on a long support one of two pieces goes."""
-        heading = self.pieces[support].yaw_rad(support) + math.pi / 2
-        ux, uy = math.cos(heading), math.sin(heading)
+        """Return where on a long support one of the two pieces under a bridge is placed.
+
+        Args:
+            body: the piece.
+            support: the long support.
+            neighbor: the other piece, if it is on the support already.
+            distance_m: distance between the two pieces.
+        """
+        yaw = self.pieces[support].yaw_rad(support) + math.pi / 2
+        ux, uy = math.cos(yaw), math.sin(yaw)
         sx, sy, _ = support.position
 
         def along(other: Body) -> float:
             x, y, _ = other.position
             return (x - sx) * ux + (y - sy) * uy
 
-        if beside is None:
-            place = math.copysign(apart_m / 2, along(body))
+        if neighbor is None:
+            offset = math.copysign(distance_m / 2, along(body))
         else:
-            place = along(beside) - math.copysign(apart_m, along(beside))
-        return sx + place * ux, sy + place * uy
+            offset = along(neighbor) - math.copysign(distance_m, along(neighbor))
+        return sx + offset * ux, sy + offset * uy
 
-    def _beside(
+    def _to_ground_beside(
         self,
         body: Body,
-        anchor: Body,
+        neighbor: Body,
         bridge: Slot,
         area: PlacementArea,
         rest: Sequence[Body],
         queries: GraspQueries,
     ) -> tuple[Move, float]:
-        """Return the move to the ground beside a piece, and by how much that is too near others.
+        """Return the move of a body to the ground beside another, and the clearance it lacks there.
 
         Args:
-            body: what to move.
-            anchor: the piece.
-            bridge: the slot of what will lie on both.
-            area: where there is room.
-            rest: the pieces that are still to be fetched then.
-            queries: as for `next_move`.
+            body: the body to move.
+            neighbor: the other body.
+            bridge: the slot that both will support.
+            area: where pieces may be placed on the ground.
+            rest: the pieces that remain to be picked.
+            queries: answers about the gripper.
         """
         piece = self.pieces[body]
         x, y, z = body.position
-        center = np.array(anchor.position[:2])
+        center = np.array(neighbor.position[:2])
         start = math.atan2(y - center[1], x - center[0])
         if area.line_yaw_rad is None:
             bearings = start + math.pi / BEARINGS * np.arange(2 * BEARINGS)
         else:
             bearings = area.line_yaw_rad + np.array([0.0, math.pi])
-        ways = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-        radii = np.full(len(ways), bridge.span.aim_m)
+        directions = np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+        radii = np.full(len(directions), bridge.span.aim_m)
         yaw = None
         if bridge.span.gap_m is not None:
-            # it will point at its neighbour the side that the fingers do not close on
+            # the side that faces the neighbour is one on which the fingers do not close
             side = piece.grasp_yaws_rad[0] + math.pi / 2
             cos, sin = math.cos(side), math.sin(side)
             far = (body.shape.vertices[:, :2] @ [cos, sin]).max()
             near = (body.shape.vertices[:, :2] @ [-cos, -sin]).max()
-            radii = extent_along_m(anchor, ways) + max(far, near) + bridge.span.gap_m
+            radii = extent_along_m(neighbor, directions) + max(far, near) + bridge.span.gap_m
             yaw = -side
-        spots = center + radii[:, None] * ways
-        others = [other for other in self.pieces if other is not body and other is not anchor]
-        cost = placement_deficit_m(spots, body, others, area)
+        sites = center + radii[:, None] * directions
+        others = [other for other in self.pieces if other is not body and other is not neighbor]
+        deficits = placement_deficit_m(sites, body, others, area)
         length = max(
             (
-                np.ptp(b.shape.vertices[:, 1])
-                for b, p in self.pieces.items()
-                if p.kind == bridge.piece.kind
+                np.ptp(other.shape.vertices[:, 1])
+                for other, other_piece in self.pieces.items()
+                if other_piece.kind == bridge.piece.kind
             ),
             default=0.0,
         )
         along = radii[:, None] / 2 + length / 2 * np.linspace(-1.0, 1.0, SITE_POINTS)
-        cost = cost + queries.site_deficit_m(center + along[:, :, None] * ways[:, None], rest)
-        aways = np.hypot(spots[:, 0] - x, spots[:, 1] - y)
-        best = int(np.lexsort((radii + aways, cost.round(6)))[0])
-        spot = tuple(spots[best].tolist())
-        place = (*spot, area.height_m(spot) + z - vertical_extent(body)[0])
-        heading = None if yaw is None else float(yaw + bearings[best])
-        return Move(body, piece, place, heading, piece.yaw_period_rad, ()), float(cost[best])
+        footprints = center + along[:, :, None] * directions[:, None]
+        deficits = deficits + queries.site_deficit_m(footprints, rest)
+        distances = np.hypot(sites[:, 0] - x, sites[:, 1] - y)
+        best = int(np.lexsort((radii + distances, deficits.round(6)))[0])
+        site = tuple(sites[best].tolist())
+        position = (*site, area.height_m(site) + z - vertical_extent(body)[0])
+        target_yaw = None if yaw is None else float(yaw + bearings[best])
+        move = Move(body, piece, position, target_yaw, piece.yaw_period_rad, ())
+        return move, float(deficits[best])
 
     def _to_ground(self, body: Body, area: PlacementArea) -> Move:
-        """Return the move to a spot on the ground with room around it, the nearest such."""
+        """Return the move of a body to the nearest free position on the ground."""
         others = [other for other in self.pieces if other is not body]
-        place = nearest_spot(body, others, area)
-        return Move(body, self.pieces[body], place, None, self.pieces[body].yaw_period_rad, ())
+        position = nearest_free_position(body, others, area)
+        return Move(body, self.pieces[body], position, None, self.pieces[body].yaw_period_rad, ())

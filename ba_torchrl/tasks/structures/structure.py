@@ -1,7 +1,7 @@
-"""Structure: the pieces of a blueprint as bodies of a world.
+"""The pieces of a blueprint as bodies of a world.
 
-A world takes no new bodies once it is sealed. A kind of piece whose shape varies between episodes
-is therefore loaded in all its variants, and every episode activates as many as there are slots.
+No bodies can be added to a sealed world. A kind of piece whose shape varies between episodes is
+therefore loaded in all its variants, and every episode activates as many as there are slots.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
 from ba_torchrl.tasks.structures.planner import StructurePlanner
-from ba_torchrl.tasks.workspace import Spot
+from ba_torchrl.tasks.workspace import Spacing
 
 
 class _Variants(NamedTuple):
@@ -24,7 +24,7 @@ class _Variants(NamedTuple):
 
     pieces: tuple[Piece, ...]
     count: int
-    """Number of slots to fill."""
+    """Number of slots that they fill."""
     first: int
     """Index of the first variant in the pool."""
 
@@ -36,9 +36,9 @@ class Structure:
         blueprint: the structure; its pieces have shapes or variants.
         world: not sealed yet.
         block_m: edge of a block, metres.
-        support_ids: PyBullet ids of what the lowest pieces stand on.
-        largest_first: order in which pieces are placed at random: those that need most space first,
-            or from the bottom slot up.
+        support_ids: PyBullet ids of the bodies that form the ground.
+        largest_first: whether pieces are placed at random in order of the space that they need, the
+            largest first; otherwise from the bottom slot up.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Structure:
         self._activate([kind.first + i for kind in self._variants for i in range(kind.count)])
 
     def draw(self, rng: np.random.Generator) -> None:
-        """Choose the variants of an episode."""
+        """Draw the variants of an episode and activate them."""
         chosen: list[int] = []
         for pieces, count, first in self._variants:
             if count == 1:
@@ -91,31 +91,32 @@ class Structure:
                 chosen += (first + drawn).tolist()
         self._activate(chosen)
 
-    def spots(self, gap_m: float) -> list[Spot]:
+    def spacings(self, gap_m: float) -> list[Spacing]:
         """Return the space that each piece needs at the start of an episode.
 
         Args:
-            gap_m: least distance between the circles around two pieces, which may lie end to end.
+            gap_m: least gap between the bounding circles of two pieces.
         """
-        spots, largest_radius_m = [], 0.0
+        spacings, largest_radius_m = [], 0.0
         for body, piece in self.pieces.items():
             radius = footprint_radius_m(body)
-            padding_m, distance_m = (2 * radius, 0.0) if piece.spot is None else piece.spot
-            spots.append(Spot(padding_m, max(distance_m, radius + largest_radius_m + gap_m)))
+            padding_m, distance_m = (2 * radius, 0.0) if piece.spacing is None else piece.spacing
+            distance_m = max(distance_m, radius + largest_radius_m + gap_m)
+            spacings.append(Spacing(padding_m, distance_m))
             largest_radius_m = max(largest_radius_m, radius)
-        return spots
+        return spacings
 
     def get_state(self) -> tuple[int, ...]:
-        """Return the active variants."""
+        """Return the indices of the active variants."""
         return self._pool.get_state()
 
     def set_state(self, state: tuple[int, ...]) -> None:
-        """Restore a state of `get_state`; the world restores poses and visibility."""
+        """Activate variants by their indices; the world restores poses and visibility."""
         self._pool.set_state(state)
         self._update()
 
     def _activate(self, indices: Sequence[int]) -> None:
-        """Bring these variants into the scene, and no others."""
+        """Activate these variants and deactivate all others."""
         if self._pool.bodies:
             self._pool.clear()
         for index in indices:
@@ -123,9 +124,9 @@ class Structure:
         self._update()
 
     def _update(self) -> None:
-        """Plan for the bodies that are in the scene."""
+        """Update the pieces and the planner after a change of the active variants."""
         drawn = {
-            body: self._pool_pieces[self._pool.bodies.index(body)] for body in self._pool.present
+            body: self._pool_pieces[self._pool.bodies.index(body)] for body in self._pool.active
         }
         self.pieces: dict[Body, Piece] = {**self._fixed, **drawn}
         """The bodies in the scene, in the order in which they are placed."""
@@ -135,4 +136,4 @@ class Structure:
 
 
 def _needed_distance_m(piece: Piece) -> float:
-    return 0.0 if piece.spot is None else piece.spot.distance_m
+    return 0.0 if piece.spacing is None else piece.spacing.distance_m

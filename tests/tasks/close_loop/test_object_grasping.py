@@ -33,11 +33,11 @@ def make():
 
 
 def names(env):
-    return [body.name for body in env.scene.task.clutter.pool.present]
+    return [body.name for body in env.scene.task.clutter.pool.active]
 
 
 def fingerprint(env):
-    poses = [(body.name, body.pose) for body in env.scene.task.clutter.pool.present]
+    poses = [(body.name, body.pose) for body in env.scene.task.clutter.pool.active]
     return hashlib.sha256(repr(poses).encode()).hexdigest()
 
 

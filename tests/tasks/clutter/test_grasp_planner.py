@@ -65,7 +65,7 @@ def block(size_m, xy=(0.45, 0.0), yaw_rad=0.0):
 def scene(gripper, *bodies):
     """Return a planner and the height image of upright boxes on a flat floor."""
     planner = GraspPlanner(bodies, None, WORKSPACE, gripper)
-    heights = np.full_like(planner._plain, FLOOR_M)
+    heights = np.full_like(planner._empty_image, FLOOR_M)
     i, j = np.indices(heights.shape)
     x = planner.corner[0] + (i + 0.5) * PIXEL_M
     y = planner.corner[1] + (j + 0.5) * PIXEL_M

@@ -4,7 +4,7 @@ import pytest
 
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.tasks.footprints import Rectangle
-from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, pieces
+from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, object_shapes
 from tests.tasks.packing.scenes import BIN, QUARTER_TURN, follow
 
 
@@ -92,5 +92,5 @@ def test_kinds_are_drawn_with_replacement(make_env):
         env.reset()
         seen.append([body.name.split()[0] for body in env.scene.task.objects])
     assert all(len(kinds) == 8 for kinds in seen)
-    assert {kind for kinds in seen for kind in kinds} == set(pieces(1.0))
+    assert {kind for kinds in seen for kind in kinds} == set(object_shapes(1.0))
     assert any(kinds.count(kind) >= 3 for kinds in seen for kind in kinds)

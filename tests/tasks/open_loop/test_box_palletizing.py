@@ -23,7 +23,7 @@ class Pallet:
         pallet = self.task.container
         self.frame = Rectangle(*pallet.position[:2], pallet.yaw_rad, 0.0, 0.0)
         while len(self.task.objects) < count:
-            self.task._bring()
+            self.task._activate_next_box()
         for number in range(count):
             self.put(number)
         env.scene.world.settle()
@@ -101,9 +101,9 @@ def test_a_box_counts_in_its_slot_only(make_env, off, counts):
 
 def test_boxes_count_on_full_layers_only(make_env):
     pallet = Pallet(make_env(BOXES, num_objects=12), 7)
-    assert len(pallet.task.filled()) == 7
+    assert len(pallet.task.stacked()) == 7
     pallet.task.objects[2].place((0.3, 0.15, BOX_M[2] / 2), 0.0)
-    assert len(pallet.task.filled()) == 5
+    assert len(pallet.task.stacked()) == 5
 
 
 def test_a_box_may_lie_on_any_long_side_but_not_on_its_end(make_env):
@@ -115,7 +115,7 @@ def test_a_box_may_lie_on_any_long_side_but_not_on_its_end(make_env):
     for (x, y), counts in zip(rolled, (True, False), strict=True):
         # the yaw after the quarter turn
         body.set_pose(position, (w * x - z * y, w * y + z * x, z * half, w * half))
-        assert (body in pallet.task.filled().values()) is counts
+        assert (body in pallet.task.stacked().values()) is counts
 
 
 def test_a_new_box_appears_after_a_correct_place_only(make_env):
@@ -143,7 +143,7 @@ def test_a_new_box_appears_after_a_correct_place_only(make_env):
     state = follow(env, state, 2)[-1]
     assert not state["holding"]
     assert len(task.objects) == 2
-    assert len(task.filled()) == 1
+    assert len(task.stacked()) == 1
     (x, y), _ = arrivals[1]
     assert task.objects[1].position[:2] == pytest.approx((x, y), abs=1e-3)
     assert world.is_still()

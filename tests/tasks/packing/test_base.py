@@ -6,18 +6,18 @@ import pytest
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.open_loop.bin_packing import pieces
+from ba_torchrl.tasks.open_loop.bin_packing import object_shapes
 from ba_torchrl.tasks.open_loop.bottle_arrangement import BOTTLES_CM
 from ba_torchrl.tasks.packing.base import open_box
 from tests.tasks.packing.scenes import BIN, BOTTLES, BOXES
 
 
 def test_objects_have_the_papers_sizes():
-    for shape in pieces(1.0).values():
+    for shape in object_shapes(1.0).values():
         size = np.ptp(shape.vertices, axis=0)
         assert (size >= (0.0395, 0.0395, 0.0195)).all()
         assert (size <= (0.0405, 0.0805, 0.0405)).all()
-    assert len(pieces(1.0)) == 7
+    assert len(object_shapes(1.0)) == 7
     for profile in BOTTLES_CM.values():
         assert 2 * max(r for r, _ in profile) <= 5.0
         assert 13.0 <= profile[-1][1] <= 14.5
@@ -29,7 +29,7 @@ def test_an_open_box_holds_objects():
         size, wall, floor = (0.2, 0.1, 0.08), 0.004, 0.004
         box = world.add(open_box(size, wall, floor, (1.0, 1.0, 1.0, 1.0)), "box")
         box.place((0.0, 0.0, size[2] / 2))
-        ball = world.add(pieces(1.0)["cube"], "cube")
+        ball = world.add(object_shapes(1.0)["cube"], "cube")
         for x, y, z in ((0.0, 0.0, floor), (0.075, -0.025, floor), (0.2, 0.0, 0.0)):
             ball.place((x, y, 0.15))
             assert world.settle(400)

@@ -6,8 +6,9 @@ import numpy as np
 
 from ba_torchrl.sim.meshes import gable_mesh
 from ba_torchrl.sim.shapes import Box, Solid
-from ba_torchrl.tasks.structures.blueprint import CUBE, CUBOID, ROOF, Blueprint, Slot, Span
+from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, Span
 from ba_torchrl.tasks.structures.free_space import PlacementArea
+from ba_torchrl.tasks.structures.parts import CUBE, CUBOID, ROOF
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 
 B = 0.03
@@ -19,13 +20,13 @@ SHAPES = {
     "roof": Solid(parts=(gable_mesh((B, 4 * B, B), eaves_m=B / 4),)),
     "triangle": Solid(parts=(gable_mesh((B, B, B)),)),
 }
-BRIDGE = Blueprint((Slot(CUBE), Slot(CUBE), Slot(ROOF, on=(0, 1), span=SPAN, stays_free=True)))
+BRIDGE = Blueprint((Slot(CUBE), Slot(CUBE), Slot(ROOF, on=(0, 1), span=SPAN, stays_clear=True)))
 TWO_STOREYS = Blueprint(
     (
         Slot(CUBE),
         Slot(CUBE),
         Slot(CUBOID, on=(0, 1), span=SPAN),
-        Slot(ROOF, on=(2,), over=(0, 1), stays_free=True),
+        Slot(ROOF, on=(2,), centered_over=(0, 1), stays_clear=True),
     )
 )
 THREE_STOREYS = Blueprint(
@@ -35,7 +36,7 @@ THREE_STOREYS = Blueprint(
         Slot(CUBOID, on=(0, 1), span=SPAN),
         Slot(CUBE, on=(2,)),
         Slot(CUBE, on=(2,)),
-        Slot(ROOF, on=(3, 4), span=SPAN, stays_free=True),
+        Slot(ROOF, on=(3, 4), span=SPAN, stays_clear=True),
     )
 )
 

@@ -8,7 +8,8 @@ import pytest
 from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.structures.blueprint import CUBE, TRIANGLE, tower
+from ba_torchrl.tasks.structures.blueprint import tower
+from ba_torchrl.tasks.structures.parts import CUBE, TRIANGLE
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 from tests.tasks.structures.scenes import AREA, BRIDGE, SHAPES, B, rotate
 

@@ -4,16 +4,8 @@ import math
 
 import pytest
 
-from ba_torchrl.tasks.structures.blueprint import (
-    CUBE,
-    CUBOID,
-    ROOF,
-    TRIANGLE,
-    Blueprint,
-    Piece,
-    Slot,
-    tower,
-)
+from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece, Slot, tower
+from ba_torchrl.tasks.structures.parts import CUBE, CUBOID, ROOF, TRIANGLE
 from tests.tasks.structures.scenes import BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, rotate
 
 

@@ -273,8 +273,8 @@ def test_the_site_is_away_from_what_is_still_to_be_fetched():
     named["cuboid 1"].place((0.56, -0.08, B / 2))
     world.step(2)
     pick = task.expert_command()
-    area = task._placement_area()
-    move = task.planner.next_move(area, None, task)
+    area = task.expert._placement_area()
+    move = task.planner.next_move(area, None, task.expert)
     assert math.dist(move.position[:2], (0.47, -0.08)) > 0.1
     assert (pick.x_m, pick.y_m) == pytest.approx(move.body.position[:2])
     env.close()

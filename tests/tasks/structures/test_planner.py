@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ba_torchrl.tasks.structures.blocking import GraspQueries
-from ba_torchrl.tasks.structures.blueprint import CUBE, TRIANGLE, tower
+from ba_torchrl.tasks.structures.blueprint import tower
+from ba_torchrl.tasks.structures.parts import CUBE, TRIANGLE
 from tests.tasks.structures.scenes import AREA, BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, B
 
 
@@ -152,7 +153,7 @@ def test_effort_decides_between_equal_moves(scene):
     s = scene(tower(CUBE, CUBE, CUBE))
     queries = GraspQueries()
     for favourite in s.cubes:
-        queries.pick_effort_m = lambda body, f=favourite: float(body is not f)
+        queries.pick_cost_m = lambda body, f=favourite: float(body is not f)
         move = s.planner.next_move(AREA, queries=queries)
         assert move.body is favourite
 

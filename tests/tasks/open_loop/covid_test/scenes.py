@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ba_torchrl.actions import PLACE, PickPlaceCommand
-from ba_torchrl.tasks.open_loop.covid_test import USED_BOX
+from ba_torchrl.tasks.covid_layout import USED_BOX
 
 TASK = "open_loop/covid_test"
 FIXED = {"random_orientation": False, "action_sequence": "pxy"}
@@ -35,19 +35,19 @@ def follow(env, count):
 
 def lay(task, body, area, spot, along=math.pi / 2):
     """Place a tube or swab on the floor of an area, with position and yaw in the area's frame."""
-    task._lay(body, task._to_world(area, spot), area.yaw_rad + along)
+    task.layout.lay(body, task.layout.to_world(area, spot), area.yaw_rad + along)
 
 
 def outline(task, area, size):
     """Return the corners of an area."""
     signs = itertools.product((-0.5, 0.5), repeat=2)
-    return np.array([task._to_world(area, (s * size[0], t * size[1])) for s, t in signs])
+    return np.array([task.layout.to_world(area, (s * size[0], t * size[1])) for s, t in signs])
 
 
 def lay_pair(task, tube=0, swab=0):
     """Lay a tube and a swab into the test area."""
-    lay(task, task.tubes[tube], task.test_area, (0.0, 0.06))
-    lay(task, task.swabs[swab], task.test_area, (0.0, -0.06))
+    lay(task, task.tubes[tube], task.layout.test_area, (0.0, 0.06))
+    lay(task, task.swabs[swab], task.layout.test_area, (0.0, -0.06))
 
 
 def local(area, point):
@@ -60,13 +60,13 @@ def local(area, point):
 def misplace(task, tube, where):
     """Place a used tube outside its box."""
     if where == "new_box":
-        lay(task, tube, task.new_box, (0.0, 0.04))
+        lay(task, tube, task.layout.new_box, (0.0, 0.04))
     elif where == "across the rim":  # across the corner, its centre above the inside
         rim = USED_BOX.size[2] + tube.shape.size_m[2] / 2
-        x, y = task._to_world(task.used_box, (0.037, 0.027))
-        tube.place((x, y, rim), task.used_box.yaw_rad - math.atan2(0.046, 0.056))
+        x, y = task.layout.to_world(task.layout.used_box, (0.037, 0.027))
+        tube.place((x, y, rim), task.layout.used_box.yaw_rad - math.atan2(0.046, 0.056))
     else:
-        lay(task, tube, task.used_box, (0.0, 0.064), along=0.0)
+        lay(task, tube, task.layout.used_box, (0.0, 0.064), along=0.0)
 
 
 def carry_out_tests(env, rounds=3):
@@ -76,9 +76,9 @@ def carry_out_tests(env, rounds=3):
         lay_pair(task, i, i)
         state = wait(env)
         assert not state["done"]
-        assert len(task.get_state().used) == i + 1
+        assert len(task.get_state().used_tubes) == i + 1
         if i < rounds - 1:
-            lay(task, task.tubes[i], task.used_box, (0.0, 0.024 * i - 0.024), along=0.0)
+            lay(task, task.tubes[i], task.layout.used_box, (0.0, 0.024 * i - 0.024), along=0.0)
     return task
 
 

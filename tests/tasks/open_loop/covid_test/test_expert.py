@@ -8,7 +8,7 @@ import torch
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import vertical_extent
-from ba_torchrl.tasks.open_loop.covid_test import NEW_BOX, SHEET_M
+from ba_torchrl.tasks.covid_layout import NEW_BOX, SHEET_M
 from tests.tasks.open_loop.covid_test.scenes import (
     FIXED,
     carry_out_tests,
@@ -67,7 +67,7 @@ def test_the_expert_continues_after_a_misplaced_tube(make):
     task = env.scene.task
     lay_pair(task)
     wait(env)
-    lay(task, task.tubes[0], task.new_box, (0.0, -0.01), along=0.2)
+    lay(task, task.tubes[0], task.layout.new_box, (0.0, -0.01), along=0.2)
     assert finish(env)["success"]
 
 
@@ -82,7 +82,7 @@ def test_the_expert_puts_back_objects_that_it_must_not_present(make):
         assert task.robot.held_body() is body
         follow(env, 1)
         assert task.robot.held_body() is None
-        x, y = local(task.new_box, body.position)
+        x, y = local(task.layout.new_box, body.position)
         assert abs(x) < NEW_BOX.size[0] / 2
         assert abs(y) < NEW_BOX.size[1] / 2
     assert not task.has_failed
@@ -92,14 +92,14 @@ def test_the_expert_puts_back_objects_that_it_must_not_present(make):
 def test_the_expert_takes_a_fresh_tube_out_of_the_wrong_box(make):
     env = make(obs_size=128, max_steps=40)
     task = env.scene.task
-    lay(task, task.tubes[1], task.used_box, (0.0, 0.0), along=0.0)
+    lay(task, task.tubes[1], task.layout.used_box, (0.0, 0.0), along=0.0)
     assert finish(env)["success"]
 
 
 def test_expert_actions_after_success_change_nothing(make):
     env = make()
     task = carry_out_tests(env)
-    lay(task, task.tubes[2], task.used_box, (0.0, 0.024), along=0.0)
+    lay(task, task.tubes[2], task.layout.used_box, (0.0, 0.024), along=0.0)
     assert wait(env)["success"]
     command = task.expert_command()
     assert command == task.expert_command()
@@ -117,7 +117,7 @@ def test_heights_from_the_image_fit_thin_objects(make, kind):
     x, y, _ = body.position
     step(env, PickPlaceCommand(PICK, x, y, None, body.yaw_rad + math.pi / 2))
     assert task.robot.held_body() is body
-    x, y = task._to_world(task.test_area, (0.0, 0.03))
+    x, y = task.layout.to_world(task.layout.test_area, (0.0, 0.03))
     seen = []
     place = env.scene.controller.place
     env.scene.controller.place = lambda position, turn: (

@@ -8,7 +8,7 @@ import pytest
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import vertical_extent
-from ba_torchrl.tasks.open_loop.covid_test import NEW_BOX, SHEET_M, TEST_AREA, USED_BOX, WALL_M
+from ba_torchrl.tasks.covid_layout import NEW_BOX, SHEET_M, TEST_AREA, USED_BOX, WALL_M
 from tests.tasks.open_loop.covid_test.scenes import FIXED, TASK, local, outline
 
 
@@ -25,18 +25,23 @@ def test_layouts_are_random_adjacent_and_inside_the_workspace(make):
     for _ in range(60):
         env.reset()
         task = env.scene.task
-        areas = ((task.new_box, NEW_BOX), (task.used_box, USED_BOX), (task.test_area, TEST_AREA))
+        layout = task.layout
+        areas = (
+            (layout.new_box, NEW_BOX),
+            (layout.used_box, USED_BOX),
+            (layout.test_area, TEST_AREA),
+        )
         corners = {area: outline(task, area, spec.size) for area, spec in areas}
         for points in corners.values():
             assert (points >= (0.25 - 1e-9, -0.2 - 1e-9)).all()
             assert (points <= (0.65 + 1e-9, 0.2 + 1e-9)).all()
-        for one, other in ((task.new_box, task.used_box), (task.new_box, task.test_area)):
+        for one, other in ((layout.new_box, layout.used_box), (layout.new_box, layout.test_area)):
             near = np.linalg.norm(corners[one][:, None] - corners[other][None], axis=-1).min()
             assert near < 0.06
         assert len({area.yaw_rad for area, _ in areas}) == 1
-        yaws.append(task.new_box.yaw_rad)
-        centers.append(task.test_area.position[:2])
-        x, _ = local(task.new_box, task.test_area.position)
+        yaws.append(task.layout.new_box.yaw_rad)
+        centers.append(task.layout.test_area.position[:2])
+        x, _ = local(task.layout.new_box, task.layout.test_area.position)
         assert abs(x) == pytest.approx(0.1525, abs=1e-6)
         sides.append(x > 0)
     quarters = np.round(np.array(yaws) / (math.pi / 2)).astype(int) % 4
@@ -54,7 +59,7 @@ def test_tubes_and_swabs_start_apart_on_the_floor_of_their_box(make):
         task = env.scene.task
         assert len(task.objects) == 6
         for body in task.objects:
-            x, y = local(task.new_box, body.position)
+            x, y = local(task.layout.new_box, body.position)
             assert abs(x) < NEW_BOX.size[0] / 2 - WALL_M
             assert abs(y) < NEW_BOX.size[1] / 2 - WALL_M
             assert vertical_extent(body)[0] == pytest.approx(SHEET_M, abs=3e-4)
@@ -69,7 +74,7 @@ def test_fixed_orientations_lie_along_y(make):
     for _ in range(12):
         env.reset()
         task = env.scene.task
-        yaws.add(round(abs(task.new_box.yaw_rad), 6))
+        yaws.add(round(abs(task.layout.new_box.yaw_rad), 6))
         for body in task.objects:
             assert body.yaw_rad == pytest.approx(math.pi / 2, abs=1e-2)
     assert yaws == {0.0, round(math.pi, 6)}

@@ -6,7 +6,7 @@ import pytest
 
 from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.geometry import downward
-from ba_torchrl.tasks.open_loop.covid_test import SHEET_M, USED_BOX, WALL_M
+from ba_torchrl.tasks.covid_layout import SHEET_M, USED_BOX, WALL_M
 from tests.tasks.open_loop.covid_test.scenes import (
     carry_out_tests,
     follow,
@@ -25,12 +25,12 @@ def test_a_pair_in_the_test_area_becomes_a_test(make):
     before = env._heightmap(env.scene)
     state = wait(env)
     assert not state["done"]
-    assert task.get_state().used == (1,)
-    assert task.get_state().spent == (2,)
+    assert task.get_state().used_tubes == (1,)
+    assert task.get_state().used_swabs == (2,)
     assert task.swabs[2].is_hidden
     assert task.swabs[2] not in task.objects
     assert len(task.objects) == 5
-    x, y = local(task.test_area, task.tubes[1].position)
+    x, y = local(task.layout.test_area, task.tubes[1].position)
     assert abs(x) < 0.0126
     assert abs(y) < 0.1001
     assert (x, y) != pytest.approx((0.0, 0.06), abs=1e-3)  # it has a new pose
@@ -45,10 +45,10 @@ def test_swab_and_tube_come_in_any_order_and_one_alone_is_not_a_test(make):
         env = make()
         task = env.scene.task
         bodies, spots = (task.tubes[0], task.swabs[0]), ((0.0, 0.06), (0.0, -0.06))
-        lay(task, bodies[first], task.test_area, spots[first])
+        lay(task, bodies[first], task.layout.test_area, spots[first])
         assert not wait(env)["done"]
         assert task.get_state()[1:] == ((), (), False)
-        lay(task, bodies[second], task.test_area, spots[second])
+        lay(task, bodies[second], task.layout.test_area, spots[second])
         assert not wait(env)["done"]
         assert task.get_state()[1:] == ((0,), (0,), False)
 
@@ -60,7 +60,7 @@ def test_poses_of_used_tubes_are_random_and_depend_on_the_seed(make):
         task = env.scene.task
         lay_pair(task)
         wait(env)
-        spots.append((*local(task.test_area, task.tubes[0].position), task.tubes[0].yaw_rad))
+        spots.append((*local(task.layout.test_area, task.tubes[0].position), task.tubes[0].yaw_rad))
     assert spots[0] == spots[3]
     assert len(set(spots)) == 3
 
@@ -72,12 +72,12 @@ def test_a_used_tube_is_placed_clear_of_other_objects(make):
         env.reset()
         lay_pair(task)
         # their centres are outside the test area, but they extend far into it
-        side = math.copysign(0.0585, local(task.new_box, task.test_area.position)[0])
-        lay(task, task.tubes[1], task.test_area, (side, 0.03), along=0.0)
-        lay(task, task.tubes[2], task.test_area, (side, -0.03), along=0.0)
+        side = math.copysign(0.0585, local(task.layout.new_box, task.layout.test_area.position)[0])
+        lay(task, task.tubes[1], task.layout.test_area, (side, 0.03), along=0.0)
+        lay(task, task.tubes[2], task.layout.test_area, (side, -0.03), along=0.0)
         where = [tube.position for tube in task.tubes[1:]]
         assert not wait(env)["done"], attempt
-        assert task.get_state().used == (0,)
+        assert task.get_state().used_tubes == (0,)
         for tube, position in zip(task.tubes[1:], where, strict=True):
             assert math.dist(tube.position, position) < 2e-3
         assert vertical_extent(task.tubes[0])[0] == pytest.approx(SHEET_M, abs=5e-4)
@@ -89,7 +89,7 @@ def test_a_held_object_above_the_test_area_is_not_presented(make):
     follow(env, 1)
     held = task.robot.held_body()
     assert held in task.tubes
-    x, y = task._to_world(task.test_area, (0.0, 0.0))
+    x, y = task.layout.to_world(task.layout.test_area, (0.0, 0.0))
     joints = task.robot.inverse_kinematics((x, y, 0.1), downward(0.0))
     env.scene.controller._teleport(joints)
     env.scene.world.step(2)
@@ -101,7 +101,7 @@ def test_a_held_object_above_the_test_area_is_not_presented(make):
 def test_a_swab_in_the_used_box_is_not_a_failure(make):
     env = make()
     task = env.scene.task
-    lay(task, task.swabs[0], task.used_box, (0.0, 0.0), along=0.0)
+    lay(task, task.swabs[0], task.layout.used_box, (0.0, 0.0), along=0.0)
     assert not wait(env)["done"]
 
 
@@ -120,7 +120,7 @@ def test_two_of_a_kind_in_the_test_area_fail(make, kind):
     env = make()
     task = env.scene.task
     for body, y in zip(getattr(task, kind), (0.06, -0.06), strict=False):
-        lay(task, body, task.test_area, (0.0, y))
+        lay(task, body, task.layout.test_area, (0.0, y))
     expect_failure(env)
 
 
@@ -128,7 +128,7 @@ def test_two_swabs_and_a_tube_fail(make):
     env = make()
     task = env.scene.task
     lay_pair(task)
-    lay(task, task.swabs[1], task.test_area, (0.03, -0.06))
+    lay(task, task.swabs[1], task.layout.test_area, (0.03, -0.06))
     expect_failure(env)
 
 
@@ -137,8 +137,8 @@ def test_a_swab_beside_an_uncollected_used_tube_fails(make):
     task = env.scene.task
     lay_pair(task)
     assert not wait(env)["done"]
-    lay(task, task.tubes[0], task.test_area, (0.0, 0.06))
-    lay(task, task.swabs[1], task.test_area, (0.0, -0.06))
+    lay(task, task.tubes[0], task.layout.test_area, (0.0, 0.06))
+    lay(task, task.swabs[1], task.layout.test_area, (0.0, -0.06))
     expect_failure(env)
 
 
@@ -147,8 +147,8 @@ def test_a_fresh_tube_beside_an_uncollected_used_tube_fails(make):
     task = env.scene.task
     lay_pair(task)
     assert not wait(env)["done"]
-    lay(task, task.tubes[0], task.test_area, (0.0, 0.06))
-    lay(task, task.tubes[1], task.test_area, (0.0, -0.06))
+    lay(task, task.tubes[0], task.layout.test_area, (0.0, 0.06))
+    lay(task, task.tubes[1], task.layout.test_area, (0.0, -0.06))
     expect_failure(env)
 
 
@@ -169,7 +169,7 @@ def test_a_collected_tube_is_not_tested_again(make):
     task = env.scene.task
     lay_pair(task)
     wait(env)
-    lay(task, task.tubes[0], task.used_box, (0.0, 0.0), along=0.0)
+    lay(task, task.tubes[0], task.layout.used_box, (0.0, 0.0), along=0.0)
     assert not wait(env)["done"]
     lay_pair(task, 0, 1)
     expect_failure(env)
@@ -189,7 +189,7 @@ def test_three_used_tubes_in_their_box_are_a_success(make):
     env = make()
     task = carry_out_tests(env)
     assert not task.is_success()
-    lay(task, task.tubes[2], task.used_box, (0.0, 0.024), along=0.0)
+    lay(task, task.tubes[2], task.layout.used_box, (0.0, 0.024), along=0.0)
     state = wait(env)
     assert state["success"]
     assert state["terminated"]
@@ -212,7 +212,7 @@ def test_a_tube_across_the_rim_is_not_in_the_box(make):
     task = carry_out_tests(env)
     misplace(task, task.tubes[2], "across the rim")
     wait(env)
-    x, y = local(task.used_box, task.tubes[2].position)
+    x, y = local(task.layout.used_box, task.tubes[2].position)
     assert abs(x) < USED_BOX.size[0] / 2 - WALL_M
     assert abs(y) < USED_BOX.size[1] / 2 - WALL_M
     assert vertical_extent(task.tubes[2])[0] > USED_BOX.size[2] - 2e-3
@@ -223,7 +223,7 @@ def test_fresh_tubes_in_the_used_box_are_not_a_success(make):
     env = make()
     task = env.scene.task
     for tube, y in zip(task.tubes, (-0.024, 0.0, 0.024), strict=True):
-        lay(task, tube, task.used_box, (0.0, y), along=0.0)
+        lay(task, tube, task.layout.used_box, (0.0, y), along=0.0)
     assert all(map(task.is_collected, task.tubes))
     state = wait(env)
     assert not state["success"]

@@ -23,13 +23,13 @@ def test_a_state_restores_the_task_the_hidden_swabs_and_later_steps(make):
     kept = env.get_state()
     first = advance(env, state, 3)
     assert swab.is_hidden
-    assert task.get_state().spent == (task.swabs.index(swab),)
+    assert task.get_state().used_swabs == (task.swabs.index(swab),)
     later = env.get_state()
     there = poses(env), task.get_state()
     env.set_state(kept)
     assert motion.held is swab
     assert swab.is_hidden
-    assert task.get_state().spent == ()
+    assert task.get_state().used_swabs == ()
     assert swab in task.objects
     env.set_state(later)  # while the swab is held
     assert motion.held is not swab
@@ -60,7 +60,7 @@ def test_a_failure_is_part_of_the_state(make):
     task = env.scene.task
     kept = env.get_state()
     for body, y in zip(task.tubes, (0.06, -0.06), strict=False):
-        lay(task, body, task.test_area, (0.0, y))
+        lay(task, body, task.layout.test_area, (0.0, y))
     wait(env)
     failed = env.get_state()
     env.set_state(kept)

@@ -98,7 +98,7 @@ def test_a_pick_without_a_height_succeeds(make):
     state, pool = env.reset(), env.scene.task.clutter.pool
     pool.clear()
     pool.activate(next(body for body in pool.bodies if body.name == "brick"))
-    pool.present[0].place((*CENTER, FLOOR_Z_M + 0.02))
+    pool.active[0].place((*CENTER, FLOOR_Z_M + 0.02))
     env.scene.world.settle()
     state = env.step(state.set("action", torch.tensor([*CENTER, 0.0])))["next"]
     assert state["success"]

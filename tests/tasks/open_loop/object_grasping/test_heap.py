@@ -96,11 +96,11 @@ def test_when_a_heap_is_replaced(make, present, failures, succeeds, should_conti
     env.reset()
     clutter = env.scene.task.clutter
     clutter.failures = failures
-    grasped_object = clutter.pool.present[0] if succeeds else None
+    grasped_object = clutter.pool.active[0] if succeeds else None
     assert clutter.should_continue(grasped_object) is should_continue
     clutter.advance(grasped_object)
     assert clutter.failures == (0 if succeeds else failures + 1)
-    assert len(clutter.pool.present) == present - succeeds
+    assert len(clutter.pool.active) == present - succeeds
 
 
 def test_household_and_graspnet_objects(make, tmp_path):
