@@ -78,7 +78,7 @@ def enabled_observations(config: EnvConfig, workspace: Workspace) -> list[Observ
     ]
 
 
-def joined(parts: list[dict]) -> dict:
+def merge_entries(parts: list[dict]) -> dict:
     """Return the entries of several observations.
 
     Raises:

@@ -83,7 +83,7 @@ class OpenLoopEnv(ManipulationEnv):
         )
 
     @property
-    def _heights_to_reach(self) -> tuple[float, ...]:
+    def _required_tool_heights(self) -> tuple[float, ...]:
         floor = self.workspace.z[0]
         return floor + 0.01, floor + PickPlaceLimits().approach_m + 0.01
 

@@ -26,7 +26,7 @@ def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = No
     model = env_config_model(TASKS[task_id].Parameters)
     values = dict(values)
     for name in values.keys() - model.model_fields.keys():
-        defaults = _declared_elsewhere(name)
+        defaults = _tasks_with_parameter(name)
         if defaults and all(values[name] != default for default in defaults.values()):
             raise ConfigError(
                 f"{name!r} has no meaning for {task_id}: leave it out; it is a parameter of "
@@ -90,7 +90,7 @@ def check_action_components(task_id: str, components: list[str]) -> None:
         )
 
 
-def _declared_elsewhere(name: str) -> dict[str, Any]:
+def _tasks_with_parameter(name: str) -> dict[str, Any]:
     """Return the tasks that declare a parameter of their own, and its default in each."""
     return {
         task_id: TASKS[task_id].Parameters.model_fields[name].default

@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 MakeEnv = Callable[[], EnvBase]
 
 _HEALTH_CHECK_S = 5e-3
-_LOSS = {
+_LOST_STEP = {
     keys.REWARD: 0,
     keys.TERMINATED: False,
     keys.TRUNCATED: True,
@@ -143,7 +143,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 self.parent_channels.append(self._launch(index))
             for index, worker in enumerate(self.parent_channels):
                 try:
-                    worker.greet()
+                    worker.wait_until_ready()
                 except WorkerError as error:
                     raise RuntimeError(f"worker {index} could not be started: {error}") from None
         except BaseException:
@@ -241,7 +241,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             self.parent_channels[index].kill()
             worker = self.parent_channels[index] = self._launch(index)
             try:
-                worker.greet()
+                worker.wait_until_ready()
                 _seed(worker, self._new_seed(index) if seed is None else seed)
                 return
             except WorkerError as error:
@@ -325,7 +325,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         """Answer the command in ``message`` for an environment that lost its episode."""
         command = message[0]
         if command != "reset":
-            self._write_loss(index)
+            self._write_lost_step(index)
             message = ("reset", (False, {}))
         self.parent_channels[index].muted = False
         if command == "step":  # the environment is done, so the caller resets it
@@ -338,7 +338,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 return
             self._replace(index, failures[index])
 
-    def _write_loss(self, index: int) -> None:
+    def _write_lost_step(self, index: int) -> None:
         """Write the answer to a step that was not executed."""
         if self._use_buffers:
             root = self.shared_tensordicts[index]
@@ -352,8 +352,8 @@ class VectorEnv(SeededVector, ParallelEnv):
         if root is not None:
             for key in self.observation_keys:
                 answer.get(key).copy_(root.get(key))
-        for key in _LOSS.keys() & set(answer.keys()):
-            answer.get(key).fill_(_LOSS[key])
+        for key in _LOST_STEP.keys() & set(answer.keys()):
+            answer.get(key).fill_(_LOST_STEP[key])
 
 
 def _seed(worker: Worker, seed: int) -> None:

@@ -24,8 +24,8 @@ logger = logging.getLogger(__name__)
 _FAILED = "failed"
 _IDLE_TIMEOUT_S = 1e6  # TorchRL's workers give up after 10,000 s without a command
 _START_TIMEOUT_S = 120.0  # a spawned worker imports torch first
-_SPIN_S = 100e-6
-_NAP_S = 30e-6
+_BUSY_WAIT_S = 100e-6
+_POLL_INTERVAL_S = 30e-6
 
 
 class Worker:
@@ -62,7 +62,7 @@ class Worker:
             "mp_event": self.event,
         }
         # Daemonic: it ends with the parent, closed or not.
-        self.process = context.Process(target=_work, args=(loop, options), daemon=True)
+        self.process = context.Process(target=_run_worker, args=(loop, options), daemon=True)
         self.process.start()
         child_pipe.close()  # else the pipe stays open when the worker dies
 
@@ -71,7 +71,7 @@ class Worker:
         """The name of the last command."""
         return self.message[0]
 
-    def greet(self) -> None:
+    def wait_until_ready(self) -> None:
         """Wait until the environment is made.
 
         Raises:
@@ -110,7 +110,7 @@ class Worker:
                 raise WorkerError(f"it did not answer {self.command!r} within {timeout_s:g} s")
             message = self.pipe.recv()
         except (EOFError, OSError):
-            raise WorkerError(self._cause_of_death()) from None
+            raise WorkerError(self._exit_reason()) from None
         if isinstance(message, tuple) and message[0] == _FAILED:
             raise WorkerError(f"it raised\n{message[1]}")
         return message
@@ -141,7 +141,7 @@ class Worker:
         self.process.close()
         self.pipe.close()
 
-    def _cause_of_death(self) -> str:
+    def _exit_reason(self) -> str:
         self.process.join(1.0)
         code = self.process.exitcode
         if code is None:
@@ -151,7 +151,7 @@ class Worker:
         return f"its process was ended by {signal.Signals(-code).name}"
 
 
-def _work(loop: Callable[..., None], options: dict[str, Any]) -> None:
+def _run_worker(loop: Callable[..., None], options: dict[str, Any]) -> None:
     """Run TorchRL's loop in a worker; send its exception, if any, to the parent."""
     # The parent handles interrupts; the worker does not inherit its handlers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -173,6 +173,6 @@ def wait_until(condition: Callable[[], bool], timeout_s: float) -> bool:
         elapsed = time.perf_counter() - start
         if elapsed > timeout_s:
             return False
-        if elapsed > _SPIN_S:
-            time.sleep(_NAP_S)  # leave the core to the workers
+        if elapsed > _BUSY_WAIT_S:
+            time.sleep(_POLL_INTERVAL_S)  # leave the core to the workers
     return True
