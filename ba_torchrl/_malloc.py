@@ -1,4 +1,4 @@
-"""Settings of the C library's allocator that make updates on the CPU about twice as fast."""
+"""Settings of glibc's memory allocator that make updates on the CPU about twice as fast."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _M_MMAP_MAX = -4
 
 @functools.cache
 def tune_malloc() -> bool:
-    """Let this process keep the memory of large tensors that it has freed.
+    """Set glibc to keep the memory of freed large tensors for reuse.
 
-    By default glibc returns every large block to the kernel when it is freed, so each activation
-    map is faulted in page by page at every update. Kept pages halve the time of an update of a
-    large network and change no number. The price: the process stays as large as it ever was. Call
-    this early; blocks that exist already are not affected. Calling it again does nothing.
+    By default glibc returns every freed large block to the kernel, so every update causes page
+    faults for each activation map. Reusing pages halves the time of an update of a large network
+    and does not change results. The drawback is that the process never releases memory. Call this
+    early: existing blocks are not affected. Further calls have no effect.
 
     Returns:
         Whether the settings took effect: True with glibc on Linux, False elsewhere.
@@ -32,8 +32,8 @@ def tune_malloc() -> bool:
     mallopt.restype = ctypes.c_int
     settings = (
         (_M_MMAP_MAX, 0),  # large blocks come from the heap as well
-        (_M_TRIM_THRESHOLD, 2**31 - 1),  # whose end is not given back
-        (_M_TOP_PAD, 256 * 2**20),  # and which grows in large steps
+        (_M_TRIM_THRESHOLD, 2**31 - 1),  # the heap is never trimmed
+        (_M_TOP_PAD, 256 * 2**20),  # the heap grows in large steps
     )
     applied = [mallopt(option, value) == 1 for option, value in settings]
     return all(applied)

@@ -1,9 +1,8 @@
 """Plugins: modules outside the package that register tasks, robots, networks or algorithms.
 
-A plugin is an importable module; importing it runs the decorators. Three ways lead to that import:
-the user's own ``import``, a list of names (``register_modules`` of worker processes, ``plugins`` of
-recipes and run configurations), and entry points of installed packages in the group
-``ba_torchrl.plugins``.
+A plugin is an importable module; its import runs the decorators. It is imported by the user's code,
+by name (``register_modules`` of worker processes, ``plugins`` of recipes and run configurations),
+or as an entry point of an installed package in the group ``ba_torchrl.plugins``.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ GROUP = "ba_torchrl.plugins"
 """Group of entry points; the value of each is the dotted name of a module."""
 
 MAIN = ("__main__", "__mp_main__")
-"""Names of the module that a process starts with, in itself and in its spawned children."""
+"""Names of a process's main module, in the process itself and in its spawned children."""
 
 _loaded_groups: set[str] = set()
 
 
 class PluginWarning(UserWarning):
-    """An installed plugin that cannot be imported."""
+    """An installed plugin cannot be imported."""
 
 
 def load_entry_points() -> None:
     """Import the plugins that installed packages declare, once per process.
 
-    A plugin that cannot be imported gives a `PluginWarning` that names it; the others are loaded.
+    A plugin that cannot be imported causes a `PluginWarning` with its name; the others are loaded.
     """
     if GROUP in _loaded_groups:
         return
@@ -53,7 +52,7 @@ def load_entry_points() -> None:
 
 
 def module_names(modules: Iterable[str | ModuleType]) -> tuple[str, ...]:
-    """Return the dotted names of modules that are given by name or as they are."""
+    """Return the dotted names of modules that are given by name or as module objects."""
     return tuple(
         module.__name__ if isinstance(module, ModuleType) else module for module in modules
     )
@@ -66,14 +65,14 @@ def import_modules(names: Iterable[str]) -> None:
         names: dotted names of modules.
 
     Raises:
-        ConfigError: a module does not exist; the message says what to do.
+        ConfigError: a module does not exist; the message names possible fixes.
     """
     for name in names:
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
             if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-                raise  # the plugin exists, and imports something that does not
+                raise  # the plugin exists, and one of its own imports is missing
             raise ConfigError(
                 f"cannot import the plugin {name!r}: there is no module {error.name!r}. Run from "
                 "the folder that holds it, put that folder on PYTHONPATH, or install the package"
@@ -81,7 +80,7 @@ def import_modules(names: Iterable[str]) -> None:
 
 
 def load_plugins(names: Iterable[str]) -> None:
-    """Import the plugins of a recipe or a run; the current directory counts, as with ``python -m``.
+    """Import the plugins of a recipe or a run, also from the current directory.
 
     Args:
         names: dotted names of modules.
@@ -96,14 +95,14 @@ def load_plugins(names: Iterable[str]) -> None:
 
 
 def check_spawned_process_knows(kind: str, name: str) -> None:
-    """Check that a spawned process has what the main module of this one registers.
+    """Check that a spawned process can import the main module of this process.
 
-    It imports the main module of a script and of ``python -m``. There is nothing to import for a
-    notebook, an interactive session and ``python -c``.
+    The main module of a script and of ``python -m`` can be imported. That of a notebook, an
+    interactive session and ``python -c`` cannot.
 
     Args:
-        kind: of the entry, "task".
-        name: of the entry, which the main module registered.
+        kind: kind of the registered entry, such as "task".
+        name: name of the entry, which the main module registered.
 
     Raises:
         ConfigError: the main module cannot be imported.

@@ -1,4 +1,4 @@
-"""Acting policies, which see images as the replay returns them."""
+"""Acting policies, whose input images are those that the replay returns."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ba_torchrl.envs import keys
 
 
 class ActingPolicy(TensorDictModuleBase):
-    """A policy on images that are encoded and decoded first, as those that it learns from.
+    """A policy on images that pass through the replay's codecs, as in training.
 
     It writes ``action`` and nothing else.
 
     Args:
         policy: from the observation to ``action``.
-        codecs: codec of each image by key, those of the replay.
+        codecs: the replay's codec of each image, by key.
     """
 
     def __init__(self, policy: TensorDictModuleBase, codecs: Mapping[str, ImageCodec]) -> None:

@@ -1,4 +1,4 @@
-"""Algorithm: a policy, a replay and an update; the experiment loop drives it."""
+"""The interface of algorithms: a policy, a replay and an update, called by the experiment."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ ALGORITHMS: Registry[type[AlgorithmConfig]] = Registry("algorithm", "ba_torchrl.
 
 @dataclass(frozen=True)
 class Problem:
-    """What an algorithm knows about its environments and its run."""
+    """Description of the environments and the run for which an algorithm is built."""
 
     control: Control
-    """Kind of control of the task."""
+    """Control of the task."""
     images: Mapping[str, ImageSpec]
     """Declarations of the images that the environment observes, by key."""
     actions: CloseLoopActions | OpenLoopActions
     """The action vector."""
     total_updates: int
-    """Length of the run, over which schedules extend."""
+    """Gradient updates of the run, the length of schedules."""
     seed: int
     device: torch.device
 
@@ -55,7 +55,7 @@ class Problem:
 
 
 class Algorithm(ABC):
-    """Learns from transitions; `ba_torchrl.training.experiment` collects them and calls it."""
+    """Learns from transitions, which `ba_torchrl.training.experiment` collects."""
 
     policy: TensorDictModuleBase
     """From a root TensorDict of any batch shape to ``action``; explores under TorchRL's
@@ -63,14 +63,13 @@ class Algorithm(ABC):
     updates: int = 0
     """Gradient updates so far."""
     stores_expert_action: ClassVar[bool] = False
-    """Whether the environments are made with ``expert=True``, and transitions keep
-    ``expert_action``."""
+    """Whether environments are made with ``expert=True`` and transitions have ``expert_action``."""
 
     def nearest_action(self, action: Tensor) -> Tensor:
-        """Return the action that the policy can choose and that is nearest to another one.
+        """Return the action nearest to a given one among those that the policy can choose.
 
-        Demonstrations are executed with it, so that what is learnt is what was executed. By
-        default every action can be chosen.
+        Demonstrations execute this action, so that the executed action is the one that is learnt.
+        By default the policy can choose every action.
 
         Args:
             action: [..., A].
@@ -79,7 +78,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDictBase:
-        """Return the transitions [N] that the replay stores of collected data.
+        """Return collected data as the transitions [N] that the replay stores.
 
         Args:
             data: steps of any batch shape, those of an episode in order.
@@ -87,7 +86,7 @@ class Algorithm(ABC):
         """
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Receive the demonstrations, before the first update; by default the replay stores them.
+        """Process the demonstrations before the first update; by default they enter the replay.
 
         Args:
             episodes: TensorDicts [T].
@@ -97,7 +96,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def extend(self, transitions: TensorDictBase) -> None:
-        """Add transitions [N] to the replay; those with a fault are left out."""
+        """Add transitions [N] to the replay, except those with a fault."""
 
     @property
     @abstractmethod
@@ -113,9 +112,9 @@ class Algorithm(ABC):
         """
 
     def pretrain_update(self) -> TensorDict:
-        """Take one update on the demonstrations, before the first collection; by default `update`.
+        """Take one update before the first collection; by default `update`.
 
-        Counts in `updates`, returns and raises as `update` does.
+        An override increments `updates`, and returns and raises as `update` does.
         """
         return self.update()
 
@@ -125,7 +124,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore networks, optimiser, counters and generators from a `state_dict`."""
 
     @abstractmethod
     def save_replay(self, folder: Path) -> None:
@@ -137,28 +136,28 @@ class Algorithm(ABC):
 
     @abstractmethod
     def load_replay(self, folder: Path) -> None:
-        """Restore what `save_replay` wrote.
+        """Restore the replay from a folder that `save_replay` wrote.
 
         Args:
-            folder: may be deleted afterwards.
+            folder: the folder; it may be deleted after the call.
         """
 
 
 class AlgorithmConfig(StrictModel, ABC):
-    """Hyper-parameters of an algorithm; building it needs a network and the problem."""
+    """Hyper-parameters of an algorithm, from which it is built for a network and a problem."""
 
     controls: ClassVar[frozenset[Control]]
-    """Kinds of control of the tasks that it learns."""
+    """Controls of the tasks that the algorithm supports."""
 
     def check(self, network: NetworkConfig, control: Control) -> None:
-        """Refuse a task or a network that the algorithm does not go with.
+        """Check that the algorithm supports the task's control, and that the network does.
 
         Args:
             network: hyper-parameters of the network.
-            control: kind of control of the task.
+            control: control of the task.
 
         Raises:
-            ConfigError: the algorithm does not learn such tasks, or the network is for others.
+            ConfigError: the algorithm or the network does not support this control.
         """
         if control not in self.controls:
             raise ConfigError(

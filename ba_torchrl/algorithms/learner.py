@@ -1,4 +1,4 @@
-"""Learner: gradient steps on batches from a replay. An algorithm overrides its parts."""
+"""Learner: gradient steps on batches from a replay, with parts that algorithms override."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ class LearnerConfig(AlgorithmConfig):
     learning_rate: float = Field(default=1e-3, gt=0)
     """Learning rate of Adam."""
     learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
-    """Share of the learning rate at the end of the run, to which it falls linearly."""
+    """Final fraction of the learning rate, which decreases linearly over the run."""
     weight_decay: float = Field(default=0.0, ge=0)
     """Adam's L2 term on the networks' parameters."""
     gradient_clamp: float | None = Field(default=None, gt=0)
-    """Bound of each element of the networks' gradient; by default there is none."""
+    """Bound of each element of the networks' gradient; None for no bound."""
     batch_size: int = Field(default=64, ge=1)
     """Transitions per update."""
     replay: ReplayKind = "uniform"
-    """How transitions are drawn: "uniform", "prioritized" or "symmetric"."""
+    """Sampling of transitions: "uniform", "prioritized" or "symmetric"."""
     buffer_size: int = Field(default=100_000, ge=1)
     """Transitions in the replay; in each half of a symmetric one."""
     priority_exponent: float = Field(default=0.6, ge=0)
     """Exponent alpha of the priorities of a prioritised replay."""
     importance_exponent: float = Field(default=0.4, ge=0, le=1)
-    """First value of its exponent beta of the weights, which grows to 1 over the run."""
+    """Initial exponent beta of the importance weights, which increases to 1 over the run."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
 
@@ -55,9 +55,9 @@ class LearnerConfig(AlgorithmConfig):
 class Learner(Algorithm):
     """Networks, a loss, an optimiser and a replay.
 
-    The constructor calls the ``make_...`` methods in the order in which they stand here. An
-    algorithm implements the first three and overrides others where the defaults do not fit. An
-    update minimises the sum of the ``loss_...`` entries of the loss module.
+    The constructor calls the ``make_...`` methods in the order of their definition. An algorithm
+    implements the first three and can override the others. An update minimises the sum of the
+    ``loss_...`` entries of the loss module.
 
     Args:
         config: hyper-parameters.
@@ -65,8 +65,8 @@ class Learner(Algorithm):
         problem: images, actions, device, seed and length of the run.
 
     Raises:
-        ConfigError: the environment lacks an image that the network sees.
-        ValueError: the network, the images or the actions do not go together.
+        ConfigError: the environment does not observe an image that the network needs.
+        ValueError: the network does not support the images or the actions.
     """
 
     def __init__(self, config: LearnerConfig, network: NetworkConfig, problem: Problem) -> None:
@@ -79,7 +79,7 @@ class Learner(Algorithm):
                 f"{', '.join(problem.images) or 'no images'}"
             )
         self.images = {key: problem.images[key] for key in network.image_keys}
-        """Declarations of the images that the networks see and the replay stores."""
+        """Declarations of the networks' input images, which the replay stores."""
         self.observation_keys = [*self.images, keys.HOLDING]
         self.codecs = make_codecs(self.images)
         networks = self.make_networks(network)
@@ -104,10 +104,10 @@ class Learner(Algorithm):
 
     @abstractmethod
     def make_loss(self, networks: Any) -> LossModule:
-        """Return the loss module, its value estimator made."""
+        """Return the loss module with its value estimator."""
 
     def make_target_updater(self) -> TargetNetUpdater | None:
-        """Return what moves the target network after each update; by default there is none."""
+        """Return the updater of the target network, None if there is no target network."""
         return None
 
     def make_replay(self) -> ReplayBuffer:
@@ -125,11 +125,11 @@ class Learner(Algorithm):
         )
 
     def make_augmentation(self) -> nn.Module:
-        """Return the augmentation of sampled batches; by default there is none."""
+        """Return the augmentation of sampled batches; by default the identity."""
         return nn.Identity()
 
     def make_optimizer(self) -> torch.optim.Optimizer:
-        """Return Adam, whose weight decay leaves all but the networks' parameters alone."""
+        """Return Adam, with weight decay on the parameters of the networks only."""
         networks = self.network_parameters()
         known = set(map(id, networks))
         others = [p for p in self.loss.parameters() if id(p) not in known]
@@ -153,19 +153,19 @@ class Learner(Algorithm):
         )
 
     def network_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that weight decay and the gradient's bound apply to."""
+        """Return the parameters to which weight decay and the gradient's bound apply."""
         return list(self.loss.parameters())
 
     # -- data --------------------------------------------------------------------------------
 
     def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
-        """Return the transitions [N] that the replay stores of collected data."""
+        """Return collected data as the transitions [N] that the replay stores."""
         return as_transitions(
             data, self.images, is_expert=is_expert, expert_action=self.stores_expert_action
         )
 
     def extend(self, transitions: TensorDictBase) -> None:
-        """Add transitions [N] to the replay; those with a fault are left out."""
+        """Add transitions [N] to the replay, except those with a fault."""
         self.replay.extend(transitions)
 
     @property
@@ -183,7 +183,7 @@ class Learner(Algorithm):
     # -- updates -----------------------------------------------------------------------------
 
     def update(self) -> TensorDict:
-        """Sample a batch, step networks and target, and refresh the priorities if there are any.
+        """Take one gradient step on a batch, and update the target network and the priorities.
 
         Raises:
             FloatingPointError: a loss is not finite.
@@ -198,13 +198,13 @@ class Learner(Algorithm):
         if self.target_updater is not None:
             self.target_updater.step()
         if self._prioritized_sampler() is not None:
-            # the sampler's trees are on the CPU for any device of the learner
+            # the trees of the sampler are on the CPU
             self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
         self.updates += 1
         return scalars.detach()
 
     def step(self, loss: Tensor) -> None:
-        """Take one step of the optimiser and of the learning rate's schedule."""
+        """Take one step of the optimiser and of the schedule of the learning rate."""
         self.optimizer.zero_grad()
         loss.backward()
         if self.config.gradient_clamp is not None:
@@ -219,7 +219,7 @@ class Learner(Algorithm):
     # -- state -------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, target, optimiser, schedule, augmentation and counter."""
+        """Return networks, target, optimiser, schedule, augmentation and number of updates."""
         return {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -229,7 +229,7 @@ class Learner(Algorithm):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned, on any device."""
+        """Restore the learner from a `state_dict` of any device."""
         for name in ("loss", "optimizer", "scheduler", "augmentation"):
             getattr(self, name).load_state_dict(state[name])
         self.updates = state["updates"]
@@ -239,5 +239,5 @@ class Learner(Algorithm):
         self.replay.dumps(folder)
 
     def load_replay(self, folder: Path) -> None:
-        """Restore what `save_replay` wrote."""
+        """Restore the replay from a folder that `save_replay` wrote."""
         self.replay.loads(folder)

@@ -22,7 +22,7 @@ from ba_torchrl.objectives.sacfd import SACfDLoss
 
 @ALGORITHMS.register("sac")
 class SACConfig(LearnerConfig):
-    """Hyper-parameters of the SAC family; the presets in ``configs/algorithm`` name its members.
+    """Hyper-parameters of SAC and its variants, which are presets in ``configs/algorithm``.
 
     The defaults are the paper's (appendix G.2).
     """
@@ -32,18 +32,18 @@ class SACConfig(LearnerConfig):
     gamma: float = Field(default=0.99, gt=0, le=1)
     """Discount factor."""
     tau: float = Field(default=0.01, gt=0, le=1)
-    """Share of the critic that enters its target at every update."""
+    """Weight of the critic in the update of its target."""
     alpha_init: float = Field(default=0.01, gt=0)
-    """First value of the entropy temperature."""
+    """Initial entropy temperature."""
     target_entropy: float = -5.0
     """Entropy that the temperature is tuned for, nats."""
     demonstration_weight: float = Field(default=1.0, ge=0)
-    """Factor of the behaviour term; 0 is plain SAC."""
+    """Weight of the behaviour term; 0 for plain SAC."""
     replay: ReplayKind = "prioritized"
     augmentation: Literal["so2", "none"] = "so2"
-    """Rotation of sampled transitions about the vertical."""
+    """Rotation of sampled transitions about the z axis."""
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
-    """Share of the sampled transitions that is rotated."""
+    """Probability of rotating a sampled transition."""
 
     def build(self, network: NetworkConfig, problem: Problem) -> SAC:
         """Return a freshly initialised learner."""
@@ -99,7 +99,7 @@ class SAC(Learner):
         return loss.make_value_estimator(gamma=config.gamma)
 
     def make_target_updater(self) -> SoftUpdate:
-        """Return the moving average of the critic."""
+        """Return the soft update of the critic's target."""
         return SoftUpdate(self.loss, tau=self.config.tau)
 
     def make_augmentation(self) -> nn.Module:

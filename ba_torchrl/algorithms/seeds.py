@@ -10,8 +10,8 @@ import numpy as np
 class SeedUse(IntEnum):
     """Uses of randomness in a run.
 
-    Initial weights, and what SAC samples from its policy, come from torch's global generator, which
-    starts from the run's own seed.
+    Initial weights and the actions that SAC samples are drawn from torch's global generator, which
+    is seeded with the seed of the run.
     """
 
     DEMONSTRATIONS = 0
@@ -32,6 +32,6 @@ def derive_seed(seed: int, use: SeedUse, part: int = 0) -> int:
     Args:
         seed: of the run.
         use: the use.
-        part: number of a further seed for the same use.
+        part: index among several seeds of the same use.
     """
     return int(np.random.SeedSequence([seed, use, part]).generate_state(1)[0])

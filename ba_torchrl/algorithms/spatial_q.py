@@ -1,4 +1,4 @@
-"""Q-learning in spatial action spaces: DQN, and ADET, DQfD, SDQfD from demonstrations (G.1)."""
+"""Q-learning in spatial action spaces: DQN, ADET, DQfD and SDQfD (appendix G.1)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from ba_torchrl.objectives.dqn import Demonstrations, LevelDQNLoss
 
 @ALGORITHMS.register("spatial_q")
 class SpatialQConfig(LearnerConfig):
-    """Hyper-parameters of spatial Q-learning; presets in ``configs/algorithm`` name its members.
+    """Hyper-parameters of spatial Q-learning; its variants are presets in ``configs/algorithm``.
 
     The defaults are those of SDQfD in the paper (appendix G.1).
     """
@@ -47,7 +47,7 @@ class SpatialQConfig(LearnerConfig):
     demonstrations: Demonstrations = "sdqfd"
     """The term on demonstrated actions: "none", "dqfd", "sdqfd" or "adet"."""
     demonstration_weight: float = Field(default=0.1, ge=0)
-    """Factor of that term."""
+    """Weight of that term."""
     margin: float = Field(default=0.1, ge=0)
     """Margin of "dqfd" and "sdqfd" between demonstrated actions and others."""
     first_beta: float = Field(default=100.0, gt=0)
@@ -61,32 +61,32 @@ class SpatialQConfig(LearnerConfig):
     """Discount factor."""
     batch_size: int = Field(default=16, ge=1)
     target_interval: int = Field(default=100, ge=1)
-    """Updates between copies of the network to its target."""
+    """Updates between two copies of the network to its target."""
     replay: ReplayKind = "symmetric"
     augmentation: RigidTransforms = "none"
     """Rigid transforms of sampled transitions: "translation", "cn", "d4" or "se2"."""
     augmentation_probability: float = Field(default=1.0, ge=0, le=1)
-    """Share of the sampled transitions that is transformed."""
+    """Probability of transforming a sampled transition."""
     augmentation_order: int = Field(default=16, ge=1)
-    """n of "cn"."""
+    """Number of rotations n of "cn"."""
     epsilon_init: float = Field(default=0.0, ge=0, le=1)
-    """Share of random actions at the start; the paper acts greedily."""
+    """Initial probability of a random action; 0 in the paper."""
     epsilon_end: float = Field(default=0.0, ge=0, le=1)
-    """Share of random actions at the end."""
+    """Final probability of a random action."""
     epsilon_updates: int = Field(default=1000, ge=1)
-    """Updates over which the share changes linearly."""
+    """Updates over which that probability changes linearly."""
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
         """Return a freshly initialised learner.
 
         Raises:
-            ValueError: the network does not go with the task's images or actions.
+            ValueError: the network does not support the task's images or actions.
         """
         return SpatialQ(self, network, problem)
 
 
 class SpatialQ(Learner):
-    """A network of spatial Q values with a target that is copied at intervals.
+    """A network of spatial Q values with a target network that is copied at intervals.
 
     Args:
         config: hyper-parameters.
@@ -94,7 +94,7 @@ class SpatialQ(Learner):
         problem: images, actions, device, seed and length of the run.
 
     Raises:
-        ValueError: the network or the augmentation does not go with the task's images or actions.
+        ValueError: the network or the augmentation does not support the task's images or actions.
     """
 
     config: SpatialQConfig
@@ -105,9 +105,9 @@ class SpatialQ(Learner):
         self._set_epsilon()
 
     def make_networks(self, network: NetworkConfig) -> SpatialValues:
-        """Return the values of actions."""
+        """Return the network, wrapped as values of the environment's actions."""
         actions = self.problem.actions
-        assert isinstance(actions, OpenLoopActions), "open_loop tasks have no other"
+        assert isinstance(actions, OpenLoopActions), "spatial Q-learning is for open_loop tasks"
         spec = SpatialSpec(
             self.images,
             components=tuple(name for name in actions.components if name != "p"),
@@ -119,7 +119,7 @@ class SpatialQ(Learner):
         return values.to(self.problem.device)
 
     def make_policy(self, networks: SpatialValues) -> TensorDictModule:
-        """Return the greedy policy with a share of random actions."""
+        """Return the epsilon-greedy policy."""
         self.explorer = SpatialPolicy(networks, seed=self.problem.derived_seed(SeedUse.EXPLORATION))
         return spatial_policy(self.explorer)
 
@@ -137,8 +137,8 @@ class SpatialQ(Learner):
         return loss.make_value_estimator(gamma=config.gamma)
 
     def make_target_updater(self) -> HardUpdate:
-        """Return the copy at intervals."""
-        # TorchRL copies one step after its interval.
+        """Return the updater that copies the network to its target."""
+        # TorchRL copies when its counter exceeds the interval, one update later.
         return HardUpdate(self.loss, value_network_update_interval=self.config.target_interval - 1)
 
     def make_augmentation(self) -> RigidAugmentation:
@@ -158,7 +158,7 @@ class SpatialQ(Learner):
         return self.actions.nearest(action)
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store demonstrations; actions that were executed off the grid become the nearest on it.
+        """Store demonstrations, with actions replaced by the nearest ones on the grid.
 
         Args:
             episodes: TensorDicts [T].
@@ -168,8 +168,8 @@ class SpatialQ(Learner):
     def _on_grid(self, episode: TensorDictBase) -> TensorDictBase:
         """Return an episode [T] with the nearest actions on the grid.
 
-        Where a yaw close to half a turn becomes zero, the fingers are swapped, and images in the
-        gripper's axes of what this pick holds are reversed.
+        If the nearest yaw of a pick close to half a turn is zero, the fingers are swapped, and the
+        images with the gripper's axes are reversed while the picked object is held.
         """
         action = episode[keys.ACTION]
         nearest = self.nearest_action(action)
@@ -191,7 +191,7 @@ class SpatialQ(Learner):
         return out
 
     def update(self) -> TensorDict:
-        """Take one step, see `Learner.update`, and change the share of random actions.
+        """Take one step as `Learner.update`, and update epsilon.
 
         Raises:
             FloatingPointError: a loss is not finite.
@@ -207,11 +207,11 @@ class SpatialQ(Learner):
         self.explorer.epsilon.fill_(epsilon)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return network, target, optimiser, schedule, generators and counter."""
+        """Return network, target, optimiser, schedule, generators and number of updates."""
         return {**super().state_dict(), "exploration": self.explorer.get_generator_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned, on any device."""
+        """Restore the learner from a `state_dict` of any device."""
         super().load_state_dict(state)
         self.explorer.set_generator_state(state["exploration"])
         self.target_updater.counter = self.updates % self.config.target_interval

@@ -1,4 +1,4 @@
-"""Files of demonstrations: episodes with the task and the parameters that they come from."""
+"""Files of demonstrations: episodes, with the task and parameters of their environment."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def save_demonstrations(
         path: a new folder.
         episodes: TensorDicts [T].
         task: id of the task.
-        env: fields of `EnvConfig` that were given.
+        env: fields of `EnvConfig` that were set.
         seed: of the first episodes.
-        source: where they come from.
+        source: how the demonstrations were made.
 
     Raises:
         ValueError: there are no episodes.
-        FileExistsError: the folder holds demonstrations.
+        FileExistsError: the folder already holds demonstrations.
     """
     if not episodes:
         raise ValueError("there are no episodes to save")
@@ -69,16 +69,16 @@ def save_demonstrations(
 
 
 def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> list[TensorDict]:
-    """Read episodes back, if they were collected from the same task and parameters.
+    """Read episodes that were collected from the same task with the same parameters.
 
     Args:
         path: folder that `save_demonstrations` wrote.
-        task: id of the task they are for.
-        env: fields of `EnvConfig` of the environments they are for.
+        task: id of the task.
+        env: fields of `EnvConfig` of the environments.
 
     Raises:
-        ConfigError: there are none at ``path``, or they come from other environments; the message
-            names every difference.
+        ConfigError: there are none at ``path``, or task or parameters differ; the message names
+            every difference.
     """
     path = Path(path)
     check_demonstrations(path, task=task, env=env)
@@ -92,12 +92,12 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
 
     Args:
         path: folder that `save_demonstrations` wrote.
-        task: id of the task they are for.
-        env: fields of `EnvConfig` of the environments they are for.
+        task: id of the task.
+        env: fields of `EnvConfig` of the environments.
 
     Raises:
-        ConfigError: there are none, or they come from other environments; the message names every
-            difference.
+        ConfigError: there are none at ``path``, or task or parameters differ; the message names
+            every difference.
     """
     path = Path(path)
     try:
@@ -106,7 +106,7 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     if not {"task", "env"} <= metadata.keys():
         raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
-    # A field that was added later had its default value.
+    # A field that is missing in the file was added later and has its default value.
     found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
     wanted = {"task": task, **_env_values(task, env)}
     differences = [
@@ -121,6 +121,6 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
 
 
 def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
-    """Return every environment parameter that shapes the data, defaults filled in, as JSON."""
+    """Return every parameter that affects the data, defaults included, as JSON values."""
     other = {"seed", "render", *source_config("deconstruction")}
     return json.loads(resolve(task, **env).model_dump_json(exclude=other))

@@ -18,12 +18,12 @@ from ba_torchrl.envs.factory import make_vector
 from ba_torchrl.errors import ConfigError
 
 Source = Literal["expert", "deconstruction"]
-"""Where demonstrations come from."""
+"""How demonstrations are made: by an expert, or by reversing deconstruction episodes."""
 SOURCES: tuple[Source, ...] = get_args(Source)
 
 
 def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
-    """Write the expert's action; the environment must be made with ``expert=True``."""
+    """Copy the expert's action; the environment must be made with ``expert=True``."""
     return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION].clone())
 
 
@@ -40,15 +40,15 @@ def collect_demonstrations(
     """Play episodes with the expert.
 
     Args:
-        env: a vector of environments made with ``expert=True``, and with ``deconstruct=True`` if
-            that is the source.
+        env: a vector of environments made with ``expert=True``, and with ``deconstruct=True`` for
+            the source "deconstruction".
         episodes: number of episodes to play.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        source: "expert", or "deconstruction" for episodes reversed in time. Episodes that cannot
-            be reversed are left out; all others succeed.
-        only_successful: leave out episodes that did not reach the goal.
-        nearest_action: from the expert's action to the one that is executed and recorded, which a
-            policy with discrete actions needs; by default the expert's own.
+        source: "expert", or "deconstruction" for episodes reversed in time. Episodes that cannot be
+            reversed are dropped; all others succeed.
+        only_successful: drop episodes that did not reach the goal.
+        nearest_action: maps the expert's action to the action that is executed and recorded. A
+            policy with discrete actions needs it; None for the expert's own action.
         on_episode: called with each episode when it ends, for progress bars.
 
     Returns:
@@ -88,7 +88,7 @@ class ExpertScores(NamedTuple):
     mean_length: float
     """Steps of the episodes that reached the goal; nan if none did."""
     median_length: float
-    """Median of the same."""
+    """Median steps of these episodes."""
 
 
 def expert_scores(

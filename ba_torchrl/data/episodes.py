@@ -1,4 +1,4 @@
-"""Whole episodes from a vector of environments, a fixed number from each."""
+"""Complete episodes from a vector of environments, a fixed number from each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 def quotas(episodes: int, num_envs: int) -> list[int]:
-    """Return the number of episodes of each environment; they differ by at most one."""
+    """Return the number of episodes of each environment; the numbers differ by at most one."""
     return [episodes // num_envs + (i < episodes % num_envs) for i in range(num_envs)]
 
 
@@ -32,22 +32,22 @@ def collect_episodes(
     on_episode: Callable[[TensorDict], None] | None = None,
     max_lost: int = 100,
 ) -> list[TensorDict]:
-    """Play whole episodes, a fixed number in each environment.
+    """Play complete episodes, a fixed number in each environment.
 
-    Taking the first episodes that finish would favour short ones. An episode with a fault is left
-    out and replaced by one with the next seed.
+    The number is fixed because the first episodes to finish are biased towards short ones. An
+    episode with a fault is dropped, and the environment plays another one.
 
     Args:
         env: a vector of environments, batch size [num_envs].
         policy: writes the action.
-        episodes: number of episodes in all.
+        episodes: total number of episodes.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        exclude: entries to leave out, such as the pixels when only results are needed.
+        exclude: entries to drop, such as the pixels when only results are needed.
         on_episode: called with each episode when it ends, for progress bars.
-        max_lost: number of faults that are tolerated.
+        max_lost: largest number of episodes that may be lost to faults.
 
     Returns:
-        Episodes as TensorDicts [T], those of the first environment first.
+        Episodes as TensorDicts [T], in the order of the environments.
 
     Raises:
         RuntimeError: more than ``max_lost`` episodes were lost to faults.
@@ -83,7 +83,7 @@ def collect_episodes(
 
 
 def is_success(episode: TensorDictBase) -> bool:
-    """Whether an episode [T] ended with the goal reached."""
+    """Return whether an episode [T] reached the goal."""
     return bool(episode[keys.NEXT, keys.SUCCESS][-1])
 
 
@@ -93,5 +93,5 @@ def success_rate(episodes: Sequence[TensorDictBase]) -> float:
 
 
 def mean_length(episodes: Sequence[TensorDictBase]) -> float:
-    """Return the mean number of steps."""
+    """Return the mean number of steps per episode."""
     return sum(len(episode) for episode in episodes) / len(episodes)

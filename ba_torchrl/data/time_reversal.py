@@ -31,8 +31,8 @@ _EXTRA = (keys.UNDO_ACTION, keys.UNDO_IN_HAND, keys.CAN_UNDO, keys.EXPERT_ACTION
 def is_reversible(episode: TensorDictBase) -> bool:
     """Return whether the reverse of a deconstruction episode [T] builds the structure.
 
-    The episode must succeed, each of its actions must move one object and have an inverse, and
-    picks and places must alternate, starting with a pick.
+    The episode must succeed, each of its actions must move exactly one object and be invertible,
+    and picks and places must alternate, starting with a pick and ending with a place.
     """
     holding = episode[keys.HOLDING].flatten().tolist()
     return (
@@ -46,9 +46,9 @@ def is_reversible(episode: TensorDictBase) -> bool:
 def reverse_episode(episode: TensorDictBase) -> TensorDict:
     """Return a deconstruction episode [T] reversed in time, which builds the structure.
 
-    It has the form of an expert's episode: observations come in reverse order, actions are the
-    inverse ones, in-hand images are those that the inverse picks see, and the last step completes
-    the structure, has the reward and terminates.
+    It has the entries of an expert's episode. Observations are in reverse order, actions are the
+    inverse actions, and in-hand images are those of the inverse picks. The last step completes the
+    structure, has the reward and terminates.
 
     Args:
         episode: steps [T] of an environment with ``deconstruct=True``.
@@ -61,10 +61,10 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
     steps = len(episode)
     following = episode[keys.NEXT]
     seen = [key for key in episode.keys() if key not in {*_ENDS, *_EXTRA, keys.ACTION, keys.NEXT}]  # noqa: SIM118 -- a TensorDict
-    # state t + 1, then t: the states on both sides of each step, the last step first
+    # the state before each reversed step is t + 1, the state after it is t; the last step first
     before, after = (side.select(*seen).flip(0).clone() for side in (following, episode))
     if keys.IN_HAND in seen:
-        # what is held in state t is picked, in reverse, from state t + 1
+        # the reversed episode picks the object held in state t from the scene of state t + 1
         shown = torch.where(
             episode[keys.HOLDING][..., None, None],
             following[keys.UNDO_IN_HAND],
@@ -93,17 +93,17 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
 
 
 class ReplayScores(NamedTuple):
-    """Results of reversed episodes in the simulator."""
+    """Results of reversed episodes that are replayed in the simulator."""
 
     reversible: float
     """Share of the deconstruction episodes that can be reversed."""
     success_rate: float
-    """Share of the reversible ones whose inverse actions reach the goal."""
+    """Fraction of the reversible episodes whose inverse actions reach the goal."""
     mean_length: float
 
 
 def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> ReplayScores:
-    """Play deconstruction episodes, then their inverse actions from the state that they end in.
+    """Play deconstruction episodes, each followed by its inverse actions from its last state.
 
     Args:
         task: id of a task with a structure.

@@ -1,4 +1,4 @@
-"""Transitions: what the replay stores of a rollout."""
+"""Conversion of rollouts to the transitions that the replay stores."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ def as_transitions(
     is_expert: bool,
     expert_action: bool = False,
 ) -> TensorDict:
-    """Return what the replay stores of a rollout, flattened to [N].
+    """Return the transitions [N] of a rollout with the entries that the replay stores.
 
     Args:
         tensordict: transitions of any batch shape.
         images: keys of the images to store.
         is_expert: whether the transitions are demonstrations.
-        expert_action: also store ``expert_action``; of demonstrations that lack it, the action.
+        expert_action: also store ``expert_action``; for demonstrations without it, a copy of the
+            action.
 
     Raises:
         KeyError: an entry is missing.

@@ -18,7 +18,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.envs.checks import checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.envs.observations import enabled_observations, joined
+from ba_torchrl.envs.observations import enabled_observations, merge_entries
 from ba_torchrl.envs.scene import (
     Controller,
     Scene,
@@ -44,15 +44,15 @@ MAX_CONSECUTIVE_FAULTS = 10
 class ManipulationEnv(EnvBase):
     """A manipulation task as an unbatched TorchRL environment on the CPU.
 
-    Episodes are determined by the seed alone: episode n of seed s is the same in any process and
-    after any other episodes. Only tasks that keep the objects of the last episode depend on it.
+    The seed determines the episodes: episode n of seed s is the same in any process and after any
+    other episodes. Exceptions are tasks that continue with the objects of the previous episode.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
         config: the environment's parameters.
 
     Raises:
-        ConfigError: the parameters do not fit the task or the robot.
+        ConfigError: the task or the robot does not support the parameters.
     """
 
     def __init__(self, task_id: str, config: EnvConfig) -> None:
@@ -85,15 +85,15 @@ class ManipulationEnv(EnvBase):
         self._observation: dict[str, torch.Tensor] = {}
         self._observations = enabled_observations(config, self.workspace)
         self._memory: dict[str, Any] = {}
-        """Content of observations that stems from earlier steps; replaced, never modified."""
+        """Parts of observations from earlier steps; the dictionary is replaced, never modified."""
         self._ends: dict[str, bool] = {}
-        """How the last step ended, by key."""
+        """Success, fault and done flags of the last step, by key."""
         self._conditions: dict[str, bool] | None = None
         """The conditions of success after the last step, None before the first."""
         self._step_count = 0
         self._episode = 0
         self.faults = 0
-        """Simulator faults since construction."""
+        """Number of simulator faults since construction."""
         self._consecutive_faults = 0
         self.base_seed = 0
         self._set_seed(config.seed)
@@ -105,10 +105,10 @@ class ManipulationEnv(EnvBase):
     actions: CloseLoopActions | OpenLoopActions
     """The action space; set by `_configure`."""
     physics: ClassVar[Physics] = Physics()
-    """Settings of the physics engine in the mode "fast"."""
+    """Settings of the physics engine for ``physics_mode="fast"``."""
     camera_pose: ClassVar[tuple[float, float, float]] = (-0.06, 0.2, 1.05)
-    """Of `render`: offset of the target from the workspace's centre along x, its height, and the
-    distance of the camera, metres."""
+    """Camera of `render`: x offset of its target from the workspace's centre, height of the target,
+    and distance of the camera, metres."""
     default_action_sequence: ClassVar[str]
     """Default `action_sequence`."""
     default_half_rotation: ClassVar[bool]
@@ -116,7 +116,7 @@ class ManipulationEnv(EnvBase):
 
     @abstractmethod
     def _configure(self) -> None:
-        """Check the parameters of the control, and build `actions`."""
+        """Validate the parameters of the control and set `actions`."""
 
     @abstractmethod
     def _make_controller(self, robot: Robot, task: Task) -> Controller:
@@ -129,8 +129,8 @@ class ManipulationEnv(EnvBase):
 
     @property
     @abstractmethod
-    def _heights_to_reach(self) -> tuple[float, ...]:
-        """Heights of the tool that the arm must reach above every corner of the workspace."""
+    def _required_tool_heights(self) -> tuple[float, ...]:
+        """Heights of the tool that the arm must reach at every corner of the workspace."""
 
     @abstractmethod
     def _make_action_spec(self) -> Bounded:
@@ -138,22 +138,22 @@ class ManipulationEnv(EnvBase):
 
     @abstractmethod
     def _declare_images(self) -> dict[str, ImageSpec]:
-        """Return what `_images` gives, by key."""
+        """Return the declarations of the images that `_images` returns, by key."""
 
     @abstractmethod
     def _place_robot(self, scene: Scene) -> None:
-        """Put the robot into the initial pose of an episode."""
+        """Move the robot to the initial pose of an episode."""
 
     @abstractmethod
     def _act(self, scene: Scene, action: np.ndarray) -> None:
-        """Carry out an action."""
+        """Execute an action."""
 
     @abstractmethod
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         """Return the images, [C, H, W] each, by key."""
 
     def _is_holding(self, scene: Scene) -> bool:
-        """Whether the gripper holds something."""
+        """Return whether the gripper holds an object."""
         return scene.robot.held_body() is not None
 
     @abstractmethod
@@ -164,10 +164,10 @@ class ManipulationEnv(EnvBase):
 
     @property
     def scene(self) -> Scene:
-        """World, robot and task as they are now.
+        """The world, robot and task of the current episode.
 
         Raises:
-            SimulationError: the environment was not reset yet.
+            SimulationError: the environment has not been reset.
         """
         if self._episodes.scene is None:
             raise SimulationError("reset the environment first")
@@ -200,13 +200,13 @@ class ManipulationEnv(EnvBase):
     def get_state(self) -> EnvState:
         """Return the full state, for `set_state`.
 
-        A state is valid in this process only and takes a few milliseconds. Continuing after this
-        call and continuing after `set_state` give the same future bit by bit; without this call,
-        the future may differ in the last bits. Tasks with clutter or a bin continue in a newly
-        built world, here and after each `set_state`, which takes tenths of a second.
+        A state is valid in this process only and takes a few milliseconds. The steps after this
+        call and after `set_state` with its result are the same bit for bit; steps without this call
+        may differ from them in the last bits. For tasks with clutter or a bin, this method and
+        `set_state` build a new world, which takes tenths of a second.
 
         Raises:
-            SimulationError: the environment was not reset yet.
+            SimulationError: the environment has not been reset.
         """
         scene = self.scene
         needs_fresh_world = self.task_class.needs_fresh_world
@@ -226,17 +226,18 @@ class ManipulationEnv(EnvBase):
         return state
 
     def set_state(self, state: EnvState) -> TensorDict:
-        """Restore a state of this environment: the same actions then give the same future.
+        """Restore a state of this environment; the same actions then give the same steps.
 
         Args:
             state: from `get_state`.
 
         Returns:
-            The observation in that state, as `step` gives it under "next", without reward.
+            The entries of that state that `step` returns under "next", without the
+            reward.
 
         Raises:
-            SimulationError: it is the state of another environment, or of a simulation that
-                failed and was rebuilt since.
+            SimulationError: the state is of another environment, or of a world that was closed
+                after a fault.
         """
         if state.owner is not self._identity:
             raise SimulationError("the state is of another environment")
@@ -251,7 +252,7 @@ class ManipulationEnv(EnvBase):
         return self._tensordict(self._observation, **self._ends)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close every world of this environment."""
+        """Close all worlds of this environment."""
         self._episodes.close()
         super().close(raise_if_closed=raise_if_closed)
 
@@ -319,11 +320,11 @@ class ManipulationEnv(EnvBase):
 
         action = self._make_action_spec()
         images = self._declare_images() if self.config.obs_type == "pixel" else {}
-        self.images = joined([images, *(extra.images() for extra in self._observations)])
+        self.images = merge_entries([images, *(extra.images() for extra in self._observations)])
         """Declaration of each image that is observed, by key."""
         seen = {key: image.to_tensor_spec() for key, image in self.images.items()}
         largest = self._episodes.largest_scene
-        seen = joined([seen, *(extra.specs(largest) for extra in self._observations)])
+        seen = merge_entries([seen, *(extra.specs(largest) for extra in self._observations)])
         observation = {
             **seen,
             keys.HOLDING: flag(),
@@ -341,9 +342,9 @@ class ManipulationEnv(EnvBase):
         )
 
     def _check_feasible(self) -> None:
-        """Raise, before any worker starts, if the objects or the robot do not fit the workspace."""
+        """Check before any worker starts that the workspace suits the objects and the robot."""
         largest = self._episodes.largest_scene
-        check_action_limits(largest.robot, self.workspace, self._heights_to_reach)
+        check_action_limits(largest.robot, self.workspace, self._required_tool_heights)
         try:
             self._episodes.check_starts()
         except PlacementError as error:

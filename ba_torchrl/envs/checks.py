@@ -1,4 +1,4 @@
-"""Checks of actions before anything moves."""
+"""Validation of actions before they are executed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: s
         action_sequence: one letter per component.
 
     Raises:
-        InvalidActionError: the action is missing, not finite, or not shaped and typed like that.
+        InvalidActionError: the action is missing, not finite, or has another shape or type.
     """
     size = len(action_sequence)
     if action is None:
@@ -38,15 +38,16 @@ def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: s
 def check_actions(
     actions: torch.Tensor | None, spec: TensorSpec, stepped: torch.Tensor | None = None
 ) -> None:
-    """Refuse actions that are missing, not finite or of the wrong shape or type.
+    """Check that actions are present, finite and of the right shape and type.
 
     Args:
         actions: [n, A], one row per environment.
         spec: of ``actions``; values out of its bounds are allowed, the environments clip them.
-        stepped: [n] or [n, 1] bool, the environments that are about to step; None means all.
+        stepped: [n] or [n, 1] bool, the environments that step; None for all.
 
     Raises:
-        InvalidActionError: an action is missing, not finite, or not shaped and typed like ``spec``.
+        InvalidActionError: an action is missing, not finite, or has another shape or type than
+            ``spec``.
     """
     if actions is None:
         raise InvalidActionError(

@@ -1,4 +1,4 @@
-"""Close-loop control: small displacements of the gripper, observed by a camera above it."""
+"""Close-loop control: displacements of the gripper, observed by a camera above it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ba_torchrl.tasks.workspace import ActionLimits
 
 START_HEIGHT_M = 0.2
 HALF_TURN = (-math.pi / 2, math.pi / 2)
-"""Range of the yaw with `half_rotation`; episodes start in its middle."""
+"""Range of the yaw with `half_rotation`; episodes start at its centre."""
 
 
 @CONTROLS.register("close_loop")
@@ -29,9 +29,9 @@ class CloseLoopEnv(ManipulationEnv):
     """A task under close-loop control (paper section 3.2, appendix A.2, G.2).
 
     An action moves the tool by at most `dpos` along each axis and turns it by at most `drot`,
-    then opens or closes the gripper. By default the image is orthographic depth below a camera
-    that stays above the tool and does not turn with it, the fingers drawn as squares of zero;
-    `ba_torchrl.sim.vision.views` has others.
+    then opens or closes the gripper. By default the image is the orthographic depth below a camera
+    that moves with the tool and does not rotate with it. The fingers are drawn as squares of zero.
+    Other views are in `ba_torchrl.sim.vision.views`.
     """
 
     default_action_sequence = "pxyzr"
@@ -60,7 +60,7 @@ class CloseLoopEnv(ManipulationEnv):
         return CloseLoopController(robot, teleport=self.config.fast_mode)
 
     @property
-    def _heights_to_reach(self) -> tuple[float, ...]:
+    def _required_tool_heights(self) -> tuple[float, ...]:
         return self.workspace.z
 
     def _make_action_spec(self) -> Bounded:

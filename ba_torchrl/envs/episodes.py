@@ -1,4 +1,4 @@
-"""Episodes: the scenes of an environment, one per scale of the objects, their starts and states."""
+"""Episodes: the scenes of an environment, one per scale of the objects, and their starts."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Episodes:
     """Builds scenes on demand and starts episodes in them.
 
     Args:
-        scales: scales of the objects, of which every episode draws one.
+        scales: scales of the objects; every episode draws one.
         build: builds the scene for a scale.
-        place_robot: puts the robot of a scene into the initial pose of an episode.
+        place_robot: moves the robot of a scene to the initial pose of an episode.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Episodes:
         self._place_robot = place_robot
         self._scenes: dict[float, Scene] = {}
         self.scene: Scene | None = None
-        """The scene of the present episode."""
+        """The scene of the current episode."""
 
     def scene_for(self, scale: float) -> Scene:
         """Return the scene for objects of a scale, built on the first call."""
@@ -67,7 +67,7 @@ class Episodes:
         return self.scene_for(float(self.scales[-1]))
 
     def check_starts(self) -> None:
-        """Start an episode with the smallest and one with the largest objects.
+        """Start one episode with the smallest objects and one with the largest.
 
         Raises:
             PlacementError: the objects do not fit the workspace.
@@ -76,7 +76,7 @@ class Episodes:
             self.initialize(self.scene_for(scale), np.random.default_rng(0))
 
     def scale(self) -> float:
-        """Return the scale of the objects in the present episode."""
+        """Return the scale of the objects in the current episode."""
         return next(key for key, scene in self._scenes.items() if scene is self.scene)
 
     def close(self) -> None:
@@ -87,11 +87,11 @@ class Episodes:
         self.scene = None
 
     def begin(self, rng: np.random.Generator, *, with_new_objects: bool) -> Scene:
-        """Start an episode, with the objects of the last one where the task continues with them.
+        """Start an episode; a task that continues keeps the objects of the previous one.
 
         Args:
             rng: draws the scale and the initial poses.
-            with_new_objects: place new objects in any case.
+            with_new_objects: place new objects even if the task continues.
 
         Raises:
             PlacementError: no valid start was found.
@@ -111,7 +111,7 @@ class Episodes:
         """Place new objects in a scene.
 
         Raises:
-            PlacementError: no attempt gave a valid scene in which the goal does not hold.
+            PlacementError: no attempt gave a valid scene that is not solved.
         """
         invalid = 0
         for _ in range(RESET_ATTEMPTS):
@@ -130,9 +130,9 @@ class Episodes:
 
 
 def evaluate_at_rest(scene: Scene) -> tuple[dict[str, bool], bool]:
-    """Return the named conditions of success, once everything is at rest, and whether it is valid.
+    """Return the conditions of success of the scene at rest, and whether it is valid.
 
-    The scene is settled only if the conditions hold before.
+    The scene is settled only if all conditions hold before.
 
     Raises:
         SimulationError: the position of a body is not finite.

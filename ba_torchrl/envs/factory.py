@@ -1,4 +1,4 @@
-"""Environments by name."""
+"""Construction of environments from task ids."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def make_env(task: str, **config: Any) -> ManipulationEnv:
 
 
 def resolve(task: str, **config: Any) -> EnvConfig:
-    """Return the parameters of an environment, with the task's own defaults in place of None.
+    """Return the parameters of an environment, with the task's defaults in place of None.
 
-    Those that stay None have no default: physics of their own, colours, a seed.
+    Parameters without a default stay None: overrides of the physics, colours, the seed.
 
     Args:
         task: id of the task.

@@ -1,4 +1,4 @@
-"""The environments for Gymnasium: NumPy arrays in and out, no tensors."""
+"""The environments in Gymnasium's interface, with NumPy arrays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ba_torchrl.plugins import import_modules
 Observation = dict[str, np.ndarray]
 
 INFO_KEYS = (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT, keys.EXPERT_ACTION)
-"""Entries of ``info``: a policy does not observe them."""
+"""Entries that are in ``info`` and not in the observation."""
 
 
 class GymEnv(gymnasium.Env[Observation, np.ndarray]):
@@ -31,7 +31,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     Args:
         task: as listed by `ba_torchrl.list_tasks`.
-        render_mode: ``rgb_array`` for pictures from `render`, ``human`` for PyBullet's window.
+        render_mode: ``rgb_array`` for images from `render`, ``human`` for PyBullet's window.
         register_modules: names of modules outside the package that register the task or its robot.
         config: fields of `ba_torchrl.config.EnvConfig`.
 
@@ -68,10 +68,10 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode: the first of ``seed``, or the next one of the seed in use.
+        """Start an episode: the first one of ``seed``, or the next one of the current seed.
 
         Raises:
-            ConfigError: there are ``options``; episodes have none.
+            ConfigError: ``options`` are given; there are none.
         """
         super().reset(seed=seed)
         if options:
@@ -84,10 +84,10 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         return self._split(self.torchrl_env.reset())
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Carry out an action of `action_space` (floats of any precision).
+        """Execute an action of `action_space` (floats of any precision).
 
         Raises:
-            InvalidActionError: it has the wrong shape or type, or is not finite.
+            InvalidActionError: the action has the wrong shape or type, or is not finite.
         """
         following = self.torchrl_env.step(_as_tensordict(action))[keys.NEXT]
         observation, info = self._split(following)
@@ -100,7 +100,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         )
 
     def render(self) -> np.ndarray | None:
-        """Return a picture of the scene, [height, width, 3] uint8, in the mode ``rgb_array``."""
+        """Return an image of the scene, [height, width, 3] uint8, in the mode ``rgb_array``."""
         if self.render_mode is None:
             gymnasium.logger.warn(
                 "nothing is rendered without a render mode: "
@@ -109,11 +109,11 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         return self.torchrl_env.render() if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Close the simulator; closing twice does no harm."""
+        """Close the simulator; further calls have no effect."""
         self.torchrl_env.close(raise_if_closed=False)
 
     def _split(self, state: TensorDictBase) -> tuple[Observation, dict[str, Any]]:
-        """Return the observation and the info in what TorchRL's environment returned."""
+        """Return the observation and the info of a state of the TorchRL environment."""
         observation = {
             key: state[key].numpy().astype(space.dtype, copy=False)
             for key, space in self.observation_space.items()
@@ -129,10 +129,10 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
 
 
 def space_of(spec: TensorSpec) -> spaces.Space:
-    """Return Gymnasium's space for one of TorchRL's specs, with the same shape.
+    """Return the Gymnasium space of a TorchRL spec, with the same shape.
 
     Raises:
-        TypeError: there is none.
+        TypeError: the spec has no corresponding space.
     """
     if isinstance(spec, Composite):
         return spaces.Dict({key: space_of(part) for key, part in spec.items()})

@@ -1,4 +1,4 @@
-"""ImageSpec: everything that is declared about an image that an environment observes."""
+"""ImageSpec: the declaration of an image that an environment observes."""
 
 from __future__ import annotations
 
@@ -9,27 +9,28 @@ import torch
 from torchrl.data import Bounded
 
 Storage = Literal["uint8", "float16", "exact"]
-"""How the replay stores an image: 255 equal steps over its range, half precision, or unchanged."""
+"""Type of an image in the replay: 255 equal steps over its range, half precision, or unchanged."""
 Frame = Literal["scene", "gripper", "camera"]
-"""Which axes an image has: the scene's (rows +x, columns +y), the gripper's, or those of a camera
-that stands elsewhere, for which no transformation is defined."""
+"""Axes of an image: the scene's (rows +x, columns +y), the gripper's, or those of another camera,
+for which no augmentation is defined."""
 
 
 @dataclass(frozen=True)
 class ImageSpec:
     """Shape, values, storage and axes of an image.
 
-    The replay, demonstrations, augmentation, policies and networks read them from here.
+    The replay, demonstrations, augmentation, policies and networks use these declarations.
 
     Args:
         channels: number of channels.
         size: rows and columns, pixels.
         high: largest value.
         low: smallest value.
-        storage: how the replay stores it.
-        frame: "scene" images turn with the scene, "gripper" images stay when the scene turns and
-            are reversed when the gripper's axes are, "camera" images cannot be augmented.
-        channel_axes: of a "gripper" image: the gripper's axes along rows and columns of each
+        storage: type of the image in the replay.
+        frame: "scene" images rotate with the scene; "gripper" images are invariant under rotations
+            of the scene and are reversed with the gripper's axes; "camera" images cannot be
+            augmented.
+        channel_axes: for "gripper" images, the gripper's axes along rows and columns of each
             channel; empty for "xy" in every channel.
         dtype: of the values.
     """

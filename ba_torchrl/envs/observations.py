@@ -1,7 +1,6 @@
-"""Observations beside the images of the control: poses, RGB-D images and point clouds.
+"""Observations in addition to the images of the control: poses, RGB-D images, point clouds.
 
-Each is a class that registers its name. Adding one takes a file with such a class; it is enabled by
-its name in the environment's parameter `observations`.
+Each is a registered class. It is enabled by its name in the environment's parameter `observations`.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Observation(ABC):
     """
 
     parameter: ClassVar[str | None] = None
-    """Field of `EnvConfig` that enables it, besides its name in `observations`."""
+    """Field of `EnvConfig` that enables the observation, in addition to `observations`."""
 
     def __init__(self, config: EnvConfig, workspace: Workspace) -> None:
         self.config = config
@@ -47,7 +46,7 @@ class Observation(ABC):
 
     @classmethod
     def is_enabled(cls, config: EnvConfig) -> bool:
-        """Whether `parameter` enables it."""
+        """Return whether `parameter` enables the observation."""
         return cls.parameter is not None and bool(getattr(config, cls.parameter))
 
     def images(self) -> dict[str, ImageSpec]:
@@ -78,11 +77,11 @@ def enabled_observations(config: EnvConfig, workspace: Workspace) -> list[Observ
     ]
 
 
-def joined(parts: list[dict]) -> dict:
-    """Return the entries of several observations.
+def merge_entries(parts: list[dict]) -> dict:
+    """Return the union of dictionaries with different keys.
 
     Raises:
-        ConfigError: two of them use the same key.
+        ConfigError: two of them have the same key.
     """
     entries: dict = {}
     for part in parts:
@@ -94,11 +93,11 @@ def joined(parts: list[dict]) -> dict:
 
 @OBSERVATIONS.register("vec")
 class PoseVector(Observation):
-    """The poses of gripper and landmarks, and the opening of the gripper."""
+    """The poses of the gripper and the task's landmarks, and the opening of the gripper."""
 
     @classmethod
     def is_enabled(cls, config: EnvConfig) -> bool:
-        """Whether ``obs_type="vec"``."""
+        """Return whether ``obs_type="vec"``."""
         return config.obs_type == "vec"
 
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
@@ -145,7 +144,7 @@ class RgbDepth(Observation):
 
 @OBSERVATIONS.register("point_cloud")
 class PointCloud(Observation):
-    """Points on the surfaces of floor, bodies and fingers, seen by two cameras at the sides."""
+    """Points on the surfaces of floor, bodies and fingers, from two cameras at the sides."""
 
     parameter = "point_cloud"
 

@@ -1,4 +1,4 @@
-"""Open-loop control: every action is a whole pick or place, chosen on a heightmap."""
+"""Open-loop control: every action is a complete pick or place, chosen on a heightmap."""
 
 from __future__ import annotations
 
@@ -32,20 +32,21 @@ from ba_torchrl.tasks.workspace import ActionLimits
 class OpenLoopEnv(ManipulationEnv):
     """A task under open-loop control (paper section 3.2, appendix A.1, G.1).
 
-    An action names a pose; the gripper picks there if it is empty and places there if it holds
-    something. A pick with something in hand and a place without do nothing but count as steps.
-    Without z, the height follows from the heightmap around the target; without the primitive, it
-    follows from what is held. The image is the height above the floor of all that lies in the
-    workspace; neither the arm nor what it holds is in it.
+    An action is a pose and a primitive. A pick with an object in the gripper and a place without
+    one have no effect but count as steps. Without the z component, the height is computed from the
+    heightmap around the target. Without the primitive, an empty gripper picks and a gripper that
+    holds an object places. The image is the heightmap of the workspace, without the arm and the
+    held object.
 
     Raises:
-        ConfigError: the parameters do not fit, or the workspace is not square.
+        ConfigError: the task or the robot does not support the parameters, or the workspace is not
+            square.
     """
 
     default_action_sequence = "pxyr"
     default_half_rotation = True
     camera_pose = (0.0, 0.05, 0.85)
-    # half a millimetre of creep in a stack of four, and at rest after three steps
+    # a stack of four creeps by 0.5 mm and is at rest after three steps
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 
     def __init__(self, task_id: str, config: EnvConfig) -> None:
@@ -64,12 +65,12 @@ class OpenLoopEnv(ManipulationEnv):
 
     @property
     def action_limits(self) -> ActionLimits:
-        """What one action covers: everything, but turns only if there is an angle."""
+        """Displacement and rotation of one action: unlimited, or zero for an angle it lacks."""
         return ActionLimits(math.inf, math.pi if "r" in self.action_sequence else 0.0)
 
     @property
     def pixel_m(self) -> float:
-        """Width of a pixel."""
+        """Width of a pixel, metres."""
         return self.workspace.width / self.config.obs_size
 
     # -- for the base class ------------------------------------------------------------------
@@ -84,7 +85,7 @@ class OpenLoopEnv(ManipulationEnv):
         )
 
     @property
-    def _heights_to_reach(self) -> tuple[float, ...]:
+    def _required_tool_heights(self) -> tuple[float, ...]:
         floor = self.workspace.z[0]
         return floor + 0.01, floor + PickPlaceLimits().approach_distance_m + 0.01
 
@@ -120,7 +121,7 @@ class OpenLoopEnv(ManipulationEnv):
         held = scene.controller.held
         scene.controller.reset()
         if held is not None and held not in scene.task.objects:
-            held.is_hidden = True  # the task has put it aside
+            held.is_hidden = True  # the task has deactivated it
         self._memory = {}
 
     def _act(self, scene: Scene, action: np.ndarray) -> None:
@@ -203,7 +204,7 @@ class OpenLoopEnv(ManipulationEnv):
             return memory
         action = self.actions.encode(command)
         command, image = self.actions.decode(action), None
-        if before.held is not None:  # the pick that undoes a place: as it will be seen
+        if before.held is not None:  # the inverse of a place is a pick, which has an in-hand image
             now = self._heightmap(scene)
             position = self._position(scene, command, now, PICK)
             image = self._draw_in_hand(now, heights, position, command)
@@ -224,7 +225,7 @@ class OpenLoopEnv(ManipulationEnv):
     def _position(
         self, scene: Scene, command: PickPlaceCommand, heights: np.ndarray, primitive: int
     ) -> tuple[float, float, float]:
-        """Return where the tool goes; without a z component, the height follows from the image."""
+        """Return the target of the tool; the heightmap gives its height if the action has no z."""
         if command.z_m is not None:
             return command.x_m, command.y_m, command.z_m
         task, xy = scene.task, (command.x_m, command.y_m)

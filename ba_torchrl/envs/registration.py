@@ -1,8 +1,8 @@
-"""Gymnasium's ids of the tasks, registered in whatever order things are imported.
+"""Registration of the tasks with Gymnasium, in any order of imports.
 
-Gymnasium no longer looks for entry points, so importing this package registers the ids. That must
-stay cheap for those who never use Gymnasium: the tasks are imported when Gymnasium is. A task that
-registers later, from a module outside the package, gets its id at that moment.
+Gymnasium does not load entry points, so the import of this package registers the ids. To keep that
+import fast, the tasks are imported only when Gymnasium is. A task that registers later, from a
+module outside the package, gets its id at that time.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ ENTRY_POINT = "ba_torchrl.envs.gym:GymEnv"
 def gym_id(task: str) -> str:
     """Return Gymnasium's id of a task.
 
-    ``close_loop/block_picking`` is ``BulletArm/CloseLoopBlockPicking-v0``; ``mine/push_far``, from
-    outside the package, is ``BulletArm/MinePushFar-v0``.
+    The id of ``close_loop/block_picking`` is ``BulletArm/CloseLoopBlockPicking-v0``, and that of
+    ``mine/push_far``, a task from outside the package, is ``BulletArm/MinePushFar-v0``.
     """
     words = task.replace("/", "_").split("_")
     return f"{NAMESPACE}/{''.join(word.capitalize() for word in words)}-v0"
 
 
 def register_task(task: str) -> None:
-    """Register one task with Gymnasium, unless it is registered; torch is not imported.
+    """Register a task with Gymnasium, if it is not registered yet, without importing torch.
 
-    The step limit is not registered: it is ``max_steps`` of the configuration, and the
-    environment itself truncates the episode there. A task from outside the package is registered
-    with its module, which processes of ``gymnasium.make_vec`` import.
+    No step limit is registered, because the environment truncates the episode at ``max_steps`` of
+    its configuration. A task from outside the package is registered with its module, which the
+    processes of ``gymnasium.make_vec`` import.
 
     Raises:
         ValueError: another task has the same id.
@@ -59,7 +59,7 @@ def register_task(task: str) -> None:
 
 
 def register_tasks() -> None:
-    """Register every task that Gymnasium does not know yet."""
+    """Register every task that is not registered with Gymnasium yet."""
     from ba_torchrl.tasks.base import TASKS
 
     for task in TASKS:
@@ -67,7 +67,7 @@ def register_tasks() -> None:
 
 
 def register_with_gymnasium() -> None:
-    """Register the tasks if Gymnasium is imported, else as soon as it is, and later ones then."""
+    """Register all present and future tasks, once Gymnasium is imported."""
     call_on_registration("task", _register_if_imported)
     if "gymnasium" in sys.modules:
         register_tasks()
@@ -76,12 +76,13 @@ def register_with_gymnasium() -> None:
 
 
 def _register_if_imported(task: str) -> None:
-    if hasattr(sys.modules.get("gymnasium"), "register"):  # else all tasks follow its import
+    # Otherwise the import of Gymnasium registers all tasks.
+    if hasattr(sys.modules.get("gymnasium"), "register"):
         register_task(task)
 
 
 class _RegisterOnImport(MetaPathFinder):
-    """Registers the tasks when Gymnasium, which the other finders find, has been imported."""
+    """An import hook that registers the tasks after the import of Gymnasium."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -97,7 +98,7 @@ class _RegisterOnImport(MetaPathFinder):
 
         def load_and_register(module: ModuleType) -> None:
             load(module)
-            # Only now: others look for a module to see whether it is there, and never load it.
+            # Not in find_spec, which is also called to test whether a module exists.
             sys.meta_path.remove(self)
             register_tasks()
 

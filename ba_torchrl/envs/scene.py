@@ -24,18 +24,18 @@ MARK_M = 1e-3
 
 
 class Controller(Protocol):
-    """Executes actions; the methods that do so are those of each control."""
+    """Executes actions; each control defines the methods for its actions."""
 
     def get_state(self) -> Any:
-        """Return the state that lasts from one action to the next."""
+        """Return the state that persists between actions."""
 
     def set_state(self, state: Any) -> None:
-        """Restore a state of `get_state`."""
+        """Restore a state that `get_state` returned."""
 
 
 @dataclass(frozen=True)
 class SceneState:
-    """The state of everything in a scene."""
+    """The full state of a scene."""
 
     world: Snapshot | SavedState
     robot: Any
@@ -59,7 +59,7 @@ class Scene:
         """Return the state.
 
         Args:
-            outlives_world: make a state that any scene of the same configuration can restore.
+            outlives_world: return a state that any scene of the same configuration can restore.
         """
         return SceneState(
             self.world.save() if outlives_world else self.world.snapshot(),
@@ -70,7 +70,7 @@ class Scene:
         )
 
     def set_state(self, state: SceneState) -> None:
-        """Restore a state of this scene, or one that outlives its world.
+        """Restore a state of this scene, or a state that outlives its world.
 
         Raises:
             SimulationError: the state is of another scene.
@@ -102,13 +102,13 @@ def build_scene(
         task_id: as listed by `ba_torchrl.list_tasks`.
         config: the environment's parameters.
         workspace: bounds of the task.
-        limits: of one action.
-        scale: of the objects.
-        physics: settings of the engine, unless the configuration overrides them.
+        limits: limits of one action.
+        scale: scale of the objects.
+        physics: settings of the engine, which the configuration can override.
         make_controller: builds the controller of a robot and a task.
 
     Raises:
-        ConfigError: there is no display for ``render=True``.
+        ConfigError: ``render=True`` without a display.
     """
     task_class = TASKS[task_id]
     world = _empty_world(config, workspace, physics)
@@ -137,10 +137,10 @@ def build_scene(
 
 
 def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[float]) -> None:
-    """Check that a robot reaches above every corner of the workspace.
+    """Check that a robot reaches some heights at every corner of the workspace.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: a point is out of reach.
     """
     for x in workspace.x:
         for y in workspace.y:
@@ -154,7 +154,7 @@ def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[
 
 
 def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> World:
-    """Return a world with nothing but the floor."""
+    """Return a world with a floor only."""
     if config.physics_mode == "slow":
         physics = FINE_PHYSICS
     custom = {

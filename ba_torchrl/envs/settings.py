@@ -1,4 +1,4 @@
-"""Configuration of an environment, checked against its task."""
+"""Validation of an environment's configuration for its task."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ba_torchrl.tasks.base import TASKS, Task, check_scales
 def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = None) -> EnvConfig:
     """Validate the parameters of an environment, those of its task included.
 
-    A parameter that other tasks declare is accepted and dropped at its default value there, so that
-    a complete configuration of one task can be used for another.
+    A parameter of other tasks is dropped if it has its default value, so that a complete
+    configuration of one task is valid for another.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
         values: field names and their values.
-        what: subject of the error message.
+        what: name of the configuration in the error message.
 
     Raises:
         ConfigError: a name is unknown, a type wrong or a value out of range.
@@ -26,7 +26,7 @@ def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = No
     model = env_config_model(TASKS[task_id].Parameters)
     values = dict(values)
     for name in values.keys() - model.model_fields.keys():
-        defaults = _declared_elsewhere(name)
+        defaults = _tasks_with_parameter(name)
         if defaults and all(values[name] != default for default in defaults.values()):
             raise ConfigError(
                 f"{name!r} has no meaning for {task_id}: leave it out; it is a parameter of "
@@ -38,16 +38,16 @@ def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = No
 
 
 def task_parameters(task_class: type[Task], config: EnvConfig) -> TaskParameters:
-    """Return the task's own part of a configuration."""
+    """Return the task's parameters in a configuration."""
     model = task_class.Parameters
     return model(**{name: getattr(config, name) for name in model.model_fields})
 
 
 def check_task_parameters(task_id: str, config: EnvConfig) -> None:
-    """Check that a task accepts these parameters.
+    """Check that a task supports the parameters of a configuration.
 
     Raises:
-        ConfigError: one has no meaning for it, or a value that it does not accept.
+        ConfigError: a parameter has no meaning for the task, or an unsupported value.
     """
     task_class = TASKS[task_id]
     config.check_control(task_id, task_class.control)
@@ -90,8 +90,8 @@ def check_action_components(task_id: str, components: list[str]) -> None:
         )
 
 
-def _declared_elsewhere(name: str) -> dict[str, Any]:
-    """Return the tasks that declare a parameter of their own, and its default in each."""
+def _tasks_with_parameter(name: str) -> dict[str, Any]:
+    """Return the default of a parameter in each task that declares it."""
     return {
         task_id: TASKS[task_id].Parameters.model_fields[name].default
         for task_id in TASKS

@@ -1,1 +1,1 @@
-"""Networks and policies: they know shapes, not tasks."""
+"""Networks and policies. They depend on image and action shapes, not on tasks."""

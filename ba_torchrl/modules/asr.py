@@ -17,9 +17,9 @@ from ba_torchrl.modules.spatial import Level, SpatialQNetwork, SpatialSpec
 from ba_torchrl.modules.spatial_inputs import (
     UNET_STRIDE,
     SpatialImageConfig,
-    of_primitive,
     require_unet_size,
     require_yaw,
+    select_primitive,
 )
 from ba_torchrl.modules.trunk import scaled_width
 from ba_torchrl.modules.unet import PlainPixelValues
@@ -28,7 +28,7 @@ _LARGEST_MAP = 8
 
 
 class ASRState(NamedTuple):
-    """What the second level needs besides the pixel: the images and the first level's features."""
+    """Inputs of the second level besides the pixel: the images and the first level's features."""
 
     pixels: Tensor
     in_hand: Tensor
@@ -37,15 +37,17 @@ class ASRState(NamedTuple):
 
 
 class ASR(SpatialQNetwork):
-    """Two levels: all pixels, then the yaws at the chosen one.
+    """Two levels of choices: all pixels, then the yaws at the chosen pixel.
 
-    The second level's loss reaches the first one's encoder through the map that they share.
+    Both levels share the first level's feature map, so the second level's loss also trains the
+    first level's encoder.
 
     Args:
-        positions: (pixels, in_hand, holding) -> (values [B, 1, H, W], scene map).
-        yaws: (patch [B, 1, p, p], in_hand, scene map, holding) -> values [B, yaws].
+        positions: (pixels, in_hand, holding) -> (values [B, 1, H, W], scene feature map).
+        yaws: (patch [B, 1, p, p], in_hand, scene feature map, holding) -> values [B, yaws].
         levels: pixels and yaws.
-        patch_size: rows and columns of the surroundings that the second level sees.
+        patch_size: rows and columns of the patch around the chosen pixel that the second level
+            sees.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class ASR(SpatialQNetwork):
 
 
 class PlainYawValues(nn.Module):
-    """Q values of yaws from a patch, the in-hand image and the scene map, through two layers.
+    """Q values of yaws from a patch, the in-hand image and the scene feature map.
 
     Args:
         spec: shapes of the images.
@@ -116,7 +118,7 @@ class PlainYawValues(nn.Module):
             patch: heights around the pixel [B, 1, p, p].
             in_hand: [B, C, h, w].
             scene: [B, scene_channels, H/16, W/16].
-            holding: [B, 1], which picks the primitive.
+            holding: [B, 1], which selects the primitive.
         """
         hand = centre_fit(self.config.in_hand(in_hand), patch.shape[-1])
         x = self.patch(torch.cat([self.config.heights(patch), hand], dim=1))
@@ -124,17 +126,17 @@ class PlainYawValues(nn.Module):
             size = (self.map_size, self.map_size)
             x = F.interpolate(x, size, mode="bilinear", align_corners=False)
         x = torch.cat([x.flatten(1), scene.flatten(1)], dim=1).float()
-        return of_primitive(self.values(F.relu(self.linear(x))), holding)
+        return select_primitive(self.values(F.relu(self.linear(x))), holding)
 
 
 class ASRNetworkConfig(SpatialImageConfig):
-    """Hyper-parameters that both networks of this kind have.
+    """Hyper-parameters of both ASR networks.
 
     Args:
         num_rotations: yaws, evenly spaced.
-        patch_size: rows and columns of the surroundings of a pixel that the yaws depend on; none
-            is the size of the in-hand image, 24 in the paper. Where they differ, the in-hand image
-            is cut or padded to it about its centre.
+        patch_size: rows and columns of the patch around a pixel that the yaw values depend on; None
+            for the size of the in-hand image (24 in the paper). If the two sizes differ, the
+            in-hand image is cropped or zero-padded to the patch size about its centre.
     """
 
     num_rotations: int = Field(default=16, ge=2)

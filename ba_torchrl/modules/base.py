@@ -23,10 +23,10 @@ LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
 @dataclass(frozen=True)
 class ActorCriticSpec:
-    """What an actor-critic network is built for.
+    """Images and actions that an actor-critic network is built for.
 
     Args:
-        images: declarations of the images that it sees, by key, in the order of its arguments.
+        images: declarations of the network's input images, by key, in the order of its arguments.
         action_sequence: one letter per action component, in the order of the action ("pxyzr").
 
     Raises:
@@ -61,7 +61,7 @@ class ActorCriticSpec:
 
 
 class ActorCritic(NamedTuple):
-    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, also none.
+    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, including none.
 
     Fields:
         actor: (images [..., C, H, W] each, holding [..., 1]) -> (loc [..., A], scale [..., A]) of
@@ -79,10 +79,11 @@ class NetworkConfig(Protocol):
     """A registered network: a pydantic model of its hyper-parameters that builds it."""
 
     control: ClassVar[Control]
-    """Which tasks it is for: close-loop ones take an `ActorCritic`, open-loop ones a
-    `ba_torchrl.modules.spatial.SpatialQNetwork`."""
+    """Control of the tasks that it supports. ``build`` returns an `ActorCritic` for close-loop
+    tasks and a `ba_torchrl.modules.spatial.SpatialQNetwork` for open-loop tasks."""
     image_keys: ClassVar[tuple[str, ...]]
-    """Keys of the images that it sees, in the order of its arguments; the holding flag follows."""
+    """Keys of its input images, in the order of its arguments. The last argument is the holding
+    flag."""
 
     def build(self, spec: Any) -> Any:
         """Return freshly initialised modules for an `ActorCriticSpec`, or for a `SpatialSpec`."""

@@ -76,7 +76,8 @@ class CNNTwinCritic(nn.Module):
 
 
 def initialise_plain(module: nn.Module) -> None:
-    """Draw a plain layer's weights as Xavier does (others are left alone); for ``apply``."""
+    """Xavier-initialise a convolution or linear layer; other modules are unchanged. For
+    ``apply``."""
     if isinstance(module, nn.Conv2d):
         nn.init.xavier_normal_(module.weight)
     elif isinstance(module, nn.Linear):

@@ -1,7 +1,7 @@
-"""Steerable convolutions whose coefficients another network computes: one filter per sample.
+"""Steerable convolutions whose coefficients are computed by another network, one filter per sample.
 
-What the coefficients are computed from is thereby an invariant context of an equivariant network:
-the in-hand image, say, which lives in the gripper's frame and does not turn with the scene.
+The inputs of that other network are invariant inputs of the equivariant network. An example is the
+in-hand image, which has the gripper's frame and does not rotate with the scene.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 class DynamicSteerableConv2d(nn.Module):
-    """A steerable convolution that is given its coefficients, others for each sample.
+    """A steerable convolution that takes its coefficients as an input, different for each sample.
 
-    The coefficients are those of the kernels, ordered by output field, input field and kernel, and
-    then one bias for each trivial irrep of the output. It has no parameters.
+    The coefficients are those of the kernels, ordered by output field, input field and kernel,
+    followed by one bias for each trivial irrep of the output. The module has no parameters.
 
     Args:
         gspace: images and their symmetry group.
-        representation: of the input fields and of the output fields.
+        representation: of each input field and each output field.
         count: number of fields, in and out.
         kernel_size: pixels; the map keeps its size.
     """
@@ -37,7 +37,7 @@ class DynamicSteerableConv2d(nn.Module):
     ) -> None:
         super().__init__()
         block = kernel_block(gspace, representation, representation, kernel_size)
-        assert block is not None  # the identity is always among them
+        assert block is not None  # the identity is always one of them
         self._block = block
         self.count, self.size, self.kernel_size = count, representation.size, kernel_size
         types = [(representation, count)]
@@ -68,11 +68,11 @@ class DynamicSteerableConv2d(nn.Module):
     def forward(self, x: Tensor, coefficients: Tensor) -> Tensor:
         """Return the convolutions of x [B, C, H, W] with the filters of coefficients [B, n]."""
         batch, channels, height, width = x.shape
-        if not batch:  # a convolution cannot have no groups
+        if not batch:  # a convolution needs at least one group
             return x
         filters, biases = self.filters(coefficients)
-        # All samples side by side as groups of channels: one convolution for the whole batch. Laid
-        # out channels-last, where CPUs take a tenth of the time that planes of channels take.
+        # One grouped convolution for the whole batch, one group of channels per sample.
+        # Channels-last takes a tenth of the time of the contiguous layout on CPUs.
         y = F.conv2d(
             x.permute(2, 3, 0, 1).reshape(1, height, width, -1).permute(0, 3, 1, 2),
             filters.flatten(0, 1).to(dtype=x.dtype, memory_format=torch.channels_last),
@@ -87,12 +87,13 @@ class DynamicSteerableConv2d(nn.Module):
 def filter_generator(features: int, convolution: DynamicSteerableConv2d) -> nn.Linear:
     """Return a layer from features to the coefficients of a dynamic convolution.
 
-    Its biases are He-initialised coefficients, so without any features the convolution is an
-    ordinary fresh layer; its weights make the features' part as large, for features of size one.
+    The layer's biases are He-initialised coefficients, so for zero features the convolution is an
+    ordinary freshly initialised layer. For features of unit size, its weights add a term of the
+    same standard deviation.
 
     Args:
         features: number of features.
-        convolution: takes the coefficients.
+        convolution: the convolution that uses the coefficients.
     """
     layer = nn.Linear(features, convolution.num_coefficients)
     scales = convolution.scales()

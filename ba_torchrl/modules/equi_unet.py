@@ -1,4 +1,4 @@
-"""The equivariant UNet, and Q values of every pixel from it: what is held enters as a filter."""
+"""The equivariant UNet and its Q values of every pixel; the in-hand image enters as a filter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FIELDS = (16, 32, 64, 128, 128)
 
 
 def _block(gspace: GSpace2D, fields: int, width: int) -> ResidualBlock:
-    """Return a block of regular fields; unlike the plain one its shortcut is 3x3."""
+    """Return a residual block of regular fields, with a 3x3 shortcut (1x1 in the plain block)."""
     regular = gspace.regular_repr
     inputs, outputs = [(regular, fields)], [(regular, width)]
 
@@ -54,15 +54,15 @@ def equivariant_unet(gspace: GSpace2D, fields: Sequence[int]) -> UNet:
 
 
 class _Head(nn.Module):
-    """Regular fields to values: a hidden 3x3 layer of invariants if any, then one pixel wide.
+    """Regular fields to values: a hidden 3x3 layer for invariant values, then a 1x1 layer.
 
-    The hidden layer keeps its size where the network is narrow: with four units in it, every
-    sixteenth head would be born with negative weights only, and values that no pixel exceeds.
+    The hidden layer keeps its full width in narrow networks. With four units, one head in sixteen
+    would be initialised with negative output weights only, and no value would exceed its bias.
 
     Args:
         gspace: images and their symmetry group.
         fields: number of regular fields.
-        out_repr: representation of the values; a hidden layer makes sense for invariant ones.
+        out_repr: representation of the values; there is a hidden layer only for invariant values.
     """
 
     def __init__(self, gspace: GSpace2D, fields: int, out_repr: Representation) -> None:
@@ -79,17 +79,18 @@ class _Head(nn.Module):
         """Return float32 values [B, out, H, W] of x [B, C, H, W]."""
         if self.hidden is not None:
             x = F.relu(self.hidden(x), inplace=True)
-        # bfloat16 would round values near one to multiples of 1/256: ties among the best.
+        # bfloat16 would round values near one to multiples of 1/256, so many pixels would share the
+        # maximum.
         return self.values(x.float())
 
 
 class EquivariantPixelValues(nn.Module):
-    """Q values of every pixel that turn with the image; for full hands, what is held decides.
+    """Q values of every pixel, equivariant; those of places also depend on the in-hand image.
 
     Args:
         gspace: images and their symmetry group.
-        out_repr: how the values of one pixel transform: the trivial representation for one value,
-            a representation on yaws for one each.
+        out_repr: how the values of one pixel transform: the trivial representation for a single
+            value, a representation on yaws for one value per yaw.
         spec: shapes of the images.
         config: width, precision, units.
 
@@ -119,18 +120,18 @@ class EquivariantPixelValues(nn.Module):
         self.place = _Head(gspace, fields[0], out_repr)
 
     def forward(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values and the invariant innermost map.
+        """Return values and the invariant bottleneck map.
 
         Args:
             pixels: heightmaps [B, 1, H, W].
-            in_hand: [B, C, h, w]; matters where something is held.
+            in_hand: [B, C, h, w]; used for the samples in which an object is held.
             holding: [B, 1].
 
         Returns:
-            float32 [B, out, H, W], and [B, scene_channels, H/16, W/16] of numbers that turn with
-            the image and do not mix.
+            float32 [B, out, H, W], and [B, scene_channels, H/16, W/16] of invariant channels, whose
+            positions rotate with the image.
         """
-        # Open hands first: then either head sees a slice, and no large map is copied.
+        # Samples with an empty gripper first, so each head gets a slice and no large map is copied.
         order = holding.reshape(-1).long().argsort(stable=True)
         full = int(holding.bool().sum())
         parts = [len(order) - full, full]

@@ -1,7 +1,8 @@
 """The rotation-equivariant actor-critic (appendix G.2; "Equi SACfD").
 
 Turning the scene by +90 degrees about z turns the image by ``torch.rot90(k=1)`` and (dx, dy) into
-(-dy, dx); escnn's rotations have the same sense, so (dx, dy) is a vector field as it stands.
+(-dy, dx); escnn's rotations have the same sense, so (dx, dy) is a vector field without a change of
+sign.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class ActionFields:
-    """How the components of an action transform: (x, y) as a vector, the others not at all.
+    """How the components of an action transform: (x, y) is a vector, the others are invariant.
 
     Args:
         action_sequence: one letter per component.
@@ -48,12 +49,13 @@ class ActionFields:
             )
         self.size = len(action_sequence)
         self.invariants = [i for i, letter in enumerate(action_sequence) if letter not in "xy"]
-        # Place in the action of each component of [vector, invariants], and the other way round.
+        # Index in the action of each component of [vector, invariants], and the inverse
+        # permutation.
         self._grouped = [action_sequence.index("x"), action_sequence.index("y"), *self.invariants]
         self._restore = [self._grouped.index(i) for i in range(self.size)]
 
     def types(self, gspace: GSpace2D, extra_invariants: int = 0) -> FieldTypes:
-        """Return the fields [vector, invariants], with some more invariants at the end."""
+        """Return the fields [vector, invariants], with extra invariants at the end."""
         rotation = gspace.irrep(1)
         # A half turn acts on x and y separately, so C_2 needs its one-dimensional irrep twice.
         vector = (rotation, 2 // rotation.size)
@@ -65,7 +67,7 @@ class ActionFields:
         return torch.stack([action[..., i] for i in self._grouped], dim=-1)
 
     def ungroup(self, fields: Tensor) -> Tensor:
-        """Return [vector, invariants] [..., A] in the order of the action."""
+        """Return the components [..., A] of [vector, invariants] in the order of the action."""
         return torch.stack([fields[..., i] for i in self._restore], dim=-1)
 
 
@@ -75,7 +77,7 @@ class EquivariantActor(nn.Module):
     Args:
         gspace: images and their symmetry group.
         trunk: the image trunk.
-        features: the fields that it returns.
+        features: fields that the trunk returns.
         action: how the action transforms.
     """
 
@@ -85,7 +87,7 @@ class EquivariantActor(nn.Module):
         super().__init__()
         self.trunk = trunk
         self.action = action
-        # The log-stds are invariants, too.
+        # The log standard deviations are invariant as well.
         outputs = action.types(gspace, extra_invariants=action.size)
         self.head = SteerableLinear(gspace, features, outputs)
 
@@ -101,7 +103,7 @@ class EquivariantTwinCritic(nn.Module):
 
     Args:
         gspace: images and their symmetry group.
-        features: fields of the features: regular ones.
+        features: fields of the features, all regular.
         action: how the action transforms.
     """
 
@@ -114,7 +116,8 @@ class EquivariantTwinCritic(nn.Module):
         self.hidden = nn.ModuleList(
             SteerableLinear(gspace, inputs, [(regular, count)]) for _ in range(2)
         )
-        # Invariants to one value: its only steerable kernel is the identity, a plain linear map.
+        # From invariants to one value: the only steerable kernel is the identity, so this is a
+        # plain linear layer.
         scalars, value = [(gspace.trivial_repr, count)], [(gspace.trivial_repr, 1)]
         self.values = nn.ModuleList(SteerableLinear(gspace, scalars, value) for _ in range(2))
 
@@ -134,8 +137,8 @@ class EquivariantConfig(ImageNetworkConfig):
 
     Args:
         group_order: number of rotations n of the cyclic group C_n, at least 2.
-        n_hidden: regular fields of the last layers; the first has an eighth of them (at 64 px
-            the first stage is missing, and the first layer has a quarter).
+        n_hidden: number of regular fields of the last layers. The first layer has an eighth of it
+            at 128 px, and a quarter at 64 px, where the first stage is left out.
     """
 
     group_order: int = Field(default=8, ge=2)

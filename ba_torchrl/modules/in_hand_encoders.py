@@ -1,4 +1,4 @@
-"""Plain convolutional encoders of the in-hand image, and of images of its size."""
+"""Plain convolutional encoders of the in-hand image and of patches of the same size."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LARGEST_LAST_MAP = 6
 
 
 class InHandMap(nn.Module):
-    """A feature map of a small image: three valid 3x3 convolutions and a pool, 24 -> 8 pixels.
+    """A feature map of a small image: three unpadded 3x3 convolutions and a pool, 24 -> 8 pixels.
 
     Args:
         channels: of the image.
@@ -20,7 +20,7 @@ class InHandMap(nn.Module):
         width: factor on the layers' widths, 64, 128 and 256.
 
     Raises:
-        ValueError: nothing is left of an image of this size.
+        ValueError: the image is smaller than 10 pixels.
     """
 
     def __init__(self, channels: int, size: int, width: float) -> None:
@@ -42,9 +42,9 @@ class InHandMap(nn.Module):
 
 
 class InHandVector(nn.Module):
-    """A feature vector of a small image: four padded 3x3 convolutions with pools, and one layer.
+    """A feature vector of a small image: four padded 3x3 convolutions, pools and a linear layer.
 
-    Two pools at 24 pixels, three at 40.
+    There are two pools for images of 24 pixels and three for 40 pixels.
 
     Args:
         channels: of the image.

@@ -1,4 +1,4 @@
-"""Turned views of images, sampled bilinearly at the size that is asked for."""
+"""Rotated crops of images, sampled bilinearly."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from torch import Tensor
 def sampling_grid(center_px: Tensor, yaw_rad: Tensor, size: int, image_size: int) -> Tensor:
     """Return where a square view samples a square image, for ``grid_sample``.
 
-    Rows of the view run along the direction at angle yaw from the image's rows: it is what a
-    gripper turned by that yaw sees, which is the scene turned by minus the yaw.
+    The view has the frame of a gripper at this yaw: its row axis is the image's row axis rotated by
+    the yaw, so the view shows the scene rotated by minus the yaw.
 
     Args:
         center_px: rows and columns of the views' centres [N, 2]; pixel (i, j) has its centre at
             (i + 1/2, j + 1/2).
         yaw_rad: [N].
-        size: rows and columns of the views, pixels as large as the image's.
+        size: rows and columns of the views, whose pixels have the size of the image's pixels.
         image_size: rows and columns of the image.
 
     Returns:
-        [N, size, size, 2], column then row, -1 and 1 the image's outer edges.
+        [N, size, size, 2], column then row; -1 and 1 are the outer edges of the image.
     """
     offsets = torch.arange(size, device=center_px.device) - (size - 1) / 2
     along, across = torch.meshgrid(offsets, offsets, indexing="ij")
@@ -32,24 +32,24 @@ def sampling_grid(center_px: Tensor, yaw_rad: Tensor, size: int, image_size: int
 
 
 def sample(images: Tensor, grid: Tensor) -> Tensor:
-    """Return views [N, C, h, w] of float32 images [N, C, H, W]; outside of them is zero."""
+    """Return views [N, C, h, w] of float32 images [N, C, H, W], zero outside the images."""
     return F.grid_sample(images, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
 
 
 def patches(images: Tensor, pixels: Tensor, size: int, yaw_rad: Tensor | None = None) -> Tensor:
-    """Return the surroundings of one pixel of each image.
+    """Return a patch around one pixel of each image.
 
-    The centre of the patch is the centre of the pixel. So with an even size and no yaw, every
-    value is the mean of four neighbours.
+    The centre of the patch is the centre of the pixel. With an even size and no yaw, every value is
+    therefore the mean of four neighbouring pixels.
 
     Args:
         images: float32 [B, C, H, H].
         pixels: int64 [B, 2], row and column.
         size: rows and columns of the patch.
-        yaw_rad: angle of the patch's rows to the image's, [B]; none is zero.
+        yaw_rad: rotation of the patch relative to the image, [B]; zero if None.
 
     Returns:
-        [B, C, size, size]; zero outside of the image.
+        [B, C, size, size]; zero outside the image.
     """
     center_px = pixels.to(images.dtype) + 0.5
     yaw_rad = torch.zeros_like(center_px[:, 0]) if yaw_rad is None else yaw_rad

@@ -1,4 +1,4 @@
-"""The FCN that chooses a yaw by looking at turned images (appendix G.1; "Rot FCN")."""
+"""The FCN that evaluates rotated images, one per yaw (appendix G.1; "Rot FCN")."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from ba_torchrl.modules.unet import PlainPixelValues
 
 
 class RotFCN(SpatialQNetwork):
-    """Turns the image into the frame of each yaw, values its pixels, and turns the values back.
+    """Rotates the image into the frame of each yaw, computes pixel values, and rotates them back.
 
     Args:
-        values: (pixels, in_hand, holding) -> (values [n*B, 1, P, P], innermost map), of n views.
+        values: (pixels, in_hand, holding) -> (values [n*B, 1, P, P], bottleneck map), of n views.
         image_size: rows and columns of the heightmap.
         num_yaws: number of yaws.
-        half_rotation: they span half a turn.
+        half_rotation: whether the yaws span half a turn.
     """
 
     def __init__(
@@ -37,12 +37,12 @@ class RotFCN(SpatialQNetwork):
         self.padded_size = math.ceil(image_size * math.sqrt(2) / UNET_STRIDE) * UNET_STRIDE
 
     def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
-        """Return the Q values [B, yaws, H, W] and no state."""
+        """Return the Q values [B, yaws, H, W], and None as the state."""
         num_yaws, size, _ = self.levels[0].shape
         padded, batch = self.padded_size, len(pixels)
         yaws = yaws_rad(num_yaws, self.half_rotation, pixels.device)
         centers = pixels.new_full((num_yaws, 2), size / 2)
-        # A view samples all images alike, so that they can be its channels.
+        # The sampling grid of a view is the same for all images, so the batch becomes its channels.
         images = pixels[:, 0].expand(num_yaws, -1, -1, -1)
         views = sample(images, sampling_grid(centers, yaws, padded, size))
         values, _ = self.values(views.reshape(-1, 1, padded, padded), in_hand, holding)
@@ -73,7 +73,7 @@ class RotFCNConfig(SpatialImageConfig):
         require_yaw("rot_fcn", spec)
         if spec.image_size % 2:
             raise ValueError(
-                f"network 'rot_fcn' pads the image alike on all sides, which takes an even "
+                f"network 'rot_fcn' pads the image equally on all sides, which needs an even "
                 f"image_size; got {spec.image_size}"
             )
         values = PlainPixelValues(spec, self, maps=1)

@@ -1,4 +1,4 @@
-"""The interface of networks with spatial Q values: one value per pixel, and per angle if any."""
+"""The interface of spatial Q networks: one value per pixel, and per angle if the action has any."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ba_torchrl.envs.images import ImageSpec
 
 @dataclass(frozen=True)
 class SpatialSpec:
-    """What a network with spatial Q values is built for.
+    """Images and actions that a spatial Q network is built for.
 
     Args:
-        images: declarations of the images that it sees, by key, in the order of its arguments: the
-            heightmap, the in-hand image (1 channel for "raw" and "sub", 3 for "proj"), others.
-        components: of the action without its primitive, in the order of the action: some of x, y,
-            z, rz, ry, rx.
-        half_rotation: yaws half a turn apart are the same.
+        images: declarations of the network's input images, by key, in the order of its arguments:
+            the heightmap, the in-hand image (1 channel for "raw" and "sub", 3 for "proj"), others.
+        components: components of the action except its primitive, in the order of the action: a
+            subset of x, y, z, rz, ry, rx.
+        half_rotation: whether yaws half a turn apart are equivalent.
 
     Raises:
         ValueError: x or y is missing.
@@ -53,7 +53,7 @@ class SpatialSpec:
 
 
 class Level(NamedTuple):
-    """Components of the action that are chosen together.
+    """Components of the action that one maximisation chooses together.
 
     Fields:
         components: their names in the order of the axes of the Q values: x (rows of the image),
@@ -66,10 +66,10 @@ class Level(NamedTuple):
 
 
 class SpatialQNetwork(nn.Module, ABC):
-    """Q values of an action that is chosen level by level, each given the levels before it.
+    """Q values of an action that is chosen level by level, each given the choices before it.
 
-    The primitive is not chosen: an empty gripper picks, a holding one places, and the values are
-    those of that primitive.
+    The primitive is not chosen: an empty gripper picks, a gripper that holds an object places. The
+    values are those of that primitive.
     """
 
     levels: tuple[Level, ...]
@@ -81,17 +81,17 @@ class SpatialQNetwork(nn.Module, ABC):
         Args:
             pixels: heightmaps [B, 1, H, W], metres.
             in_hand: images of what is held [B, C, h, w].
-            holding: [B, 1], true where something is held; after all images that it sees.
+            holding: [B, 1], true where an object is held; follows all input images.
 
         Returns:
-            float32 [B, *levels[0].shape], and a state of any type.
+            float32 [B, *levels[0].shape], and a state of any type, None if there is one level.
         """
 
     def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
         """Return the Q values of a later level.
 
         Args:
-            level: its number, at least 1.
+            level: index of the level, at least 1.
             state: from `first`.
             chosen: int64 [B, n], indices of the components chosen so far, level after level.
 

@@ -1,4 +1,4 @@
-"""Inputs of the networks with spatial Q values, and the actions that they take."""
+"""Inputs of the spatial Q networks, and checks of the actions that they support."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from ba_torchrl.modules.spatial import SpatialSpec
 from ba_torchrl.modules.trunk import Precision, compute_dtype
 
 UNET_STRIDE = 16
-"""Pixels of the image per pixel of a UNet's innermost map; image sizes are multiples of it."""
+"""Pixels of the image per pixel of a UNet's bottleneck map; image sizes are multiples of it."""
 
 
 class SpatialImageConfig(StrictModel):
-    """Hyper-parameters of every network with spatial Q values.
+    """Hyper-parameters of every spatial Q network.
 
-    The default leaves heights in metres, as the paper does; then a block of 3 cm hardly moves the
-    values of a fresh network. A scale of 0.05 makes it about one and suits a quick start.
+    By default heights are in metres, as in the paper, and a block of 3 cm hardly affects the values
+    of a freshly initialised network. With a scale of 0.05 it has a height of about one, and
+    learning is faster at the start.
 
     Args:
         precision: number format of the convolutions, see `compute_dtype`. Values of actions, the
             fully connected layers and the filters' coefficients are always float32.
-        height_scale_m: height that becomes one. The floor stays zero, like what lies outside of
-            the image.
+        height_scale_m: height that is scaled to one. The floor stays zero, like the padding.
         width: factor on every layer's width; 1 is the reference's size.
     """
 
@@ -41,11 +41,12 @@ class SpatialImageConfig(StrictModel):
     width: float = Field(default=1.0, gt=0)
 
     def heights(self, images: Tensor) -> Tensor:
-        """Return heights [B, 1, H, W] as the networks see them, in the compute dtype."""
+        """Return heights [B, 1, H, W] divided by the scale, in the compute dtype."""
         return self.images(images if self.height_scale_m == 1 else images / self.height_scale_m)
 
     def in_hand(self, images: Tensor) -> Tensor:
-        """Return in-hand images [B, C, h, w] likewise: C = 1 are heights, C = 3 counts."""
+        """Return in-hand images [B, C, h, w] in the compute dtype; only heights (C = 1) are
+        scaled."""
         return self.heights(images) if images.shape[1] == 1 else self.images(images)
 
     def images(self, images: Tensor) -> Tensor:
@@ -54,11 +55,11 @@ class SpatialImageConfig(StrictModel):
         return images.to(dtype=dtype, memory_format=torch.channels_last)
 
 
-def of_primitive(values: Tensor, holding: Tensor) -> Tensor:
-    """Return the values of one primitive: of picks where nothing is held, else of places.
+def select_primitive(values: Tensor, holding: Tensor) -> Tensor:
+    """Return the values of the primitive: those of picks where nothing is held, else of places.
 
     Args:
-        values: [B, 2n, ...], those of picks first.
+        values: [B, 2n, ...], first those of picks, then those of places.
         holding: [B, 1].
 
     Returns:
@@ -72,8 +73,8 @@ def has_yaw(name: str, spec: SpatialSpec) -> bool:
     """Return whether the action has a yaw besides x and y.
 
     Args:
-        name: of the network, for the error.
-        spec: names the action's components.
+        name: of the network, for the error message.
+        spec: holds the action's components.
 
     Raises:
         ValueError: the action has other components.
@@ -91,7 +92,7 @@ def require_yaw(name: str, spec: SpatialSpec) -> None:
     """Refuse an action without yaw.
 
     Raises:
-        ValueError: the action has none, or something besides x, y and rz.
+        ValueError: the action has no yaw, or has components other than x, y and rz.
     """
     if not has_yaw(name, spec):
         raise ValueError(
@@ -114,6 +115,6 @@ def require_unet_size(name: str, image_size: int) -> None:
 
 
 def yaws_rad(count: int, half_rotation: bool, device: torch.device) -> Tensor:
-    """Return the yaws that the indices of an angle stand for, [count]."""
+    """Return the yaw of each index of a yaw axis, [count]."""
     period_rad = math.pi if half_rotation else 2 * math.pi
     return torch.arange(count, device=device) * (period_rad / count)

@@ -1,4 +1,4 @@
-"""Policies on spatial Q values, whose actions are in the environment's units."""
+"""Policies on spatial Q values, with actions in the environment's units."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ba_torchrl.envs import keys
 from ba_torchrl.modules.spatial import Level, SpatialQNetwork
 
 OBJECT_HEIGHT_M = 0.01
-"""Random actions choose pixels higher than this, if there are any."""
+"""Random actions choose among the pixels higher than this, if there are any."""
 
 
 class SpatialActions:
-    """The bijection between the choices of the levels and the actions on their grid.
+    """The bijection between the levels' indices and the actions on their grid.
 
-    Indices of x and y are rows and columns of the heightmap, and stand for the centres of pixels.
+    Indices of x and y are rows and columns of the heightmap. The action is the centre of the pixel.
 
     Args:
         actions: the environment's action vector.
-        levels: the components that are chosen, in this order.
+        levels: the levels of choices, in their order.
 
     Raises:
         ValueError: the components of the levels are not those of the action.
@@ -46,23 +46,23 @@ class SpatialActions:
             for level in levels
             for name, count in zip(level.components, level.shape, strict=True)
         ]
-        self._places = [actions.components.index(name) for name in chosen]
+        self._positions = [actions.components.index(name) for name in chosen]
         ends = torch.tensor([len(level.shape) for level in levels]).cumsum(0).tolist()
         self._parts = [
             slice(end - len(level.shape), end) for end, level in zip(ends, levels, strict=True)
         ]
 
     def to_action(self, indices: Tensor, holding: Tensor) -> Tensor:
-        """Return the action [..., A] of indices: a pick if nothing is held, else a place.
+        """Return the actions [..., A] of indices: picks where nothing is held, else places.
 
         Args:
             indices: int64 [..., n], of the components of all levels in their order.
             holding: [..., 1], true where something is held.
         """
         shape = (*indices.shape[:-1], self.actions.size)
-        # float64 in between: the float32 nearest to the exact value on any device
+        # computed in float64, so that the result is the nearest float32 on any device
         action = torch.zeros(shape, dtype=torch.float64, device=indices.device)
-        for i, (place, axis) in enumerate(zip(self._places, self.axes, strict=True)):
+        for i, (place, axis) in enumerate(zip(self._positions, self.axes, strict=True)):
             action[..., place] = axis.first + axis.step * indices[..., i].double()
         if "p" in self.actions.components:
             primitive = self.actions.components.index("p")
@@ -72,7 +72,7 @@ class SpatialActions:
     def to_indices(self, action: Tensor) -> Tensor:
         """Return the nearest indices, int64 [..., n], of actions [..., A]."""
         columns = []
-        for place, axis in zip(self._places, self.axes, strict=True):
+        for place, axis in zip(self._positions, self.axes, strict=True):
             index = ((action[..., place].double() - axis.first) / axis.step).round().long()
             if axis.period is None:
                 index = index.clamp(0, axis.count - 1)
@@ -82,41 +82,41 @@ class SpatialActions:
         return torch.stack(columns, dim=-1)
 
     def nearest(self, action: Tensor) -> Tensor:
-        """Return the nearest actions on the grid of actions [..., A], the primitive unchanged."""
+        """Return the grid actions nearest to actions [..., A]; the primitive is unchanged."""
         indices, out = self.to_indices(action), action.clone()
-        for i, (place, axis) in enumerate(zip(self._places, self.axes, strict=True)):
+        for i, (place, axis) in enumerate(zip(self._positions, self.axes, strict=True)):
             out[..., place] = (axis.first + axis.step * indices[..., i].double()).to(out)
         return out
 
-    def part(self, indices: Tensor, level: int) -> Tensor:
-        """Return the indices of one level, of indices [..., n]."""
+    def at_level(self, indices: Tensor, level: int) -> Tensor:
+        """Return one level's part of the indices [..., n]."""
         return indices[..., self._parts[level]]
 
     def before(self, indices: Tensor, level: int) -> Tensor:
-        """Return the indices of the levels before one, of indices [..., n]."""
+        """Return the part of the indices [..., n] that belongs to the levels before one."""
         return indices[..., : self._parts[level].start]
 
-    def flat(self, indices: Tensor, level: int) -> Tensor:
+    def ravel(self, indices: Tensor, level: int) -> Tensor:
         """Return one level's choice [...] as an index into its flattened values."""
         flat = torch.zeros_like(indices[..., 0])
         for index, size in zip(
-            self.part(indices, level).unbind(-1), self.levels[level].shape, strict=True
+            self.at_level(indices, level).unbind(-1), self.levels[level].shape, strict=True
         ):
             flat = flat * size + index
         return flat
 
-    def unflat(self, flat: Tensor, level: int) -> Tensor:
+    def unravel(self, flat: Tensor, level: int) -> Tensor:
         """Return the indices [..., m] of a choice [...] among a level's flattened values."""
         return torch.stack(torch.unravel_index(flat, self.levels[level].shape), dim=-1)
 
 
 class SpatialValues(nn.Module):
-    """The values of actions in the environment's units, level by level.
+    """Values of actions in the environment's units, level by level.
 
     Args:
         network: computes the values of its choices.
         actions: the bijection between its choices and the environment's actions.
-        image_keys: keys of the images that the network sees, in the order of its arguments.
+        image_keys: keys of the network's input images, in the order of its arguments.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class SpatialValues(nn.Module):
         self.in_keys = [*image_keys, keys.HOLDING]
 
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the choices of greatest value, level after level, and the last level's value.
+        """Return the greedy choices, level after level, and the last level's value.
 
         Args:
             observation: the images [B, C, H, W] each, and the holding flag [B, 1].
@@ -141,11 +141,11 @@ class SpatialValues(nn.Module):
         """
         q, state = self.network.first(*observation)
         value, best = q.flatten(1).max(dim=1, keepdim=True)
-        chosen = self.actions.unflat(best[:, 0], 0)
+        chosen = self.actions.unravel(best[:, 0], 0)
         for level in range(1, len(self.actions.levels)):
             q = self.network.later(level, state, chosen)
             value, best = q.flatten(1).max(dim=1, keepdim=True)
-            chosen = torch.cat([chosen, self.actions.unflat(best[:, 0], level)], dim=-1)
+            chosen = torch.cat([chosen, self.actions.unravel(best[:, 0], level)], dim=-1)
         return chosen, value
 
     def forward(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -161,19 +161,19 @@ class SpatialValues(nn.Module):
         *observation, action = observation_and_action
         indices = self.actions.to_indices(action)
         q, state = self.network.first(*observation)
-        found = [(q.flatten(1), self.actions.flat(indices, 0))]
+        found = [(q.flatten(1), self.actions.ravel(indices, 0))]
         for level in range(1, len(self.actions.levels)):
             q = self.network.later(level, state, self.actions.before(indices, level))
-            found.append((q.flatten(1), self.actions.flat(indices, level)))
+            found.append((q.flatten(1), self.actions.ravel(indices, level)))
         return found
 
 
 class SpatialPolicy(nn.Module):
-    """Acts on spatial Q values: greedily, or with probability epsilon at random.
+    """Epsilon-greedy policy on spatial Q values.
 
-    A random action has a random angle and chooses a pixel of an object, if there is one. TorchRL's
-    ``EGreedyModule`` would draw the primitive as well, which follows from the state. Only under
-    the exploration type RANDOM does it explore, as everywhere in TorchRL.
+    A random action has random angles and a random pixel among those of objects, if there are any.
+    TorchRL's ``EGreedyModule`` would also draw the primitive, which the state determines. As in
+    TorchRL, the policy explores under the exploration type RANDOM only.
 
     Args:
         values: of the actions; the first image is the heightmap.

@@ -1,8 +1,8 @@
 """Steerable convolutions on escnn's kernel bases, with plain tensors in and out.
 
-escnn builds the bases; the layers here own the coefficients and expand them anew in every forward
-pass. So there is no cached filter that could go stale when weights are copied in place, and
-``state_dict``, ``deepcopy`` and functional calls see ordinary parameters only.
+escnn builds the bases; the layers here hold the coefficients and expand them in every forward pass.
+No filter is cached, so none is outdated when weights are copied in place, and ``state_dict``,
+``deepcopy`` and functional calls see ordinary parameters only.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ESCNN_FIX = (
 def _gspaces() -> ModuleType:
     try:
         with warnings.catch_warnings():
-            # It misses the SO(3) package that the set-up leaves out on purpose.
+            # escnn warns that the SO(3) package is missing; planar groups do not need it.
             warnings.filterwarnings("ignore", message=".*py3nj")
             from escnn import gspaces
     except ImportError as error:
@@ -72,15 +72,16 @@ def planar_rotations_and_flips(order: int) -> GSpace2D:
 
 
 def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representation]:
-    """Return images under rotations, and how values of ``count`` evenly spaced yaws transform.
+    """Return the planar rotations, and the representation of the values of ``count`` yaws.
 
-    Turning the image by one step moves every value to the next yaw. Where yaws half a turn apart
-    are the same, the steps make C_2count, and half a turn moves nothing: the quotient
-    representation C_2count / C_2. Else it is the regular representation of C_count.
+    A rotation by one step moves every value to the next yaw. If yaws half a turn apart are
+    equivalent, the steps generate C_2count and half a turn leaves the values unchanged, which is
+    the quotient representation C_2count / C_2. Otherwise it is the regular representation of
+    C_count.
 
     Args:
-        count: number of yaws.
-        half_rotation: they span half a turn.
+        count: number of yaws, evenly spaced.
+        half_rotation: whether the yaws span half a turn.
 
     Raises:
         ImportError: escnn is not installed; the message names the fix.
@@ -108,7 +109,7 @@ class KernelBlock:
     _copies: dict[tuple[torch.device, torch.dtype], Tensor] = field(default_factory=dict)
 
     def __deepcopy__(self, memo: dict) -> KernelBlock:
-        return self  # constant, and shared by every layer of the process
+        return self  # constant, shared by every layer of the process
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "_copies": {}}
@@ -154,11 +155,11 @@ def _build_block(
             layer = R2Conv(*types, kernel_size, initialize=False)
     except ValueError as error:
         if "basis" in str(error) and "empty" in str(error):
-            return None  # for instance trivial to vector through one pixel
+            return None  # for example trivial to vector with a 1x1 kernel
         raise
     expansion = layer.basisexpansion
-    # One pair of representations, so one buffer. Expanding unit vectors gives the same numbers, but
-    # takes most of a minute for 7x7 kernels of C_32.
+    # One pair of representations has one buffer. Expanding unit vectors gives the same numbers, but
+    # takes almost a minute for 7x7 kernels of C_32.
     (kernels,) = (v for n, v in expansion.named_buffers() if n.endswith("sampled_basis"))
     shape = (-1, out_repr.size, in_repr.size, kernel_size, kernel_size)
     info = list(expansion.get_basis_info())
@@ -176,10 +177,10 @@ def he_scales(
 
     The generalised He initialisation (Weiler and Cesa, "General E(2)-equivariant steerable
     CNNs", 2019): every input irrep that feeds an output irrep contributes equally, and so does
-    every kernel from it. All fields of a type share the values, hence no loop over weights.
+    every kernel from it. The values are the same for all fields of a type.
 
     Args:
-        blocks: kernels for each (input type, output type) that has any.
+        blocks: kernels of each pair (input type, output type) that has kernels.
         in_types: input fields.
         out_types: output fields.
     """
@@ -265,8 +266,8 @@ class SteerableConv2d(nn.Module):
             for i, (in_repr, _) in enumerate(in_types)
             for o, (out_repr, _) in enumerate(out_types)
         }
-        # Constants, so neither parameters nor buffers: a target network's soft update, the
-        # checkpoint and the optimiser have nothing to do with them.
+        # Neither parameters nor buffers, because they are constant: soft updates of target
+        # networks, checkpoints and optimisers must not contain them.
         self._blocks = {pair: block for pair, block in found.items() if block is not None}
         if not self._blocks:
             raise ValueError("no steerable kernel maps these input fields to these output fields")
@@ -292,7 +293,7 @@ class SteerableConv2d(nn.Module):
         """Return the filter [out, in, K, K], channels-last, and the bias [out], from the weights.
 
         Args:
-            dtype: of the result, in which it is also computed; sums are float32 or better.
+            dtype: of the result and of the computation; sums are accumulated in float32 or better.
         """
         rows = [
             torch.cat([self._expand_pair((i, o), dtype) for i in range(len(self._in))], dim=-1)
@@ -311,8 +312,9 @@ class SteerableConv2d(nn.Module):
         if pair not in self._blocks:
             some = next(iter(self.coefficients.values()))
             return some.new_zeros((out_count * out_size, k, k, in_count * in_size), dtype=dtype)
-        # In bfloat16 where the convolution is: float32 takes longer than the convolution for 7x7
-        # kernels of C_32. Rounding maps symmetric kernels to symmetric ones.
+        # In the dtype of the convolution: in float32 the expansion takes longer than the
+        # convolution for 7x7 kernels of C_32. Rounding to bfloat16 keeps the symmetry of the
+        # kernels.
         coefficients = self.coefficients[self._name(pair)].to(dtype)
         kernels = coefficients.flatten(0, 1) @ self._blocks[pair].matrix(coefficients)
         kernels = kernels.view(out_count, in_count, out_size, k, k, in_size)

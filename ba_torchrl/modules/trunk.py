@@ -35,8 +35,9 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     """Return the number format that convolutions on ``device`` use.
 
     Args:
-        precision: "auto" takes bfloat16 where the hardware multiplies it natively.
-        device: where the input lives.
+        precision: "auto" is bfloat16 if the hardware has native bfloat16 multiplication, else
+            float32.
+        device: device of the input.
     """
     if precision == "auto":
         return torch.bfloat16 if _bfloat16_is_fast(device.type) else torch.float32
@@ -74,15 +75,14 @@ def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int,
 class ImageNetworkConfig(StrictModel):
     """Hyper-parameters that every network on depth images has.
 
-    The networks see (depth - depth_center_m) / depth_scale_m. The defaults leave metres as they
-    are, as the paper does. Depth in units of the scene (center 0.2, scale 0.1) makes a block's
-    height as large as the network's weights expect, keeps it above the grain of bfloat16, and
-    learns much faster.
+    The input of the networks is (depth - depth_center_m) / depth_scale_m. The defaults keep metres,
+    as in the paper. With a center of 0.2 and a scale of 0.1, inputs have unit size and differences
+    of a block's height are well above the resolution of bfloat16; learning is much faster.
 
     Args:
         precision: number format of the convolutions, see `compute_dtype`.
-        depth_center_m: depth that becomes zero.
-        depth_scale_m: depth that becomes one, counted from there.
+        depth_center_m: depth that is scaled to zero.
+        depth_scale_m: difference in depth that is scaled to one.
     """
 
     control: ClassVar[Control] = "close_loop"
@@ -107,7 +107,8 @@ class ImageNetworkConfig(StrictModel):
                 )
 
     def image_trunk(self, convs: Iterable[nn.Module], pools: Iterable[bool]) -> ImageTrunk:
-        """Return a trunk of these convolutions; ``pools`` says which a 2x2 max pool follows."""
+        """Return a trunk of these convolutions; ``pools`` is true for each that a 2x2 max pool
+        follows."""
         return ImageTrunk(convs, pools, self)
 
 

@@ -1,4 +1,4 @@
-"""UNets, and the plain one whose innermost map takes in what the gripper holds."""
+"""UNets, and the plain UNet whose bottleneck map is fused with in-hand features."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor, nn
 from ba_torchrl.modules.cnn import CastConv2d, initialise_plain
 from ba_torchrl.modules.in_hand_encoders import InHandMap
 from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, of_primitive
+from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, select_primitive
 from ba_torchrl.modules.trunk import scaled_width
 
 _WIDTHS = (32, 64, 128, 256, 512)
 
 
 class UNet(nn.Module):
-    """Encoders on ever coarser maps and decoders back, joined by skip connections.
+    """Encoders from fine to coarse maps and decoders back, joined by skip connections.
 
     Args:
-        encoders: one per scale, from fine to coarse; before each but the first, a 2x2 max pool.
-        decoders: one per scale, from the second coarsest to the finest; each sees the map so far,
-            doubled in size, and the encoder's map of its scale.
+        encoders: one per scale, from fine to coarse; a 2x2 max pool precedes each but the first.
+        decoders: one per scale, from the second coarsest to the finest; the input of each is the
+            previous map, upsampled by two, and the encoder's map of its scale.
     """
 
     def __init__(self, encoders: Iterable[nn.Module], decoders: Iterable[nn.Module]) -> None:
@@ -42,11 +42,11 @@ class UNet(nn.Module):
         """Return the finest decoder's map [B, C, H, W] of the encoders' maps."""
         *skips, x = maps
         for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
-            # Doubled about the pixels' outer edges, so that turns of the image stay exact.
+            # Without aligned corners, so that quarter turns of the image stay exact.
             doubled = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
             if doubled.requires_grad:
-                # Its gradient is a slice of the joined map's. On CPUs the interpolation would take
-                # ten times as long for that as for a map of its own.
+                # Its gradient is a slice of the concatenated map's gradient. On CPUs the backward
+                # pass of the interpolation takes ten times as long for a slice as for a copy.
                 doubled.register_hook(_channels_last)
             x = decoder(torch.cat([doubled, skip], dim=1))
         return x
@@ -57,12 +57,12 @@ def _channels_last(gradient: Tensor) -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions of equal output beside a shortcut, with ReLUs between and after.
+    """Two convolutions and a shortcut, with ReLUs after the first convolution and after the sum.
 
     Args:
         first: convolution to the new width.
         second: convolution that keeps it.
-        shortcut: convolution to the new width, none where the width stays.
+        shortcut: convolution to the new width; None for the identity.
     """
 
     def __init__(self, first: nn.Module, second: nn.Module, shortcut: nn.Module | None) -> None:
@@ -88,7 +88,7 @@ def residual_block(channels: int, width: int) -> ResidualBlock:
 
 
 class PlainPixelValues(nn.Module):
-    """Q values of every pixel from a plain UNet (learnt features of image and in-hand image).
+    """Q values of every pixel from a plain UNet on the heightmap and the in-hand image.
 
     Args:
         spec: shapes of the images.
@@ -126,10 +126,11 @@ class PlainPixelValues(nn.Module):
         self.apply(initialise_plain)
 
     def forward(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values and the innermost map.
+        """Return values and the bottleneck map.
 
         Args:
-            pixels: n views of the B heightmaps, batch after batch [n*B, 1, H, W].
+            pixels: n views of the B heightmaps [n*B, 1, H, W]; the index of the view is the outer
+                one.
             in_hand: [B, C, h, w].
             holding: [B, 1], which picks the primitive.
 
@@ -142,6 +143,7 @@ class PlainPixelValues(nn.Module):
             hand = F.interpolate(hand, inner.shape[-2:], mode="bilinear", align_corners=False)
         views = len(pixels) // len(in_hand)
         scene = self.fuse(torch.cat([inner, hand.repeat(views, 1, 1, 1)], dim=1))
-        # bfloat16 would round values near one to multiples of 1/256: ties among the best.
+        # bfloat16 would round values near one to multiples of 1/256, so many pixels would share the
+        # maximum.
         values = self.head(self.unet.decode([*skips, scene]).float())
-        return of_primitive(values, holding.reshape(-1, 1).repeat(views, 1)), scene
+        return select_primitive(values, holding.reshape(-1, 1).repeat(views, 1)), scene

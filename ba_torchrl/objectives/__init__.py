@@ -1,1 +1,1 @@
-"""Loss modules, after TorchRL's contract."""
+"""Loss modules that follow TorchRL's contract."""

@@ -1,4 +1,4 @@
-"""The base of the losses on batches of single transitions."""
+"""The base class of losses on batches of single transitions."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torchrl.objectives.utils import dispatch_value_estimator
 from ba_torchrl.envs import keys
 
 Reduction = Literal["none", "mean", "sum"]
-"""What becomes of the losses of a batch's samples, as in TorchRL."""
+"""How the losses of a batch's samples are combined, as in TorchRL."""
 
 
 class TransitionLoss(LossModule):
-    """A loss with one-step targets, whose samples may have importance weights.
+    """A loss with one-step targets and optional importance weights of the samples.
 
     Args:
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
@@ -36,7 +36,7 @@ class TransitionLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` needs, also the order of its arguments without a TensorDict."""
+        """Entries that ``forward`` needs, in the order of its arguments if called with tensors."""
         if self._in_keys is None:
             self._in_keys = self._required_keys()
         return self._in_keys
@@ -52,12 +52,12 @@ class TransitionLoss(LossModule):
     def make_value_estimator(
         self, value_type: ValueEstimators | None = None, **hyperparams: object
     ) -> Self:
-        """Choose how targets are computed; by default TD(0) with gamma 0.99.
+        """Set the estimator of targets; the default is TD(0) with gamma 0.99.
 
         Args:
             value_type: TD0, the only estimator for a batch of single transitions, or one of
                 TorchRL's estimator objects.
-            hyperparams: its parameters, such as ``gamma``.
+            hyperparams: parameters of the estimator, such as ``gamma``.
 
         Raises:
             NotImplementedError: another of TorchRL's named estimators.
@@ -75,7 +75,7 @@ class TransitionLoss(LossModule):
         return self
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        """Pass renamed keys to the value estimator; `in_keys` follows them."""
+        """Pass renamed keys to the value estimator and recompute `in_keys`."""
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._value_estimator_keys())
         self._in_keys = None
@@ -87,7 +87,7 @@ class TransitionLoss(LossModule):
         }
 
     def _transition_keys(self, observation: list[NestedKey]) -> list[NestedKey]:
-        """Return the entries of a transition with this observation, action and ends included."""
+        """Return the keys of a transition: observation, action, reward and done flags."""
         ends = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
         names = [self.tensor_keys.action, *observation, *map(_next, (*observation, *ends))]
         return list(dict.fromkeys(names))
@@ -106,7 +106,7 @@ def reduce_loss(losses: Tensor, reduction: Reduction) -> Tensor:
 
     Args:
         losses: of the samples, of any shape.
-        reduction: which of these.
+        reduction: "none", "mean" or "sum".
     """
     if reduction == "none":
         return losses
@@ -118,8 +118,8 @@ def reduce_over(losses: Tensor, chosen: Tensor, reduction: Reduction) -> Tensor:
 
     Args:
         losses: of the samples, [...].
-        chosen: bool [...]; other samples count as zero, and not in the mean.
-        reduction: which of these; "none" returns zeros for the other samples.
+        chosen: bool [...]; the other samples are excluded from the mean and the sum.
+        reduction: "none", "mean" or "sum"; "none" returns zeros for the other samples.
     """
     share = chosen.to(losses.dtype)
     if reduction == "mean":

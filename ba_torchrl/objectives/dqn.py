@@ -1,4 +1,4 @@
-"""Q-learning where an action is chosen level by level, with demonstrations (appendix E, G.1)."""
+"""Q-learning with actions chosen level by level, and demonstrations (appendix E, G.1)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ba_torchrl.objectives.base import Reduction, TransitionLoss, reduce_loss, r
 from ba_torchrl.objectives.single_level import SingleLevelValues
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
-"""The term on demonstrated actions beside the TD error."""
+"""The loss on demonstrated actions that is added to the TD loss."""
 
 
 class LevelValues(Protocol):
@@ -28,9 +28,9 @@ class LevelValues(Protocol):
     """Keys of the observation, in the order of the arguments."""
 
     def __call__(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values [B, N] of each level and the action's choice among them [B].
+        """Return the values [B, N] of each level and the index of the action's choice [B].
 
-        The values of a level are given the action's choices at the levels before.
+        The values of a level are conditioned on the action's choices at the levels before.
         """
         ...
 
@@ -54,8 +54,8 @@ def large_margin(
         q: values of all actions [B, N].
         chosen: the stored action [B].
         is_expert: bool [B].
-        margin: by which Q(a_e) must exceed the other values.
-        reduction: of the samples' losses; samples that are no demonstrations are zero.
+        margin: least difference of Q(a_e) to the other values.
+        reduction: of the samples' losses; zero for samples that are not demonstrations.
     """
     of_chosen = q.gather(1, chosen[:, None])
     is_other = torch.ones_like(q).scatter_(1, chosen[:, None], 0.0)
@@ -72,14 +72,15 @@ def strict_large_margin(
 ) -> Tensor:
     """Return the margin loss of SDQfD, which applies to every violating action (appendix E).
 
-    The mean of Q(a) - Q(a_e) + margin over {a != a_e: Q(a) > Q(a_e) - margin}, zero if that is
-    empty; the mean is over the whole batch, in which other samples than demonstrations are zero.
+    The mean of Q(a) - Q(a_e) + margin over {a != a_e: Q(a) > Q(a_e) - margin}, zero if that set is
+    empty. The loss is averaged over the whole batch, with zero for samples that are not
+    demonstrations.
 
     Args:
         q: values of all actions [B, N].
         chosen: the stored action [B].
         is_expert: bool [B].
-        margin: by which Q(a_e) must exceed the other values.
+        margin: least difference of Q(a_e) to the other values.
         reduction: of the samples' losses.
     """
     gap = q - q.gather(1, chosen[:, None]) + margin
@@ -105,35 +106,35 @@ def cross_entropy(
         chosen: the stored action [B].
         is_expert: bool [B].
         beta: inverse temperature.
-        reduction: of the samples' losses; samples that are no demonstrations are zero.
+        reduction: of the samples' losses; zero for samples that are not demonstrations.
     """
     losses = F.cross_entropy(beta * q, chosen, reduction="none")
     return reduce_over(losses, is_expert, reduction)
 
 
 class LevelDQNLoss(TransitionLoss):
-    """Deep Q-learning on levels of choices, alone or with demonstrations (appendix G.1).
+    """Deep Q-learning on levels of choices, with or without demonstrations (appendix G.1).
 
-    The value of the stored action at each level, given its choices at the levels before, is
-    regressed to one target: the last level's value of the greedy choices of the *target* network,
-    level after level::
+    At each level, the value of the stored action, conditioned on its choices at the levels before,
+    is regressed to the same target: the last level's value of the choices that are greedy under the
+    *target* network, level after level::
 
         y        = r + gamma (1 - terminated) Q'_last(s', a'_1, ..., a'_k)
         loss_qvalue        = sum over levels of the mean of w_i huber(Q_level(s_i, a_i) - y_i)
         loss_demonstration = weight * sum over levels of the chosen term on the experts' samples
 
-    A truncated step bootstraps, a terminated one does not. ``forward`` also writes the priority,
-    the mean of |Q_level - y| over the levels, of shape [B, 1], into its input.
+    The target bootstraps on truncated steps and not on terminated ones. ``forward`` also writes the
+    priority, the mean of |Q_level - y| over the levels, of shape [B, 1], into its input.
 
     Args:
-        value_network: computes the values of the levels; a `QValueActor` of TorchRL is one level,
-            see `SingleLevelValues`.
+        value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a
+            single level, see `SingleLevelValues`.
         demonstrations: "dqfd" `large_margin`, "sdqfd" `strict_large_margin`, "adet"
-            `cross_entropy`, or "none" for plain DQN, whose batches may lack the expert flag.
-        demonstration_weight: factor on that term.
-        margin: of the margin terms.
-        first_beta: of ADET at the first level.
-        later_beta: of ADET at the later ones.
+            `cross_entropy`, or "none" for plain DQN, which needs no expert flag in the batch.
+        demonstration_weight: weight of that term.
+        margin: margin of "dqfd" and "sdqfd".
+        first_beta: inverse temperature of "adet" at the first level.
+        later_beta: inverse temperature of "adet" at later levels.
         reduction: of the samples' losses; the formulas above are "mean".
     """
 
@@ -202,12 +203,13 @@ class LevelDQNLoss(TransitionLoss):
 
         Returns:
             ``loss_qvalue`` and ``loss_demonstration``, scalars or, with the reduction "none", of
-            shape [B], whose sum is to be minimised; and without gradient the scalars
+            shape [B], whose sum is minimised; and without gradient the scalars
             ``demonstration_error`` (the term before its weight), ``td_error``, ``q_value`` and
             ``target_value`` (means over the batch; levels averaged).
 
         Raises:
-            KeyError: an entry is missing, such as the expert flag if there is a term on it.
+            KeyError: an entry is missing, such as the expert flag if there is a term on
+                demonstrations.
         """
         target = self._target(tensordict)
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):

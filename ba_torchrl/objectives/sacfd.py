@@ -1,4 +1,4 @@
-"""Soft Actor-Critic from demonstrations, of which plain SAC is a special case (appendix G.2)."""
+"""Soft Actor-Critic from demonstrations, which includes plain SAC (appendix G.2)."""
 
 from __future__ import annotations
 
@@ -28,20 +28,21 @@ class SACfDLoss(TransitionLoss):
                       + demonstration_weight * mean over experts of mean over components (a - a_i)^2
         loss_alpha  = mean_i -log_alpha (log pi(a | s_i) + target_entropy)
 
-    All three are taken at the current parameters and have disjoint gradients, so their sum takes
-    one backward pass. The encoder sees the critic's gradient only; the actor term reuses its
-    features, detached. A truncated step bootstraps, a terminated one does not.
+    All three are computed with the current parameters and have gradients with respect to disjoint
+    parameters, so one backward pass on their sum suffices. The encoder is trained by loss_qvalue
+    only; loss_actor uses its detached features. The target bootstraps on truncated steps and not on
+    terminated ones.
 
     ``forward`` also writes the priority, mean_k |q_k - y| of shape [..., 1], into its input.
 
     Args:
         actor_network: policy; from the observation to a distribution with ``rsample``.
-        encoder_network: from the observation to one entry, the critics' shared features.
+        encoder_network: from the observation to a single entry, the critics' shared features.
         qvalue_network: from features and action to twin values [..., 2].
-        alpha_init: first value of the entropy temperature.
-        target_entropy: entropy that the temperature steers to, nats.
-        demonstration_weight: factor on the behaviour term; 0 gives plain SAC, and the batch may
-            then lack the expert flag.
+        alpha_init: initial entropy temperature.
+        target_entropy: entropy that the temperature is tuned for, nats.
+        demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
+            flag in the batch.
         reduction: of the samples' losses; the formulas above are "mean".
 
     Raises:
@@ -143,7 +144,8 @@ class SACfDLoss(TransitionLoss):
             twin values of the stored actions).
 
         Raises:
-            KeyError: an entry is missing, such as the expert flag if the behaviour term has weight.
+            KeyError: an entry is missing, such as the expert flag if the behaviour term has a
+                weight.
         """
         weights = self._importance_weights(tensordict)
         target = self._target(tensordict)
@@ -157,7 +159,8 @@ class SACfDLoss(TransitionLoss):
         tensordict.set(self.tensor_keys.priority, priority)
 
         sample, log_prob = self._sample_action(tensordict)
-        # Frozen heads on detached features: only the action passes a gradient to a parameter.
+        # Detached features and heads: the gradient reaches the actor's parameters only, through the
+        # action.
         q_pi = self._twin_values(features.detach(), sample, self.qvalue_network_params.data)
         policy_term = self.alpha * log_prob - q_pi.amin(dim=-1)
         is_expert = self._expert_flag(tensordict)
@@ -209,7 +212,7 @@ class SACfDLoss(TransitionLoss):
             return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
 
     def _expert_flag(self, tensordict: TensorDictBase) -> Tensor:
-        """Return which samples are demonstrations, bool [..., B]; none if the flag may be absent.
+        """Return the flag of demonstrations, bool [..., B]; False for plain SAC without it.
 
         Raises:
             KeyError: the flag is absent, and the behaviour term needs it.

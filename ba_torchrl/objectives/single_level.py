@@ -9,7 +9,7 @@ from torchrl.modules import QValueActor
 
 
 class SingleLevelValues(nn.Module):
-    """The action values of a TorchRL `QValueActor` as the only level of an action.
+    """The action values of a TorchRL `QValueActor` as a single level of choices.
 
     Args:
         actor: with the action space "one_hot" or "categorical".
@@ -36,7 +36,7 @@ class SingleLevelValues(nn.Module):
         return best, value
 
     def forward(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values of all actions [B, N], and the index of the given one [B]."""
+        """Return the values of all actions [B, N], and the index of the given action [B]."""
         *observation, action = observation_and_action
         chosen = action.long().argmax(dim=-1) if self.is_one_hot else action.reshape(len(action))
         return [(self._action_values(observation), chosen.long())]

@@ -1,8 +1,8 @@
-"""Measurements of the package: times of steps, images and updates, and records to compare.
+"""Measurements of the package: times of steps, images and updates, memory, and fingerprints.
 
-Times on different machines are not comparable, so each is also given as a multiple of a unit that
-is timed in turn in the same process: a step of PyBullet for the simulation, a convolution for the
-learner. A function in this package that is decorated with `table.measurement` adds rows.
+Times on different machines are not comparable, so each is also given as a multiple of a unit of
+work that is timed alternately in the same process: a step of PyBullet for the simulation, a
+convolution for the learner. A function decorated with `table.measurement` adds rows.
 
-`fingerprint` records what environments and training compute, bit by bit.
+`fingerprint` records the results of environments and training bit by bit.
 """

@@ -1,4 +1,4 @@
-"""Times of the learner, in convolutions; and the memory of its replay."""
+"""Times of the learner, also as multiples of a convolution, and the memory of its replay."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ CAPACITY = 100_000
 
 
 class LearningUnit:
-    """One float32 3 x 3 convolution, 64 to 128 channels, 64 images of 64 x 64, and its gradient."""
+    """A float32 3 x 3 convolution, 64 to 128 channels, 64 images of 64 x 64, and its gradient."""
 
     def __init__(self) -> None:
         self.convolution = nn.Conv2d(64, 128, 3, padding=1)
         self.images = torch.randn(64, 64, 64, 64, requires_grad=True)
 
     def __call__(self) -> None:
-        """Forward and backward."""
+        """Compute the forward and the backward pass."""
         self.convolution(self.images).sum().backward()
 
 
@@ -78,7 +78,7 @@ def _update(bench: Bench, work: str, learner: Algorithm, budget: Budget) -> list
 
 @measurement("learning/equi_sacfd_update")
 def equivariant_update(bench: Bench) -> list[Row]:
-    """The paper's largest close-loop learner."""
+    """Update of the paper's largest close-loop learner."""
     return _update(
         bench,
         "Equi SACfD update, batch 64, 128 px, C8, 64 fields",
@@ -89,7 +89,7 @@ def equivariant_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/equi_sacfd_update_small")
 def quickstart_update(bench: Bench) -> list[Row]:
-    """The learner of `make train`."""
+    """Update of the learner of `make train`."""
     return _update(
         bench,
         "Equi SACfD update, batch 64, 64 px, C8, 16 fields",
@@ -100,7 +100,7 @@ def quickstart_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/cnn_sacfd_update")
 def plain_update(bench: Bench) -> list[Row]:
-    """The close-loop learner without symmetry."""
+    """Update of the paper's plain close-loop learner."""
     return _update(
         bench,
         "CNN SACfD update, batch 64, 128 px",
@@ -111,7 +111,7 @@ def plain_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/equi_sdqfd_update")
 def equivariant_spatial_update(bench: Bench) -> list[Row]:
-    """The paper's open-loop learner."""
+    """Update of the paper's equivariant open-loop learner."""
     return _update(
         bench,
         "SDQfD Equi ASR update, batch 16, 128 px, 16 rotations",
@@ -122,7 +122,7 @@ def equivariant_spatial_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/cnn_sdqfd_update")
 def plain_spatial_update(bench: Bench) -> list[Row]:
-    """The open-loop learner without symmetry."""
+    """Update of the paper's plain open-loop learner."""
     return _update(
         bench,
         "SDQfD CNN ASR update, batch 16, 128 px, 16 rotations",
@@ -134,7 +134,7 @@ def plain_spatial_update(bench: Bench) -> list[Row]:
 def _replay_memory(
     bench: Bench, task: str, codecs: Callable[[float], dict[str, ImageCodec]], budget: Budget
 ) -> list[Row]:
-    """Bytes of the expert's episodes in the replay, scaled to its capacity."""
+    """Memory of the expert's episodes in the replay, scaled to the full capacity."""
     high, episodes = _expert_episodes(task, 128, bench.repeats)
     storage = FrameStorage(CAPACITY, codecs(high))
     stored = 0
@@ -150,7 +150,7 @@ def _replay_memory(
 
 @measurement("memory/close_loop_replay")
 def close_loop_memory(bench: Bench) -> list[Row]:
-    """Eight-bit depth."""
+    """Memory of a replay of 8-bit depth images."""
     return _replay_memory(
         bench,
         "close_loop/block_picking",
@@ -161,7 +161,7 @@ def close_loop_memory(bench: Bench) -> list[Row]:
 
 @measurement("memory/open_loop_replay")
 def open_loop_memory(bench: Bench) -> list[Row]:
-    """Half-precision heightmaps and in-hand images."""
+    """Memory of a replay of half-precision heightmaps and in-hand images."""
     return _replay_memory(
         bench,
         "open_loop/block_stacking",

@@ -1,4 +1,4 @@
-"""The height camera in NumPy, for comparison with the compiled one."""
+"""A height camera in NumPy, for comparison with the compiled one."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class NumpyHeightCamera:
                 for body, mesh in zip(self._bodies, self._meshes, strict=True)
             ]
         )
-        # rows and columns, integral at pixel centres
+        # rows and columns, with integers at pixel centres
         scale = pixels / side_m
         vertices[:, :2] = (vertices[:, :2] - center_m + side_m / 2) * scale - 0.5
         corners = vertices[self._faces]

@@ -1,4 +1,4 @@
-"""Times of the simulator: steps, resets and images, in steps of PyBullet."""
+"""Times of steps, resets and images, also as multiples of a step of PyBullet."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ BUDGETS: dict[str, tuple[Budget, Budget | None]] = {
     "open_loop/bin_packing": (Budget("181", 18.0, 8.0), None),
     "open_loop/object_grasping": (Budget("2650", 200.0, 60.0), Budget("2210", 250.0, 150.0)),
 }
-"""Budgets of a step and of a reset by task, or by control for the tasks that are not listed."""
+"""Budgets of a step and a reset by task, or by control for tasks that are not listed."""
 
 
 def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
@@ -108,7 +108,7 @@ def step_and_reset(bench: Bench, task: str) -> list[Row]:
 
 @measurement("simulation/depth_image")
 def depth_image(bench: Bench) -> list[Row]:
-    """One image of four cubes at 128 x 128: compiled, in NumPy, and by PyBullet."""
+    """Times of an image of four cubes at 128 x 128: compiled, NumPy and PyBullet."""
     unit = SimulationUnit()
     center, side_m, pixels = (0.45, 0.0), 0.45, 128
     camera, plain = HeightCamera(unit.bodies), NumpyHeightCamera(unit.bodies)
@@ -136,7 +136,7 @@ def depth_image(bench: Bench) -> list[Row]:
         repeats=10,
     )
     cubes = [body.id for body in unit.bodies]
-    pybullet.removeBody(unit.robot.id, physicsClientId=unit.world.client)  # it hides cubes
+    pybullet.removeBody(unit.robot.id, physicsClientId=unit.world.client)  # the arm occludes cubes
     drawn = np.isin(np.reshape(tiny_renderer()[4], (pixels, pixels)), cubes)
     off = int((drawn != (heights > 0)).sum())
     unit.world.close()

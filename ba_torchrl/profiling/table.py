@@ -1,4 +1,4 @@
-"""The table of times: how rows are measured, collected and written."""
+"""The table of measurements: its rows, their measurement and their output."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ GROUPS = ("simulation", "learning", "memory")
 MEASUREMENTS: Registry[Measurement] = Registry("measurement", "ba_torchrl.profiling")
 
 WARM_UP = 3
-"""Calls before the first one that is timed: they allocate the memory."""
+"""Calls before the first timed one, which allocate memory."""
 
 PROFILE_ROWS = 40
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Values that a row is compared with, in the row's unit."""
+    """Values for comparison with a row, in the row's unit."""
 
     reference: str
     """The reference implementation's figure, on two cores of a Xeon with AMX."""
@@ -40,7 +40,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table."""
+    """A row of the table."""
 
     work: str
     unit: Literal["ms", "s", "MB"]
@@ -53,11 +53,11 @@ class Row:
 
 
 class Bench:
-    """Repeats a measurement, and times a unit of work in turn with the measured calls.
+    """Repeats a measurement, and alternates timed calls with a unit of work.
 
     Args:
         repeats: rounds of each measurement.
-        bar: shows the rounds.
+        bar: progress bar of the rounds.
         profiles: receives a profile of each timed call, by name; None for no profiles.
     """
 
@@ -75,12 +75,12 @@ class Bench:
     def time_against(
         self, unit: Callable[[], Any], calls: dict[str, Callable[[], Any]], repeats: int = 1
     ) -> tuple[list[float], dict[str, list[float]]]:
-        """Time calls and a unit of work in turn; return the seconds of each.
+        """Time calls and a unit of work alternately; return the seconds of each.
 
         Args:
             unit: the unit of work.
             calls: the measured calls, by name.
-            repeats: times of each call in a round.
+            repeats: number of timed calls in a round.
         """
         for call in (unit, *calls.values()):
             for _ in range(WARM_UP):
@@ -105,7 +105,7 @@ def seconds(call: Callable[[], Any]) -> float:
 
 
 def operations(call: Callable[[], Any]) -> str:
-    """Return a table of the PyTorch operations of a call, the longest first, over all threads."""
+    """Return a table of the PyTorch operations of a call, by decreasing time over all threads."""
     with torch.profiler.profile(record_shapes=True) as profile:
         call()
     averages = profile.key_averages(group_by_input_shape=True)
@@ -119,7 +119,7 @@ def operations(call: Callable[[], Any]) -> str:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A function that measures rows of the table, and the names that it is called with."""
+    """A function that measures rows of the table, and the names for which it is called."""
 
     function: Callable[..., list[Row]]
     names: Callable[[], Iterable[str]] | None
@@ -132,7 +132,7 @@ def measurement(
 
     Args:
         name: one of `GROUPS`, a slash, and the name of the measurement.
-        over: returns names; the function is called with each of them as its second argument.
+        over: returns names; the function is called once per name, as its second argument.
     """
 
     def decorate(function: Callable[..., list[Row]]) -> Callable[..., list[Row]]:
@@ -145,7 +145,7 @@ def measurement(
 def measure(
     which: str, repeats: int, progress: bool = True, profiles: dict[str, str] | None = None
 ) -> list[Row]:
-    """Measure one group of the table, one of its measurements, or "all".
+    """Measure one group of the table, a single measurement, or "all".
 
     Args:
         which: the group, or the measurement as "group/name".
@@ -187,15 +187,15 @@ def timed_row(
     budget: Budget | None = None,
     notes: str = "",
 ) -> Row:
-    """Return the row of some times.
+    """Return a row of measured times.
 
     Args:
         work: name of the timed work.
         unit: of the table.
         times: seconds of the work.
-        units: seconds of the unit of work, timed in turn.
+        units: seconds of the unit of work, timed alternately.
         budget: reference and limits.
-        notes: further text.
+        notes: remarks.
     """
     scale = {"ms": 1e3, "s": 1.0}[unit]
     multiple = statistics.median(times) / statistics.median(units)
@@ -233,7 +233,7 @@ def _digits(value: float | None) -> str:
 
 
 def machine() -> str:
-    """Return processor, packages, date and load of the measurement."""
+    """Return processor, package versions, date and load of the machine."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "pybullet"))
     load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return (

@@ -1,4 +1,4 @@
-"""Pictures of tasks: the expert's episode as rendered images, and the policy's observation."""
+"""Figures of tasks: rendered images of the expert's episode, and the policy's observation."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class Strip(NamedTuple):
     """Rendered images of an episode."""
 
     pictures: list[np.ndarray]
-    """[H, W, 3] uint8, from the first scene to the last."""
+    """[H, W, 3] uint8, from the initial to the final state."""
     first_image: np.ndarray
     """The policy's first observation, [H, W] metres."""
 
 
 def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool = False) -> Strip:
-    """Play one episode with the expert.
+    """Play an episode with the expert and render it.
 
     Args:
         task: id of the task.
         seed: of the episode.
-        pictures: their number, evenly spaced from the first scene to the last.
+        pictures: number of images, evenly spaced from the initial to the final state.
         deconstruct: whether the episode takes the structure apart.
     """
     env = make(task, expert=True, seed=seed, deconstruct=deconstruct)
@@ -50,7 +50,7 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
 
 
 def strip_figure(name: str, strip: Strip, path: str | Path) -> Path:
-    """Write one row: the policy's first observation, then the expert's episode.
+    """Write a row of images: the policy's first observation, then the expert's episode.
 
     Args:
         name: title.
@@ -67,12 +67,12 @@ def strip_figure(name: str, strip: Strip, path: str | Path) -> Path:
 
 
 def overview_figure(strips: Mapping[str, Strip], path: str | Path, columns: int = 5) -> Path:
-    """Write a grid with one picture per task, from the middle of the expert's episode.
+    """Write a grid with one image per task, from the middle of the expert's episode.
 
     Args:
-        strips: by task, the episode from `expert_strip`.
+        strips: the episode from `expert_strip`, by task.
         path: the PNG to write.
-        columns: pictures side by side.
+        columns: number of images per row.
     """
     rows = math.ceil(len(strips) / columns)
     figure, axes = _canvas(rows, columns, (2.6 * columns, 2.5 * rows))

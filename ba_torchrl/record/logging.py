@@ -1,4 +1,4 @@
-"""Scalars of a run: always one CSV file, and a TorchRL logger on request."""
+"""Scalars of a run, in a CSV file and optionally a TorchRL logger."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Series(NamedTuple):
 def make_logger(
     backend: Backend, run_dir: str | Path, name: str, config: Mapping[str, Any]
 ) -> Logger | None:
-    """Return TorchRL's logger for ``backend``, None for "csv"; `ScalarLog` writes the CSV file.
+    """Return TorchRL's logger for ``backend``; None for "csv", which `ScalarLog` writes.
 
     Args:
         backend: "csv", "tensorboard" or "wandb".
         run_dir: folder of the run, for the logger's files.
         name: of the run.
-        config: of the run, logged as its hyper-parameters; may be nested.
+        config: of the run, logged as hyper-parameters; may be nested.
 
     Raises:
         ValueError: the backend is unknown.
@@ -61,35 +61,35 @@ def make_logger(
 
 
 def is_available(backend: Backend) -> bool:
-    """Whether the package that a backend needs is installed."""
+    """Return whether the package of a backend is installed."""
     return backend == "csv" or importlib.util.find_spec(backend) is not None
 
 
 def limit_library_logs() -> None:
-    """Let the libraries log warnings and errors only."""
+    """Set the log levels of libraries to warnings or errors."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 def progress_bar(**settings: Any) -> tqdm:
-    """Return a progress bar; one that is written to a file is updated less often.
+    """Return a progress bar, with fewer updates if it is written to a file.
 
     Args:
-        settings: of ``tqdm``.
+        settings: keyword arguments of ``tqdm``.
     """
     return tqdm(mininterval=0.1 if sys.stderr.isatty() else FILE_INTERVAL_S, **settings)
 
 
 class ScalarLog:
-    """Writes scalars to ``scalars.csv`` in the run folder and, on request, to a TorchRL logger.
+    """Writes scalars to ``scalars.csv`` in the run folder and optionally to a TorchRL logger.
 
     The file has the columns step, name and value, one row per scalar, and is complete after each
-    `write`. A resumed run appends to the same file. TorchRL's own CSV logger is not used: it writes
-    one file without a header per scalar and keeps all values in memory.
+    `write`. A resumed run appends to the same file. TorchRL's CSV logger is not used, because it
+    writes one file without a header per scalar and keeps all values in memory.
 
     Args:
-        run_dir: folder of the run; made if it does not exist.
-        backend: "csv" for the file only, or "tensorboard" or "wandb" in addition.
+        run_dir: folder of the run, which is created if needed.
+        backend: "csv" for the file only; "tensorboard" or "wandb" for an additional logger.
         config: of the run, for the backend.
 
     Raises:
@@ -127,7 +127,7 @@ class ScalarLog:
                 self.logger.log_scalar(name, value, step)
 
     def close(self) -> None:
-        """Close the file and the logger; closing twice does nothing."""
+        """Close the file and the logger; further calls have no effect."""
         self._file.close()
         if self.logger is not None:
             self.logger.close()
@@ -137,14 +137,14 @@ class ScalarLog:
 def read_scalars(path: str | Path) -> dict[str, Series]:
     """Read the scalars of a run.
 
-    Of steps that a resumed run wrote twice, the later value is returned. An incomplete last row,
-    which a killed run leaves, is ignored.
+    If a resumed run wrote a step twice, the later value is returned. An incomplete last row of a
+    killed run is ignored.
 
     Args:
         path: ``scalars.csv`` or the run folder.
 
     Raises:
-        FileNotFoundError: there is no such file.
+        FileNotFoundError: the file does not exist.
         ValueError: the file does not hold scalars.
     """
     path = Path(path)
@@ -168,7 +168,7 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
 
 
 def _drop_incomplete_row(path: Path) -> None:
-    """Remove a last row without a line end, which a killed run leaves."""
+    """Remove an incomplete last row, without a line end, of a killed run."""
     if path.exists():
         content = path.read_bytes()
         if not content.endswith(b"\n"):
@@ -176,7 +176,7 @@ def _drop_incomplete_row(path: Path) -> None:
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested settings to the types that every backend shows: numbers, flags and text."""
+    """Flatten nested settings to types that every backend supports: numbers, flags and text."""
     flat: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, Mapping):

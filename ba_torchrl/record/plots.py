@@ -1,4 +1,4 @@
-"""Learning curves as pictures."""
+"""Figures of learning curves."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
     Curve = Sequence[ArrayLike]
 
-# Distinguishable by colour-blind readers (Okabe and Ito), in the order of decreasing contrast.
+# Distinguishable by colour-blind readers (Okabe and Ito), in order of decreasing contrast.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")
 _MANY_POINTS = 25
 LEAST_WIDTH_IN = 5.0
-"""Least width of a figure, which the legend needs."""
+"""Least width of a figure, for the legend."""
 
 
 def plot_learning_curve(
@@ -36,17 +36,17 @@ def plot_learning_curve(
     ylabel: str = "success rate",
     ylim: tuple[float, float] | None = (0.0, 1.0),
 ) -> Path:
-    """Draw curves into a PNG, each with a band if it has one.
+    """Plot curves into a PNG, with optional error bands.
 
     Args:
-        curves: by name, x and y or x, y, low and high, each [n]; low and high bound the band,
-            such as mean minus and plus standard error. Or the ``scalars.csv`` of a run, whose
-            success rates are drawn.
-        path: of the PNG; its folder is made if it does not exist.
-        title: above the axes.
-        xlabel: below them.
-        ylabel: at their left.
-        ylim: least and greatest y; None fits the curves.
+        curves: by name, (x, y) or (x, y, low, high), each [n]; low and high bound the band, for
+            example mean minus and plus standard error. Or the ``scalars.csv`` of a run, of which
+            the success rates are plotted.
+        path: of the PNG; its folder is created if needed.
+        title: title of the axes.
+        xlabel: label of the x axis.
+        ylabel: label of the y axis.
+        ylim: limits of the y axis; None for automatic limits.
 
     Returns:
         The path.
@@ -80,16 +80,18 @@ def plot_panels(
     ylim: tuple[float, float] | None = (0.0, 1.0),
     columns: int | None = None,
 ) -> Path:
-    """Draw curves into panels side by side, as in the paper's figures 18 to 22.
+    """Plot curves into a grid of panels, as in the paper's figures 18 to 22.
 
     Args:
-        panels: by title, curves by name as for `plot_learning_curve`.
+        panels: curves as for `plot_learning_curve`, by title.
         path: of the PNG; its folder is made if it does not exist.
-        names: every name, in the order of colours; one name has one colour in all panels.
+        names: names of all curves, in the order of colours; a name has the same colour in all
+            panels.
         xlabel: below the panels.
         ylabel: at their left.
         ylim: least and greatest y; None fits the curves.
-        columns: most panels in a row; None chooses three to five, with the fewest empty places.
+        columns: largest number of panels in a row; None for three to five, with the fewest empty
+            cells.
 
     Returns:
         The path.
@@ -106,7 +108,7 @@ def plot_panels(
     rows = math.ceil(len(panels) / columns)
     width_in = max(3.1 * columns + 0.6, LEAST_WIDTH_IN)
     entry_in = 0.6 + 0.09 * max(map(len, names), default=0)
-    entries = max(int(width_in / entry_in), 1)  # of a row of the legend
+    entries = max(int(width_in / entry_in), 1)  # in a row of the legend
     figure = _figure((width_in, 2.6 * rows + 0.6 + 0.25 * math.ceil(len(names) / entries)))
     grid = figure.subplots(rows, columns, squeeze=False, sharey=ylim is not None)
     shown: dict[str, Line2D] = {}
@@ -142,7 +144,7 @@ def _figure(size_in: tuple[float, float]) -> Figure:
 
 def _style_axes(axes: Axes, ylim: tuple[float, float] | None) -> None:
     if ylim is not None:
-        margin = 0.02 * (ylim[1] - ylim[0])  # lines along the edges stay visible
+        margin = 0.02 * (ylim[1] - ylim[0])  # keeps lines at the limits visible
         axes.set_ylim(ylim[0] - margin, ylim[1] + margin)
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

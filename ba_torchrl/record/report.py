@@ -1,6 +1,6 @@
-"""Report: results of runs as curves (PNG), tables (CSV, Markdown) and a page (HTML).
+"""Reports of runs: curves (PNG), tables (CSV, Markdown) and a page (HTML).
 
-Made from the ``result.json`` of finished runs (see `ba_torchrl.record.results`).
+A report is made from the ``result.json`` of finished runs (see `ba_torchrl.record.results`).
 """
 
 from __future__ import annotations
@@ -43,16 +43,15 @@ _HEADER = (
 
 
 def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
-    """Write curves (PNG), tables (CSV, Markdown) and a page (HTML) of the runs below some folders.
+    """Write the report of all runs below some folders.
 
-    The page contains the curves and links to the videos.
+    The page contains the curves and tables, and links to the videos.
 
     Args:
         roots: folders that are searched for runs.
-        folder: of the report; made if it does not exist.
+        folder: of the report, which is created if needed.
 
-    Returns:
-        The page.
+    Returns: Path of the page.
 
     Raises:
         FileNotFoundError: there is no finished run.
@@ -118,7 +117,7 @@ def _plot(section: Section, path: Path) -> Path:
 
 
 def _note(section: Section) -> str:
-    """Return a text that defines the figures and their uncertainty."""
+    """Return the definition of the reported numbers and their uncertainty."""
     counts = sorted({len(group.runs) for group in section.groups})
     seeds = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     policies = {run.result.final.policy for group in section.groups for run in group.runs}
@@ -137,7 +136,7 @@ def _note(section: Section) -> str:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
-    """Return a row of the table as text."""
+    """Return the cells of a row as text."""
     error = "" if math.isnan(row["standard_error"]) else f" ± {row['standard_error']:.3f}"
     return [
         row["task"],
@@ -166,7 +165,7 @@ def _markdown(section: Section, table: Sequence[dict[str, Any]]) -> str:
 
 
 def _machines(section: Section) -> list[str]:
-    """Return the machines and package versions of the runs, each once."""
+    """Return the different machines and package versions of the runs."""
     found = set()
     for group in section.groups:
         for run in group.runs:
@@ -182,7 +181,7 @@ def _machines(section: Section) -> list[str]:
 
 
 def _videos(section: Section, folder: Path) -> list[dict[str, Any]]:
-    """Return each group's videos: the page shows that of the first seed and links the others."""
+    """Return the videos of each group; the page shows the first seed's and links the others."""
     found = []
     for group in sorted(section.groups, key=lambda group: (group.task, group.method)):
         videos = [

@@ -1,6 +1,6 @@
-"""Results: the data of a finished run, one ``result.json`` per run folder.
+"""Results of finished runs, one ``result.json`` per run folder.
 
-`RunResult` is the schema. Reports are made from these files alone.
+`RunResult` is the schema. Reports are made from these files only.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ NON_LEARNING_FIELDS = frozenset(
         "video_episodes",
     }
 )
-"""Fields of a run's configuration that do not change what is learnt: a resumed run may have other
-values, and reports average over runs that differ in them."""
+"""Fields of a run's configuration that do not affect learning. A resumed run may have other values,
+and reports average over runs that differ in them."""
 
 
 class CurvePoint(StrictModel):
@@ -54,13 +54,13 @@ class CurvePoint(StrictModel):
     env_steps: int
     """Steps of all environments so far, demonstrations not counted."""
     seconds: float
-    """Since the start of the run, without the time between an interruption and its resumption."""
+    """Duration of the run so far, without interruptions."""
     episodes: int
     success_rate: float
     standard_error: float
-    """Of the success rate, over these episodes (binomial)."""
+    """Binomial standard error of the success rate over these episodes."""
     mean_length: float
-    """Steps per episode, failures at their full length."""
+    """Mean steps per episode, failed episodes included."""
 
 
 class FinalEvaluation(StrictModel):
@@ -76,7 +76,7 @@ class FinalEvaluation(StrictModel):
 
 
 class RunResult(StrictModel):
-    """Results and settings of a run, from which reports are made."""
+    """Results and settings of a run."""
 
     format: Literal[1] = 1
     task: str
@@ -86,26 +86,26 @@ class RunResult(StrictModel):
     """The benchmark that the run belongs to."""
     seed: int
     curve: list[CurvePoint]
-    """In the order of updates."""
+    """Evaluations in the order of updates."""
     final: FinalEvaluation
     config: dict[str, Any]
-    """The run's configuration, every default filled in."""
+    """The run's configuration, defaults included."""
     versions: dict[str, str]
-    """Of Python and the packages."""
+    """Versions of Python and the packages."""
     hardware: dict[str, Any]
     """`cpu`, `cores`, `memory_gb`, `gpu` (None on the CPU) and the learner's `threads`."""
     seconds: float
-    """Wall time of the run, without the time between an interruption and its resumption."""
+    """Wall time of the run, without interruptions."""
     resumed_at: list[int] = Field(default_factory=list)
     """Updates after which the run was resumed."""
     finished: str
-    """When, UTC, ISO 8601."""
+    """Time of the end of the run, UTC, ISO 8601."""
     files: dict[str, str]
-    """`curve`, `checkpoint` and perhaps `video`, relative to the run folder."""
+    """Paths of `curve`, `checkpoint` and optionally `video`, relative to the run folder."""
 
 
 def write_result(folder: str | Path, result: RunResult) -> Path:
-    """Write ``result.json`` into a run folder; the file appears when it is complete."""
+    """Write ``result.json`` into a run folder, atomically."""
     path = Path(folder) / RESULT_FILE
     scratch = path.with_suffix(".tmp")
     scratch.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -131,7 +131,7 @@ def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
     """Find the run folders below some folders, themselves included.
 
     Returns:
-        Those of finished runs and those of all others, each sorted.
+        The folders of finished runs and those of unfinished runs, both sorted.
     """
     roots = [Path(root) for root in roots]
     finished, *others = (
@@ -142,13 +142,13 @@ def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
 
 
 def read_failure(folder: str | Path) -> str | None:
-    """Return why a benchmark's last attempt at the run in a folder failed, None if it did not."""
+    """Return why a benchmark's last run in a folder failed, None if it did not fail."""
     path = Path(folder) / FAILURE_FILE
     return json.loads(path.read_text(encoding="utf-8"))["reason"] if path.exists() else None
 
 
 def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested settings by dotted name, "env.obs_size"."""
+    """Return nested settings by dotted name, such as "env.obs_size"."""
     out: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, Mapping):
@@ -163,10 +163,10 @@ def differences(
     second: Mapping[str, Any],
     ignored: Collection[str] = NON_LEARNING_FIELDS,
 ) -> dict[str, tuple[Any, Any]]:
-    """Return the settings in which two runs' configurations differ, and both values.
+    """Return the settings in which the configurations of two runs differ, with both values.
 
     Args:
-        first: a configuration with every default filled in.
+        first: a configuration, defaults included.
         second: another.
         ignored: fields that may differ.
     """
@@ -193,7 +193,7 @@ def versions() -> dict[str, str]:
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
-    """Return the hardware that a run is computed on.
+    """Return a description of the hardware of a run.
 
     Args:
         device: of the learner.
@@ -220,7 +220,7 @@ def processor() -> str:
 
 
 def now() -> str:
-    """Return the time, UTC, ISO 8601."""
+    """Return the current time, UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 

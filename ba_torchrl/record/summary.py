@@ -1,6 +1,6 @@
-"""Summary: statistics over seeds of finished runs, by benchmark, task and method.
+"""Statistics over seeds of finished runs, by benchmark, task and method.
 
-Runs whose settings differ are never averaged: their methods have different names.
+Runs with different settings are not averaged; their methods get different names.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from ba_torchrl.record.results import (
 CONFIDENCE = 0.95
 RESAMPLES = 9999
 GOOD_RATE = 0.8
-"""Sample efficiency is measured as the updates until the mean curve reaches this success rate."""
+"""Success rate of the mean curve for the measure of sample efficiency, updates to that rate."""
 ALL_TASKS = "all tasks"
 OTHER_RUNS = "runs"
-"""Title of the runs that belong to no benchmark."""
+"""Title of the section of runs without a benchmark."""
 COLUMNS = (
     "benchmark",
     "task",
@@ -60,7 +60,7 @@ class Group:
     task: str
     method: str
     runs: Sequence[Run]
-    """By seed."""
+    """Runs in the order of seeds."""
 
     @property
     def updates(self) -> np.ndarray:
@@ -69,23 +69,23 @@ class Group:
 
     @property
     def rates(self) -> np.ndarray:
-        """Success rate of every seed at these points, [seeds, n]."""
+        """Success rate of every seed at the points of the curve, [seeds, n]."""
         return np.array([[p.success_rate for p in run.result.curve] for run in self.runs])
 
     @property
     def by_seed(self) -> dict[int, float]:
-        """Success rate that each seed reports."""
+        """Success rate of the final evaluation by seed."""
         return {run.result.seed: run.result.final.success_rate for run in self.runs}
 
     @property
     def final(self) -> np.ndarray:
-        """The same as an array, [seeds]."""
+        """Success rates of the final evaluations, [seeds]."""
         return np.array(list(self.by_seed.values()))
 
     def reaches(self, rate: float) -> tuple[float, float]:
         """Return the updates and environment steps at which the mean curve reaches a rate.
 
-        Both are nan if it does not. Their resolution is the interval of evaluations.
+        Both are nan if it does not. The resolution is the interval between evaluations.
         """
         reached = np.flatnonzero(self.rates.mean(0) >= rate)
         if not reached.size:
@@ -96,7 +96,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Section:
-    """One benchmark, or all runs that belong to no benchmark."""
+    """The runs of one benchmark, or all runs without a benchmark."""
 
     title: str
     groups: Sequence[Group]
@@ -119,7 +119,8 @@ def load_sections(roots: Iterable[str | Path]) -> tuple[list[Section], list[Path
         roots: folders.
 
     Returns:
-        Benchmarks by name, runs without a benchmark last; and the folders of unfinished runs.
+        Sections in the order of the benchmarks' names, runs without a benchmark last; and the
+        folders of unfinished runs.
 
     Raises:
         FileNotFoundError: a folder is missing, or none holds a finished run.
@@ -170,10 +171,10 @@ def interval(values: np.ndarray) -> tuple[float, float]:
 
 
 def summarize(section: Section) -> list[dict[str, Any]]:
-    """Return the table of a section: rows with the names of `COLUMNS`.
+    """Return the table of a section: rows with the keys `COLUMNS`.
 
-    There is a row per task and method, and one more for each method that ran on every task, with
-    the mean over tasks as the success of a seed.
+    There is a row per task and method, and for each method that ran on every task a row in which
+    the success of a seed is the mean over tasks.
     """
     groups = sorted(section.groups, key=lambda group: (group.task, group.method))
     rows = [_row(section.title, group) for group in groups]
@@ -208,7 +209,7 @@ def summarize(section: Section) -> list[dict[str, Any]]:
 
 
 def _row(title: str, group: Group) -> dict[str, Any]:
-    """Return a task's and method's row."""
+    """Return the row of a task and a method."""
     low, high = interval(group.final)
     updates, steps = group.reaches(GOOD_RATE)
     results = [run.result for run in group.runs]
@@ -259,7 +260,7 @@ def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
 
 
 def _distinction(run: Run, others: Sequence[Run]) -> str:
-    """Return the settings in which a run differs from others, such as " (env.obs_size 64)"."""
+    """Return the settings in which a run differs from others as text, " (env.obs_size 64)"."""
     names = sorted({name for other in others for name in _differences(run, other)})
     values = []
     for name in names:

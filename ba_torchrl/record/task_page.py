@@ -1,4 +1,4 @@
-"""The page of tasks, written from the registry."""
+"""The documentation page of the tasks, generated from the registry."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
 
 
 def _section(task: str) -> list[str]:
-    """Return the lines of one task."""
+    """Return the lines of a task's section."""
     cls = TASKS[task]
     env = make(task, seed=0, obs_size=16)
     env.reset()

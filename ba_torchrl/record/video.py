@@ -11,20 +11,21 @@ _SUFFIXES = (".mp4", ".gif")
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> Path:
-    """Write pictures as a video.
+    """Write images as a video.
 
     Args:
-        path: ends in ``.mp4`` (H.264) or ``.gif``; its folder is made if it does not exist.
-        frames: [T, H, W, 3] uint8, or a sequence of T pictures of one size. For ``.mp4``, an odd
+        path: ends in ``.mp4`` (H.264) or ``.gif``; its folder is created if needed.
+        frames: [T, H, W, 3] uint8, or a sequence of T images of equal size. For ``.mp4``, an odd
             height or width is padded with a copy of the last row or column.
-        fps: pictures per second.
+        fps: frames per second.
 
     Returns:
         The path.
 
     Raises:
         ImportError: imageio or its ffmpeg is missing.
-        ValueError: the frames or the suffix are not of this kind.
+        ValueError: the suffix is unknown, ``fps`` is not positive, or a frame has another shape or
+            type.
     """
     path = Path(path)
     suffix = path.suffix.lower()

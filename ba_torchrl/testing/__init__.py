@@ -1,4 +1,4 @@
-"""Checks that every task passes, for tests of tasks inside and outside the package."""
+"""Contract checks of tasks, for tests of tasks inside and outside the package."""
 
 from ba_torchrl.testing.tasks import check_task
 

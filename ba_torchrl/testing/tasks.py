@@ -1,7 +1,7 @@
-"""The contract of a task, one check per promise; each raises `AssertionError` with the reason.
+"""Contract checks of tasks; each raises an `AssertionError` that states the reason.
 
-`check_task` runs all of them on the id of a task. The checks ask the task for its control, so the
-id may be anything.
+`check_task` runs all checks for the id of a task. The control is that of the task's class, so the
+id is arbitrary.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.tasks.base import TASKS, Task
 
 IMAGE_SIZES = {"close_loop": 32, "open_loop": 128}
-"""Pixels by control. Open-loop experts read heights off the image: with fewer pixels a block falls
-between them."""
+"""Image size by control. Open-loop picks take their height from the image, in which a
+block must cover several pixels."""
 
 MAX_EPISODE_STEPS = 60
 
@@ -40,19 +40,20 @@ def check_task(
     min_recovery_rate: float = 0.85,
     max_typical_steps: float | None = None,
 ) -> None:
-    """Check that a task keeps the promises of this package's tasks; it takes about a minute.
+    """Check that a task fulfils the contract of this package's tasks; takes about a minute.
 
     Args:
         task: id of a registered task.
-        robot: the arm, in the checks that need no particular one.
-        episodes: episodes that the expert plays, from the start and after random actions.
-        min_success_rate: least share of these that the expert solves from the start.
-        min_recovery_rate: the same after random actions.
-        max_typical_steps: most steps that the expert needs: the mean in close loop, the median in
-            open loop; None for no limit.
+        robot: name of the robot.
+        episodes: number of episodes that the expert plays, both from the start and after random
+            actions.
+        min_success_rate: least success rate of the expert from the start.
+        min_recovery_rate: least success rate of the expert after random actions.
+        max_typical_steps: largest mean (close loop) or median (open loop) number of the expert's
+            steps; None for no limit.
 
     Raises:
-        AssertionError: a promise is broken; the message says which.
+        AssertionError: a check fails; the message states the reason.
         ConfigError: the task is unknown.
     """
     check_specs(task, robot=robot)
@@ -78,7 +79,7 @@ def check_task(
 
 
 def check_specs(task: str, **config: Any) -> None:
-    """Check that observations, actions and ends are those of the environment's specs."""
+    """Check that observations, actions and done flags match the environment's specs."""
     env = make_small(task, expert=True, max_steps=2, **config)
     try:
         check_env_specs(env, break_when_any_done="both", seed=0)
@@ -118,7 +119,7 @@ def check_resets(task: str, *, episodes: int = 10, **config: Any) -> None:
 
 
 def check_seeds(task: str, **config: Any) -> None:
-    """Check that a seed fixes the images bit for bit, and that another seed gives others."""
+    """Check that a seed determines the images bit for bit, and that another seed changes them."""
     first, second = make_small(task, **config), make_small(task, **config)
     policy = _constant_policy(first, 0.65, 0.25, 0.85, 0.0, 0.6)
     try:
@@ -137,7 +138,7 @@ def check_seeds(task: str, **config: Any) -> None:
 
 
 def check_successive_episodes(task: str, **config: Any) -> None:
-    """Check that the next episode starts from another scene; tasks that continue are exempt."""
+    """Check that the next episode starts from another scene, unless the task continues it."""
     if continues(task):
         return
     env = make_small(task, **config)
@@ -149,7 +150,7 @@ def check_successive_episodes(task: str, **config: Any) -> None:
 
 
 def check_observations_are_copies(task: str, **config: Any) -> None:
-    """Check that a step does not write into images that were returned before."""
+    """Check that a step does not modify images that were returned earlier."""
     env = make_small(task, expert=True, **config)
     try:
         state = env.reset()
@@ -166,7 +167,7 @@ def check_observations_are_copies(task: str, **config: Any) -> None:
 
 
 def check_random_actions(task: str, **config: Any) -> None:
-    """Check that random actions neither fail nor lead out of the specs."""
+    """Check that random actions cause no fault and no observation outside its spec."""
     env = make_small(task, **config)
     torch.manual_seed(0)
     try:
@@ -179,7 +180,7 @@ def check_random_actions(task: str, **config: Any) -> None:
 
 
 def check_extreme_actions(task: str, **config: Any) -> None:
-    """Check that actions at the ends of their ranges do not fail."""
+    """Check that actions at the bounds of their ranges cause no fault."""
     env = make_small(task, **config)
     rng = np.random.default_rng(0)
 
@@ -206,11 +207,11 @@ def check_pickling(task: str, **config: Any) -> None:
 
 
 def check_step_limit(task: str, **config: Any) -> None:
-    """Check that the step limit truncates, unless the limit is the task."""
+    """Check that the step limit truncates, unless the task terminates there."""
     if TASKS[task].terminates_at_limit:
         return
     env = make_small(task, max_steps=3, **config)
-    # close loop: stay, gripper open; open loop: place nothing
+    # close loop: no motion, gripper open; open loop: a place without an object
     action = action_at(env, [0.5])
     action[0] = 1.0
     try:
@@ -234,14 +235,14 @@ def check_expert(
     max_typical_steps: float | None = None,
     **config: Any,
 ) -> None:
-    """Check that the expert reaches the goal, and that reward and ends agree with it.
+    """Check the expert's success rate and steps, and the rewards and ends of its episodes.
 
     Args:
         task: id of the task.
-        episodes: how many to play.
-        min_success_rate: least share of them that the expert solves.
-        max_typical_steps: most steps of solved episodes: their mean in close loop, their median in
-            open loop; None for no limit.
+        episodes: number of episodes.
+        min_success_rate: least success rate.
+        max_typical_steps: largest mean (close loop) or median (open loop) number of steps of solved
+            episodes; None for no limit.
         config: fields of `EnvConfig`.
     """
     env = make_small(task, expert=True, **config)
@@ -252,7 +253,7 @@ def check_expert(
     lengths = [len(episode) for episode in played if episode[keys.NEXT, keys.SUCCESS][-1]]
     assert len(lengths) >= min_success_rate * episodes, (
         f"{task}: the expert solves {len(lengths)} of {episodes} episodes, "
-        f"fewer than a share of {min_success_rate:g}"
+        f"a success rate below {min_success_rate:g}"
     )
     if max_typical_steps is not None:
         typical = np.mean if TASKS[task].control == "close_loop" else np.median
@@ -273,12 +274,12 @@ def check_expert(
 
 
 def check_recovery(task: str, *, episodes: int, min_success_rate: float, **config: Any) -> None:
-    """Check that the expert reaches the goal after random actions; one-step tasks are exempt.
+    """Check the expert's success rate after random actions; one-step tasks are exempt.
 
     Args:
         task: id of the task.
-        episodes: how many to play; those that random actions end do not count.
-        min_success_rate: least share that the expert solves.
+        episodes: number of episodes, without those that end during the random actions.
+        min_success_rate: least success rate.
         config: fields of `EnvConfig`.
     """
     if TASKS[task].terminates_at_limit:
@@ -298,7 +299,7 @@ def check_recovery(task: str, *, episodes: int, min_success_rate: float, **confi
     assert len(outcomes) >= episodes / 2, f"{task}: random actions end most episodes"
     assert np.mean(outcomes) >= min_success_rate, (
         f"{task}: after {random_steps} random actions the expert solves {sum(outcomes)} of "
-        f"{len(outcomes)} episodes, fewer than a share of {min_success_rate:g}"
+        f"{len(outcomes)} episodes, a success rate below {min_success_rate:g}"
     )
 
 
@@ -319,7 +320,7 @@ def check_expert_is_passive(task: str, **config: Any) -> None:
 
 
 def check_partial_resets(task: str, **config: Any) -> None:
-    """Check that one environment of a vector can be reset and the other keeps its episode."""
+    """Check that a reset of one environment of a vector does not affect the other."""
     env = make_vector_env(task, 2, parallel=False, **{"obs_size": 32, "seed": 0, **config})
     try:
         state = env.reset()
@@ -345,18 +346,18 @@ def check_partial_resets(task: str, **config: Any) -> None:
 
 
 def make_small(task: str, **config: Any) -> ManipulationEnv:
-    """Make an environment with the smallest image on which the task can be solved, seed 0."""
+    """Make an environment with seed 0 and a small image."""
     size = IMAGE_SIZES[TASKS[task].control]
     return make(task, **{"obs_size": size, "seed": 0, **config})
 
 
 def continues(task: str) -> bool:
-    """Whether the next episode of a task starts from the scene in which the last one ended."""
+    """Return whether an episode of a task can start from the last scene of the previous one."""
     return TASKS[task].continues is not Task.continues
 
 
 def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
-    """Act as the expert does; TorchRL asks for the argument's name."""
+    """Copy the expert's action. TorchRL requires the name of the argument."""
     return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION])
 
 
@@ -369,7 +370,7 @@ def play_expert(env: ManipulationEnv, episodes: int) -> list[TensorDict]:
 
 
 def action_at(env: ManipulationEnv, fractions: Sequence[float]) -> torch.Tensor:
-    """Return the action at fractions, 0 to 1, of each component's range, repeated to its length."""
+    """Return the action at fractions, 0 to 1, of the components' ranges; they are cycled."""
     low, high = env.action_spec.space.low, env.action_spec.space.high
     place = torch.tensor([fractions[i % len(fractions)] for i in range(len(low))])
     return low + place * (high - low)
@@ -380,7 +381,7 @@ def _constant_policy(env: ManipulationEnv, *fractions: float) -> Policy:
 
 
 def _recover(env: ManipulationEnv, seed: int, random_steps: int) -> bool | None:
-    """Return whether the expert succeeds after random actions; None if these end the episode."""
+    """Return the expert's success after random actions; None if these end the episode."""
     state = env.reset(seed=seed)
     rng = np.random.default_rng(seed)
     for _ in range(random_steps):

@@ -64,9 +64,9 @@ def test_every_choice_becomes_an_action_and_comes_back(sequence, levels, half_ro
     assert len(action.unique(dim=0)) == len(every)
     for level in range(len(levels)):
         assert torch.equal(
-            actions.unflat(actions.flat(every, level), level), actions.part(every, level)
+            actions.unravel(actions.ravel(every, level), level), actions.at_level(every, level)
         )
-    assert torch.equal(actions.flat(every, 0).unique(), torch.arange(math.prod(levels[0].shape)))
+    assert torch.equal(actions.ravel(every, 0).unique(), torch.arange(math.prod(levels[0].shape)))
 
 
 def test_an_index_means_the_middle_of_its_pixel():

@@ -1,1 +1,1 @@
-"""Rigid motions of sampled transitions."""
+"""Rigid transforms of sampled transitions."""

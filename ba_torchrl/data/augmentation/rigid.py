@@ -25,13 +25,14 @@ RigidTransforms = Literal["none", "translation", "cn", "d4", "se2"]
 """Translations; rotations of C_n; quarter turns and reflections; rotations and translations."""
 
 SHIFT_SHARE = 0.05
-"""Standard deviation of a translation, as a share of the workspace's side."""
+"""Standard deviation of a translation, as a fraction of the workspace's side."""
 ATTEMPTS = 10
-"""Transforms drawn for a transition until its action stays within the workspace."""
+"""Largest number of transforms drawn for a transition until its action stays in the workspace."""
 
 
 class RigidTransform(NamedTuple):
-    """Rigid transforms of the plane about the workspace's centre: reflect y, rotate, translate."""
+    """Rigid transforms of the plane about the workspace's centre: reflect y, then rotate, then
+    translate."""
 
     mirrored: Tensor
     """bool [B]."""
@@ -42,7 +43,7 @@ class RigidTransform(NamedTuple):
 
 
 def transform_images(images: Tensor, transform: RigidTransform) -> Tensor:
-    """Return images transformed with the scene; pixels from outside of the image are zero.
+    """Return images transformed with the scene; pixels from outside the image are zero.
 
     Quarter turns and reflections without a translation are exact, other transforms bilinear.
 
@@ -70,7 +71,8 @@ def transform_images(images: Tensor, transform: RigidTransform) -> Tensor:
 def reverse_gripper_axes(images: Tensor, channel_axes: tuple[str, ...], axes: str) -> Tensor:
     """Return images in the gripper's axes with some of these axes reversed.
 
-    Exact for heights; to one voxel for the three projections, whose smoothing is not symmetric.
+    Exact for heights. Projections are accurate to one voxel, because their smoothing is not
+    symmetric.
 
     Args:
         images: [B, C, h, w].
@@ -84,14 +86,14 @@ def reverse_gripper_axes(images: Tensor, channel_axes: tuple[str, ...], axes: st
 
 
 class RigidAugmentation(nn.Module):
-    """Transforms images, next images and action of sampled transitions, each by a random transform.
+    """Applies a random rigid transform to images, next images and action of each transition.
 
-    Images in the gripper's axes stay, except that reflections reverse the gripper's y axis, and
-    that a yaw wrapped into half a turn reverses both. A transition for which no transform keeps
-    the action within the workspace stays as it is.
+    Images with the gripper's axes do not change, with two exceptions: a reflection reverses the
+    gripper's y axis, and a yaw that is wrapped into half a turn reverses both axes. A transition is
+    unchanged if no drawn transform keeps its action within the workspace.
 
     Args:
-        transforms: which, see `RigidTransforms`.
+        transforms: set of transforms, see `RigidTransforms`.
         actions: the environment's action vector.
         images: declarations of the images by key.
         seed: of the module's own draws.
@@ -99,8 +101,9 @@ class RigidAugmentation(nn.Module):
         order: n of C_n.
 
     Raises:
-        ValueError: the probability is outside [0, 1], the order is not positive, an image cannot
-            be transformed, or the transforms rotate and the action has no yaw, or has tilts.
+        ValueError: the probability is outside [0, 1], the order is not positive, an image cannot be
+            transformed, the transforms rotate and the action has no yaw, or they reflect and the
+            action has tilts.
     """
 
     def __init__(
@@ -136,14 +139,15 @@ class RigidAugmentation(nn.Module):
         self._gripper_images = {
             key: image.axes for key, image in images.items() if image.frame == "gripper"
         }
-        # On the CPU for any device of the batch, so that a seed gives the same draws on all.
+        # On the CPU for any device of the batch, so that the draws of a seed are the same on all
+        # devices.
         self._generator = torch.Generator().manual_seed(seed)
         self._xy = [actions.components.index(name) for name in "xy"]
         bounds = torch.tensor(actions.bounds_m[:2], dtype=torch.float64)
         self._center, self._side = bounds.mean(dim=1), bounds[:, 1] - bounds[:, 0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return a batch of transitions [B] with some transformed; the input is not changed.
+        """Return a copy of a batch of transitions [B] with some of them transformed.
 
         Args:
             tensordict: holds the images, ``action`` and their successors.
@@ -170,7 +174,7 @@ class RigidAugmentation(nn.Module):
         return out
 
     def _draw_inside(self, action: Tensor) -> tuple[Tensor, RigidTransform]:
-        """Return which actions [B, A] are transformed, bool [B], and the transforms."""
+        """Return which actions [B, A] are transformed, bool [B], and the drawn transforms."""
         is_wanted = torch.rand(len(action), generator=self._generator) < self.probability
         transform = self._draw(len(action))
         is_found = is_wanted & self._stays_inside(action, transform)
@@ -214,7 +218,8 @@ class RigidAugmentation(nn.Module):
     def _transform_actions(
         self, action: Tensor, transform: RigidTransform
     ) -> tuple[Tensor, Tensor]:
-        """Return transformed actions [B, A] with wrapped angles, and which reverse the gripper."""
+        """Return transformed actions [B, A], and where the wrapped yaw swaps the fingers, bool
+        [B]."""
         moved = action.double()
         moved[:, self._xy] = self._positions(action, transform)
         is_turned_over = torch.zeros(len(action), dtype=torch.bool)
@@ -233,7 +238,7 @@ class RigidAugmentation(nn.Module):
         return moved.to(action), is_turned_over
 
     def _reverse_axes(self, out: TensorDictBase, rows: Tensor, axes: str) -> None:
-        """Reverse axes of the images in the gripper's axes, in some rows of a batch."""
+        """Reverse axes of the images with the gripper's axes, in some rows of a batch."""
         for key, channel_axes in self._gripper_images.items():
             for nested in (key, (keys.NEXT, key)):
                 image = out[nested].clone()

@@ -1,4 +1,4 @@
-"""Rotation of sampled transitions about the vertical (appendix G.2)."""
+"""Rotation of sampled transitions about the z axis (appendix G.2)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ba_torchrl.envs.images import ImageSpec
 
 
 def quarters_and_rotation(angle_rad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (quarter turns or -1 if not a whole number of them, cosine, sine) of angles [B].
+    """Return (number of quarter turns, -1 for other angles; cosine; sine) of angles [B].
 
     Cosine and sine are exact at quarter turns.
     """
@@ -33,7 +33,7 @@ def rotate_images(images: Tensor, angle_rad: Tensor) -> Tensor:
     """Return images rotated about their centres as the scene rotates about z.
 
     A quarter turn is ``torch.rot90(k=1)`` and exact; other angles are bilinear, and pixels from
-    outside of the image repeat its border.
+    outside the image repeat its border.
 
     Args:
         images: [B, C, H, H], rows along +x, columns along +y.
@@ -56,7 +56,7 @@ def copy_exact_quarters(rotated: Tensor, images: Tensor, quarters: Tensor) -> No
     Args:
         rotated: [B, C, H, H], changed in place.
         images: before the rotation.
-        quarters: int64 [B] on the CPU; -1 leaves an image as it is.
+        quarters: int64 [B] on the CPU, number of quarter turns; -1 leaves an image unchanged.
     """
     for k in sorted(set(quarters.tolist()) - {-1}):
         exact = (quarters == k).nonzero().squeeze(-1).to(images.device)
@@ -64,9 +64,9 @@ def copy_exact_quarters(rotated: Tensor, images: Tensor, quarters: Tensor) -> No
 
 
 def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
-    """Return (dx, dy) rotated about z and, outside of [-1, 1]^2, shortened to its edge.
+    """Return (dx, dy) rotated about z and, if it leaves [-1, 1]^2, scaled to its boundary.
 
-    The direction is kept, unlike with clipped components.
+    Scaling keeps the direction, which clipping of the components does not.
 
     Args:
         displacement: [B, 2].
@@ -82,13 +82,14 @@ def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
 def map_pairs(
     tensordict: TensorDictBase, key: str, rows: Tensor, transform: Callable[[Tensor], Tensor]
 ) -> None:
-    """Transform an image and its successor in some rows of a batch, both by one call.
+    """Transform an image and the next image in some rows of a batch by one call.
 
     Args:
         tensordict: batch [B]; gets new tensors under ``key`` and ("next", ``key``).
         key: of the image.
         rows: int64 [R], on the batch's device.
-        transform: from [R, 2 C, H, W], both images as channels of one, to the same shape.
+        transform: maps [R, 2 C, H, W], both images concatenated along the channels, to the same
+            shape.
     """
     image = tensordict[key]
     images = torch.cat([image, tensordict[keys.NEXT, key]], dim=1)
@@ -101,7 +102,7 @@ def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
     """Refuse images for which no transformation is defined.
 
     Raises:
-        ValueError: an image has a camera's axes.
+        ValueError: an image has the axes of a fixed camera.
     """
     unknown = [key for key, image in images.items() if image.frame == "camera"]
     if unknown:
@@ -112,12 +113,12 @@ def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
 
 
 class SO2Augmentation(nn.Module):
-    """Rotates images, next images and (dx, dy) of sampled transitions, each by a random angle.
+    """Rotates images, next images and (dx, dy) of each transition by a random angle.
 
-    It replaces the rotated copies that the reference stores beside each transition (appendix G.2,
-    "augmentation buffer"): four copies and the original are a probability of 0.8. The gripper, z
-    and yaw components are unchanged, and so are images in the gripper's axes. Another call on the
-    same batch gives another view.
+    It replaces the rotated copies that the reference stores with each transition (appendix G.2,
+    "augmentation buffer"): four copies and the original correspond to a probability of 0.8. The
+    gripper, z and yaw components and images with the gripper's axes are unchanged. Each call on the
+    same batch draws new angles.
 
     Args:
         images: declarations of the images by key.
@@ -147,11 +148,12 @@ class SO2Augmentation(nn.Module):
         self.probability = probability
         self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
         self._plane = [action_sequence.index("x"), action_sequence.index("y")]
-        # On the CPU for any device of the batch, so that a seed gives the same angles on all.
+        # On the CPU for any device of the batch, so that the angles of a seed are the same on all
+        # devices.
         self._generator = torch.Generator().manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return a batch of transitions [B] with some rotated; the input is not changed.
+        """Return a copy of a batch of transitions [B] with some of them rotated.
 
         Args:
             tensordict: holds the images, their successors and ``action``.

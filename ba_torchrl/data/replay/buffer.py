@@ -1,4 +1,4 @@
-"""The replay: each image once, compressed, behind TorchRL's own replay buffer."""
+"""A TorchRL replay buffer that stores each image once and compressed."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))
 
 
 class FrameStorage(LazyTensorStorage):
-    """A TorchRL storage that keeps each image once, as a step's observation and as its next one.
+    """A TorchRL storage that stores an image once, also where it is both an image and a next image.
 
-    All other entries are ordinary columns. Images are stored as their codec's codes, compressed
-    without loss, and come out within the codec's error.
+    All other entries are ordinary columns. Images are stored as codes of their codec, compressed
+    without loss; the error of a returned image is the codec's error.
 
     Args:
         max_size: number of transitions.
-        codecs: codec of each image by its key, such as ``pixels``; also of the image of the same
-            key in "next".
+        codecs: codec of each image by its key, such as ``pixels``; also used for the same key in
+            "next".
 
     Raises:
-        ValueError: there is no image.
+        ValueError: ``codecs`` is empty.
     """
 
     def __init__(self, max_size: int, codecs: Mapping[str, ImageCodec]) -> None:
@@ -61,33 +61,34 @@ class FrameStorage(LazyTensorStorage):
         """Store transitions.
 
         Args:
-            cursor: their indices.
-            data: one transition for an int, else a batch of them.
-            set_cursor: whether the storage's length grows with them, as for a writer.
+            cursor: indices of the transitions.
+            data: one transition if ``cursor`` is an int, else a batch of them.
+            set_cursor: whether the storage's length is extended to these indices, as for a writer.
         """
         if isinstance(cursor, int) or (isinstance(cursor, Tensor) and not cursor.ndim):
             cursor, data = [int(cursor)], data.unsqueeze(0)
-        places = torch.arange(self.max_size)[cursor] if isinstance(cursor, slice) else cursor
-        places = torch.as_tensor(places, dtype=torch.long)
-        if len(places) > self.max_size:  # each index once, with the last
-            places, data = places[-self.max_size :], data[-self.max_size :]
-        super().set(places, data.exclude(*self.frame_keys), set_cursor=set_cursor)
+        indices = torch.arange(self.max_size)[cursor] if isinstance(cursor, slice) else cursor
+        indices = torch.as_tensor(indices, dtype=torch.long)
+        if len(indices) > self.max_size:  # keep the last of each index
+            indices, data = indices[-self.max_size :], data[-self.max_size :]
+        super().set(indices, data.exclude(*self.frame_keys), set_cursor=set_cursor)
         for number, (key, codec) in enumerate(self.codecs.items()):
             images = [data.get(nested).cpu() for nested in (key, (keys.NEXT, key))]
             if key not in self._frames:
                 self._frames[key] = FrameTable(codec.encode(images[0][:1]).shape[1:])
-            self._store_frames(places, images, codec, self._frames[key], self._slots[number])
+            self._store_frames(indices, images, codec, self._frames[key], self._slots[number])
 
     @staticmethod
     def _store_frames(
-        places: Tensor, images: list[Tensor], codec: ImageCodec, frames: FrameTable, slots: Tensor
+        indices: Tensor, images: list[Tensor], codec: ImageCodec, frames: FrameTable, slots: Tensor
     ) -> None:
         slots = slots.numpy()
-        for row, place in enumerate(places.tolist()):
-            # One by one: a single image is too small for torch to start its threads, which costs
-            # milliseconds while environments keep the cores busy.
+        for row, place in enumerate(indices.tolist()):
+            # One image at a time: torch starts no threads for a single image. Threads cost
+            # milliseconds while the environments use all cores.
             codes = [codec.encode(image[row]).flatten().numpy() for image in images]
-            # Acquired before the old ones are released, so that a frame in both stays.
+            # New frames are acquired before the old ones are released, so that a frame in both is
+            # not freed.
             new = [frames.acquire(code) for code in codes]
             for slot in slots[place].tolist():
                 if slot >= 0:
@@ -95,12 +96,12 @@ class FrameStorage(LazyTensorStorage):
             slots[place] = new
 
     def get(self, index: int | Sequence[int] | slice | Tensor) -> TensorDictBase:
-        """Return transitions, images decoded.
+        """Return transitions with decoded images.
 
-        A slice over the whole storage decodes every image; ``column`` decodes none.
+        A slice over the whole storage decodes every image; `column` decodes none.
 
         Args:
-            index: which.
+            index: of the transitions.
         """
         data = super().get(index).copy()
         for number, (key, codec) in enumerate(self.codecs.items()):
@@ -111,13 +112,13 @@ class FrameStorage(LazyTensorStorage):
         return data
 
     def column(self, key: NestedKey) -> Tensor:
-        """Return one entry, not an image, of all transitions stored: a view.
+        """Return a view of one entry of all stored transitions; images have no column.
 
         Args:
-            key: the entry.
+            key: of the entry.
 
         Raises:
-            KeyError: it is not stored.
+            KeyError: the entry is not stored.
         """
         if not self.initialized:
             raise KeyError(f"{key!r}: the replay is empty")
@@ -125,7 +126,7 @@ class FrameStorage(LazyTensorStorage):
 
     @property
     def image_types(self) -> dict[str, tuple[torch.dtype, torch.Size]]:
-        """Type and shape of each image by key, once one is stored."""
+        """Type and shape of each image by key; empty before the first transition is stored."""
         decoded = {
             key: self.codecs[key].decode(torch.zeros(table.shape, dtype=torch.uint8))
             for key, table in self._frames.items()
@@ -134,12 +135,12 @@ class FrameStorage(LazyTensorStorage):
 
     @property
     def frame_count(self) -> int:
-        """Number of different frames held, of all keys together."""
+        """Number of distinct frames of all keys."""
         return sum(len(frames) for frames in self._frames.values())
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory in use; reserved pages that were never written are not counted."""
+        """Bytes of memory in use, without reserved pages that were never written."""
         if not self._frames:
             return 0
         row = sum(
@@ -155,7 +156,7 @@ class FrameStorage(LazyTensorStorage):
             frames.clear()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return columns, frames and their assignment; they are views and must not be changed."""
+        """Return columns, frames and slots of the frames. They are views: do not modify them."""
         if not self.initialized:
             return {"size": 0}
         size = len(self)
@@ -182,10 +183,10 @@ class FrameStorage(LazyTensorStorage):
         """Restore the columns and frames of a ``state_dict``.
 
         Args:
-            state_dict: of a storage with at most this one's capacity.
+            state_dict: of a storage that holds at most this storage's capacity.
 
         Raises:
-            ValueError: it holds more transitions than fit, or other images.
+            ValueError: it holds too many transitions, or images with other keys.
         """
         size = state_dict["size"]
         if size > self.max_size:
@@ -213,29 +214,28 @@ class FrameStorage(LazyTensorStorage):
             )
 
     def dumps(self, path: str | Path) -> None:
-        """Write the contents into a folder, made if missing."""
+        """Write the contents into a folder, which is created if needed."""
         Path(path).mkdir(parents=True, exist_ok=True)
         torch.save(self.state_dict(), Path(path) / "frames.pt")
 
     def loads(self, path: str | Path) -> None:
         """Read the contents from a folder that ``dumps`` wrote."""
-        # Mapped, so that the frames do not pass through memory twice.
+        # Memory-mapped, so that the frames are not held in memory twice.
         self.load_state_dict(torch.load(Path(path) / "frames.pt", weights_only=True, mmap=True))
 
 
 class FrameReplayBuffer(TensorDictReplayBuffer):
-    """TorchRL's buffer on a `FrameStorage`, which checks transitions and keeps demonstrations.
+    """A replay buffer on a `FrameStorage` that checks transitions and keeps demonstrations.
 
-    The first transitions fix the entries, types and shapes; later ones must have the same, since
-    TorchRL would keep stale values where one is missing. Transitions whose ``fault`` flag is set
-    are left out and counted in ``faults_dropped``; the flag itself is not stored. Once the buffer
-    is full, new transitions overwrite the oldest ones that are no demonstrations. The input is not
-    changed.
+    Entries, types and shapes of the first transitions are required of all later ones, because
+    TorchRL would keep stale values of a missing entry. Transitions whose ``fault`` flag is set are
+    dropped and counted in ``faults_dropped``; the flag is not stored. When the buffer is full, new
+    transitions overwrite the oldest ones that are not demonstrations. The input is not modified.
 
     Args:
         storage: the frame storage.
-        sampler: TorchRL's or ours.
-        batch_size: of a sample; None where every call gives it.
+        sampler: a TorchRL sampler.
+        batch_size: of a sample; None if each call of ``sample`` passes it.
         generator: source of uniform draws.
     """
 
@@ -272,14 +272,14 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
         return self.extend(data.unsqueeze(0))
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
-        """Store transitions, faults left out.
+        """Store transitions and drop those with a fault.
 
         Args:
             tensordicts: transitions [N].
             update_priority: see TorchRL.
 
         Returns:
-            Indices of those that were stored, int64 [M], M <= N.
+            Indices of the stored transitions, int64 [M], M <= N.
 
         Raises:
             ReplaySchemaError: entries, types or shapes are not those of the stored ones.
@@ -299,7 +299,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             data = data[sound]
         if not len(data):
             return torch.zeros(0, dtype=torch.long)
-        data = self.writer.fitting(data)
+        data = self.writer.select_fitting(data)
         return super().extend(data, update_priority=update_priority)
 
     def _check_schema(self, data: TensorDictBase) -> None:
@@ -323,7 +323,7 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             )
 
     def _schema(self) -> dict[NestedKey, tuple[torch.dtype, torch.Size]] | None:
-        """Return type and shape of every entry stored, None while there is none."""
+        """Return type and shape of every stored entry, None if the buffer is empty."""
         storage: FrameStorage = self.storage
         if not storage.initialized:
             return None
@@ -352,14 +352,14 @@ def make_replay_buffer(
     weight_exponent: float = 0.4,
     expert_bonus: float = 1.0,
 ) -> FrameReplayBuffer:
-    """Return an empty replay from which transitions are drawn uniformly or by priority (G.2).
+    """Return an empty replay buffer with uniform or prioritised sampling (appendix G.2).
 
     Args:
         capacity: number of transitions.
-        batch_size: of a sample; None where every call gives it.
+        batch_size: of a sample; None if each call of ``sample`` passes it.
         codecs: codec of each image by key; the acting policy must use the same.
         seed: of the draws.
-        prioritized: draw by TD error with the bonus of demonstrations, else uniformly.
+        prioritized: sample by TD error with a bonus for demonstrations, else uniformly.
         priority_exponent: alpha.
         weight_exponent: beta at the start of the run; ``buffer.sampler.anneal`` raises it.
         expert_bonus: added to the priority of demonstrations.

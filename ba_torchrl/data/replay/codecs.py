@@ -1,4 +1,4 @@
-"""Codecs: how the replay stores images, applied to what the acting policy sees, too."""
+"""Codecs of images in the replay, which are also applied to the acting policy's images."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from ba_torchrl.envs.images import ImageSpec
 class ImageCodec(Protocol):
     """Maps images to uint8 codes and back; equal images have equal codes.
 
-    As a module it encodes and decodes, so that a policy sees what the replay returns.
+    Called as a module, it encodes and decodes an image, so that the acting policy sees the same
+    images as the replay returns.
     """
 
     def encode(self, image: Tensor) -> Tensor:
-        """Return uint8 codes; leading dimensions stay as they are."""
+        """Return uint8 codes with the same leading dimensions."""
         ...
 
     def decode(self, codes: Tensor) -> Tensor:
@@ -27,18 +28,18 @@ class ImageCodec(Protocol):
         ...
 
     def __call__(self, image: Tensor) -> Tensor:
-        """Return the image that is stored for this one, in its type."""
+        """Return the decoded code of an image, in the image's type."""
         ...
 
 
 def make_codecs(images: Mapping[str, ImageSpec]) -> dict[str, ImageCodec]:
-    """Return the codec of each image that its declaration asks for, by key.
+    """Return the codec that each image's declaration specifies, by key.
 
     Args:
         images: declarations by key.
 
     Raises:
-        ValueError: an image has values that its storage cannot hold.
+        ValueError: an image has values that its storage cannot represent.
     """
     return {key: _make_codec(key, image) for key, image in images.items()}
 
@@ -60,7 +61,7 @@ def _make_codec(key: str, image: ImageSpec) -> ImageCodec:
 
 
 class Uint8Images(nn.Module):
-    """Images that are uint8 already, stored as they are."""
+    """The identity codec of uint8 images."""
 
     def encode(self, image: Tensor) -> Tensor:
         """Return the image.
@@ -84,7 +85,7 @@ class Uint8Images(nn.Module):
 class DepthQuantizer(nn.Module):
     """Depth images as uint8, in 255 equal steps over [0, high_m].
 
-    Depth outside the range is clipped; zero, the value of the fingers, is exact.
+    Depth outside the range is clipped. Zero, the value of the fingers, is exact.
 
     Args:
         high_m: largest depth, metres.
@@ -101,7 +102,7 @@ class DepthQuantizer(nn.Module):
 
     @property
     def step_m(self) -> float:
-        """Distance between neighbouring values, metres."""
+        """Quantisation step, metres."""
         return self.high_m / 255
 
     @property
@@ -121,8 +122,8 @@ class DepthQuantizer(nn.Module):
         if not depth.is_floating_point():
             raise TypeError(f"depth must be floating point metres, got {depth.dtype}")
         codes = depth.float().clamp(0, self.high_m) * (255 / self.high_m)
-        # Not round(): it wakes torch's threads even for one small image, which takes ten
-        # milliseconds while environments or updates keep the cores busy.
+        # Not round(), which starts torch's threads even for one small image. That takes ten
+        # milliseconds while environments or updates use all cores.
         return codes.add_(0.5).to(torch.uint8)
 
     def decode(self, codes: Tensor) -> Tensor:
@@ -130,7 +131,7 @@ class DepthQuantizer(nn.Module):
         return codes.to(torch.float32).mul_(self.step_m)
 
     def forward(self, depth: Tensor) -> Tensor:
-        """Return the nearest storable depth, in the type of the input."""
+        """Return the quantised depth, in the type of the input."""
         return self.decode(self.encode(depth)).to(depth.dtype)
 
     def extra_repr(self) -> str:
@@ -139,7 +140,7 @@ class DepthQuantizer(nn.Module):
 
 
 class HalfPrecision(nn.Module):
-    """Heights as float16: two bytes each, with an error of at most a 2048th of the height.
+    """Heights as float16: two bytes each, with a relative error of at most 1/2048.
 
     Args:
         high_m: largest height, metres.
@@ -174,7 +175,7 @@ class HalfPrecision(nn.Module):
         return codes.view(torch.float16).float()
 
     def forward(self, image: Tensor) -> Tensor:
-        """Return the nearest storable heights, in the type of the input."""
+        """Return the heights rounded to float16, in the type of the input."""
         return image.half().to(image.dtype)
 
     def extra_repr(self) -> str:

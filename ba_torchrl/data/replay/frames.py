@@ -1,4 +1,4 @@
-"""A table of compressed images, in which equal images are stored once."""
+"""A table of compressed images that stores equal images once."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 
 _LEVEL = 1
-"""Of zlib. Rendered depth becomes fifty times smaller; higher levels are slower and gain little."""
+"""Level of zlib: it compresses rendered depth fifty-fold, and higher ones gain little."""
 _BYTES_PER_FRAME = 100
-"""Of slot, count and index entry in CPython, without the frame itself."""
+"""Memory of a frame's slot, count and index entry in CPython, without the compressed frame."""
 
 
 class FrameTable:
     """Reference-counted uint8 frames, compressed and indexed by their content.
 
-    Equal frames share a slot: a step's next image and the following step's image, in any order of
-    environments, demonstrations and resets. Frames that do not compress take their full size.
+    Equal frames share a slot, such as the next image of a step and the image of the following step,
+    in any order of insertion. Incompressible frames take their full size.
 
     Args:
         shape: of one frame.
@@ -39,7 +39,7 @@ class FrameTable:
         self._packed_bytes = 0
 
     def __len__(self) -> int:
-        """Number of frames held."""
+        """Number of stored frames."""
         return len(self._slots)
 
     @property
@@ -48,7 +48,7 @@ class FrameTable:
         return self._packed_bytes + _BYTES_PER_FRAME * len(self._packed)
 
     def acquire(self, frame: np.ndarray) -> int:
-        """Return the slot of a frame and count one more use; the frame is stored if it is new.
+        """Return the slot of a frame, stored if it is new, and increment the count of its uses.
 
         Args:
             frame: uint8 of one frame's size, flat and contiguous.
@@ -70,7 +70,7 @@ class FrameTable:
         return slot
 
     def release(self, slot: int) -> None:
-        """Count one use of a slot less; without uses it becomes free."""
+        """Decrement the count of a slot's uses; a slot without uses is freed."""
         self._counts[slot] -= 1
         if self._counts[slot] == 0:
             packed, self._packed[slot] = self._packed[slot], b""

@@ -1,4 +1,4 @@
-"""The one place where a replay is chosen."""
+"""Construction of the replay that a configuration names."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.symmetric import SymmetricReplay
 
 ReplayKind = Literal["uniform", "prioritized", "symmetric"]
-"""How a batch is drawn: uniformly; by TD error, with a bonus for demonstrations; or half of it
-from the demonstrations and half from the other transitions, uniformly each."""
+"""How a batch is drawn: uniformly; by TD error with a bonus for demonstrations; or half of it
+uniformly from the demonstrations and half uniformly from the other transitions."""
 
 
 def make_replay(
@@ -29,12 +29,12 @@ def make_replay(
 
     Args:
         kind: how a batch is drawn.
-        capacity: number of transitions; of a symmetric replay, of each half.
+        capacity: number of transitions; for a symmetric replay, in each half.
         batch_size: of a sample.
         codecs: codec of each image by key.
         seed: of the draws.
         priority_exponent: alpha of a prioritised replay.
-        weight_exponent: its beta at the start of the run.
+        weight_exponent: initial beta of a prioritised replay.
         expert_bonus: added to the priority of demonstrations.
     """
     if kind == "symmetric":

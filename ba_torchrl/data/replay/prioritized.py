@@ -22,20 +22,19 @@ _FILE = "sampler.pt"
 class ExpertPrioritizedSampler(PrioritizedSampler):
     """Prioritised sampling that prefers demonstrations (appendix G.2).
 
-    A transition is drawn in proportion to (|td| + eps + bonus * is_expert) ^ alpha. New ones
-    get the largest |td| seen so far; the bonus is kept out of that maximum, which would
-    otherwise grow by one bonus per insertion. A draw comes with the weight
-    ``priority_weight`` = (p / p_min) ^ -beta, in (0, 1]; the loss divides it by the batch's
-    largest.
+    A transition is drawn in proportion to (|td| + eps + bonus * is_expert) ^ alpha. New transitions
+    get the largest |td| so far. That maximum excludes the bonus, since it would otherwise grow by
+    one bonus per insertion. Each draw has the importance weight ``priority_weight`` = (p / p_min) ^
+    -beta, in (0, 1]; the loss divides it by the batch's largest.
 
     Args:
         max_capacity: number of transitions of the storage, over all its dimensions.
         generator: source of every draw.
         alpha: exponent of the priorities.
-        beta: exponent of the weights at the start of a run; ``anneal`` raises it to one.
+        beta: initial exponent of the weights; ``anneal`` raises it to one.
         eps: added to every priority.
         expert_bonus: added to the priority of demonstrations.
-        expert_key: entry that flags them.
+        expert_key: entry with the flag of demonstrations.
 
     Raises:
         ValueError: an exponent or the bonus is negative, or ``eps`` is not positive.
@@ -65,10 +64,10 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         self._initial_beta = beta
 
     def anneal(self, fraction: float) -> None:
-        """Set beta between its first value and one.
+        """Interpolate beta between its initial value and one.
 
         Args:
-            fraction: of the run that is over; clipped to [0, 1].
+            fraction: elapsed fraction of the run; clipped to [0, 1].
         """
         fraction = min(max(fraction, 0.0), 1.0)
         self.beta = self._initial_beta + (1.0 - self._initial_beta) * fraction
@@ -112,11 +111,13 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         Args:
             index: of the transitions: [N], or for a storage of several dimensions [N, ndim] or a
                 tuple of tensors [N].
-            priority: absolute TD error of each, or one for all; without the bonus.
-            storage: holds the expert flags; TorchRL's buffers pass it.
+            priority: absolute TD error of each transition, or a single one for all; without the
+                bonus.
+            storage: storage with the expert flags, which TorchRL's buffers pass.
 
         Raises:
-            ValueError: a priority is not finite, or the storage is needed and missing.
+            ValueError: a priority is not finite, or the storage is missing and the bonus is not
+                zero.
         """
         index = _flat_index(index, storage)
         if not index.numel():
@@ -169,7 +170,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
                 f"the saved sampler has capacity {leaves.numel()}, this one {self._max_capacity}"
             )
         self._init()
-        written = leaves.nonzero().reshape(-1)  # every leaf of a transition is positive
+        written = leaves.nonzero().reshape(-1)  # priorities of stored transitions are positive
         if written.numel():
             self._sum_tree[written] = leaves[written]
             self._min_tree[written] = leaves[written]
@@ -179,7 +180,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         self.generator.set_state(state_dict["generator"].cpu())
 
     def dumps(self, path: str | Path) -> None:
-        """Write the state into a folder, made if missing."""
+        """Write the state into a folder, which is created if needed."""
         Path(path).mkdir(parents=True, exist_ok=True)
         torch.save(self.state_dict(), Path(path) / _FILE)
 

@@ -1,7 +1,7 @@
-"""NumPy stand-ins for TorchRL's native segment trees.
+"""NumPy replacements of TorchRL's native segment trees.
 
-No published torchrl wheel has an extension that loads against torch 2.13, and prioritised replay
-needs its trees. ``install`` fills the gap where, and only where, the native ones are missing.
+Prioritised replay needs the trees of TorchRL's native extension, and no published torchrl wheel has
+an extension that loads with torch 2.13. ``install`` replaces only trees that did not load.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from torchrl.data.replay_buffers.samplers import prioritized
 
 
 class SegmentTree:
-    """Leaves with a running reduction over any range, updated and searched in batches.
+    """Leaves with a reduction over any range, updated and searched in batches.
 
-    A heap in one array: node i has the children 2 i and 2 i + 1, the leaves are the last half.
-    Values are float64 inside, for sums over many leaves, and come out in ``dtype``.
+    A binary heap in an array: node i has the children 2 i and 2 i + 1, and the leaves are the
+    second half. Values are stored as float64, for sums over many leaves, and returned in ``dtype``.
 
     Args:
         capacity: number of leaves.
@@ -23,12 +23,12 @@ class SegmentTree:
 
     dtype = torch.float64
     reduce = np.add
-    neutral = 0.0
+    identity = 0.0
 
     def __init__(self, capacity: int) -> None:
         self.capacity = int(capacity)
         self._leaves = 1 << max(0, self.capacity - 1).bit_length()
-        self._nodes = np.full(2 * self._leaves, self.neutral)
+        self._nodes = np.full(2 * self._leaves, self.identity)
 
     def __len__(self) -> int:
         return self.capacity
@@ -50,7 +50,7 @@ class SegmentTree:
         nodes = self._nodes
         node = node + self._leaves
         nodes[node] = np.asarray(value, dtype=np.float64).reshape(-1)
-        if 8 * node.size > self._leaves:  # then whole levels are cheaper than their paths
+        if 8 * node.size > self._leaves:  # recomputing whole levels is faster than single paths
             level = self._leaves
             while level > 1:
                 nodes[level // 2 : level] = self.reduce(
@@ -72,7 +72,7 @@ class SegmentTree:
         nodes = self._nodes
         if start <= 0 and stop >= self.capacity:
             return float(nodes[1])
-        result = self.neutral
+        result = self.identity
         left, right = max(start, 0) + self._leaves, min(stop, self.capacity) + self._leaves
         while left < right:
             if left & 1:
@@ -86,13 +86,13 @@ class SegmentTree:
 
 
 class SumTree(SegmentTree):
-    """Sums, and the search that turns a uniform draw into a leaf."""
+    """Sums, and the search for the leaf of a uniform draw."""
 
     def scan_lower_bound(self, mass: float | np.ndarray | torch.Tensor) -> int | torch.Tensor:
         """Return the first leaf whose inclusive prefix sum reaches ``mass``.
 
         Args:
-            mass: in [0, total]; beyond it the answer is the last leaf, or the capacity.
+            mass: in [0, total]; for larger values the result is the last leaf, or the capacity.
         """
         rest = np.atleast_1d(np.asarray(mass, dtype=np.float64)).copy()
         node = np.ones(rest.shape, dtype=np.int64)
@@ -109,22 +109,22 @@ class MinTree(SegmentTree):
     """Minima."""
 
     reduce = np.minimum
-    neutral = np.inf
+    identity = np.inf
 
 
 class SumTreeFp32(SumTree):
-    """Sums, read as float32."""
+    """Sums, returned as float32."""
 
     dtype = torch.float32
 
 
 class MinTreeFp32(MinTree):
-    """Minima, read as float32."""
+    """Minima, returned as float32."""
 
     dtype = torch.float32
 
 
-_STAND_INS = {
+_REPLACEMENTS = {
     "SumSegmentTreeFp32": SumTreeFp32,
     "SumSegmentTreeFp64": SumTree,
     "MinSegmentTreeFp32": MinTreeFp32,
@@ -133,7 +133,7 @@ _STAND_INS = {
 
 
 def install() -> None:
-    """Give TorchRL's prioritised sampler these trees where its native ones did not load."""
-    for name, stand_in in _STAND_INS.items():
+    """Set these trees in TorchRL's prioritised sampler where the native ones did not load."""
+    for name, replacement in _REPLACEMENTS.items():
         if getattr(prioritized, name) is None:
-            setattr(prioritized, name, stand_in)
+            setattr(prioritized, name, replacement)

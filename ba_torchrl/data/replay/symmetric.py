@@ -21,10 +21,10 @@ _NAMES = ("expert", "online")
 class SymmetricReplay(ReplayBufferEnsemble):
     """Half of every batch from demonstrations, half from online transitions (appendix G.1).
 
-    Demonstrations are never overwritten. While one buffer is empty, the other fills the batch; an
-    odd transition comes from the demonstrations. TorchRL's ensemble and its
-    ``OfflineToOnlineReplayBuffer`` draw from a generator that both buffers share, or from the
-    global one, and only even batches; here each buffer has a generator of its own.
+    Demonstrations are never overwritten. While one buffer is empty, the whole batch is drawn from
+    the other. A batch of odd size has one demonstration more. In TorchRL's ensemble and
+    ``OfflineToOnlineReplayBuffer``, both buffers share a generator or use the global one, and
+    batches have even sizes; here each buffer has a separate generator.
 
     Args:
         capacity: number of online transitions, and of demonstrations.
@@ -42,21 +42,21 @@ class SymmetricReplay(ReplayBufferEnsemble):
         )
         super().__init__(self.expert, self.online, batch_size=batch_size, collate_fn=torch.cat)
         for buffer in (self.expert, self.online):
-            buffer.set_rng(buffer._rng)  # the ensemble has given its own to the samplers
+            buffer.set_rng(buffer._rng)  # the ensemble has replaced the samplers' generators
 
     def __len__(self) -> int:
         """Number of transitions in both buffers."""
         return len(self.expert) + len(self.online)
 
     def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> None:
-        """Add transitions [N], each to the buffer that its ``is_expert`` flag names.
+        """Add transitions [N], each to the buffer that its ``is_expert`` flag selects.
 
         Args:
             data: transitions.
             update_priority: see TorchRL; the buffers have no priorities.
 
         Raises:
-            ConfigError: there is no room for more demonstrations.
+            ConfigError: the new demonstrations exceed the free capacity.
             ReplaySchemaError: entries, types or shapes are not those of the stored ones.
         """
         is_expert = data[keys.IS_EXPERT].reshape(-1)
@@ -88,7 +88,7 @@ class SymmetricReplay(ReplayBufferEnsemble):
         return torch.cat([buffer.sample(count) for buffer, count in counts if count]), {}
 
     def dumps(self, path: str | Path) -> None:
-        """Write both buffers into a folder, made if missing."""
+        """Write both buffers into a folder, which is created if needed."""
         for name, buffer in self._buffers():
             buffer.dumps(Path(path) / name)
 

@@ -1,4 +1,4 @@
-"""The replay's writer: round robin, except that demonstrations are never overwritten."""
+"""A round-robin writer of the replay that never overwrites demonstrations."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from ba_torchrl.errors import ConfigError
 
 
 class ExpertKeepingWriter(TensorDictRoundRobinWriter):
-    """TorchRL's round-robin writer until the storage is full; then it skips demonstrations.
+    """TorchRL's round-robin writer, which skips demonstrations when the storage is full.
 
-    A transition whose ``is_expert`` flag is set is never overwritten; others overwrite the oldest
-    ones without it. Data without the flag are written as TorchRL does.
+    A new transition overwrites the oldest one whose ``is_expert`` flag is not set. Data without
+    this entry are written as by TorchRL's writer.
     """
 
-    def fitting(self, data: TensorDictBase) -> TensorDictBase:
-        """Return the transitions that there is room for: all demonstrations, the newest others.
+    def select_fitting(self, data: TensorDictBase) -> TensorDictBase:
+        """Return the transitions that fit: all demonstrations, and the newest of the others.
 
         Args:
             data: transitions [N].
 
         Raises:
-            ConfigError: the demonstrations, stored and new, leave no room.
+            ConfigError: stored and new demonstrations exceed the capacity.
         """
-        places = self._places(data)
-        excess = 0 if places is None else len(data) - len(places)
+        indices = self._writable_indices(data)
+        excess = 0 if indices is None else len(data) - len(indices)
         if excess <= 0:
             return data
         others = (~data[keys.IS_EXPERT].reshape(-1)).nonzero().reshape(-1)
-        if not len(places) or excess > len(others):
+        if not len(indices) or excess > len(others):
             raise ConfigError(
                 f"demonstrations fill the replay of {self._storage.max_size} transitions, and "
                 f"{len(data)} more do not fit; raise buffer_size"
@@ -42,11 +42,11 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         return data[is_chosen]
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Write transitions [N] that `fitting` returned; return their indices, int64 [N]."""
-        places = self._places(data)
-        if places is None:
+        """Write transitions [N] that `select_fitting` returned; return their indices, int64 [N]."""
+        indices = self._writable_indices(data)
+        if indices is None:
             return super().extend(data)
-        index = places[: len(data)]
+        index = indices[: len(data)]
         self._cursor = (int(index[-1]) + 1) % self._storage.max_size
         self._write_count += len(data)
         data.set("index", index)
@@ -54,8 +54,9 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         self._mark_update_entities(index)
         return index
 
-    def _places(self, data: TensorDictBase) -> Tensor | None:
-        """Return the indices that can be written, the oldest first; None for all, in turn."""
+    def _writable_indices(self, data: TensorDictBase) -> Tensor | None:
+        """Return the indices that can be overwritten, oldest first; None if TorchRL's order
+        applies."""
         storage = self._storage
         if len(storage) + len(data) <= storage.max_size or keys.IS_EXPERT not in data:
             return None

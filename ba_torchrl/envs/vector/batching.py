@@ -1,4 +1,4 @@
-"""Seeds and checks of actions, common to all vectors of environments."""
+"""Seeding and validation of actions, common to all vectors of environments."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ba_torchrl.envs.checks import check_actions
 
 
 class SeededVector:
-    """Mix-in of both kinds of vectors: seeds of the environments and the check of actions."""
+    """Mix-in of both vectors: seeds of the environments and validation of actions."""
 
     _base_seed: int | None = None
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int:
-        """Seed environment i with ``seed + i``; return a seed for the next vector.
+        """Seed environment i with ``seed + i``; return the seed for the next vector.
 
         Raises:
             ValueError: ``seed`` is not a natural number.

@@ -33,18 +33,19 @@ def make_vector_env(
 
     Args:
         make_env: builds one environment, or a list with one such function per environment. A
-            `functools.partial` of an importable function or class suits every start method.
+            `functools.partial` of an importable function or class works with every start method.
         num_envs: number of environments.
-        seed: environment i is seeded with ``seed + i``, in this process and in workers alike.
+        seed: environment i is seeded with ``seed + i``, both in this process and in workers.
         parallel: whether each environment runs in a separate process.
         start_method: how processes start. "fork" takes milliseconds and needs a parent without an
             open simulator and without CUDA; "spawn" takes seconds and has no such condition.
-        num_threads: torch threads of this process while the environments are open; None for no
-            change.
+        num_threads: number of torch threads of this process while the environments are open; None
+            for no change.
         use_buffers: whether data pass through shared memory (the default, faster for steps of a
             few milliseconds) or through pipes.
         timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: consecutive replacements of a worker without a completed step.
+        max_restarts: largest number of consecutive replacements of a worker without a completed
+            step.
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.
@@ -74,7 +75,7 @@ def make_vector_env(
 
 
 class SerialVectorEnv(SeededVector, SerialEnv):
-    """Environments that step one after the other in this process."""
+    """Environments that step sequentially in this process."""
 
     def _seed_env(self, index: int, seed: int) -> None:
         self._envs[index].set_seed(seed, static_seed=True)

@@ -1,4 +1,4 @@
-"""VectorEnv: TorchRL's ParallelEnv with workers that are replaced when they fail."""
+"""VectorEnv: TorchRL's ParallelEnv, with replacement of failed workers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 MakeEnv = Callable[[], EnvBase]
 
 _HEALTH_CHECK_S = 5e-3
-_LOSS = {
+_LOST_STEP = {
     keys.REWARD: 0,
     keys.TERMINATED: False,
     keys.TRUNCATED: True,
@@ -38,18 +38,19 @@ _LOSS = {
 
 
 class VectorEnv(SeededVector, ParallelEnv):
-    """Environments in worker processes; a worker that raises, dies or hangs is replaced.
+    """Environments in worker processes; a worker that raises, ends or hangs is replaced.
 
     The other workers keep their episodes. For the environment of the failed worker, the step
     returns the last valid observation with ``fault``, ``truncated`` and ``done`` set and a reward
-    of zero; TorchRL then resets it like any finished one. Actions are checked in this process
-    before they are sent. ``restarts`` counts the replacements.
+    of zero; TorchRL then resets it like any environment that is done. Actions are validated in this
+    process before they are sent. ``restarts`` counts the replacements.
 
     Args:
         num_workers: number of environments.
         create_env_fn: builds one environment, or one such function per environment.
         timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: consecutive replacements of a worker without a completed step.
+        max_restarts: largest number of consecutive replacements of a worker without a completed
+            step.
         parallel_options: further options of `torchrl.envs.ParallelEnv`.
 
     Raises:
@@ -75,7 +76,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         self.restarts = 0
         self._failures_in_a_row = [0] * num_workers
         self._replacements = [0] * num_workers  # since the last seed
-        self._lost: set[int] = set()  # replaced between two steps, not reported yet
+        self._lost: set[int] = set()  # replaced between two steps, fault not reported yet
         self._threads_before = torch.get_num_threads()
         self.parent_channels: list[Worker] = []
 
@@ -99,7 +100,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         was_open, threads = not self.is_closed, torch.get_num_threads()
         super().close(raise_if_closed=raise_if_closed)
         if was_open:
-            # TorchRL raises the number, on the assumption that it lowered it at the start.
+            # TorchRL increases the number, assuming that it decreased it at the start.
             torch.set_num_threads(threads if self.num_threads is None else self._threads_before)
 
     def __getitem__(self, item: Any) -> EnvBase:
@@ -132,18 +133,18 @@ class VectorEnv(SeededVector, ParallelEnv):
     def _start_workers(self) -> None:
         if self._use_buffers and self._non_tensor_keys:
             raise ValueError(f"use_buffers=False is needed for {self._non_tensor_keys}")
-        # TorchRL raises when it finds a dead process in `_workers`; ours are replaced instead.
+        # TorchRL raises if a process in `_workers` has ended; here it is replaced instead.
         self._workers: list[Any] = []
         self._timeout = self.shutdown_timeout
         self._shm_done_flags = mp.RawArray("b", self.num_workers)
         self._lost.clear()
-        self.event = None  # of CUDA: these environments are on the CPU
+        self.event = None  # TorchRL's CUDA event; these environments are on the CPU
         try:
             for index in range(self.num_workers):
                 self.parent_channels.append(self._launch(index))
             for index, worker in enumerate(self.parent_channels):
                 try:
-                    worker.greet()
+                    worker.wait_until_ready()
                 except WorkerError as error:
                     raise RuntimeError(f"worker {index} could not be started: {error}") from None
         except BaseException:
@@ -201,7 +202,7 @@ class VectorEnv(SeededVector, ParallelEnv):
 
     @contextlib.contextmanager
     def _stepping(self) -> Iterator[None]:
-        """Context of a step: workers that died since the last command report a lost episode."""
+        """Context of a step: workers that ended since the last command report a fault."""
         if self.is_closed:
             self.start()
         self._replace_dead()
@@ -222,7 +223,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 self._lost.add(index)
 
     def _replace(self, index: int, cause: WorkerError, seed: int | None = None) -> None:
-        """Start a new process for worker ``index``; it must be reset before it steps."""
+        """Start and seed a new process for worker ``index``; it must be reset before a step."""
         while True:
             self._failures_in_a_row[index] += 1
             if self._failures_in_a_row[index] > self.max_restarts:
@@ -234,21 +235,21 @@ class VectorEnv(SeededVector, ParallelEnv):
                 )
             self.restarts += 1
             self._replacements[index] += 1
-            # The text only: the traceback of a stored log record would hold the dead worker.
+            # As text: the traceback in a stored log record would keep the ended worker alive.
             logger.warning(
                 "worker %d is replaced (restart %d): %s", index, self.restarts, str(cause)
             )
             self.parent_channels[index].kill()
             worker = self.parent_channels[index] = self._launch(index)
             try:
-                worker.greet()
+                worker.wait_until_ready()
                 _seed(worker, self._new_seed(index) if seed is None else seed)
                 return
             except WorkerError as error:
                 cause = error
 
     def _new_seed(self, index: int) -> int:
-        """Return a seed that no environment has used, the same in every repetition of the run."""
+        """Return an unused seed, which is the same in every repetition of the run."""
         known = self._base_seed is not None
         entropy = [self._base_seed, index, self._replacements[index]] if known else None
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
@@ -266,7 +267,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             self._lost.discard(index)
 
     def _collect(self, indices: list[int]) -> dict[int, WorkerError]:
-        """Wait for the answers of workers; return the errors of those that failed."""
+        """Wait for the answers of workers; return the errors of failed workers by index."""
         pending = set(indices)
         failures: dict[int, WorkerError] = {}
         deadline = time.monotonic() + self.timeout_s
@@ -280,14 +281,14 @@ class VectorEnv(SeededVector, ParallelEnv):
                 failures |= failed
                 pending -= failed.keys()
         except BaseException:
-            # After an interrupt, late answers would be read as those to the next command.
+            # After an interrupt, a late answer would be taken for the answer to the next command.
             for index in pending:
                 self.parent_channels[index].abort()
             raise
         return failures
 
     def _collect_flags(self, pending: set[int]) -> dict[int, WorkerError]:
-        """Remove workers that answered from ``pending``; return the errors of dead ones."""
+        """Remove workers that answered from ``pending``; return the errors of ended workers."""
         flags = self._shm_done_flags
 
         def all_answered() -> bool:
@@ -304,18 +305,18 @@ class VectorEnv(SeededVector, ParallelEnv):
             try:
                 self.parent_channels[index].check()
             except WorkerError as error:
-                if not flags[index]:  # else it answered before it died
+                if not flags[index]:  # else it answered before it ended
                     failures[index] = error
         return failures
 
     def _collect_messages(self, pending: set[int]) -> dict[int, WorkerError]:
-        """The same as `_collect_flags`, for workers that answer through their pipes."""
+        """As `_collect_flags`, for workers that answer through pipes."""
         failures: dict[int, WorkerError] = {}
         workers = {self.parent_channels[index].pipe: index for index in pending}
         for pipe in wait(list(workers), _HEALTH_CHECK_S):
             worker = self.parent_channels[workers[pipe]]
             try:
-                worker.inbox.append(worker.read(0.0))  # TorchRL fetches it from there
+                worker.inbox.append(worker.read(0.0))  # TorchRL reads it from the inbox
                 pending.discard(workers[pipe])
             except WorkerError as error:
                 failures[workers[pipe]] = error
@@ -325,7 +326,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         """Answer the command in ``message`` for an environment that lost its episode."""
         command = message[0]
         if command != "reset":
-            self._write_loss(index)
+            self._write_lost_step(index)
             message = ("reset", (False, {}))
         self.parent_channels[index].muted = False
         if command == "step":  # the environment is done, so the caller resets it
@@ -338,8 +339,8 @@ class VectorEnv(SeededVector, ParallelEnv):
                 return
             self._replace(index, failures[index])
 
-    def _write_loss(self, index: int) -> None:
-        """Write the answer to a step that was not executed."""
+    def _write_lost_step(self, index: int) -> None:
+        """Write the answer to a step that was lost."""
         if self._use_buffers:
             root = self.shared_tensordicts[index]
             answer = root.get("next")
@@ -352,8 +353,8 @@ class VectorEnv(SeededVector, ParallelEnv):
         if root is not None:
             for key in self.observation_keys:
                 answer.get(key).copy_(root.get(key))
-        for key in _LOSS.keys() & set(answer.keys()):
-            answer.get(key).fill_(_LOSS[key])
+        for key in _LOST_STEP.keys() & set(answer.keys()):
+            answer.get(key).fill_(_LOST_STEP[key])
 
 
 def _seed(worker: Worker, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""One worker process of a vector of environments, on the side of the parent process."""
+"""The parent process's handle of a worker process of a vector of environments."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from ba_torchrl.errors import WorkerError
 logger = logging.getLogger(__name__)
 
 _FAILED = "failed"
-_IDLE_TIMEOUT_S = 1e6  # TorchRL's workers give up after 10,000 s without a command
+_IDLE_TIMEOUT_S = 1e6  # by default TorchRL's workers end after 10,000 s without a command
 _START_TIMEOUT_S = 120.0  # a spawned worker imports torch first
-_SPIN_S = 100e-6
-_NAP_S = 30e-6
+_BUSY_WAIT_S = 100e-6
+_POLL_INTERVAL_S = 30e-6
 
 
 class Worker:
     """A process that runs one of TorchRL's worker loops, and the pipe to it.
 
-    It has the interface of the pipe, which TorchRL uses. It stores the last command and answers
-    that were read early, and a broken pipe raises a `WorkerError` when an answer is read.
+    It has the interface of a pipe, which TorchRL expects. It stores the last command and the
+    answers that were read in advance. Reading from a broken pipe raises a `WorkerError`.
 
     Args:
         loop: TorchRL's worker loop.
         options: keyword arguments of ``loop``, except the two ends of the pipe and the event.
-        start_method: "spawn" or "fork"; None means the default of this process.
+        start_method: "spawn" or "fork"; None for the default of this process.
         timeout_s: seconds to wait for an answer.
     """
 
@@ -53,7 +53,7 @@ class Worker:
         self.event = context.Event()
         self.inbox: deque[Any] = deque()
         self.message: tuple[Any, Any] = ("start", None)
-        self.muted = False  # commands are dropped: the episode is lost
+        self.muted = False  # commands are dropped, because the episode is lost
         self._timeout_s = timeout_s
         options = {
             **options,
@@ -61,32 +61,32 @@ class Worker:
             "child_pipe": child_pipe,
             "mp_event": self.event,
         }
-        # Daemonic: it ends with the parent, closed or not.
-        self.process = context.Process(target=_work, args=(loop, options), daemon=True)
+        # Daemonic: it ends with the parent, even without a call of close.
+        self.process = context.Process(target=_run_worker, args=(loop, options), daemon=True)
         self.process.start()
-        child_pipe.close()  # else the pipe stays open when the worker dies
+        child_pipe.close()  # else the pipe stays open when the worker ends
 
     @property
     def command(self) -> str:
         """The name of the last command."""
         return self.message[0]
 
-    def greet(self) -> None:
-        """Wait until the environment is made.
+    def wait_until_ready(self) -> None:
+        """Wait until the environment is built.
 
         Raises:
-            WorkerError: it could not be made.
+            WorkerError: the environment could not be built.
         """
         self.read(_START_TIMEOUT_S)
         self.send(("init", None))
 
     def send(self, message: tuple[Any, Any]) -> None:
-        """Send a command and its argument; reading the answer raises if the worker is dead."""
+        """Send a command and its argument; if the worker has ended, reading the answer raises."""
         self.message = message
         if self.muted:
             return
         try:
-            # Not `send`: it passes tensors as descriptors, which a dead worker never opens.
+            # Not `send`, which passes tensors as file descriptors that an ended worker never opens.
             self.pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
         except OSError as error:
             logger.debug("could not send %r: %s", message[0], error)
@@ -110,13 +110,13 @@ class Worker:
                 raise WorkerError(f"it did not answer {self.command!r} within {timeout_s:g} s")
             message = self.pipe.recv()
         except (EOFError, OSError):
-            raise WorkerError(self._cause_of_death()) from None
+            raise WorkerError(self._exit_reason()) from None
         if isinstance(message, tuple) and message[0] == _FAILED:
             raise WorkerError(f"it raised\n{message[1]}")
         return message
 
     def check(self) -> None:
-        """Drop answers to earlier commands.
+        """Drop answers to earlier commands, and check that the worker runs.
 
         Raises:
             WorkerError: the worker has ended.
@@ -132,7 +132,7 @@ class Worker:
 
     def abort(self) -> None:
         """Kill the process; the next `check` raises."""
-        self.process.kill()  # a hanging simulator handles no other signal
+        self.process.kill()  # a hanging simulator ignores other signals
         self.process.join()
 
     def kill(self) -> None:
@@ -141,7 +141,7 @@ class Worker:
         self.process.close()
         self.pipe.close()
 
-    def _cause_of_death(self) -> str:
+    def _exit_reason(self) -> str:
         self.process.join(1.0)
         code = self.process.exitcode
         if code is None:
@@ -151,8 +151,8 @@ class Worker:
         return f"its process was ended by {signal.Signals(-code).name}"
 
 
-def _work(loop: Callable[..., None], options: dict[str, Any]) -> None:
-    """Run TorchRL's loop in a worker; send its exception, if any, to the parent."""
+def _run_worker(loop: Callable[..., None], options: dict[str, Any]) -> None:
+    """Run TorchRL's loop in a worker process, and send its exception to the parent."""
     # The parent handles interrupts; the worker does not inherit its handlers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -163,16 +163,16 @@ def _work(loop: Callable[..., None], options: dict[str, Any]) -> None:
     except BaseException:
         with contextlib.suppress(OSError):  # the parent has ended
             pipe.send((_FAILED, traceback.format_exc()))
-        os._exit(1)  # the environment is broken: skip its clean-up
+        os._exit(1)  # skip the clean-up of the failed environment
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Poll ``condition``, at first without a pause; return whether it holds before the timeout."""
+    """Poll ``condition``, first by busy waiting; return whether it holds before the timeout."""
     start = time.perf_counter()
     while not condition():
         elapsed = time.perf_counter() - start
         if elapsed > timeout_s:
             return False
-        if elapsed > _SPIN_S:
-            time.sleep(_NAP_S)  # leave the core to the workers
+        if elapsed > _BUSY_WAIT_S:
+            time.sleep(_POLL_INTERVAL_S)  # free the core for the workers
     return True
