@@ -1,1 +1,1 @@
-"""What there is to do: one file per task, each with its goal and expert."""
+"""The tasks: bodies, random initial poses, conditions of success, and experts."""

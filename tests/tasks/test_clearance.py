@@ -1,4 +1,4 @@
-"""Room that a gripper needs, against arithmetic by hand."""
+"""Clearances of a gripper against values computed by hand."""
 
 import math
 from dataclasses import replace
@@ -45,7 +45,7 @@ def cubes():
         yield world.add(shape, "grasped"), world.add(shape, "other")
 
 
-def test_a_gripper_reaches_as_far_as_its_x():
+def test_extents_of_the_gripper_follow_from_its_outline():
     assert GRIPPER.finger_depth_m == pytest.approx(0.014)
     assert GRIPPER.finger_reach_m == 0.06
     tips_only = replace(GRIPPER, outline=((0.0, math.inf), (0.04, -0.01)))
@@ -55,7 +55,7 @@ def test_a_gripper_reaches_as_far_as_its_x():
 
 
 @pytest.mark.parametrize("opening", [0.5, 1.0])
-def test_the_ranges_of_the_fingers(opening):
+def test_finger_ranges_include_both_margins(opening):
     left, right = finger_ranges_m(GRIPPER, opening)
     inner = opening * (0.04 - INNER_MARGIN_M)
     assert right == pytest.approx((inner, 0.06 - (1 - opening) * 0.04 + OUTER_MARGIN_M))
@@ -64,17 +64,17 @@ def test_the_ranges_of_the_fingers(opening):
 
 @pytest.mark.parametrize("gripper", [GRIPPER, WIDE])
 @pytest.mark.parametrize("yaw", [0.0, 0.7])
-def test_wider_fingers_have_less_room_beside_a_neighbour(cubes, gripper, yaw):
+def test_wider_fingers_have_less_clearance_beside_a_neighbour(cubes, gripper, yaw):
     body, other = cubes
     frame = PlanarFrame(0.45, 0.02, yaw)
     body.place((0.45, 0.02, EDGE_M / 2), yaw)
-    # where a finger comes down, but aside
+    # along the closing direction at a finger, across it at its flank
     other.place((*frame.to_world(0.05, 0.035), EDGE_M / 2), yaw)
     gap = grasp_clearance_m(gripper, body, yaw, [other])
     assert gap == pytest.approx(0.035 - EDGE_M / 2 - gripper.half_width_m, abs=1e-4)
 
 
-def test_what_the_fingers_pass_over_is_in_no_ones_way(cubes):
+def test_bodies_below_the_fingertips_are_no_obstacles(cubes):
     body, other = cubes
     body.place((0.45, 0.0, 0.1))
     other.place((0.5, 0.0, EDGE_M / 2))
@@ -83,7 +83,7 @@ def test_what_the_fingers_pass_over_is_in_no_ones_way(cubes):
     assert grasp_clearance_m(GRIPPER, body, 0.0, [other], at=low) < 0
 
 
-def test_the_hand_meets_what_reaches_up_to_its_palm(cubes):
+def test_only_bodies_higher_than_the_palm_are_obstacles_of_the_hand(cubes):
     _, other = cubes
     robot = SimpleNamespace(gripper=GRIPPER, hand_half_extents_m=(0.07, 0.03))
     tool = PlanarFrame(0.45, 0.0, math.pi / 2)
@@ -95,7 +95,7 @@ def test_the_hand_meets_what_reaches_up_to_its_palm(cubes):
     assert hand_rectangle(robot, tool) == Rectangle(0.45, 0.0, math.pi / 2, 0.07, 0.03)
 
 
-def test_fingers_from_above_and_their_gap_to_an_outline():
+def test_footprints_of_the_fingers_and_their_clearance_from_an_outline():
     tool = PlanarFrame(0.4, 0.1, math.pi / 2)
     left, right = finger_rectangles(GRIPPER, tool, 0.03)
     assert left[:2] == pytest.approx((0.4, 0.1 - 0.04))
@@ -106,7 +106,7 @@ def test_fingers_from_above_and_their_gap_to_an_outline():
     assert outline_clearance_m(GRIPPER, tool, 0.03, []) == math.inf
 
 
-def test_heights_follow_from_how_deep_the_fingers_end():
+def test_heights_follow_from_the_depth_of_the_fingertips():
     assert passing_height_m(GRIPPER) == 0.03
     assert passing_height_m(replace(GRIPPER, tip_arc=((0.0, -0.04),))) == pytest.approx(0.052)
     robot = SimpleNamespace(gripper=GRIPPER, opening=lambda: 1.0)

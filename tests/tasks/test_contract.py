@@ -1,4 +1,4 @@
-"""Every task passes the checks of `ba_torchrl.testing`; new tasks are found by the registry."""
+"""Every registered task passes the checks of `ba_torchrl.testing`."""
 
 import pytest
 
@@ -32,8 +32,8 @@ STEPS = {
     "open_loop/covid_test": 18,
     "open_loop/object_grasping": 1,
 }
-"""Mean steps of the published planners in close loop, least possible steps in open loop
-(appendix A); tests allow a tenth more."""
+"""Mean steps of the published planners in close loop, optimal steps in open loop (appendix A). The
+tests allow 1.1 times as many."""
 
 SUCCESS = {
     "close_loop/object_grasping": 0.95,
@@ -42,23 +42,23 @@ SUCCESS = {
     "open_loop/improvise_house_building_2": 0.97,
     "open_loop/improvise_house_building_3": 0.97,
 }
-"""Least share of episodes that the experts solve; 0.99 unless listed."""
+"""Least success rate of the experts; 0.99 for all other tasks."""
 
-NOT_WITHOUT_YAW = {"open_loop/box_palletizing": "every other layer of the pallet is turned"}
-"""Tasks that cannot be solved without turning the gripper, and why."""
+NOT_WITHOUT_YAW = {"open_loop/box_palletizing": "odd layers are rotated by 90 degrees"}
+"""Tasks that cannot be solved without yaw actions, and why."""
 
 OTHERS_NOT_WITHOUT_YAW = {
-    "open_loop/object_grasping": "their grippers open less, or swing: they cannot hold some shapes"
+    "open_loop/object_grasping": "grippers that open less or on an arc cannot hold some shapes"
 }
-"""The same for robots other than kuka."""
+"""Tasks that robots other than kuka cannot solve without yaw actions, and why."""
 
 OPEN_LOOP = [task for task in TASKS if REGISTRY[task].control == "open_loop"]
 LOW = ["open_loop/improvise_house_building_3", "open_loop/covid_test"]
-"""Tasks whose objects are so low that fingers held too deep would meet the floor."""
+"""Tasks with objects so low that the fingers of a deep grasp would touch the floor."""
 
 OTHER_ROBOTS = [robot for robot in ROBOTS if robot != "kuka"]
 SAMPLE = [(task, OTHER_ROBOTS[i % len(OTHER_ROBOTS)]) for i, task in enumerate(TASKS)]
-"""A robot for each task; every pair is for the slow tests."""
+"""One robot for each task; the slow tests check every pair."""
 
 
 @pytest.fixture(params=TASKS)
@@ -67,14 +67,14 @@ def task(request):
 
 
 def without_yaw(task):
-    """Return the parameters of the benchmarks in which the gripper does not turn."""
+    """Return the parameters of the benchmarks without yaw actions."""
     sequence = {"close_loop": "pxyz", "open_loop": "pxy"}[REGISTRY[task].control]
     return {"random_orientation": False, "action_sequence": sequence}
 
 
 def check_expert(task, episodes, margin, **config):
-    """Check the expert against the published lengths and the success rate of this project."""
-    limit = 1.1 * STEPS[task] if task in STEPS else None  # others are not in the paper
+    """Check the expert against the published lengths and the success rates of `SUCCESS`."""
+    limit = 1.1 * STEPS[task] if task in STEPS else None  # None for tasks that are not in the paper
     checks.check_expert(
         task,
         episodes=episodes,
@@ -111,7 +111,7 @@ def test_an_episode_of_every_robot_starts_valid_and_unsolved(task, robot):
     checks.check_resets(task, robot=robot, episodes=20)
 
 
-def test_seeds_fix_the_images(task):
+def test_seeds_reproduce_the_images(task):
     checks.check_seeds(task)
 
 
@@ -139,7 +139,7 @@ def test_the_constructor_can_be_pickled(task):
 
 def test_the_step_limit_truncates(task):
     if REGISTRY[task].terminates_at_limit:
-        pytest.skip("the limit is the task")
+        pytest.skip("the step limit terminates the episode")
     checks.check_step_limit(task)
 
 

@@ -1,4 +1,4 @@
-"""Goals hold where they should and not next to it; bad scenes end the episode."""
+"""Conditions of success on both sides of their thresholds; invalid scenes; random initial poses."""
 
 import math
 
@@ -23,7 +23,7 @@ def make():
         env.close()
 
 
-def test_reaching_needs_three_centimetres(make):
+def test_reaching_succeeds_within_three_centimetres(make):
     env = make("block_reaching")
     scene = env.scene
     scene.task.block.place((0.45, 0.0, 0.025))
@@ -32,16 +32,16 @@ def test_reaching_needs_three_centimetres(make):
         assert scene.task.is_success() is expected
 
 
-def test_picking_needs_the_grasp_and_the_height(make):
+def test_picking_requires_a_grasp_and_a_height(make):
     env = make("block_picking")
     scene = env.scene
     scene.task.block.place((0.45, 0.0, 0.025))
     scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
-    assert not scene.task.is_success()  # high, but empty
+    assert not scene.task.is_success()  # high, without the block
     scene.controller.move_to((0.45, 0.0, 0.025), 0.0)
     scene.controller.grip(0.0)
     scene.controller.move_to((0.45, 0.0, 0.14), 0.0)
-    assert not scene.task.is_success()  # held, but low
+    assert not scene.task.is_success()  # held, at a low height
     scene.controller.move_to((0.45, 0.0, 0.16), 0.0)
     assert scene.task.is_success()
     scene.controller.grip(1.0)
@@ -49,7 +49,7 @@ def test_picking_needs_the_grasp_and_the_height(make):
     assert not scene.task.is_success()
 
 
-def test_pushing_needs_five_centimetres(make):
+def test_pushing_succeeds_within_five_centimetres(make):
     env = make("block_pushing")
     task = env.scene.task
     task.goal.place((0.45, 0.0, 0.0))
@@ -58,7 +58,7 @@ def test_pushing_needs_five_centimetres(make):
         assert task.is_success() is expected
 
 
-def test_pulling_needs_contact(make):
+def test_pulling_requires_contact(make):
     env = make("block_pulling")
     scene = env.scene
     first, second = scene.task.blocks
@@ -79,14 +79,14 @@ def test_an_object_that_leaves_the_workspace_terminates_without_reward(make):
     assert outcome["reward"] == 0
 
 
-def test_bounding_box_check_is_stricter_than_the_origin(make):
+def test_the_bounding_box_check_is_stricter_than_the_point_check(make):
     for check, valid in (("point", True), ("bounding_box", False)):
         env = make("block_picking", workspace_check=check)
         env.scene.task.block.place((0.45, 0.13, 0.025))
         assert env.scene.task.is_valid() is valid
 
 
-def test_fixed_orientations(make):
+def test_fixed_orientations_are_at_yaw_zero(make):
     env = make("block_pulling", random_orientation=False)
     for _ in range(5):
         env.reset()
@@ -96,7 +96,7 @@ def test_fixed_orientations(make):
         assert first.position[0] == pytest.approx(second.position[0], abs=1e-3)
 
 
-def test_scales_are_drawn_in_steps_and_show_in_the_image(make):
+def test_scales_are_drawn_in_steps_and_visible_in_the_image(make):
     env = make("block_picking", object_scale_range=(0.8, 0.9))
     seen = set()
     for _ in range(40):
@@ -108,7 +108,7 @@ def test_scales_are_drawn_in_steps_and_show_in_the_image(make):
     assert seen == {0.8, 0.82, 0.84, 0.86, 0.88, 0.9}
 
 
-def test_positions_cover_the_workspace_and_keep_clear_of_the_border(make):
+def test_positions_cover_the_workspace_up_to_the_padding(make):
     env = make("block_picking")
     points = []
     for _ in range(300):

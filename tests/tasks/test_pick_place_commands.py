@@ -1,4 +1,4 @@
-"""Commands from poses, against homogeneous matrices."""
+"""Pick and place commands against homogeneous matrices."""
 
 import math
 
@@ -18,7 +18,7 @@ from ba_torchrl.tasks.pick_place_commands import (
 from ba_torchrl.tasks.workspace import Workspace
 
 FLIP = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
-"""Of a tool that points down."""
+"""Rotation of a tool that points down."""
 
 
 def pose_of(position, rz, ry=0.0, rx=0.0, flip=False):
@@ -34,7 +34,7 @@ def matrix_of(pose):
 
 
 @pytest.mark.parametrize("angles", [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (3.0, -0.1, 0.2)])
-def test_a_pick_is_the_pose_of_the_tool(angles):
+def test_a_pick_has_the_pose_of_the_tool(angles):
     command = pick_command(pose_of((0.4, 0.1, 0.05), *angles, flip=True))
     assert command.primitive == PICK
     assert command[1:4] == (0.4, 0.1, 0.05)
@@ -45,7 +45,7 @@ def test_a_pick_is_the_pose_of_the_tool(angles):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_is_held_moves_rigidly_with_the_tool(seed):
+def test_the_held_body_moves_rigidly_with_the_tool(seed):
     rng = np.random.default_rng(seed)
     tool = pose_of(tuple(rng.normal(size=3)), *rng.uniform(-1, 1, 3), flip=True)
     held, target = (pose_of(tuple(rng.normal(size=3)), *rng.uniform(-1, 1, 3)) for _ in range(2))
@@ -66,22 +66,22 @@ def test_a_place_on_a_slope_tilts_the_tool():
     np.testing.assert_allclose(matrix_of(placed) @ in_tool, matrix_of(slope), atol=1e-12)
 
 
-def test_a_turn_about_the_vertical_swings_what_is_held_about_the_tool():
+def test_a_yaw_rotates_the_held_body_about_the_tool():
     tool, held = downward_pose((0.5, 0.0, 0.3), 0.2), Pose((0.53, 0.0, 0.28))
     command = place_command(tool, held, held.moved_to((0.4, 0.1, 0.02), math.pi / 2))
-    # 3 cm ahead of the tool along x, it comes to be 3 cm ahead along y
+    # from 3 cm beside the tool along x to 3 cm along y
     assert command[1:4] == pytest.approx((0.4, 0.07, 0.04))
     assert command.rz_rad == pytest.approx(0.2 + math.pi / 2)
 
 
-def test_a_small_lean_and_rounding_are_dropped():
-    leaning = pose_of((0.4, 0.0, 0.1), -1e-12, 0.9 * LEVEL_RAD, -0.9 * LEVEL_RAD, flip=True)
-    assert pick_command(leaning).angles_rad == (0.0, 0.0, 0.0)
-    leaning = pose_of((0.4, 0.0, 0.1), -1e-3, 1.1 * LEVEL_RAD, 0.0, flip=True)
-    assert pick_command(leaning).angles_rad == pytest.approx((-1e-3, 1.1 * LEVEL_RAD, 0.0))
+def test_small_tilts_and_rounding_errors_are_zeroed():
+    tilted = pose_of((0.4, 0.0, 0.1), -1e-12, 0.9 * LEVEL_RAD, -0.9 * LEVEL_RAD, flip=True)
+    assert pick_command(tilted).angles_rad == (0.0, 0.0, 0.0)
+    tilted = pose_of((0.4, 0.0, 0.1), -1e-3, 1.1 * LEVEL_RAD, 0.0, flip=True)
+    assert pick_command(tilted).angles_rad == pytest.approx((-1e-3, 1.1 * LEVEL_RAD, 0.0))
 
 
-def test_nothing_is_left_to_do():
+def test_a_no_op_is_in_the_corner_of_the_workspace():
     workspace = Workspace(x=(0.2, 0.6), y=(-0.3, 0.1), z=(0.0, 0.4))
     assert no_op(workspace, is_holding=False)[:3] == (PICK, 0.2, -0.3)
     assert no_op(workspace, is_holding=True)[:3] == (PLACE, 0.2, -0.3)

@@ -1,4 +1,4 @@
-"""Scale of the objects: experts cope with all of a task's limits, and nothing else is accepted."""
+"""Scales of the objects: experts succeed at the limits of every task; others are refused."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ SCALED = [task for task in ba_torchrl.list_tasks() if np.ptp(TASKS[task].scale_l
 
 
 def steps_to_success(task, episodes, **config):
-    """Return the expert's steps in each episode, None where it fails."""
+    """Return the expert's number of steps in each episode, None for a failure."""
     size = 16 if TASKS[task].control == "close_loop" else 128
     env = ba_torchrl.make(task, seed=0, expert=True, obs_size=size, **config)
     steps = []
@@ -47,7 +47,7 @@ def test_default_scales_are_within_the_limits(task):
 
 
 @pytest.mark.parametrize("task", ba_torchrl.list_tasks())
-def test_scales_beyond_the_limits_are_refused_with_what_is_allowed(task):
+def test_scales_outside_the_limits_are_refused_with_the_allowed_range(task):
     low, high = TASKS[task].scale_limits
     allowed = f"{low:g} to {high:g}" if low < high else f"{low:g} only"
     for scales in (low - BEYOND, high + BEYOND, (low - BEYOND, high), (low, high + BEYOND)):
@@ -55,12 +55,12 @@ def test_scales_beyond_the_limits_are_refused_with_what_is_allowed(task):
             ba_torchrl.make(task, object_scale_range=scales)
 
 
-def test_limits_are_met_whatever_the_rounding():
+def test_scales_may_exceed_the_limits_by_rounding_errors():
     low, high = TASKS["close_loop/block_stacking"].scale_limits
     check_scales("close_loop/block_stacking", (low - 1e-12, high + 1e-12))
 
 
-def test_the_corners_walls_go_with_the_block():
+def test_the_walls_of_the_corner_scale_with_the_block():
     heights = []
     for scale in (0.6, 1.0):
         env = ba_torchrl.make("close_loop/corner_picking", seed=0, object_scale_range=scale)

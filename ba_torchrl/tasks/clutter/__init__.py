@@ -1,1 +1,1 @@
-"""What the tasks share that grasp objects from a heap in a tray."""
+"""Parts of the tasks that grasp objects from a heap in a tray."""

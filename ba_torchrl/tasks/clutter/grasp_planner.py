@@ -190,8 +190,11 @@ class _Jaws(NamedTuple):
     """The outline of a gripper for compiled code, metres."""
 
     half_gap: float
+    """Half the gap between the open fingers."""
     band_half: float
+    """Half the width of the band that the fingers occupy."""
     palm: float
+    """Height of the palm above the tool point."""
     depth: float
     """Extent of a fingertip along the direction in which it closes."""
     arc_u: np.ndarray
@@ -201,6 +204,7 @@ class _Jaws(NamedTuple):
     """In ascending order."""
 
 
+# offsets of grasps from the centre of a body, across (v) and along (u) the closing direction
 _OFFSETS_V = np.array([0.0, -0.012, 0.012, -0.024, 0.024])
 _OFFSETS_U = np.array([0.0, -0.02, 0.02, -0.04, 0.04])
 

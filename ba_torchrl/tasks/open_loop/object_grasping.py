@@ -53,9 +53,9 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a pick without z, metres.
 
-        The pick is as deep as it improves the grasp. The palm stays above the highest point, and
-        the fingertips, which move down as the fingers close, above the floor of the tray when they
-        touch an object of the assumed width.
+        `DEEPEST_M` and the palm limit the depth below the highest point. The fingertips, which may
+        move down as the fingers close, stay above the floor of the tray around an object of
+        `OBJECT_WIDTH_M`.
 
         Args:
             top_m: height of the highest point in the window around the target.

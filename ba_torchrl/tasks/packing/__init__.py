@@ -1,1 +1,1 @@
-"""What the tasks share that place objects in a container."""
+"""Parts of the tasks that place objects in a container."""

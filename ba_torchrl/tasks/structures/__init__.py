@@ -1,1 +1,1 @@
-"""Tasks that build a structure from pieces."""
+"""Parts of the tasks that build a structure from pieces."""

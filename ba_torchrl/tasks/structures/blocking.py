@@ -188,7 +188,7 @@ class GraspBlocking:
     def _fewest_removals(self, body: Body) -> frozenset[Body] | None:
         """Return the smallest set of pieces whose removal frees a grasp of a body; None if none is.
 
-        Each of them must have a grasp that nothing but the others in the set blocks.
+        Each of them has a grasp that only pieces of the set block.
         """
         found = []
         for obstacles in self.obstacles(body):

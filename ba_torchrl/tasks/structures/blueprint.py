@@ -28,7 +28,7 @@ class Piece:
         kind: name by which bodies are matched to slots.
         yaw_period_rad: angle of its rotational symmetry about the vertical.
         grasp_yaws_rad: yaws of the gripper at which the fingers close on it, relative to its own
-            yaw; each also stands for the yaw half a turn away.
+            yaw; a yaw half a turn away is equivalent.
         up: directions in its own frame that point up when it lies on one of its valid sides.
         stays_upright: whether the episode ends when it tips over.
         shape: shape of the body; None if the bodies are loaded elsewhere.
@@ -88,7 +88,7 @@ class Slot:
         span: distance of the supports of a bridge. Supports that share a support of their own stand
             along its y axis, on both sides of its centre.
         inherits_yaw: whether the expert aligns it with its support; the goal does not require it.
-        stays_clear: whether nothing but what the blueprint places on it may rest on it.
+        stays_clear: whether only pieces that the blueprint places on it may rest on it.
     """
 
     piece: Piece

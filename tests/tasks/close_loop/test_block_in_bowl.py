@@ -1,4 +1,4 @@
-"""Block in Bowl: a hollow bowl, a goal that means inside, and an expert that recovers."""
+"""Block in Bowl: shape of the bowl, conditions of success, expert."""
 
 import math
 
@@ -38,16 +38,16 @@ def volume(mesh):
 
 def test_parts_of_the_bowl_are_convex_closed_and_face_outwards():
     for part in bowl_parts(0.08, 0.07, **BOWL):
-        middle = part.vertices.mean(axis=0)
+        center = part.vertices.mean(axis=0)
         for a, b, c in part.vertices[part.faces]:
             normal = np.cross(b - a, c - a)
-            assert normal @ (a - middle) > 0
+            assert normal @ (a - center) > 0
             assert ((part.vertices - a) @ normal).max() < 1e-12
         edges = {(i, j) for face in part.faces for i, j in zip(face, np.roll(face, -1))}  # noqa: B905
         assert edges == {(j, i) for i, j in edges}
 
 
-def test_volumes_and_centroid_against_formulas():
+def test_volumes_and_centroids_match_formulas():
     # a regular polygon with 64 sides is a circle to 0.2 %
     angles = np.arange(64) * math.pi / 32
     disc = prism_mesh([(0.1 * math.cos(a), 0.1 * math.sin(a)) for a in angles], 0.2, 0.5)
@@ -75,17 +75,17 @@ def test_the_bowl_is_hollow_for_collisions():
     with World() as world:
         parts = tuple(bowl_parts(0.08, 0.07, **BOWL))
         bowl = world.add(Solid(parts=parts, center_of_mass_m=centroid(parts)), "bowl")
-        crumb = world.add(Box(size_m=(0.02, 0.02, 0.02), mass_kg=0.02), "crumb")
+        cube = world.add(Box(size_m=(0.02, 0.02, 0.02), mass_kg=0.02), "cube")
         for x, height in ((0.0, FLOOR_M), (0.03, FLOOR_M)):
             bowl.place((0.5, 0.0, 0.035))
-            crumb.place((0.5 + x, 0.0, 0.08))
+            cube.place((0.5 + x, 0.0, 0.08))
             assert world.settle()
-            assert crumb.position[2] == pytest.approx(height + 0.01, abs=1e-3)
-            assert crumb.touches(bowl)
+            assert cube.position[2] == pytest.approx(height + 0.01, abs=1e-3)
+            assert cube.touches(bowl)
             assert bowl.tilt_rad < 0.01
 
 
-def test_the_camera_sees_the_cavity(env):
+def test_the_height_image_shows_the_cavity(env):
     task, camera = env.scene.task, env.scene.camera
     task.block.place((0.55, 0.12, 0.025))
     task.bowl.place((0.4, 0.0, 0.035))
@@ -95,7 +95,7 @@ def test_the_camera_sees_the_cavity(env):
     assert image[50, 50 + 42] == 0  # 8.4 cm from the axis
 
 
-def test_layouts_keep_their_distances_and_are_cheap(env):
+def test_initial_poses_keep_their_distances(env):
     task, rng = env.scene.task, np.random.default_rng(0)
     for _ in range(200):
         task.initialize_episode(rng)
@@ -106,7 +106,7 @@ def test_layouts_keep_their_distances_and_are_cheap(env):
 
 
 def lay(env, offset, z, yaw=0.3):
-    """Put the block near the bowl's axis and let it come to rest."""
+    """Place the block near the axis of the bowl and simulate until it is at rest."""
     task, world = env.scene.task, env.scene.world
     env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
     task.bowl.place((0.45, -0.05, 0.035))
@@ -114,7 +114,7 @@ def lay(env, offset, z, yaw=0.3):
     assert world.settle(400)
 
 
-def test_the_goal_is_a_block_that_lies_inside(env):
+def test_a_block_inside_the_bowl_is_a_success(env):
     task = env.scene.task
     lay(env, 0.0, FLOOR_M + 0.03)
     assert task.is_success()
@@ -122,10 +122,10 @@ def test_the_goal_is_a_block_that_lies_inside(env):
     assert not task.is_success()  # beside the bowl
     task.block.place((0.45, -0.05, 0.2))
     env.scene.world.step(2)
-    assert not task.is_success()  # falls towards it
+    assert not task.is_success()  # above the bowl
 
 
-def test_a_block_under_the_bowl_does_not_count(env):
+def test_a_block_under_the_bowl_is_not_a_success(env):
     task = env.scene.task
     task.block.place((0.45, -0.05, 0.025))
     task.bowl.place((0.45, -0.05, 0.05 + 0.0355))
@@ -135,7 +135,7 @@ def test_a_block_under_the_bowl_does_not_count(env):
     assert not task.is_success()
 
 
-def test_a_block_on_the_rim_does_not_count(env):
+def test_a_block_on_the_rim_is_not_a_success(env):
     lay(env, 0.07, 0.11)
     task = env.scene.task
     if math.dist(task.block.position[:2], task.bowl.position[:2]) >= 0.03:
@@ -145,7 +145,7 @@ def test_a_block_on_the_rim_does_not_count(env):
     assert not task.is_success()
 
 
-def test_a_held_block_does_not_count(env):
+def test_a_held_block_is_not_a_success(env):
     scene, task = env.scene, env.scene.task
     lay(env, 0.0, FLOOR_M + 0.03, yaw=0.0)
     x, y, z = task.block.position
@@ -169,7 +169,7 @@ def test_a_tipped_bowl_ends_the_episode(env):
     assert not outcome["success"]
 
 
-def test_a_bowl_nudged_up_on_one_side_falls_back(env):
+def test_a_tilted_bowl_returns_upright(env):
     task = env.scene.task
     env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
     task.bowl.set_pose((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((0.6, 0.0, 0.0)))
@@ -186,25 +186,26 @@ def play(env, state):
 
 
 def restart(env):
-    """Return the state after an action that does nothing."""
+    """Return the state after a no-op."""
     return env._step(env.full_action_spec.zero())
 
 
 @pytest.mark.parametrize("bearing", np.arange(8) * math.pi / 4)
-def test_the_expert_takes_a_block_from_beside_the_bowl(env, bearing):
+def test_the_expert_grasps_a_block_beside_the_bowl(env, bearing):
     env.reset()
     task = env.scene.task
     x, y = 0.45, 0.0
     task.bowl.place((x, y, 0.035))
-    away = 0.118
-    task.block.place((x + away * math.cos(bearing), y + away * math.sin(bearing), 0.025), bearing)
+    distance = 0.118
+    block_x, block_y = x + distance * math.cos(bearing), y + distance * math.sin(bearing)
+    task.block.place((block_x, block_y, 0.025), bearing)
     env.scene.world.settle()
     success, steps = play(env, restart(env))
     assert success
     assert steps < 25
 
 
-def test_grasping_does_not_drag_the_bowl_along(env):
+def test_the_grasp_does_not_move_the_bowl(env):
     state = env.reset()
     before = env.scene.task.bowl.position
     while not env.scene.task.robot.held_body():

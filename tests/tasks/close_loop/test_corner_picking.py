@@ -1,4 +1,4 @@
-"""Corner Picking: no room for fingers in the corner, a drag by friction, then the grasp."""
+"""Corner Picking: geometry of the corner, conditions of success, drag and grasp of the expert."""
 
 import math
 
@@ -45,7 +45,7 @@ def test_the_corner_has_its_sizes(env):
     assert image[15 + 12, 15 + 12] == pytest.approx(0.052, abs=5e-4)
 
 
-def test_the_corner_is_fixed_and_the_base_smooth(env):
+def test_base_and_walls_are_static_and_the_base_is_smooth(env):
     task, scene = env.scene.task, env.scene
     before = [body.pose for body in (task.base, task.walls)]
     assert all(body.is_static for body in (task.base, task.walls))
@@ -61,7 +61,7 @@ def test_the_corner_is_fixed_and_the_base_smooth(env):
     assert at_rest == [body.pose for body in (task.base, task.walls)]
 
 
-def test_the_block_stays_in_the_corner_when_left_alone(env):
+def test_the_block_stays_in_the_corner_without_contact(env):
     task = env.scene.task
     for _ in range(5):
         env.reset()
@@ -70,7 +70,7 @@ def test_the_block_stays_in_the_corner_when_left_alone(env):
         assert math.dist((x, y), (-0.065, -0.065)) < 1e-3
 
 
-def test_all_headings_occur_and_fixed_ones_are_zero(env):
+def test_random_yaws_cover_the_circle_and_fixed_ones_are_zero(env):
     yaws = []
     for _ in range(60):
         env.reset()
@@ -98,22 +98,22 @@ def test_the_block_cannot_be_grasped_in_the_corner(env, turn):
     assert not task.is_success()
 
 
-def test_the_goal_needs_the_grasp_and_fifteen_centimetres(env):
+def test_success_requires_a_grasp_and_fifteen_centimetres(env):
     scene, task = env.scene, env.scene.task
     task.put_corner((0.45, 0.0), 0.0)
     task.block.place((0.45, 0.0, 0.027))
     assert task.clearance_m(0.0) > 0
     scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
-    assert not task.is_success()  # high, but empty
+    assert not task.is_success()  # high, without the block
     scene.controller.move_to((0.45, 0.0, 0.027), 0.0)
     scene.controller.grip(0.0)
     scene.controller.move_to((0.45, 0.0, 0.145), 0.0)
-    assert not task.is_success()  # held, but low
+    assert not task.is_success()  # held, at a low height
     scene.controller.move_to((0.45, 0.0, 0.155), 0.0)
     assert task.is_success()
 
 
-def test_room_beside_the_fingers_against_arithmetic(env):
+def test_the_clearance_is_the_gap_between_fingers_and_walls(env):
     task = env.scene.task
     task.put_corner((0.45, 0.0), 0.7)
     task.block.place((*task.corner.to_world(0.01, -0.02), 0.027), 0.7)
@@ -123,7 +123,7 @@ def test_room_beside_the_fingers_against_arithmetic(env):
 
 
 def test_the_block_is_dragged_by_friction_alone(env):
-    """The expert's fingers stay above the block until it is out of the corner."""
+    """The fingertips stay above the block until it is out of the corner."""
     for _ in range(5):
         state = env.reset()
         scene, task = env.scene, env.scene.task
@@ -136,10 +136,10 @@ def test_the_block_is_dragged_by_friction_alone(env):
             if scene.robot.opening() < 0.5:
                 top = task.block.position[2] + 0.025
                 assert scene.robot.tool_pose()[0][2] > top + 4e-3
-            assert task.block.tilt_rad < 0.6  # a corner of it may catch on the seam
+            assert task.block.tilt_rad < 0.6  # its edge may catch at a wall
 
 
-def test_asked_twice_in_any_phase_the_expert_says_the_same(env):
+def test_the_expert_command_depends_on_the_scene_only(env):
     state = env.reset()
     while not state["done"]:
         commands = [env.scene.task.expert_command() for _ in range(2)]
@@ -163,10 +163,10 @@ def test_the_expert_needs_at_most_seventeen_steps(variant):
         assert state["success"]
         lengths.append(int(state["step_count"]))
     env.close()
-    assert np.mean(lengths) <= 15.3  # 1.1 times the published planner's, which lifts half as high
+    assert np.mean(lengths) <= 15.3  # 1.1 times the published one
 
 
-def test_the_expert_starts_from_a_block_turned_in_the_corner(env):
+def test_the_expert_drags_a_rotated_block_out_of_the_corner(env):
     solved = 0
     for turn in np.linspace(0.1, 1.4, 10):
         env.reset()

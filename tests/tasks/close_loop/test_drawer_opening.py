@@ -1,3 +1,5 @@
+"""Drawer Opening: geometry of the cabinet, conditions of success, contacts, expert."""
+
 import math
 
 import numpy as np
@@ -31,7 +33,7 @@ def make():
 
 
 def local_heights(travel, pose, center, side, pixels):
-    """Heights worked out from the measures alone, and where a pixel is too near an edge to tell."""
+    """Return the heights computed from the sizes, and which pixels are too close to an edge."""
     (x, y), yaw = pose
     steps = (np.arange(pixels) + 0.5) * side / pixels - side / 2
     px, py = np.meshgrid(center[0] + steps - x, center[1] + steps - y, indexing="ij")
@@ -54,12 +56,12 @@ def local_heights(travel, pose, center, side, pixels):
     rectangle((travel + 0.11, travel + 0.16), (-0.043, -0.035), 0.084)
     arc = np.sqrt(np.clip(0.0075**2 - (d - 0.16) ** 2, 0, None))
     rectangle((travel + 0.1525, travel + 0.1675), (-0.05, 0.05), 0.08 + arc)  # rod
-    rectangle((-0.11, 0.11), (-0.115, 0.115), 0.11)  # the cabinet hides what is inside
+    rectangle((-0.11, 0.11), (-0.115, 0.115), 0.11)  # the cabinet covers the drawer
     return image, unsure
 
 
 @pytest.mark.parametrize("travel", [0.0, 0.1, 0.2])
-def test_the_image_shows_cabinet_drawer_and_handle_in_their_measures(make, travel):
+def test_the_height_image_shows_cabinet_drawer_and_handle_in_their_sizes(make, travel):
     env = make()
     scene = env.scene
     scene.task.cabinet.place((0.42, 0.03, 0.0), 0.7, travel)
@@ -71,12 +73,12 @@ def test_the_image_shows_cabinet_drawer_and_handle_in_their_measures(make, trave
     np.testing.assert_allclose(image[flat], expected[flat], atol=1e-6)
 
 
-def test_the_policy_sees_the_drawer_move(make):
+def test_the_observation_shows_the_travel_of_the_drawer(make):
     env = make(obs_size=64)
     cabinet = env.scene.task.cabinet
-    state, stay = env.reset(), torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])
+    state, no_op = env.reset(), torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])
     cabinet.place(cabinet.base.position, cabinet.base.yaw_rad, 0.1)
-    after = env.step(state.clone().set("action", stay))["next"]
+    after = env.step(state.clone().set("action", no_op))["next"]
     changed = (after["pixels"] - state["pixels"]).abs() > 0.01
     assert 0.01 < changed.float().mean() < 0.3
 
@@ -118,7 +120,7 @@ def test_the_cabinet_is_hollow_in_front_and_between_its_walls():
             assert first_hit(start, end)[axis] == pytest.approx(expected, abs=1e-3)
 
 
-def test_sizes():
+def test_sizes_of_cabinet_and_rod():
     low, high = Solid(parts=cabinet_parts()).bounds_m
     np.testing.assert_allclose(np.subtract(high, low), (0.22, 0.23, 0.11))
     rod = drawer_parts()[-1].vertices
@@ -126,7 +128,7 @@ def test_sizes():
     np.testing.assert_allclose(rod.mean(axis=0), (0.11 + 0.05, 0.0, 0.08), atol=1e-9)
 
 
-def test_layouts_open_towards_the_centre_with_room_for_the_handle(make):
+def test_layouts_open_towards_the_centre_with_the_handle_in_the_workspace(make):
     for config in ({}, FIXED):
         env = make(**config)
         task, yaws = env.scene.task, []
@@ -151,12 +153,12 @@ def test_layouts_open_towards_the_centre_with_room_for_the_handle(make):
             assert (np.histogram(yaws, 6, (-math.pi, math.pi))[0] > 25).all()
 
 
-def test_a_workspace_without_room_for_the_handle_is_refused():
+def test_a_workspace_too_small_for_the_handle_is_refused():
     with pytest.raises(ba_torchrl.errors.ConfigError, match="handle"):
         ba_torchrl.make(TASK, workspace=((0.4, 0.5), (-0.05, 0.05), (0.01, 0.25)))
 
 
-def test_the_goal_is_fifteen_centimetres(make):
+def test_success_requires_fifteen_centimetres_of_travel(make):
     env = make()
     task, cabinet = env.scene.task, env.scene.task.cabinet
     assert not task.is_success()
@@ -167,8 +169,8 @@ def test_the_goal_is_fifteen_centimetres(make):
         assert task.is_success() is expected
 
 
-def test_a_drawer_that_springs_back_is_no_success(make):
-    """Success counts once everything is at rest."""
+def test_a_drawer_that_moves_back_is_not_a_success(make):
+    """Success is evaluated at rest."""
     env = make()
     cabinet = env.scene.task.cabinet
     cabinet.place(cabinet.base.position, cabinet.base.yaw_rad, 0.152)
@@ -181,21 +183,21 @@ def test_a_drawer_that_springs_back_is_no_success(make):
 
 
 def at_handle(env, ahead, height, opening, turn):
-    """Put cabinet and gripper: the rod along y at x = 0.41, opening towards -x."""
+    """Place cabinet and gripper: the rod along y at x = 0.41, the drawer opens towards -x."""
     scene = env.scene
     scene.task.cabinet.place((0.57, 0.0, 0.0), math.pi)
     scene.controller.reset(((0.41 - ahead, 0.0, height), turn), opening)
     return scene
 
 
-def test_a_hooked_drawer_follows_the_fingers_and_stays(make):
+def test_a_pulled_drawer_follows_the_fingers_and_stays(make):
     scene = at_handle(make(), -0.026, 0.07, 0.0, math.pi / 2)
     travels = []
     for _ in range(6):
         (x, y, z), yaw = scene.robot.tool_pose()
         scene.controller.move_to((x - 0.05, y, z), yaw)
         travels.append(scene.task.cabinet.travel_m)
-    # 8.5 mm of play first, then 5 cm each, and no farther than the rail
+    # a gap of 8.5 mm first, then 5 cm each, up to the limit of the joint
     np.testing.assert_allclose(travels, [0.0415, 0.0915, 0.1415, 0.1915, 0.2, 0.2], atol=4e-3)
     scene.world.settle()
     assert scene.task.cabinet.travel_m == pytest.approx(0.2, abs=2e-3)
@@ -206,7 +208,7 @@ def test_a_hooked_drawer_follows_the_fingers_and_stays(make):
     assert scene.task.cabinet.travel_m == pytest.approx(0.0, abs=2e-3)
 
 
-def test_fingers_closed_across_the_rod_pull_it_but_hold_nothing(make):
+def test_fingers_closed_on_the_rod_pull_it_without_a_held_body(make):
     scene = at_handle(make(), 0.0, 0.08, 0.2, 0.0)
     scene.controller.grip(0.0)
     assert scene.robot.held_body() is None
@@ -216,7 +218,7 @@ def test_fingers_closed_across_the_rod_pull_it_but_hold_nothing(make):
     assert scene.task.cabinet.travel_m == pytest.approx(0.15, abs=3e-3)
 
 
-def test_the_guard_spares_a_handle_that_cannot_move_that_way(make):
+def test_the_motion_stops_at_a_handle_that_cannot_move(make):
     scene = at_handle(make(), 0.0, 0.14, 0.0, math.pi / 2)
     for _ in range(3):  # onto the rod from above
         (x, y, z), yaw = scene.robot.tool_pose()
@@ -231,13 +233,13 @@ def test_the_guard_spares_a_handle_that_cannot_move_that_way(make):
     np.testing.assert_allclose(scene.task.cabinet.base.position, (0.57, 0.0, 0.0), atol=1e-9)
 
 
-def test_random_actions_keep_the_drawer_on_its_rail(make):
+def test_random_actions_keep_the_drawer_within_its_joint_limits(make):
     env = make()
     rng = np.random.default_rng(0)
     for episode in range(6):
         state = env.reset()
         scene = env.scene
-        handle, heading = scene.task.handle_pose  # start where it matters
+        handle, heading = scene.task.handle_pose  # start at the handle
         scene.controller.reset(((*handle[:2], 0.15), heading))
         while not state["done"]:
             action = rng.choice([-1.0, 1.0], 5) if episode % 2 else rng.uniform(-1, 1, 5)
@@ -289,7 +291,7 @@ def test_episodes_repeat_in_a_used_and_in_a_fresh_world(make):
         assert same(episode(used, seed), first[seed])
 
 
-def test_a_state_brings_back_the_opened_drawer(make):
+def test_a_state_restores_the_travel_of_the_drawer(make):
     env = make(expert=True)
     state = env.reset()
     while env.scene.task.cabinet.travel_m < 0.05:

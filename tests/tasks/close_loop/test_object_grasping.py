@@ -1,4 +1,4 @@
-"""Close-loop object grasping: the heap, its life over episodes, its state, goal and expert."""
+"""Close-loop object grasping: the heap over episodes, state, conditions of success, expert."""
 
 import hashlib
 import math
@@ -15,7 +15,7 @@ from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M
 
 TASK = "close_loop/object_grasping"
-STAY = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])
+NO_OP = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture
@@ -41,11 +41,11 @@ def fingerprint(env):
     return hashlib.sha256(repr(poses).encode()).hexdigest()
 
 
-def finish(env, state, policy=None):
-    """Act until the episode ends: like the expert, or as `policy` says."""
+def finish(env, state, action=None):
+    """Act until the episode ends, with expert actions or with the given one."""
     while not state["done"]:
-        action = state["expert_action"] if policy is None else policy
-        state = env.step(state.set("action", action))["next"]
+        chosen = state["expert_action"] if action is None else action
+        state = env.step(state.set("action", chosen))["next"]
     return state
 
 
@@ -79,7 +79,7 @@ def test_objects_and_poses_are_random(make):
     assert max(tilts) > 1.2
 
 
-def test_fixed_orientations_keep_objects_as_they_are_modelled(make):
+def test_fixed_orientations_keep_most_objects_upright(make):
     env = make(random_orientation=False)
     upright = []
     for seed in range(6):
@@ -89,7 +89,7 @@ def test_fixed_orientations_keep_objects_as_they_are_modelled(make):
     assert np.mean(upright) > 0.85
 
 
-def test_only_objects_in_use_are_seen_and_settle(make):
+def test_only_active_objects_are_visible(make):
     env = make(num_objects=2)
     env.reset()
     shown = [body for body in env.scene.world.bodies if not body.is_static and not body.is_hidden]
@@ -100,7 +100,7 @@ def test_only_objects_in_use_are_seen_and_settle(make):
             assert body.position[2] > 1e5
     assert env.scene.world.is_still()
     heights = env.scene.camera.heightmap((0.45, 0.0), 0.2, 64)
-    assert heights.max() < 0.12  # no arm, no gripper, nothing that waits
+    assert heights.max() < 0.12  # without arm, gripper and inactive objects
 
 
 @pytest.mark.parametrize("count", [0, 16])
@@ -109,7 +109,7 @@ def test_the_number_of_objects_is_limited(make, count):
         make(num_objects=count)
 
 
-def test_the_arm_is_where_it_started_when_the_objects_lie(make):
+def test_the_arm_is_at_its_start_after_the_drop(make):
     env = make()
     env.reset()
     position, yaw = env.scene.robot.tool_pose()
@@ -118,13 +118,13 @@ def test_the_arm_is_where_it_started_when_the_objects_lie(make):
     assert env.scene.robot.opening() > 0.95
 
 
-def test_other_sets(make, tmp_path):
+def test_household_and_graspnet_objects(make, tmp_path):
     assert set(names_after_reset(make(object_set="household"))) <= set(ITEMS)
     for name, size in (("a", (0.04, 0.05, 0.06)), ("b", (0.03, 0.03, 0.08))):
         (tmp_path / name).mkdir()
         write_obj(tmp_path / name / "mesh.obj", [box_mesh(size)])
     found = names_after_reset(make(object_set="graspnet", asset_root=str(tmp_path)))
-    assert len(found) == 5  # a set of two serves with copies
+    assert len(found) == 5  # copies of a set of two
     assert len(set(found)) == 5
     assert {name[0] for name in found} == {"a", "b"}
     with pytest.raises(ConfigError, match="asset_root"):
@@ -136,10 +136,10 @@ def names_after_reset(env):
     return names(env)
 
 
-# -- from episode to episode --------------------------------------------------------------------
+# -- over episodes ------------------------------------------------------------------------------
 
 
-def test_what_was_lifted_is_gone_and_the_rest_stays(make):
+def test_the_lifted_object_is_removed_and_the_others_stay(make):
     env = make(expert=True)
     state = finish(env, env.reset())
     assert state["success"]
@@ -153,7 +153,7 @@ def test_what_was_lifted_is_gone_and_the_rest_stays(make):
     assert not env.scene.task.is_success()
 
 
-def test_new_objects_fall_when_the_last_one_was_lifted(make):
+def test_new_objects_are_dropped_into_an_empty_tray(make):
     env = make(expert=True, num_objects=2)
     state, counts = env.reset(), []
     for _ in range(4):
@@ -164,21 +164,21 @@ def test_new_objects_fall_when_the_last_one_was_lifted(make):
     assert counts == [2, 1, 2, 1]
 
 
-def test_a_failed_episode_leaves_the_objects_and_three_in_a_row_do_not(make):
+def test_the_heap_is_replaced_after_three_failures(make):
     env = make(max_steps=2)
     state, heaps = env.reset(), []
     for _ in range(7):
         heaps.append(tuple(names(env)))
-        assert finish(env, state, STAY)["truncated"]
+        assert finish(env, state, NO_OP)["truncated"]
         state = env.reset()
     assert heaps[0] == heaps[1] == heaps[2] != heaps[3]
     assert heaps[3] == heaps[4] == heaps[5] != heaps[6]
 
 
-def test_a_success_forgives_the_failures(make):
+def test_a_success_resets_the_count_of_failures(make):
     env = make(expert=True)
-    state = finish(env, env.reset(), STAY)
-    finish(env, env.reset(), STAY)
+    state = finish(env, env.reset(), NO_OP)
+    finish(env, env.reset(), NO_OP)
     state = finish(env, env.reset())
     assert state["success"]
     env.reset()
@@ -186,12 +186,12 @@ def test_a_success_forgives_the_failures(make):
     assert env.scene.task.get_state()[1] == 0
 
 
-def test_an_object_outside_ends_the_episode_and_the_heap(make):
+def test_an_object_outside_the_workspace_ends_the_episode_and_replaces_the_heap(make):
     env = make()
     state = env.reset()
     before = names(env)
     env.scene.task.objects[0].place((0.45, 0.3, 0.05))
-    state = env.step(state.set("action", STAY))["next"]
+    state = env.step(state.set("action", NO_OP))["next"]
     assert state["terminated"]
     assert not state["success"]
     env.reset()
@@ -199,7 +199,7 @@ def test_an_object_outside_ends_the_episode_and_the_heap(make):
     assert names(env) != before
 
 
-def test_thin_objects_below_the_workspace_are_valid_and_high_ones_are_not(make):
+def test_low_objects_are_valid_and_high_ones_are_not(make):
     env = make(num_objects=1)
     env.reset()
     (body,) = env.scene.task.objects
@@ -213,11 +213,11 @@ def test_thin_objects_below_the_workspace_are_valid_and_high_ones_are_not(make):
     assert not checked.scene.task.is_valid()
 
 
-def test_a_seed_rebuilds_the_heap_bit_by_bit(make):
+def test_a_seed_reproduces_the_heap_exactly(make):
     env, other = make(), make()
     env.reset(seed=5)
     first = fingerprint(env)
-    for seed in (1, 2):  # other heaps, and episodes that go on, in between
+    for seed in (1, 2):  # with other heaps and continued ones in between
         state = env.reset(seed=seed)
         finish(env, state, torch.tensor([-1.0, 0.2, -0.1, -1.0, 0.3]))
         env.reset()
@@ -232,21 +232,21 @@ def test_a_seed_rebuilds_the_heap_bit_by_bit(make):
 # -- state --------------------------------------------------------------------------------------
 
 
-def test_a_state_brings_back_what_was_in_use(make):
+def test_a_state_restores_the_active_objects(make):
     env = make(expert=True)
     state = finish(env, env.reset())
     state = env.reset()
-    kept, present = env.get_state(), names(env)
+    saved, active = env.get_state(), names(env)
     pixels, before = state["pixels"].clone(), fingerprint(env)
     for _ in range(6):
         finish(env, env.reset())
-    assert names(env) != present
-    state = env.set_state(kept)
-    assert names(env) == present
+    assert names(env) != active
+    state = env.set_state(saved)
+    assert names(env) == active
     assert fingerprint(env) == before
     assert torch.equal(state["pixels"], pixels)
     assert [b.is_hidden for b in env.scene.task.clutter.pool.bodies] == [
-        b.name not in present for b in env.scene.task.clutter.pool.bodies
+        b.name not in active for b in env.scene.task.clutter.pool.bodies
     ]
     finish(env, state)
     env.reset()
@@ -261,20 +261,25 @@ def test_the_vector_observation_keeps_its_length(make):
     assert state["success"]
     state = env.reset()
     assert state["observation"].shape == (1 + 4 * 4,)
-    assert state["observation"][-4:].tolist() == [1.0, 1.0, 1.0, 0.0]  # gone: the upper corner
+    assert state["observation"][-4:].tolist() == [
+        1.0,
+        1.0,
+        1.0,
+        0.0,
+    ]  # the upper corner
 
 
-# -- goal ---------------------------------------------------------------------------------------
+# -- success ------------------------------------------------------------------------------------
 
 
-def test_the_goal_needs_the_grasp_and_the_height(make):
+def test_success_requires_a_grasp_and_a_height(make):
     env = make(num_objects=1, object_set="household")
     env.reset()
     scene = env.scene
     task = scene.task
     assert not task.is_success()
     scene.controller.reset(((0.45, 0.0, 0.2), 0.0))
-    assert not task.is_success()  # high, but empty
+    assert not task.is_success()  # high, without an object
     brick = next(body for body in task.clutter.pool.bodies if body.name == "brick")
     task.clutter.pool.deactivate(task.objects[0])
     task.clutter.pool.activate(brick)
@@ -284,7 +289,7 @@ def test_the_goal_needs_the_grasp_and_the_height(make):
     scene.controller.grip(0.0)
     scene.controller.move_to((0.45, 0.0, 0.08), 0.0)
     scene.controller.move_to((0.45, 0.0, 0.14), 0.0)
-    assert not task.is_success()  # held, but low
+    assert not task.is_success()  # held, at a low height
     scene.controller.move_to((0.45, 0.0, 0.16), 0.0)
     assert task.is_success()
     scene.controller.grip(1.0)
@@ -304,14 +309,14 @@ def play(env, episodes):
     return len(steps) / episodes, float(np.mean(steps))
 
 
-def test_expert_empties_trays(make):
+def test_the_expert_is_as_fast_as_the_published_planner(make):
     success, steps = play(make(expert=True), 40)
     assert success >= 0.95
     assert steps <= 1.1 * 14.2
 
 
 @pytest.mark.parametrize("robot", [name for name in ROBOTS if name != "kuka"])
-def test_expert_empties_trays_with_every_robot(make, robot):
+def test_the_expert_succeeds_with_every_robot(make, robot):
     success, steps = play(make(expert=True, robot=robot), 25)
     assert success >= 0.9
     assert steps <= 1.1 * 14.2
@@ -329,7 +334,7 @@ def test_expert_empties_trays_with_every_robot(make, robot):
     ],
     ids=["random", "fixed, without yaw", "fixed", "15 objects", "household"],
 )
-def test_expert_over_200_episodes(make, config, least):
+def test_the_expert_over_200_episodes(make, config, least):
     success, steps = play(make(expert=True, **config), 200)
     assert success >= least
     assert steps <= 1.1 * 14.2

@@ -1,4 +1,4 @@
-"""The grasp planner on scenes whose best grasp is worked out by hand, with different grippers."""
+"""Grasp and push planner on scenes whose best grasp is computed by hand, for several grippers."""
 
 import math
 from dataclasses import dataclass, replace
@@ -35,18 +35,18 @@ JAW = Gripper(
     ),
     closed_outline=(*((u, -0.01) for u in (0.0, 0.005, 0.01, 0.015)), (0.05, 0.07), (0.09, 0.07)),
 )
-"""Fingers that slide, 1 cm past the tool."""
+"""Fingers that slide, with tips 1 cm below the tool."""
 SWING = replace(
     JAW,
     tip_arc=((0.0, -0.01), (0.04, 0.006)),
     outline=(*JAW.outline[:-4], *((u, 0.006) for u in (0.04, 0.045, 0.05, 0.055))),
 )
-"""Fingers that end above the tool when they are open, and go down as they close."""
+"""Fingers whose tips are above the tool when open and descend on an arc as they close."""
 
 
 @dataclass
 class Lying:
-    """A body as far as the planner knows it."""
+    """The attributes of a body that the planner reads."""
 
     shape: Box
     position: tuple[float, float, float]
@@ -84,19 +84,19 @@ def plan(gripper, target, *others):
     return planner.plan([target], TOOL, REACH, heights)
 
 
-def test_a_slab_is_grasped_across_in_its_middle():
+def test_a_slab_is_grasped_across_at_its_centre():
     for yaw in (0.0, 0.7, 1.3, 1.9):
         target = block((0.03, 0.11, 0.03), yaw_rad=yaw)
         grasp = plan(JAW, target)
         assert grasp.body is target
-        # closing fingers turn a body by this much into their grasp
+        # closing fingers rotate the body by the remaining angle
         assert abs(math.cos(grasp.yaw_rad - yaw)) > 0.7
         assert math.dist(grasp.position[:2], target.position[:2]) < 0.01
 
 
 @pytest.mark.parametrize("gripper", [JAW, SWING], ids=["slides", "swings"])
 @pytest.mark.parametrize("palm_height_m", [0.02, 0.03, 0.07])
-def test_the_palm_stays_above_a_tall_block_and_the_fingers_reach_deep(gripper, palm_height_m):
+def test_a_tall_block_is_grasped_as_deep_as_the_palm_allows(gripper, palm_height_m):
     inner = [(u, min(z, palm_height_m)) for u, z in gripper.outline]
     gripper = replace(gripper, palm_height_m=palm_height_m, outline=tuple(inner))
     target = block((0.03, 0.03, 0.1))
@@ -109,28 +109,28 @@ def test_the_palm_stays_above_a_tall_block_and_the_fingers_reach_deep(gripper, p
     )
 
 
-def test_open_fingers_stay_above_what_is_beside():
+def test_open_fingers_stay_above_neighbours():
     target = block((0.03, 0.11, 0.06))
     beside = [block((0.03, 0.2, 0.03), (0.45 + x, 0.0)) for x in (-0.06, 0.06)]
     assert plan(JAW, target).position[2] < 0.03
     grasp = plan(JAW, target, *beside)
-    # their top, the length of the fingers below the tool, and some room
+    # height of the neighbours, length of the fingers below the tool, and the gap
     assert grasp.position[2] >= FLOOR_M + 0.03 + 0.01 + CLEARANCE_M - 1e-6
 
 
-def test_fingers_that_swing_down_keep_off_what_is_under_their_way():
-    """Open they would fit beside the block above its neighbours, but not once they close on it."""
+def test_fingers_that_close_on_an_arc_stay_above_neighbours():
+    """Open fingers at a lower height have clearance, but touch the neighbours as they close."""
     target = block((0.03, 0.11, 0.06))
     beside = [block((0.03, 0.2, 0.03), (0.45 + x, 0.0)) for x in (-0.065, 0.065)]
     grasp = plan(SWING, target, *beside)
-    # over the neighbours' inner edge, 50 mm off, a finger 16 mm deep is at half a gap of 34 mm
-    swung = SWING.tip_height_m(0.034)
-    assert swung < 0.006
-    assert grasp.position[2] >= FLOOR_M + 0.03 - swung + CLEARANCE_M - 1e-3
+    # a finger of 16 mm above the neighbours' inner edge, at 50 mm, is at half a gap of 34 mm
+    tip = SWING.tip_height_m(0.034)
+    assert tip < 0.006
+    assert grasp.position[2] >= FLOOR_M + 0.03 - tip + CLEARANCE_M - 1e-3
 
 
 @pytest.mark.parametrize("half_gap_m", [0.025, 0.04])
-def test_what_is_wider_than_the_gap_is_left(half_gap_m):
+def test_bodies_wider_than_the_gap_have_no_grasp(half_gap_m):
     gripper = replace(
         JAW,
         half_gap_m=half_gap_m,
@@ -140,7 +140,7 @@ def test_what_is_wider_than_the_gap_is_left(half_gap_m):
         assert (plan(gripper, block((width, width, 0.03))) is not None) is fits
 
 
-def test_a_flat_body_is_out_of_reach_of_fingers_that_end_high():
+def test_fingers_with_high_tips_have_no_grasp_of_a_flat_body():
     flat = block((0.07, 0.07, 0.012))
     assert plan(JAW, flat) is not None
     high = replace(SWING, tip_arc=((0.0, 0.0), (0.04, 0.006)))
@@ -158,7 +158,7 @@ def test_the_risk_of_a_body_alone_depends_on_the_yaw():
 
 
 @pytest.mark.parametrize("name", list(ROBOTS))
-def test_pushing_fingers_stand_off_the_floor_and_behind_the_body(name):
+def test_a_push_starts_above_the_floor_and_behind_the_body(name):
     gripper = measured_gripper(ROBOTS[name])
     target = block((0.03, 0.03, 0.03), (0.4, 0.0))
     planner, heights = scene(gripper, target)
@@ -168,15 +168,15 @@ def test_pushing_fingers_stand_off_the_floor_and_behind_the_body(name):
     assert math.dist(push.start[:2], target.position[:2]) > 0.015 + gripper.closed_half_m
 
 
-def test_a_wide_hand_is_kept_off_a_wall_where_another_push_will_do():
+def test_a_push_without_contact_of_hand_and_wall_is_preferred():
     target, wall_x = block((0.03, 0.03, 0.03), (0.45, 0.05)), 0.5325
     wall = block((0.2, 0.4, 0.09), (wall_x + 0.1, 0.0))
-    rooms = []
-    for height in (0.09, 0.03):  # of what reaches 9 cm to both sides, over the tool
+    gaps = []
+    for height in (0.09, 0.03):  # of the part of the hand that is 18 cm wide, above the tool
         gripper = replace(JAW, closed_outline=(*JAW.closed_outline[:-1], (0.09, height)))
         planner, heights = scene(gripper, target, wall)
         push = PushPlanner(planner, TRAY).plan([target], TOOL, REACH, heights)
-        rooms.append(wall_x - 0.09 - max(push.start[0], push.end[0]))
-    over_the_wall, beside_it = rooms
+        gaps.append(wall_x - 0.09 - max(push.start[0], push.end[0]))
+    over_the_wall, beside_it = gaps
     assert over_the_wall < 0
     assert beside_it > 0

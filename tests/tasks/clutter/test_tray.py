@@ -1,4 +1,4 @@
-"""The tray: its profile, what slides in it and what stays, and that it is tight."""
+"""The tray: profile, friction of base and walls, and closed corners."""
 
 import math
 
@@ -30,7 +30,7 @@ def height(heights, x, y, side=0.5, pixels=500):
     return heights[i, j]
 
 
-def test_objects_stand_on_its_base():
+def test_objects_are_placed_on_the_base():
     with World() as world:
         tray = Tray(world, WORKSPACE)
         block = world.add(Box(size_m=(0.03, 0.03, 0.03)), "block")
@@ -43,13 +43,13 @@ def test_objects_stand_on_its_base():
         assert base in {body.id for body in world.bodies if body.touches(block)}
 
 
-def test_floor_is_22_cm_wide_and_grows_with_the_workspace():
+def test_the_base_is_5_cm_narrower_than_the_workspace():
     assert profile(0.3)[0][0] == pytest.approx((0.3 - 0.05) / 2)
     assert profile(0.4)[0][0] - profile(0.3)[0][0] == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("direction", [(1, 0), (-1, 0), (0, 1), (0, -1)])
-def test_profile_from_above(world, direction):
+def test_the_height_image_shows_the_profile(world, direction):
     heights = HeightCamera(world.bodies).heightmap(CENTER, 0.5, 500)
 
     def at(distance):
@@ -69,10 +69,10 @@ def test_corners_are_closed(world):
     inside = heights[5:-5, 5:-5]
     assert inside.min() >= FLOOR_Z_M - 1e-9
     diagonal = np.diagonal(heights)[: len(heights) // 2]
-    assert np.all(np.diff(diagonal[8:]) <= 1e-9)  # falls from rim to floor without a gap
+    assert np.all(np.diff(diagonal[8:]) <= 1e-9)  # decreases from rim to base without a gap
 
 
-def test_blocks_slide_off_the_walls_and_stay_on_the_floor(world):
+def test_blocks_slide_off_the_walls_and_stay_on_the_base(world):
     block = Box(size_m=(0.03, 0.03, 0.03), friction=0.6)
     on_wall, on_floor = world.add(block, "on the wall"), world.add(block, "on the floor")
     on_wall.place((CENTER[0] + 0.19, CENTER[1], 0.1))
@@ -82,7 +82,7 @@ def test_blocks_slide_off_the_walls_and_stay_on_the_floor(world):
     assert math.dist(on_floor.position, (CENTER[0] - 0.05, CENTER[1] - 0.05, 0.017)) < 2e-3
 
 
-def test_nothing_falls_through(world):
+def test_dropped_blocks_stay_in_the_tray(world):
     blocks = [world.add(Box(size_m=(0.02, 0.04, 0.02)), f"block {i}") for i in range(8)]
     rng = np.random.default_rng(0)
     for block in blocks:
@@ -95,7 +95,7 @@ def test_nothing_falls_through(world):
         assert max(abs(p - c) for p, c in zip(block.position, CENTER, strict=False)) < 0.16
 
 
-def test_other_close_loop_tasks_can_have_it():
+def test_the_tray_is_an_option_of_close_loop_tasks():
     env = ba_torchrl.make("close_loop/block_picking", close_loop_tray=True, seed=0, obs_size=32)
     for _ in range(5):
         env.reset()
@@ -104,6 +104,6 @@ def test_other_close_loop_tasks_can_have_it():
     env.close()
 
 
-def test_tasks_without_room_refuse_it():
+def test_tasks_that_do_not_fit_the_tray_refuse_it():
     with pytest.raises(ConfigError, match="close_loop_tray"):
         ba_torchrl.make("close_loop/drawer_opening", close_loop_tray=True)

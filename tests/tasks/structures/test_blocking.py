@@ -1,4 +1,4 @@
-"""Ways to grasp a piece beside others, against arithmetic by hand."""
+"""Edge grasps and their clearances against values computed by hand."""
 
 import math
 
@@ -32,7 +32,7 @@ def world():
         yield world
 
 
-def test_one_finger_comes_down_two_millimetres_beside_the_body(world):
+def test_the_near_finger_of_an_edge_grasp_has_a_clearance_of_two_millimetres(world):
     body = world.add(CUBE, "cube")
     body.place(AT)
     one, other = edge_grasps(GRIPPER, body, 0.0)
@@ -51,14 +51,14 @@ def test_one_finger_comes_down_two_millimetres_beside_the_body(world):
     ("yaw", "opening", "half_m"),
     [(math.pi / 4, 1.0, 0.015 * math.sqrt(2)), (math.pi / 2, 1.0, 0.015), (0.0, 0.5, 0.015)],
 )
-def test_the_shift_is_what_body_and_opening_leave(world, yaw, opening, half_m):
+def test_the_shift_depends_on_opening_and_width_of_the_body(world, yaw, opening, half_m):
     body = world.add(CUBE, "cube")
     body.place(AT)
     for candidate in edge_grasps(GRIPPER, body, yaw, opening):
         assert candidate.shift_m == pytest.approx(opening * 0.04 - half_m - 0.002, abs=1e-4)
 
 
-def test_a_body_off_its_origin_gives_each_finger_its_own_shift(world):
+def test_shifts_differ_for_a_body_that_is_not_centred_on_its_origin(world):
     off = transform_mesh(box_mesh((0.03, 0.03, 0.03)), (0.01, 0.0, 0.0), 0.0)
     body = world.add(Solid(parts=(off,)), "off")
     body.place(AT)
@@ -66,7 +66,7 @@ def test_a_body_off_its_origin_gives_each_finger_its_own_shift(world):
     assert shifts == pytest.approx([0.04 - 0.005 - 0.002, 0.04 - 0.025 - 0.002], abs=1e-4)
 
 
-def test_what_nearly_fills_the_gripper_leaves_no_choice(world):
+def test_a_body_that_nearly_fills_the_gripper_has_no_edge_grasp(world):
     body = world.add(Box(size_m=(0.073, 0.03, 0.03)), "wide")
     body.place(AT)
     assert edge_grasps(GRIPPER, body, 0.0) == []
@@ -85,7 +85,7 @@ def test_what_nearly_fills_the_gripper_leaves_no_choice(world):
         ((-0.100, 0.0), math.pi, 0.085 - 0.077),
     ],
 )
-def test_room_on_the_way_of_a_finger(world, offset, yaw, gap_m):
+def test_clearance_on_the_path_of_a_finger(world, offset, yaw, gap_m):
     body, other = world.add(CUBE, "cube"), world.add(CUBE, "cube")
     body.place(AT)
     other.place((AT[0] + offset[0], AT[1] + offset[1], AT[2]))
@@ -98,7 +98,7 @@ def test_room_on_the_way_of_a_finger(world, offset, yaw, gap_m):
     assert room == pytest.approx(gap_m, abs=1e-4)
 
 
-def test_fingertips_pass_over_what_is_low(world):
+def test_bodies_below_the_fingertips_do_not_block_the_path(world):
     body, low = world.add(CUBE, "cube"), world.add(Box(size_m=(0.03, 0.03, 0.006)), "low")
     body.place(AT)
     low.place((AT[0] + 0.05, AT[1], 0.003))

@@ -1,4 +1,4 @@
-"""Block Stacking and House Building under close-loop control; stacks of cylinders in open loop."""
+"""Close-loop Block Stacking and House Building; open-loop stacks of cylinders."""
 
 import math
 
@@ -45,23 +45,23 @@ def triangle_of(task):
     return triangle
 
 
-def wait(env):
+def no_op(env):
     """Take a step in which the open gripper does not move."""
     action = torch.zeros(env.action_spec.shape)
     action[0] = 1.0
     return env._step(env.full_action_spec.zero().set("action", action))
 
 
-def follow(env):
-    """Let the expert play to the end of the episode; return its last step."""
-    state = wait(env)
+def follow_expert(env):
+    """Take expert actions to the end of the episode; return the last step."""
+    state = no_op(env)
     while not state["done"]:
         action = torch.from_numpy(env._expert_action(env.scene))
         state = env._step(env.full_action_spec.zero().set("action", action))
     return state
 
 
-# -- the pieces --------------------------------------------------------------------------------
+# -- pieces ------------------------------------------------------------------------------------
 
 
 def test_sizes_are_the_papers(make):
@@ -90,7 +90,7 @@ def test_the_number_of_pieces_is_configurable(make, task):
             ba_torchrl.make(task, num_objects=count)
 
 
-def test_fixed_orientations_turn_the_ends_of_the_triangle_to_the_fingers(make):
+def test_with_fixed_orientations_the_fingers_face_the_ends_of_the_triangle(make):
     env = make(HOUSE, **FIXED)
     for _ in range(3):
         env.reset()
@@ -99,7 +99,7 @@ def test_fixed_orientations_turn_the_ends_of_the_triangle_to_the_fingers(make):
         assert triangle_of(task).yaw_rad == pytest.approx(math.pi / 2, abs=1e-3)
 
 
-def test_a_triangle_is_held_level_by_its_ends(make):
+def test_a_triangle_held_by_its_ends_stays_level(make):
     scene = make(HOUSE).scene
     task = scene.task
     task.stand(cubes_of(task)[0], (0.35, 0.1), 0.0)
@@ -115,10 +115,10 @@ def test_a_triangle_is_held_level_by_its_ends(make):
     assert triangle_of(task).tilt_rad < 0.05
 
 
-# -- the goals ---------------------------------------------------------------------------------
+# -- success -----------------------------------------------------------------------------------
 
 
-def test_stacking_succeeds_when_let_go_of_and_not_before(make):
+def test_stacking_succeeds_only_after_the_release(make):
     env = make(STACKING)
     scene = env.scene
     lower, upper = cubes_of(scene.task)
@@ -142,25 +142,25 @@ def test_stacking_succeeds_when_let_go_of_and_not_before(make):
     [
         ((0.45, 0.0, 0.075), True),
         ((0.45, 0.02, 0.075), True),
-        ((0.45, 0.0, 0.079), True),  # dropped, it lands where it should
-        ((0.45, 0.028, 0.075), False),  # it topples
+        ((0.45, 0.0, 0.079), True),  # falls onto the lower cube
+        ((0.45, 0.028, 0.075), False),  # tips over
         ((0.45, 0.05, 0.025), False),
     ],
 )
-def test_stacking_is_judged_at_rest(make, position, expected):
+def test_stacking_is_evaluated_at_rest(make, position, expected):
     env = make(STACKING)
     lower, upper = cubes_of(env.scene.task)
     env.scene.controller.reset(((0.35, -0.1, 0.2), 0.0))
     lower.place((0.45, 0.0, 0.025))
     upper.place(position)
     env.scene.world.settle()
-    outcome = wait(env)
+    outcome = no_op(env)
     assert outcome["success"] == expected
     assert outcome["terminated"] == expected
     assert outcome["reward"] == float(expected)
 
 
-def test_a_house_has_its_triangle_on_top(make):
+def test_a_house_requires_the_triangle_on_top(make):
     env = make(HOUSE, num_objects=3)
     task = env.scene.task
     env.scene.controller.reset(((0.35, -0.1, 0.25), 0.0))
@@ -170,7 +170,7 @@ def test_a_house_has_its_triangle_on_top(make):
         (0.025, 0.075, (0.45, 0.0), 0.125, True),
         (0.075, 0.025, (0.45, 0.0), 0.125, True),
     ):
-        for i, body in enumerate(task.objects):  # out of each other's way
+        for i, body in enumerate(task.objects):  # apart from each other
             body.place((0.35, 0.1 * (i - 1), 0.03))
         env.scene.world.settle()
         first.place((0.45, 0.0, first_z))
@@ -192,59 +192,59 @@ def test_a_tipped_triangle_ends_the_episode_without_reward(make):
     triangle.set_pose((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
     env.scene.world.settle()
     assert triangle.tilt_rad > 1.0
-    outcome = wait(env)
+    outcome = no_op(env)
     assert outcome["terminated"]
     assert not outcome["success"]
     assert outcome["reward"] == 0
 
 
-def test_a_tumbled_cube_is_as_good_as_any(make):
+def test_a_cube_may_lie_on_any_side(make):
     env = make(HOUSE, expert=True)
     task = env.scene.task
     cubes_of(task)[0].set_pose(
         (*cubes_of(task)[0].position[:2], 0.025),
         (math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4)),
     )
-    assert follow(env)["success"]
+    assert follow_expert(env)["success"]
 
 
-# -- the expert --------------------------------------------------------------------------------
+# -- expert ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", [STACKING, HOUSE])
 @pytest.mark.parametrize("variant", [{}, FIXED], ids=["random orientations", "fixed"])
 @pytest.mark.parametrize(("count", "most"), [(2, 12.0), (3, 24.0), (4, 40.0)])
-def test_expert_builds_higher(make, task, variant, count, most):
+def test_expert_builds_structures_of_two_to_four_pieces(make, task, variant, count, most):
     env = make(task, num_objects=count, **variant)
     lengths = []
     for _ in range(5):
         env.reset()
-        assert follow(env)["success"]
+        assert follow_expert(env)["success"]
         lengths.append(env._step_count)
     assert np.mean(lengths) <= most
 
 
-def test_expert_takes_blocks_that_touch(make):
+def test_expert_separates_blocks_that_touch(make):
     env = make(STACKING)
     for yaw in (-0.6, 0.0, 0.4, 0.8):
         env.reset()
         first, second = cubes_of(env.scene.task)
         first.place((0.42, 0.0, 0.025), yaw)
         second.place((0.42 + 0.051 * math.cos(yaw), 0.051 * math.sin(yaw), 0.025), yaw)
-        assert follow(env)["success"]
+        assert follow_expert(env)["success"]
 
 
-def test_expert_takes_a_triangle_down_that_was_put_on_too_early(make):
+def test_expert_removes_a_triangle_in_a_low_slot(make):
     env = make(HOUSE, num_objects=3)
     task = env.scene.task
     cubes_of(task)[0].place((0.4, -0.05, 0.025), 0.3)
     cubes_of(task)[1].place((0.52, 0.05, 0.025), 0.0)
     triangle_of(task).place((0.4, -0.05, 0.075), 0.3)
     env.scene.world.settle()
-    assert follow(env)["success"]
+    assert follow_expert(env)["success"]
 
 
-def test_expert_lets_go_of_what_is_needed_later(make):
+def test_expert_releases_a_piece_that_supports_others(make):
     env = make(HOUSE)
     scene = env.scene
     task = scene.task
@@ -298,7 +298,7 @@ def test_fingers_close_on_sides_of_a_cylinder_at_every_grasp_yaw(cylinders):
         assert (along > along.max() - 1e-9).sum() == 4  # the corners of a side
 
 
-def test_a_stack_of_cylinders_is_the_goal_whichever_end_is_up(cylinders):
+def test_cylinders_may_stand_on_either_end(cylinders):
     assert cylinders.is_success()
     top = cylinders.objects[-1]
     top.set_pose(top.position, (1.0, 0.0, 0.0, 0.0))
@@ -308,7 +308,7 @@ def test_a_stack_of_cylinders_is_the_goal_whichever_end_is_up(cylinders):
 
 
 @pytest.mark.parametrize("place", [(0.45, 0.031, 0.015), (0.48, 0.1, 0.015)])
-def test_a_cylinder_beside_the_stack_does_not_count(cylinders, place):
+def test_a_cylinder_beside_the_stack_is_not_a_success(cylinders, place):
     cylinders.objects[-1].place(place)
     cylinders.world.settle()
     assert not cylinders.is_success()
@@ -349,19 +349,19 @@ def test_expert_stacks_cylinders_in_the_fewest_steps(settings):
     env.close()
 
 
-def test_a_stack_of_cylinders_taken_apart_can_be_built_again():
+def test_the_reversed_deconstruction_builds_a_stack_of_cylinders():
     scores = replay_scores(OPEN_STACKING, 10, object_type="cylinder")
     assert scores.reversible * scores.success_rate >= 0.9
 
 
 @pytest.mark.parametrize("task", [STACKING, "open_loop/house_building_1"])
-def test_cylinders_have_no_meaning_elsewhere(task):
+def test_other_tasks_refuse_cylinders(task):
     with pytest.raises(ConfigError, match="no meaning"):
         ba_torchrl.make(task, object_type="cylinder")
 
 
-def let_expert_go_on(env):
-    """The last outcome and the steps until the episode ends, from the scene as it was arranged."""
+def play_from_present_scene(env):
+    """Take expert actions from the present scene; return the last state and the steps."""
     env.scene.world.settle()
     env.scene.world.step(2)
     done, steps = False, 0
@@ -372,13 +372,13 @@ def let_expert_go_on(env):
     return outcome, steps
 
 
-def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
+def test_expert_removes_a_tower_that_blocks_the_grasp_of_the_last_cube(make):
     env = make(OPEN_STACKING, expert=True, max_steps=20)
     cubes = env.scene.task.objects
     for level, cube in enumerate(cubes[:3]):
         cube.place((0.394, 0.046, (level + 0.5) * 0.03), 1.2)
     cubes[3].place((0.362, 0.055, 0.015), 1.228)
-    outcome, steps = let_expert_go_on(env)
+    outcome, steps = play_from_present_scene(env)
     assert outcome["success"]
     assert steps <= 12
 
@@ -387,12 +387,12 @@ def test_expert_takes_a_tower_down_that_keeps_the_hand_from_the_last_cube(make):
     ("robot", "gap_m"),
     [("kuka", 0.01), ("kuka", 0.025), ("panda", 0.001), ("panda", 0.01), ("panda", 0.025)],
 )
-def test_expert_that_cannot_turn_takes_cubes_that_stand_side_by_side(make, robot, gap_m):
-    """In a row along the fingers' line each is in the others' way, grasped by its middle."""
+def test_expert_without_yaw_stacks_cubes_that_stand_side_by_side(make, robot, gap_m):
+    """In a row along the closing direction, cubes block the centred grasps of their neighbours."""
     fixed = {"action_sequence": "pxy", "random_orientation": False}
     env = make(OPEN_STACKING, expert=True, max_steps=30, robot=robot, num_objects=3, **fixed)
     for i, cube in enumerate(env.scene.task.objects):
         cube.place((0.42 + i * (0.03 + gap_m), 0.02, 0.015))
-    outcome, steps = let_expert_go_on(env)
+    outcome, steps = play_from_present_scene(env)
     assert outcome["success"]
     assert steps <= 20

@@ -1,4 +1,4 @@
-"""Open-loop structures: what counts as built, what does not, and who builds them."""
+"""Open-loop structures: conditions of success, random shapes, experts."""
 
 import math
 
@@ -25,7 +25,7 @@ IMPROVISED = ["improvise_house_building_2", "improvise_house_building_3"]
 
 
 class House:
-    """A task's scene with the finished structure, to be spoilt."""
+    """A task with its structure standing, in which tests move pieces."""
 
     def __init__(self, name):
         self.env = ba_torchrl.make(f"open_loop/{name}", seed=0)
@@ -93,7 +93,7 @@ def test_the_finished_structure_is_the_goal(house, name):
 
 
 @pytest.mark.parametrize("name", HOUSES)
-def test_a_top_piece_beside_the_rest_does_not_count(house, name):
+def test_a_top_piece_on_the_floor_is_not_a_success(house, name):
     h = house(name)
     low = h.top.shape.bounds_m[0][2]
     h.top.place((X + 0.12, Y, -low))
@@ -102,7 +102,7 @@ def test_a_top_piece_beside_the_rest_does_not_count(house, name):
 
 
 @pytest.mark.parametrize("name", ["block_stacking", "house_building_1"])
-def test_a_block_that_only_leans_against_the_stack_does_not_count(house, name):
+def test_a_block_beside_the_stack_is_not_a_success(house, name):
     h = house(name)
     lowest, second, *others = h.cubes
     h.put(second, 0.0, 0, across=B)  # beside the lowest, touching it
@@ -119,7 +119,7 @@ def test_a_block_that_only_leans_against_the_stack_does_not_count(house, name):
     ("name", "kind"),
     [("house_building_1", "triangle 1"), *((f"house_building_{i}", "roof 1") for i in (2, 3, 4))],
 )
-def test_a_tipped_roof_ends_the_episode_and_does_not_count(house, name, kind):
+def test_a_tipped_roof_ends_the_episode_without_success(house, name, kind):
     h = house(name)
     turn = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
     h.named[kind].set_pose((X + 0.13, Y, 0.02), turn)
@@ -128,13 +128,12 @@ def test_a_tipped_roof_ends_the_episode_and_does_not_count(house, name, kind):
 
 
 @pytest.mark.parametrize("name", ["house_building_2", "house_building_3", "house_building_4"])
-def test_a_roof_that_misses_a_support_does_not_count(house, name):
-    """It lies on one of the two pieces that should carry it, or to one side of the middle."""
+def test_a_roof_on_one_support_or_off_the_centre_is_not_a_success(house, name):
     h = house(name)
     roof = h.named["roof 1"]
     x, y, z = roof.position
     if name == "house_building_3":
-        roof.place((x, y + 1.2 * B, z))  # still on the cuboid, but off the middle
+        roof.place((x, y + 1.2 * B, z))  # on the cuboid, off its centre
     else:
         other = h.cubes[-1]
         side = math.copysign(1.0, other.position[1] - Y)
@@ -146,7 +145,7 @@ def test_a_roof_that_misses_a_support_does_not_count(house, name):
 
 
 @pytest.mark.parametrize("name", ["house_building_3", "house_building_4"])
-def test_a_storey_may_not_be_missing(house, name):
+def test_a_house_without_a_storey_is_not_a_success(house, name):
     h = house(name)
     roof, cuboid = h.named["roof 1"], h.named["cuboid 1"]
     for cube in h.cubes[2:]:
@@ -157,8 +156,7 @@ def test_a_storey_may_not_be_missing(house, name):
 
 
 @pytest.mark.parametrize("name", [*HOUSES, *IMPROVISED])
-def test_what_is_still_in_the_gripper_does_not_count(name):
-    """The expert's last place is needed; before it, nothing counts."""
+def test_only_the_last_place_is_a_success(name):
     env = ba_torchrl.make(f"open_loop/{name}", seed=1, expert=True)
     td, holding = env.reset(), False
     while not td["done"]:
@@ -171,10 +169,10 @@ def test_what_is_still_in_the_gripper_does_not_count(name):
     env.close()
 
 
-# -- improvised --------------------------------------------------------------------------------
+# -- improvised houses -------------------------------------------------------------------------
 
 
-def test_shapes_have_the_sizes_of_the_specification():
+def test_shapes_and_cuboids_have_the_sizes_of_the_specification():
     shapes = random_shapes()
     assert len(shapes) == len(NUMBERS) * SIZES
     assert {number for number, _ in shapes} == set(NUMBERS)
@@ -186,7 +184,7 @@ def test_shapes_have_the_sizes_of_the_specification():
         assert max(high[:2] - low[:2]) < 0.092
         (yaw,) = shape_piece(shape).grasp_yaws_rad
         across = shape.vertices[:, :2] @ (math.cos(yaw), math.sin(yaw))
-        assert np.ptp(across) < 0.085  # the open fingers take it
+        assert np.ptp(across) < 0.085  # it fits between the open fingers
     for cuboid in random_cuboids():
         for edge, (least, most) in zip(cuboid.size_m, CUBOID_M, strict=True):
             assert least <= edge <= most
@@ -207,7 +205,7 @@ def test_every_episode_draws_its_shapes(name):
     env.close()
 
 
-def test_a_restored_state_brings_its_shapes_back():
+def test_a_state_restores_the_shapes():
     env = ba_torchrl.make("open_loop/improvise_house_building_3", seed=0, expert=True)
     env.reset()
     scene = env.scene
@@ -223,7 +221,7 @@ def test_a_restored_state_brings_its_shapes_back():
     env.close()
 
 
-def test_an_improvised_roof_on_one_shape_does_not_count():
+def test_a_roof_on_one_shape_is_not_a_success():
     env = ba_torchrl.make("open_loop/improvise_house_building_2", seed=0)
     env.reset()
     task, world = env.scene.task, env.scene.world
@@ -242,7 +240,7 @@ def test_an_improvised_roof_on_one_shape_does_not_count():
 
 
 @pytest.mark.parametrize("name", [*HOUSES, *IMPROVISED])
-def test_a_gripper_that_does_not_turn_builds_it_too(name):
+def test_the_expert_succeeds_without_yaw(name):
     env = ba_torchrl.make(
         f"open_loop/{name}",
         seed=4,
@@ -260,14 +258,14 @@ def test_a_gripper_that_does_not_turn_builds_it_too(name):
     env.close()
 
 
-def test_the_site_is_away_from_what_is_still_to_be_fetched():
-    """A roof lies right beside one pair of blocks; the house is begun at another."""
+def test_the_structure_starts_at_a_site_where_other_picks_have_clearance():
+    """A roof lies close to one pair of blocks; the structure starts at the other pair."""
     env = ba_torchrl.make("open_loop/house_building_4", seed=0, expert=True)
     env.reset()
     task, world = env.scene.task, env.scene.world
     named = {body.name: body for body in task.objects}
-    spots = [(0.40, -0.12), (0.40, -0.04), (0.36, 0.15), (0.55, 0.15)]
-    for number, (x, y) in enumerate(spots, start=1):
+    points = [(0.40, -0.12), (0.40, -0.04), (0.36, 0.15), (0.55, 0.15)]
+    for number, (x, y) in enumerate(points, start=1):
         named[f"cube {number}"].place((x, y, B / 2))
     named["roof 1"].place((0.47, -0.08, B / 2))
     named["cuboid 1"].place((0.56, -0.08, B / 2))
