@@ -20,12 +20,25 @@ OPEN, CLOSED = 1.0, 0.0
 """Openings of the gripper."""
 IS_OPEN = 0.9
 """Least opening of an open gripper."""
+IS_CLOSED = 0.1
+"""Largest opening of a closed gripper."""
 ALIGNED_M = 4e-3
 """Largest horizontal offset, along each axis, of a gripper that is aligned with its target."""
 ALIGNED_RAD = 0.08
 """Largest yaw error of a gripper that is aligned with its target."""
-LOW_M = 0.02
+PUSH_HEIGHT_M = 0.02
 """Height of the tool above the lower bound of the workspace during a push."""
+PUSH_HEIGHT_TOLERANCE_M = 0.015
+"""Largest height above that of a tool that pushes."""
+PUSH_OFFSET_M = 0.015
+"""Largest distance from the line of a tool that pushes."""
+PUSH_YAW_RAD = 0.4
+"""Largest yaw error of a gripper that pushes."""
+PUSH_OVERLAP_M = 0.01
+"""Largest distance of a tool that pushes beyond the rear side of the body."""
+OBSTACLE_SHARE = 0.9
+"""A body is an obstacle of the approach if the path comes closer to it than this share of the
+distance between the body and the start of the push."""
 STANDOFF_M = 0.08
 """Distance from a body to the point from which it is pushed."""
 
@@ -143,10 +156,12 @@ def push(
     across = math.atan2(uy, ux) + math.pi / 2
     target_yaw = nearest_equivalent_yaw(yaw, across, limits, math.pi)
     turn = abs(wrap_angle(target_yaw - yaw))
-    low_z = workspace.z[0] + LOW_M
+    low_z = workspace.z[0] + PUSH_HEIGHT_M
 
     half = body.shape.height_m / 2
-    if z < low_z + 0.015 and along < -half + 0.01 and offset < 0.015 and turn < 0.4:
+    is_low = z < low_z + PUSH_HEIGHT_TOLERANCE_M
+    is_on_line = along < -half + PUSH_OVERLAP_M and offset < PUSH_OFFSET_M
+    if is_low and is_on_line and turn < PUSH_YAW_RAD:
         distance = math.dist((x, y), goal) - stop_short_m
         travel = max(min(distance, limits.step_m / max(abs(ux), abs(uy))), 0.0)
         # towards the goal from the tool, so that its offset from the line decreases
@@ -160,7 +175,7 @@ def push(
     is_behind = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
     is_obstacle = not is_behind and _distance_to_segment(
         (bx, by), (x, y), behind
-    ) < 0.9 * math.dist(behind, (bx, by))
+    ) < OBSTACLE_SHARE * math.dist(behind, (bx, by))
     if is_obstacle and z < over_z - 1e-3:
         return lift(over_z - z, opening)
     return move_toward(robot, (*behind, over_z if is_obstacle else low_z), target_yaw, opening)

@@ -1,4 +1,4 @@
-"""Experts of a robot that the package does not know, with fingers 1.5 times as wide."""
+"""Experts on a robot with fingers 1.5 times as wide, which these tests register."""
 
 import shutil
 from pathlib import Path
@@ -36,7 +36,7 @@ def robot(tmp_path_factory):
     del ROBOTS._entries["wide_jaw"]
 
 
-def test_the_fingers_are_wider_and_nothing_else(robot):
+def test_only_the_width_of_the_fingers_differs(robot):
     wide, narrow = (measured_gripper(ROBOTS[name]) for name in (robot, "ur5"))
     wider = (float(WIDER_M) - float(WIDTH_M)) / 2
     assert wide.half_width_m - narrow.half_width_m == pytest.approx(wider, abs=1e-3)
@@ -53,12 +53,12 @@ def test_the_fingers_are_wider_and_nothing_else(robot):
         "close_loop/drawer_opening",
     ],
 )
-def test_its_experts_succeed(robot, task):
+def test_experts_succeed_with_wide_fingers(robot, task):
     scores = expert_scores(task, EPISODES, seed=0, num_envs=1, parallel=False, robot=robot)
     assert scores.success_rate == 1
 
 
-def test_it_is_an_environment_like_any_other(robot):
+def test_environments_run_with_wide_fingers(robot):
     env = ba_torchrl.make("close_loop/block_picking", robot=robot, seed=0)
     assert env.rollout(3).shape[0] == 3
     env.close()

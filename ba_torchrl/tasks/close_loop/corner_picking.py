@@ -19,6 +19,7 @@ from ba_torchrl.tasks.clearance import finger_extent_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     CLOSED,
+    IS_CLOSED,
     IS_OPEN,
     OPEN,
     lift,
@@ -194,7 +195,7 @@ class CornerPicking(CloseLoopTask):
         is_off_walls = min(tool_x - px, tool_y - py) > -WALL_TOLERANCE_M
         is_clear = is_off_walls and abs(turn) < PRESS_TOLERANCE_RAD
         target = self.corner.to_world(px, py)
-        if robot.opening() < 0.1 and distance < PRESS_TOLERANCE_M and is_clear:
+        if robot.opening() < IS_CLOSED and distance < PRESS_TOLERANCE_M and is_clear:
             gap = gap_m(self.world.client, robot.id, self.block.id)
             if gap <= 2 * APPROACH_GAP_M:
                 return lift(-PRESS_M)
@@ -202,7 +203,7 @@ class CornerPicking(CloseLoopTask):
                 return lift(APPROACH_GAP_M - gap)
         if z < low_z - APPROACH_TOLERANCE_M / 2 and distance > PRESS_TOLERANCE_M:
             return lift(low_z + APPROACH_TOLERANCE_M - z)  # a low hand would push the block back
-        if not is_clear or robot.opening() >= 0.1:
+        if not is_clear or robot.opening() >= IS_CLOSED:
             low_z = wall_top + self._tips_below_m + TRAVEL_CLEARANCE_M
             if z < low_z - 1e-3:
                 return lift(low_z - z)

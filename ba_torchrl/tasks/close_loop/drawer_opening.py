@@ -22,6 +22,7 @@ from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
     CLOSED,
+    IS_CLOSED,
     lift,
     move_toward,
     nearest_equivalent_yaw,
@@ -141,7 +142,7 @@ class DrawerOpening(CloseLoopTask):
         front = -ROD_OFFSET_M * scale
         hook_z = rz - HOOK_DEPTH_M * scale
         finger = robot.gripper.half_width_m
-        is_closed = robot.opening() < 0.1
+        is_closed = robot.opening() < IS_CLOSED
 
         if (
             z < rz

@@ -18,6 +18,7 @@ from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
     CLOSED,
+    IS_CLOSED,
     IS_OPEN,
     OPEN,
     lift,
@@ -98,7 +99,7 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
         (x, y, z), yaw = robot.tool_pose()
         sx, sy, sz = push.start
         offset = max(abs(sx - x), abs(sy - y))
-        is_closed = robot.opening() < 0.1
+        is_closed = robot.opening() < IS_CLOSED
         if is_closed and z <= sz + push.height_tolerance_m and offset <= NEAR_M:
             return move_toward(robot, push.end, yaw, CLOSED)
         if is_closed and offset <= ALIGNED_M:

@@ -149,7 +149,7 @@ def test_pieces_are_put_down_in_the_area_with_clearance(scene):
             assert math.dist((x, y), cube.position[:2]) >= 2 * half_diagonal + AREA.gap_m - 1e-9
 
 
-def test_effort_decides_between_equal_moves(scene):
+def test_the_pick_cost_decides_between_equal_moves(scene):
     s = scene(tower(CUBE, CUBE, CUBE))
     queries = GraspQueries()
     for favourite in s.cubes:
@@ -170,8 +170,8 @@ def test_pieces_that_block_a_grasp_are_moved_to_the_ground(scene):
     class Queries(GraspQueries):
         clears_blocked_pieces = True
 
-        def blocks_grasp(self, body, other, place):
-            x, y, z = other.position if place is None else place
+        def blocks_grasp(self, body, other, position):
+            x, y, z = other.position if position is None else position
             near = math.dist((x, y), body.position[:2]) < 2 * B
             return [near and z - body.position[2] > B / 2]
 
