@@ -88,7 +88,7 @@ def is_success(episode: TensorDictBase) -> bool:
 
 
 def success_rate(episodes: Sequence[TensorDictBase]) -> float:
-    """Return the share of episodes that reached the goal."""
+    """Return the fraction of episodes that reached the goal."""
     return sum(map(is_success, episodes)) / len(episodes)
 
 

@@ -96,7 +96,7 @@ class ReplayScores(NamedTuple):
     """Results of reversed episodes that are replayed in the simulator."""
 
     reversible: float
-    """Share of the deconstruction episodes that can be reversed."""
+    """Fraction of the deconstruction episodes that can be reversed."""
     success_rate: float
     """Fraction of the reversible episodes whose inverse actions reach the goal."""
     mean_length: float

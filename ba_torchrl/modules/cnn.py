@@ -76,8 +76,7 @@ class CNNTwinCritic(nn.Module):
 
 
 def initialise_plain(module: nn.Module) -> None:
-    """Xavier-initialise a convolution or linear layer; other modules are unchanged. For
-    ``apply``."""
+    """Xavier-initialise a convolution or linear layer; a function for ``nn.Module.apply``."""
     if isinstance(module, nn.Conv2d):
         nn.init.xavier_normal_(module.weight)
     elif isinstance(module, nn.Linear):

@@ -45,8 +45,7 @@ class SpatialImageConfig(StrictModel):
         return self.images(images if self.height_scale_m == 1 else images / self.height_scale_m)
 
     def in_hand(self, images: Tensor) -> Tensor:
-        """Return in-hand images [B, C, h, w] in the compute dtype; only heights (C = 1) are
-        scaled."""
+        """Return in-hand images [B, C, h, w] in the compute dtype, heights (C = 1) scaled."""
         return self.heights(images) if images.shape[1] == 1 else self.images(images)
 
     def images(self, images: Tensor) -> Tensor:

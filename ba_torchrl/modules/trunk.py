@@ -107,8 +107,8 @@ class ImageNetworkConfig(StrictModel):
                 )
 
     def image_trunk(self, convs: Iterable[nn.Module], pools: Iterable[bool]) -> ImageTrunk:
-        """Return a trunk of these convolutions; ``pools`` is true for each that a 2x2 max pool
-        follows."""
+        """Return a trunk of convolutions, each followed by a 2x2 max pool where ``pools`` is
+        true."""
         return ImageTrunk(convs, pools, self)
 
 

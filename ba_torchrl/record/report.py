@@ -51,7 +51,8 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
         roots: folders that are searched for runs.
         folder: of the report, which is created if needed.
 
-    Returns: Path of the page.
+    Returns:
+        Path of the page.
 
     Raises:
         FileNotFoundError: there is no finished run.

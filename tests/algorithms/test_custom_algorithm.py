@@ -40,7 +40,7 @@ class BehaviourCloningLoss(LossModule):
 
 @ALGORITHMS.register("behaviour_cloning")
 class BehaviourCloningConfig(LearnerConfig):
-    """Regression of the expert's actions, those along the policy's own path included (DAgger)."""
+    """Regression of the expert's actions, also in states that the policy visits (DAgger)."""
 
     controls: ClassVar[frozenset[str]] = frozenset({"close_loop"})
 
@@ -109,7 +109,7 @@ def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
         assert torch.equal(a, b)
 
 
-def test_one_method_changes_one_part():
+def test_overriding_one_method_replaces_one_part():
     class Augmented(BehaviourCloning):
         def make_augmentation(self):
             return SO2Augmentation(self.images, self.problem.actions.sequence, seed=0)
@@ -120,7 +120,7 @@ def test_one_method_changes_one_part():
     assert learner.target_updater is None
 
 
-def test_pretraining_has_an_update_of_its_own(tmp_path, monkeypatch):
+def test_pretraining_calls_its_own_update(tmp_path, monkeypatch):
     taken = []
 
     def pretrain_update(self):

@@ -56,7 +56,7 @@ def test_the_policy_writes_nothing_but_the_action_for_any_batch_shape(network, s
     assert (out["action"].abs() <= 1).all()
 
 
-def test_the_policy_sees_depth_as_the_replay_stores_it():
+def test_the_policy_acts_on_quantised_depth():
     sac = build()
     codec = sac.codecs["pixels"]
     codes = torch.randint(0, 256, (4, 1, 64, 64), dtype=torch.uint8)
@@ -87,7 +87,7 @@ def test_the_acting_policy_follows_the_learner(demonstrations):
     assert not torch.equal(before, after)
 
 
-def test_updates_move_priorities_and_counter_and_imitate(demonstrations):
+def test_updates_change_priorities_and_counter_and_imitate(demonstrations):
     sac = build(learning_rate=3e-3)
     sac.extend(demonstrations)
     assert sac.replay_size == len(demonstrations)
@@ -133,7 +133,7 @@ def test_faults_never_enter_the_replay(demonstrations):
     assert sac.replay_size == len(data) // 2
 
 
-def test_a_restored_learner_goes_on_alike(demonstrations):
+def test_a_restored_learner_continues_identically(demonstrations):
     first, second = build(), build()
     first.extend(demonstrations)
     for _ in range(3):

@@ -52,7 +52,7 @@ def online(transitions):
     return data
 
 
-def test_the_batch_is_half_demonstrations_once_the_policy_has_met_something(transitions):
+def test_half_of_the_batch_are_demonstrations_once_there_are_online_transitions(transitions):
     algorithm = build()
     algorithm.extend(transitions)
     assert algorithm.replay.sample()["is_expert"].all()
@@ -122,7 +122,7 @@ def test_gradients_are_clamped_element_by_element(transitions):
     assert largest == pytest.approx(1e-5)
 
 
-def test_the_policy_sees_heights_as_the_replay_stores_them(transitions):
+def test_the_policy_acts_on_half_precision_heights(transitions):
     algorithm = build()
     state = transitions[:6].select("pixels", "in_hand", "holding")
     stored = state.clone()
@@ -132,7 +132,7 @@ def test_the_policy_sees_heights_as_the_replay_stores_them(transitions):
     assert torch.equal(algorithm.policy(nearby)["action"], algorithm.policy(stored)["action"])
 
 
-def test_the_policy_is_greedy_until_epsilon_says_otherwise(transitions):
+def test_the_policy_is_greedy_unless_epsilon_is_positive(transitions):
     state = transitions[:6].select("pixels", "in_hand", "holding")
     with set_exploration_type(ExplorationType.RANDOM):
         greedy = build()
@@ -149,7 +149,7 @@ def test_the_policy_is_greedy_until_epsilon_says_otherwise(transitions):
     assert found == pytest.approx([1.0, 0.875, 0.75, 0.625, 0.5, 0.5])
 
 
-def test_a_restored_learner_goes_on_as_the_first_would_have(transitions, tmp_path):
+def test_a_restored_learner_continues_identically(transitions, tmp_path):
     first = build(target_interval=3, augmentation="se2")
     first.extend(transitions)
     for _ in range(4):
@@ -168,7 +168,7 @@ def test_a_restored_learner_goes_on_as_the_first_would_have(transitions, tmp_pat
     assert float(one["target_value"]) == pytest.approx(float(other["target_value"]), rel=1e-6)
 
 
-def test_an_action_without_yaw_takes_the_networks_that_suit_it(transitions):
+def test_an_action_without_yaw_supports_networks_without_yaw_only(transitions):
     assert build("fcn", "pxy").policy(transitions[:2])["action"].shape == (2, 3)
     with pytest.raises(ValueError, match="fcn"):
         build("asr", "pxy")
@@ -176,7 +176,7 @@ def test_an_action_without_yaw_takes_the_networks_that_suit_it(transitions):
         build("fcn", "pxy", augmentation="se2")
 
 
-def test_networks_and_tasks_of_the_other_kind_are_refused():
+def test_networks_and_tasks_of_the_other_control_are_refused():
     spatial, close = parse(SpatialQConfig, {}, "q"), parse(ALGORITHMS["sac"], {}, "sac")
     cnn, fcn = parse(NETWORKS["cnn"], {}, "cnn"), parse(NETWORKS["fcn"], {}, "fcn")
     with pytest.raises(ConfigError, match=r"for close_loop tasks; open_loop tasks take .* asr"):

@@ -1,4 +1,4 @@
-"""Every hyper-parameter reaches the part that it is for: algorithms built with unusual values."""
+"""Every hyper-parameter has an effect: algorithms are built with unusual values."""
 
 import copy
 
@@ -213,7 +213,7 @@ def test_the_order_and_kind_of_rigid_transforms_are_the_configured_ones():
     assert isinstance(build("sac", augmentation="none").augmentation, nn.Identity)
 
 
-def test_the_optimiser_decays_the_networks_and_leaves_the_temperature_alone(algorithm):
+def test_weight_decay_applies_to_the_networks_and_not_to_the_temperature(algorithm):
     config, optimizer = algorithm.config, algorithm.optimizer
     decay = {
         id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]
@@ -271,7 +271,7 @@ def test_the_policy_explores_under_random_and_is_greedy_under_deterministic(algo
     assert torch.equal(first, second)
 
 
-def test_the_share_of_random_actions_falls_over_its_updates():
+def test_epsilon_decreases_over_its_updates():
     spatial = build("spatial_q")
     spatial.extend(transitions(spatial))
     shares = []

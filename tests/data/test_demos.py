@@ -38,7 +38,7 @@ def test_the_primitive_follows_what_is_held(collected):
         assert episode["action"][:, 0].tolist() == [0, 1]
 
 
-def test_either_source_loads_for_building(collected, tmp_path):
+def test_demonstrations_of_both_sources_can_be_loaded(collected, tmp_path):
     source, episodes = collected
     path = tmp_path / "demos"
     save_demonstrations(path, episodes, task=TASK, env=ENV, seed=0, source=source)
@@ -53,7 +53,7 @@ def test_either_source_loads_for_building(collected, tmp_path):
     assert set(metadata["versions"]) == {"ba_torchrl", "torch", "torchrl"}
 
 
-def test_defaults_may_be_written_out(collected, tmp_path):
+def test_explicit_default_values_are_accepted(collected, tmp_path):
     _, episodes = collected
     save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)
     spelled = {"action_sequence": "pxyr", "half_rotation": True, "max_steps": 10, "robot": "kuka"}
@@ -72,7 +72,7 @@ def test_another_configuration_is_refused_by_name(collected, tmp_path):
         load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "num_objects": 3})
 
 
-def test_a_field_that_came_into_being_later_counts_as_its_default(collected, tmp_path):
+def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
     _, episodes = collected
     save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=0)
     file = tmp_path / "demonstrations.json"

@@ -20,7 +20,7 @@ def expert_env():
     env.close()
 
 
-def test_quotas_share_episodes_evenly():
+def test_quotas_differ_by_at_most_one():
     assert quotas(10, 4) == [3, 3, 2, 2]
     assert quotas(2, 5) == [1, 1, 0, 0, 0]
 
@@ -69,7 +69,7 @@ def test_transitions_are_flat_and_flagged(expert_env):
     assert set(out.keys()) == {"pixels", "holding", "action", "next", "is_expert"}
 
 
-def test_demonstrations_come_back_from_disk(expert_env, tmp_path):
+def test_demonstrations_are_restored_from_disk(expert_env, tmp_path):
     episodes = collect_demonstrations(expert_env, 4, seed=0)
     env = {"obs_size": 16, "max_steps": 10}
     save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=env, seed=0)
@@ -92,7 +92,7 @@ def test_demonstrations_of_other_environments_are_refused(expert_env, tmp_path):
         load_demonstrations(tmp_path / "nowhere", task=TASK, env={})
 
 
-def test_faults_are_played_again(expert_env, monkeypatch):
+def test_episodes_with_faults_are_replaced(expert_env, monkeypatch):
     calls = 0
     scene = expert_env._envs[1].scene
     original = scene.controller.move_to

@@ -34,7 +34,7 @@ def images(*values):
 
 @pytest.fixture
 def taken_apart():
-    """Two picks and places, made up: state t shows the number t."""
+    """A synthetic episode of two picks and places, in which images of state t have the value t."""
     return TensorDict(
         {
             "pixels": images(0, 1, 2, 3),
@@ -72,7 +72,7 @@ def taken_apart():
     )
 
 
-def test_time_runs_backwards(taken_apart):
+def test_observations_are_in_reverse_order(taken_apart):
     built = reverse_episode(taken_apart)
     assert built["pixels"][:, 0, 0, 0].tolist() == [4, 3, 2, 1]
     assert built["next", "pixels"][:, 0, 0, 0].tolist() == [3, 2, 1, 0]
@@ -81,7 +81,7 @@ def test_time_runs_backwards(taken_apart):
     assert built["next", "holding"].flatten().tolist() == [True, False, True, False]
 
 
-def test_what_is_held_is_shown_as_its_pick_sees_it(taken_apart):
+def test_in_hand_images_are_those_of_the_inverse_picks(taken_apart):
     built = reverse_episode(taken_apart)
     # state 3 is held from the pick in state 4, state 1 from the pick in state 2
     assert built["in_hand"][:, 0, 0, 0].tolist() == [0, 54, 0, 52]
@@ -100,7 +100,7 @@ def test_the_last_step_has_the_reward_and_ends(taken_apart):
     assert built["next", "step_count"].flatten().tolist() == [1, 2, 3, 4]
 
 
-def test_the_recording_is_left_alone(taken_apart):
+def test_the_original_episode_is_not_modified(taken_apart):
     before = taken_apart.clone()
     built = reverse_episode(taken_apart)
     built["pixels"] = built["pixels"] + 1
@@ -117,7 +117,7 @@ def test_the_recording_is_left_alone(taken_apart):
         (("next", "holding"), (True, False, True, True)),
     ],
 )
-def test_what_did_not_go_by_turns_is_refused(taken_apart, key, values):
+def test_irreversible_episodes_are_refused(taken_apart, key, values):
     taken_apart[key] = flags(*values)
     assert not is_reversible(taken_apart)
     with pytest.raises(ValueError, match="cannot be reversed"):
@@ -125,7 +125,7 @@ def test_what_did_not_go_by_turns_is_refused(taken_apart, key, values):
 
 
 class Piece:
-    """A body that lies somewhere."""
+    """A body at a pose."""
 
     def __init__(self, x, y, z, turn=(0.0, 0.0, 0.0, 1.0)):
         self.pose = Pose((x, y, z), turn)
@@ -135,7 +135,7 @@ class Piece:
         return self.pose[0]
 
 
-def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
+def test_the_inverse_action_restores_the_pose_of_the_body():
     down = pybullet.getQuaternionFromEuler((math.pi, 0.0, 0.0))
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
     # held 4 mm beside its middle, along the tool's x axis
@@ -160,7 +160,7 @@ def test_the_action_that_undoes_brings_the_body_back_not_the_tool():
     assert place.z_m == pytest.approx(0.05)
 
 
-def test_nothing_undoes_an_action_that_moved_nothing_or_two_things():
+def test_an_action_that_moved_no_or_two_bodies_has_no_inverse():
     body, other = Piece(0.4, 0.1, 0.05), Piece(0.5, 0.0, 0.015)
     grasp = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     before = UndoRecorder({body: body.pose, other: other.pose}, None, None)
@@ -187,13 +187,13 @@ def test_reversed_actions_build_nine_structures_of_ten(task):
 
 
 @pytest.mark.parametrize("config", [{"action_sequence": "pxyzrrr"}, {"in_hand_mode": "proj"}])
-def test_other_parameters(config):
+def test_reversed_actions_build_with_other_parameters(config):
     scores = replay_scores(TASK, 4, **config)
     assert scores.reversible == scores.success_rate == 1
 
 
-def test_low_pieces_are_picked_at_heights_that_the_actions_give():
-    """The lowest cuboids are 2 cm high: held by their middle, fingers would meet the floor."""
+def test_low_pieces_are_picked_at_heights_of_the_action_space():
+    """The lowest cuboids are 2 cm high: fingers at their centre would touch the floor."""
     scores = replay_scores(
         "open_loop/improvise_house_building_3", 8, seed=50, action_sequence="pxyzr"
     )
@@ -201,15 +201,15 @@ def test_low_pieces_are_picked_at_heights_that_the_actions_give():
     assert scores.success_rate >= 0.85
 
 
-def test_fixed_orientations_without_turning():
+def test_structures_with_fixed_orientations_are_built_without_a_yaw():
     config = {"random_orientation": False, "action_sequence": "pxy"}
     scores = replay_scores("open_loop/house_building_1", 5, **config)
     assert scores.reversible == scores.success_rate == 1
 
 
 @pytest.mark.parametrize("mode", ["raw", "sub", "proj"])
-def test_episodes_come_out_as_the_experts_do(mode):
-    """Played forward in an environment for building, they give what the reversal says."""
+def test_reversed_episodes_equal_their_replay_in_the_simulator(mode):
+    """Their actions, executed in an environment, give the observations of the reversed episode."""
     config = {"seed": 5, "in_hand_mode": mode}
     env = ba_torchrl.make(TASK, deconstruct=True, expert=True, **config)
     plain = ba_torchrl.make(TASK, expert=True, **config)
@@ -244,7 +244,7 @@ def test_episodes_come_out_as_the_experts_do(mode):
         plain.close()
 
 
-def test_the_start_is_the_goal_and_the_end_is_apart():
+def test_a_deconstruction_starts_with_the_structure_and_ends_apart():
     env = ba_torchrl.make("open_loop/house_building_3", deconstruct=True, expert=True, seed=0)
     try:
         state = env.reset()
@@ -268,7 +268,7 @@ def test_the_start_is_the_goal_and_the_end_is_apart():
         env.close()
 
 
-def test_collected_side_by_side():
+def test_episodes_are_collected_in_a_vector_of_environments():
     env = ba_torchrl.make_vector_env(
         TASK, 2, parallel=False, expert=True, deconstruct=True, seed=0, obs_size=64
     )
@@ -289,6 +289,6 @@ def test_collected_side_by_side():
     assert (keys.NEXT, keys.IN_HAND) in transitions.keys(include_nested=True)
 
 
-def test_tasks_without_a_structure_refuse():
+def test_tasks_without_a_structure_refuse_deconstruction():
     with pytest.raises(ConfigError, match="no meaning for close_loop/block_picking"):
         ba_torchrl.make("close_loop/block_picking", deconstruct=True)

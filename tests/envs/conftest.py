@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 @pytest.fixture
 def make_fakes():
-    """Make vectors of fake environments (forked, unless told otherwise) and close them."""
+    """Make vectors of fake environments, by default forked, and close them."""
     from fake_env import FakeEnv
 
     made = []

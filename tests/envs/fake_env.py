@@ -1,4 +1,4 @@
-"""For the tests of vectors: a tiny environment that fails on demand, and what they all ask."""
+"""Shared parts of the tests of vectors: a small environment that fails on demand, and checks."""
 
 import os
 import time
@@ -99,7 +99,7 @@ def act(env, td, value=0.1):
 
 
 def assert_lost(result, index, before):
-    """``result`` reports for one environment that its episode was lost after ``before``."""
+    """Check that ``result`` reports the loss of one environment's episode after ``before``."""
     answer = result["next"][index]
     assert torch.equal(answer["pixels"], before["pixels"][index])
     for key in ("fault", "truncated", "done"):

@@ -61,7 +61,7 @@ def test_fingers_are_squares_of_zero_that_open_along_x(size, half):
     env.close()
 
 
-def test_turning_the_world_turns_the_image():
+def test_rotating_the_world_rotates_the_image():
     env = ba_torchrl.make("close_loop/block_pushing", obs_size=64)
     env.reset(seed=3)
     scene = env.scene

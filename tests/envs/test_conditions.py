@@ -1,4 +1,4 @@
-"""The named conditions of success: their conjunction is success, and Gymnasium's info has them."""
+"""The named conditions of success, their conjunction, and their entries in Gymnasium's info."""
 
 import gymnasium
 import pytest
@@ -9,7 +9,7 @@ from ba_torchrl.envs import keys
 
 
 @pytest.mark.parametrize("task", ba_torchrl.list_tasks())
-def test_success_is_their_conjunction(task):
+def test_success_is_the_conjunction_of_the_conditions(task):
     env = ba_torchrl.make(task, seed=3, obs_size=32, expert=True)
     state = env.reset()
     assert not all(env.conditions.values())
@@ -29,7 +29,7 @@ def test_success_is_their_conjunction(task):
     env.close()
 
 
-def test_grasping_and_lifting_are_told_apart():
+def test_grasping_and_lifting_are_separate_conditions():
     env = ba_torchrl.make("close_loop/block_picking", seed=0, obs_size=32, expert=True)
     state, seen = env.reset(), []
     while not state[keys.DONE]:
@@ -40,7 +40,7 @@ def test_grasping_and_lifting_are_told_apart():
     env.close()
 
 
-def test_they_are_those_of_a_restored_state():
+def test_conditions_are_those_of_a_restored_state():
     env = ba_torchrl.make("close_loop/block_picking", seed=0, obs_size=32)
     env.reset()
     before, state = env.conditions, env.get_state()
@@ -50,7 +50,7 @@ def test_they_are_those_of_a_restored_state():
     env.close()
 
 
-def test_the_info_of_gymnasium_has_them():
+def test_the_info_of_gymnasium_has_the_conditions():
     env = gymnasium.make("BulletArm/CloseLoopBlockPicking-v0", obs_size=32, seed=0)
     _, info = env.reset()
     assert {"is_grasped": False, "is_lifted": True}.items() <= info.items()

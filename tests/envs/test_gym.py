@@ -23,7 +23,7 @@ NOTHING = np.zeros(5, dtype=np.float32)
 
 @pytest.fixture
 def make():
-    """Make environments, small and seeded unless told otherwise, and close them."""
+    """Make environments, by default small and seeded, and close them."""
     made = []
 
     def make(gym_id=PICKING, **config):
@@ -39,7 +39,7 @@ def make():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_environment_checker_finds_nothing(make, task):
+def test_the_environment_checker_passes(make, task):
     env = make(gym_id(task), expert=True, render_mode="rgb_array", max_steps=3).unwrapped
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -68,7 +68,7 @@ def test_stable_baselines_warns_about_nothing_but_the_range_of_depth(make, task)
 # -- spaces, configuration -------------------------------------------------------------------
 
 
-def test_spaces_are_the_specs(make):
+def test_spaces_match_the_specs(make):
     env = make(action_sequence="pxyz", expert=True)
     assert set(env.observation_space) == {"pixels", "holding"}
     pixels, spec = env.observation_space["pixels"], env.unwrapped.torchrl_env.observation_spec
@@ -93,13 +93,13 @@ def test_a_spec_without_a_space_is_refused():
         ({"obs_size": "big"}, "obs_size"),
     ],
 )
-def test_wrong_keywords_are_explained(make, config, message):
+def test_wrong_keywords_are_errors_with_the_allowed_ones(make, config, message):
     with pytest.raises(ConfigError, match=message):
         make(**config)
 
 
 @pytest.mark.filterwarnings("ignore:.*render_mode='ascii'")
-def test_an_unknown_render_mode_is_explained(make):
+def test_an_unknown_render_mode_is_refused(make):
     with pytest.raises(ConfigError, match=r"'ascii'\. Known: human, rgb_array"):
         make(render_mode="ascii")
 
@@ -169,7 +169,7 @@ def test_the_expert_in_info_succeeds_and_success_terminates(make):
     assert observation["holding"].tolist() == [1]
 
 
-def test_types_are_those_of_numpy_and_python(make):
+def test_types_are_numpy_or_python_types(make):
     env = make(expert=True).unwrapped
     observation, info = env.reset(seed=0)
     assert {type(value) for value in observation.values()} == {np.ndarray}

@@ -38,7 +38,7 @@ def test_bad_actions_raise_before_anything_moves(env, action, message):
     assert env.step(state.set("action", torch.zeros(5)))["next", "step_count"] == 1
 
 
-def test_a_missing_action_says_so(env):
+def test_a_missing_action_is_an_error(env):
     with pytest.raises(InvalidActionError, match="'action'"):
         env._step(env.reset())
 
@@ -87,7 +87,7 @@ def test_a_simulator_fault_ends_the_episode_truncated(env, monkeypatch, caplog):
     assert not env.step(state.set("action", torch.zeros(5)))["next", "fault"]
 
 
-def test_faults_without_end_are_an_error(env, monkeypatch):
+def test_repeated_faults_are_an_error(env, monkeypatch):
     monkeypatch.setattr(base, "MAX_CONSECUTIVE_FAULTS", 2)
     monkeypatch.setattr("ba_torchrl.sim.control.close_loop.CloseLoopController.move_to", _fail)
     for _ in range(2):

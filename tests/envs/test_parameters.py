@@ -1,4 +1,4 @@
-"""Every parameter of `EnvConfig` does what it says (appendix B, table 4)."""
+"""Every parameter of `EnvConfig` has its documented effect (appendix B, table 4)."""
 
 import itertools
 import math
@@ -164,7 +164,7 @@ def test_experts_stay_within_the_half_turn(make, task):
     assert successes >= 9
 
 
-def test_workspace_check_looks_at_centres_or_outlines(make):
+def test_workspace_check_uses_centres_or_bounding_boxes(make):
     for check, valid in (("point", True), ("bounding_box", False)):
         env = make(workspace_check=check)
         env.reset()
@@ -181,14 +181,14 @@ def test_workspace_check_holds_for_open_loop_tasks_too(make):
         assert env.scene.task.is_valid() == valid
 
 
-def test_top_down_approach_is_the_pick_and_places(make):
+def test_top_down_approach_applies_to_picks_and_places(make):
     for top_down in (False, True):
         env = make("open_loop/block_stacking", top_down_approach=top_down)
         env.reset()
         assert env.scene.controller.top_down is top_down
 
 
-def test_in_hand_images_have_the_size_that_is_asked_for(make):
+def test_in_hand_size_sets_the_size_of_in_hand_images(make):
     env = make("open_loop/block_stacking", in_hand_size=40, obs_size=64, expert=True)
     state = env.reset()
     assert state["in_hand"].shape == (1, 40, 40)
@@ -199,7 +199,7 @@ def test_in_hand_images_have_the_size_that_is_asked_for(make):
     assert 12 <= (image > 0.02).sum() <= 100
 
 
-def test_blocks_get_the_steps_that_they_need(make):
+def test_the_step_limit_grows_with_the_number_of_blocks(make):
     for count, limit in ((4, 10), (6, 10), (7, 12), (8, 14)):
         assert make("open_loop/block_stacking", num_objects=count).max_steps == limit
     env = make("open_loop/block_stacking", num_objects=7, expert=True)
@@ -209,7 +209,7 @@ def test_blocks_get_the_steps_that_they_need(make):
     assert state["success"]
 
 
-def test_close_loop_tray_raises_the_objects_and_shows(make):
+def test_close_loop_tray_raises_the_objects_and_is_visible(make):
     env, plain = make(close_loop_tray=True, obs_size=64), make(obs_size=64)
     depths = env.reset()[keys.PIXELS], plain.reset()[keys.PIXELS]
     assert env.scene.task.block.position[2] == pytest.approx(0.027, abs=5e-4)
@@ -227,7 +227,7 @@ def test_close_loop_tray_raises_the_objects_and_shows(make):
         assert state["success"]
 
 
-def test_close_loop_tray_is_refused_where_it_has_no_room():
+def test_close_loop_tray_is_refused_for_tasks_that_do_not_fit():
     with pytest.raises(ConfigError, match="block_picking"):
         ba_torchrl.make("close_loop/block_pulling", close_loop_tray=True)
 
@@ -277,7 +277,7 @@ def test_view_types_show_the_same_scene_differently(make):
             assert first.shape != second.shape or not torch.equal(first, second)
 
 
-def test_rgb_adds_a_picture_and_its_depth(make):
+def test_rgb_adds_an_image_and_its_depth(make):
     plain, env = make(), make(rgb=True, obs_size=48)
     assert keys.RGB not in plain.reset()
     state = env.reset()
@@ -330,7 +330,7 @@ def test_physics_mode_sets_up_the_engine(make, settings, time_step_s, iterations
     assert state["success"]
 
 
-def test_colours_of_floor_and_workspace_show_in_pictures_only(make):
+def test_colours_of_floor_and_workspace_affect_rgb_images_only(make):
     plain = make()
     colored = make(floor_color=(1.0, 1.0, 1.0), workspace_color=(0.1, 0.1, 0.1))
     pixels = plain.reset()[keys.PIXELS], colored.reset()[keys.PIXELS]
@@ -340,7 +340,7 @@ def test_colours_of_floor_and_workspace_show_in_pictures_only(make):
     assert (before != after).any(axis=-1).mean() > 0.2
 
 
-def test_values_of_numpy_are_taken():
+def test_numpy_values_are_accepted():
     env = ba_torchrl.make(
         PICKING, seed=np.int64(3), object_scale_range=np.array([0.8, 0.9]), dpos=np.float32(0.04)
     )

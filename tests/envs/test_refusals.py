@@ -1,4 +1,4 @@
-"""Parameters that an environment refuses, with a message that says what is allowed."""
+"""Refused parameters of an environment, with messages that state the allowed values."""
 
 import math
 
@@ -39,7 +39,7 @@ def test_render_needs_a_display(monkeypatch):
         ({"workspace": ((0.3, 0.6), (-0.15, 0.15), (0.0, 0.02))}, "50 had an object outside"),
     ],
 )
-def test_what_has_no_meaning_is_refused(settings, message):
+def test_parameters_without_a_meaning_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         ba_torchrl.make(PICKING, **settings)
 

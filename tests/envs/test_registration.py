@@ -1,4 +1,4 @@
-"""Gymnasium knows every task, whatever is imported first."""
+"""Registration of every task with Gymnasium, in any order of imports."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ PICKING = "BulletArm/CloseLoopBlockPicking-v0"
         ("ramp/block_stacking", "BulletArm/RampBlockStacking-v0"),
     ],
 )
-def test_ids(task, wanted):
+def test_gym_ids_are_camel_case(task, wanted):
     assert gym_id(task) == wanted
 
 
@@ -65,7 +65,7 @@ def run(code, folder):
         "import ba_torchrl, importlib.util; importlib.util.find_spec('gymnasium')",
     ],
 )
-def test_ids_are_known_whatever_is_imported_first_and_without_torch(imports, tmp_path):
+def test_ids_are_registered_in_any_import_order_and_without_torch(imports, tmp_path):
     known, loaded = run(
         f"{imports}\nimport gymnasium, json, sys\n"
         "known = sorted(name for name in gymnasium.registry if name.startswith('BulletArm/'))\n"

@@ -1,4 +1,4 @@
-"""get_state and set_state: the same state and the same actions give the same future."""
+"""get_state and set_state: the same state and the same actions give the same steps."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from ba_torchrl.errors import SimulationError
 
 
 def play(env, state, actions):
-    """Return what follows from ``actions``: observations, and the bodies' poses at the end."""
+    """Return the observations after ``actions``, and the final poses of the bodies."""
     seen = []
     for action in actions:
         state = env.step(state.clone().set("action", action))["next"]
@@ -28,7 +28,7 @@ def same(first, second):
 
 
 @pytest.mark.parametrize("task", ba_torchrl.list_tasks())
-def test_a_state_and_its_actions_have_one_future(task):
+def test_a_state_and_its_actions_determine_the_steps(task):
     # enough steps, also where an episode has one
     env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=50)
     generator = torch.Generator().manual_seed(0)
@@ -53,7 +53,7 @@ def test_a_state_and_its_actions_have_one_future(task):
 
 
 def expert_steps(env, state, count):
-    """Return what follows from the expert's actions, through the ends of episodes."""
+    """Return the steps of the expert, over several episodes."""
     for _ in range(count):
         state = env.step(state.set("action", state["expert_action"]))["next"]
         if state["done"]:
@@ -71,7 +71,7 @@ def expert_steps(env, state, count):
         "close_loop/block_in_bowl",
     ],
 )
-def test_what_happens_in_between_leaves_no_trace(task):
+def test_a_restored_state_does_not_depend_on_intermediate_steps(task):
     env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True)
     expert_steps(env, env.reset(), 4)
     kept, futures = env.get_state(), []
@@ -97,7 +97,7 @@ def test_a_state_of_a_heap_survives_another_seed(task):
     env.close()
 
 
-def test_an_action_can_be_tried_and_taken_back():
+def test_an_action_can_be_undone_by_restoring_the_state():
     tried = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
     plain = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
     a, b = tried.reset(), plain.reset()
@@ -139,7 +139,7 @@ def test_a_state_of_another_environment_is_refused():
     second.close()
 
 
-def test_states_are_forgotten_with_their_object():
+def test_deleted_states_free_their_memory():
     import pybullet
 
     env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)

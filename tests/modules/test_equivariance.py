@@ -29,7 +29,7 @@ def turn_action(action, sequence, quarters):
 
 
 def steps(networks, size, action_size, n=3):
-    """A few optimiser steps towards random targets, so that biases are no longer zero."""
+    """Take a few optimiser steps towards random targets, so that biases are not zero."""
     generator = torch.Generator().manual_seed(1)
     parameters = [p for network in networks for p in network.parameters()]
     optimizer = torch.optim.Adam(parameters, 1e-2)
@@ -78,8 +78,8 @@ def test_every_quarter_turn_is_exact(size, sequence, group_order, trained):
             torch.testing.assert_close(turned_values, values, **tolerance)
 
 
-def test_opposite_sense_is_wrong():
-    """The test above can tell the two senses of rotation apart."""
+def test_rotation_in_the_opposite_sense_is_not_equivariant():
+    """The previous test distinguishes the two senses of rotation."""
     networks = build(64)
     pixels, holding = torch.rand(3, 1, 64, 64), torch.ones(3, 1, dtype=torch.bool)
     action = torch.rand(3, 5) * 2 - 1
@@ -96,7 +96,7 @@ def test_opposite_sense_is_wrong():
 
 
 def blob(size, angle_rad, sigma=0.12, radius=0.25):
-    """A Gaussian hump seen at an angle from the centre; smooth, so that 45 degrees are fair."""
+    """A Gaussian at an angle from the centre; smooth, so rotation by 45 degrees is accurate."""
     centres = (torch.arange(size) + 0.5) / size - 0.5
     x, y = torch.meshgrid(centres, centres, indexing="ij")
     x0, y0 = radius * math.cos(angle_rad), radius * math.sin(angle_rad)
@@ -119,7 +119,7 @@ def eighth_turn_deviations(actor):
     return deviation(vectors), deviation(loc[:, [0, 3, 4]])
 
 
-def test_eighth_turns_of_a_smooth_image_are_close():
+def test_eighth_turns_of_a_smooth_image_are_approximately_equivariant():
     """Pixels break 45 degrees: 20 % (vector) and 10 % (invariants), median of five networks.
 
     Before the squash, which is exact for quarter turns only.
@@ -133,8 +133,8 @@ def test_eighth_turns_of_a_smooth_image_are_close():
 
 
 @pytest.mark.parametrize("sequence", SEQUENCES)
-def test_vector_occupies_the_places_of_x_and_y(sequence):
-    """A scene with quarter-turn symmetry leaves the displacement no direction to prefer."""
+def test_the_vector_field_has_the_indices_of_x_and_y(sequence):
+    """In a scene with quarter-turn symmetry, the mean displacement is zero."""
     networks = build(64, sequence)
     pixels = torch.full((1, 64, 64), 0.2)
     loc, _ = networks.actor(pixels, torch.ones(1, dtype=torch.bool))
@@ -156,7 +156,7 @@ def eighth_turn_values(networks):
         )
 
 
-def test_eighth_turns_of_scene_and_action_leave_the_values_close():
+def test_values_are_approximately_invariant_under_eighth_turns():
     """Within 10 % of their size, median of five networks; pixels break 45 degrees."""
     deviations = []
     for seed in range(5):
@@ -166,8 +166,8 @@ def test_eighth_turns_of_scene_and_action_leave_the_values_close():
     assert sorted(deviations)[2] < 0.1
 
 
-def test_the_critics_head_is_exact_for_every_element_of_c8():
-    """At one pixel nothing is interpolated: a turn shifts the regular fields by one place."""
+def test_the_head_of_the_critic_is_exactly_invariant_under_c8():
+    """One pixel needs no interpolation: a rotation shifts the regular fields by one channel."""
     critic = build(64).critic
     features = torch.rand(3, 8 * 8)
     action = torch.rand(3, 5) - 0.5

@@ -44,7 +44,7 @@ def test_registry_holds_the_networks():
         ("cnn", {}, 1_278_874, 1_312_146),
     ],
 )
-def test_parameter_counts_are_the_papers(name, fields, actor, critic):
+def test_parameter_counts_match_the_paper(name, fields, actor, critic):
     networks = NETWORKS[name](**fields).build(actor_critic_spec(128, "pxyzr"))
     assert count(networks.actor) == actor
     if critic is not None:
@@ -73,7 +73,7 @@ def test_any_batch_shape(name, sequence, leading):
 
 
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
-def test_holding_and_action_matter(name):
+def test_outputs_depend_on_holding_and_action(name):
     networks = small(name, precision="float32")
     pixels = torch.rand(1, 64, 64)
     held, free = torch.tensor([True]), torch.tensor([False])
@@ -145,7 +145,7 @@ def test_auto_precision_follows_the_hardware(monkeypatch):
     assert compute_dtype("auto", torch.device("meta")) is torch.float32
 
 
-def test_functional_calls_see_the_given_parameters():
+def test_functional_calls_use_the_given_parameters():
     """TorchRL's target networks run the same module on other weights."""
 
     class Holder(LossModule):
@@ -201,7 +201,7 @@ def test_bad_action_sequences_are_refused(sequence):
 
 
 def test_missing_escnn_names_the_fix():
-    """The registry imports without escnn; only building an equivariant network asks for it."""
+    """The registry can be imported without escnn; building an equivariant network needs it."""
     code = """
 import sys
 sys.modules["escnn"] = None

@@ -32,7 +32,7 @@ def batch(size=SIZE, in_hand_size=24, n=4, seed=0):
 
 
 def train(network, steps=4):
-    """A few optimiser steps towards random targets, so that biases are no longer zero."""
+    """Take a few optimiser steps towards random targets, so that biases are not zero."""
     optimizer = torch.optim.Adam(network.parameters(), 1e-3)
     before = [p.detach().clone() for p in network.parameters()]
     for step in range(steps):
@@ -47,14 +47,14 @@ def train(network, steps=4):
 
 
 def assert_equal(actual, expected):
-    """To 1e-4 of the spread: a constant is equivariant, too."""
+    """Compare to 1e-4 of the spread of the values, since constants are equivariant as well."""
     spread = float(expected.std())
     assert spread > 1e-4
     torch.testing.assert_close(actual, expected, atol=1e-4 * spread, rtol=1e-4)
 
 
 def turned_pixels(chosen, size):
-    """Where a quarter turn by torch.rot90(k=1) takes pixels: read off from a turned image."""
+    """Pixels after a quarter turn by torch.rot90(k=1), found in a rotated image."""
     numbers = torch.arange(size * size).reshape(size, size)
     position = torch.empty(size * size, dtype=torch.long)
     position[torch.rot90(numbers).flatten()] = torch.arange(size * size)
@@ -100,8 +100,8 @@ def test_a_quarter_turn_turns_pixels_and_shifts_yaws(name, components, half, fie
             assert wrong.std() > 0.1 * (expected - mean).std()
 
 
-def test_opposite_sense_of_the_yaws_is_wrong():
-    """With three quarter turns left to go, the test above can tell the two senses apart."""
+def test_yaws_in_the_opposite_sense_are_not_equivariant():
+    """The previous test distinguishes the two senses of rotation."""
     network = build("equi_asr", half_rotation=False, num_rotations=8)
     pixels, in_hand, holding, chosen = batch()
     turned = torch.rot90(pixels, 1, (-2, -1))
@@ -128,7 +128,7 @@ def test_flips_of_the_image_flip_the_pixels_values(name, trained):
 
 @pytest.mark.parametrize(("half", "num_rotations"), [(True, 6), (False, 8)])
 def test_rot_fcn_sees_each_yaw_in_its_own_frame(half, num_rotations):
-    """Turning the scene shifts the yaws; those that leave the half turn meet a turned-over view."""
+    """Rotating the scene shifts the yaws; beyond half a turn, views are rotated by 180 degrees."""
     network = build("rot_fcn", half_rotation=half, size=26, num_rotations=num_rotations)
     pixels, in_hand, holding, _ = batch(size=26)
     with torch.no_grad():
@@ -142,8 +142,8 @@ def test_rot_fcn_sees_each_yaw_in_its_own_frame(half, num_rotations):
         assert_equal(turned, expected)
 
 
-def test_rot_fcn_values_the_image_turned_against_the_yaw():
-    """A gripper at +90 degrees sees the scene turned by -90; what it says is turned back."""
+def test_rot_fcn_rotates_the_image_against_the_yaw():
+    """A gripper at +90 degrees sees the scene rotated by -90; its values are rotated back."""
     network = build("rot_fcn", half_rotation=False, size=26, num_rotations=4)
     pixels, in_hand, holding, _ = batch(size=26)
     assert network.padded_size == 48
@@ -158,8 +158,8 @@ def test_rot_fcn_values_the_image_turned_against_the_yaw():
 
 
 @pytest.mark.parametrize("name", ["fcn", "asr"])
-def test_plain_networks_have_no_such_symmetry(name):
-    """So that the tests above could fail."""
+def test_plain_networks_are_not_equivariant(name):
+    """The previous tests fail for networks without equivariant layers."""
     network = build(name, XY if name == "fcn" else XYR)
     pixels, in_hand, holding, _ = batch()
     with torch.no_grad():
@@ -180,7 +180,7 @@ def test_plain_networks_have_no_such_symmetry(name):
     ],
 )
 def test_a_shift_by_the_stride_shifts_the_values(name, components, fields):
-    """Without biases an empty floor gives zeros, and the image is wider than a scene's reach."""
+    """Without biases an empty floor gives zeros, and the receptive field lies within the image."""
     size = 288
     network = build(name, components, size=size, **{"width": 1 / 16, **fields})
     with torch.no_grad():

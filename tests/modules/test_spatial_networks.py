@@ -84,15 +84,15 @@ def yaw_hand(last_map):
         ("equi_asr", XYR, 24, GENERATOR + 6_050_290, EQUI_YAWS + yaw_hand(6)),
     ],
 )
-def test_parameter_counts_are_the_references(name, components, in_hand_size, first, later):
+def test_parameter_counts_match_the_reference(name, components, in_hand_size, first, later):
     network = build(name, 128, in_hand_size, components=components, width=1.0, num_rotations=16)
     parts = dict(network.named_children())
     assert count(parts.pop("values" if "values" in parts else "positions")) == first
     assert sum(map(count, parts.values())) == later
 
 
-def test_totals_are_the_references():
-    """9.86, 28.5, 34.0 and 36.7 million; the last with the scene map flattened, as it was there."""
+def test_total_parameter_counts_match_the_reference():
+    """9.86, 28.5, 34.0 and 36.7 million; the last with a flattened scene feature map."""
     assert round(PLAIN_UNET + 66, -4) == 9_860_000
     assert round(GENERATOR + 6_050_290, -4) == 28_490_000
     assert round(PLAIN_YAWS, -5) == 34_000_000
@@ -101,7 +101,7 @@ def test_totals_are_the_references():
     assert round(flattened + yaw_hand(5), -5) == 33_800_000
 
 
-def test_equi_fcn_with_yaws_has_the_references_size():
+def test_equi_fcn_with_yaws_has_the_size_of_the_reference():
     network = build("equi_fcn", 128, width=1.0, num_rotations=8)
     assert count(network) == 47_125_954  # 47.1 million at C16
 
@@ -133,7 +133,7 @@ def test_shapes_without_a_yaw(name):
     assert values.shape == (4, 48, 48)
 
 
-def test_rot_fcn_takes_the_papers_ninety_pixels():
+def test_rot_fcn_supports_ninety_pixels_as_in_the_paper():
     network = build("rot_fcn", 90, num_rotations=2)
     assert network.padded_size == 128
     (values,) = values_of(network, *batch(90, n=1))
@@ -142,7 +142,7 @@ def test_rot_fcn_takes_the_papers_ninety_pixels():
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("name", NAMES)
-def test_every_input_matters_and_samples_do_not_mix(name, channels):
+def test_values_depend_on_every_input_and_on_their_own_sample_only(name, channels):
     network = build(name, channels=channels)
     pixels, in_hand, holding, chosen = batch(channels=channels)
     with torch.no_grad():
@@ -169,7 +169,7 @@ def test_every_input_matters_and_samples_do_not_mix(name, channels):
 
 
 @pytest.mark.parametrize("name", ["equi_fcn", "equi_asr"])
-def test_where_to_pick_does_not_depend_on_the_in_hand_image(name):
+def test_pick_values_do_not_depend_on_the_in_hand_image(name):
     network = build(name)
     pixels, in_hand, holding, _ = batch()
     with torch.no_grad():
@@ -182,7 +182,7 @@ def test_where_to_pick_does_not_depend_on_the_in_hand_image(name):
 
 @pytest.mark.parametrize("primitive", [False, True])
 @pytest.mark.parametrize("name", NAMES)
-def test_a_batch_of_one_primitive_only_learns(name, primitive):
+def test_a_batch_with_a_single_primitive_has_gradients(name, primitive):
     network = build(name)
     pixels, in_hand, _, chosen = batch()
     holding = torch.full((4, 1), primitive)
@@ -193,8 +193,8 @@ def test_a_batch_of_one_primitive_only_learns(name, primitive):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_narrow_networks_are_born_with_values_above_their_bias(seed):
-    """Else many pixels tie at the greatest value, and only the bias could ever raise it."""
+def test_initial_pixel_values_of_narrow_networks_exceed_their_bias(seed):
+    """Otherwise many pixels share the maximum, and only the bias has a gradient."""
     torch.manual_seed(seed)
     spec = spatial_spec(32, 24, 1, XY)
     network = NETWORKS["equi_fcn"](width=0.125, precision="float32").build(spec)
@@ -207,8 +207,8 @@ def test_narrow_networks_are_born_with_values_above_their_bias(seed):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_narrow_networks_are_born_with_yaws_that_differ(seed):
-    """Else everything is zero before the last layer, and stays so for want of a gradient."""
+def test_initial_yaw_values_of_narrow_networks_differ(seed):
+    """Otherwise all inputs of the last layer are zero and have no gradient."""
     torch.manual_seed(seed)
     network = NETWORKS["equi_asr"](width=0.125, num_rotations=4, precision="float32")
     _, yaws = values_of(network.build(spatial_spec(32, 24, 1, XYR)), *batch())
@@ -216,7 +216,7 @@ def test_narrow_networks_are_born_with_yaws_that_differ(seed):
 
 
 @pytest.mark.parametrize("name", ["asr", "equi_asr"])
-def test_the_second_level_trains_the_first_ones_encoder(name):
+def test_the_second_level_trains_the_encoder_of_the_first(name):
     network = build(name)
     values_of(network, *batch())[1].square().sum().backward()
     encoder = network.positions.unet.encoders[0]
@@ -227,7 +227,7 @@ def test_the_second_level_trains_the_first_ones_encoder(name):
 
 
 @pytest.mark.parametrize("name", ["asr", "equi_asr"])
-def test_the_second_level_knows_the_pixel(name):
+def test_the_second_level_depends_on_the_chosen_pixel(name):
     network = build(name)
     pixels, in_hand, holding, chosen = batch()
     with torch.no_grad():
@@ -238,7 +238,7 @@ def test_the_second_level_knows_the_pixel(name):
         network.later(2, state, chosen)
 
 
-def test_a_one_level_network_has_no_later_one():
+def test_a_network_with_one_level_has_no_later_level():
     with pytest.raises(NotImplementedError, match="one level"):
         build("fcn").later(1, None, torch.zeros(4, 2, dtype=torch.long))
 
@@ -257,8 +257,8 @@ def test_bfloat16_is_close_to_float32(name):
     assert {p.grad.dtype for p in rough.parameters() if p.grad is not None} == {torch.float32}
 
 
-def test_bfloat16_values_keep_differences_below_its_grain():
-    """The heads are float32: values between one and two would else share at most 128 levels."""
+def test_values_of_bfloat16_networks_have_float32_resolution():
+    """The heads are float32: bfloat16 has 128 different values between one and two."""
     for name in ("fcn", "equi_fcn"):
         network = build(name, precision="bfloat16", components=XY)
         biases = [p for n, p in network.named_parameters() if "head.b" in n or "values.b" in n]
@@ -272,7 +272,7 @@ def test_bfloat16_values_keep_differences_below_its_grain():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_heights_in_other_units_are_the_same_network(name):
+def test_scaled_heights_give_the_same_values(name):
     metres, units = build(name), build(name, height_scale_m=0.05)
     pixels, in_hand, holding, chosen = batch()
     for expected, actual in zip(
@@ -302,7 +302,7 @@ def test_copies_and_pickles_are_small_and_equal(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_functional_calls_see_the_given_parameters(name):
+def test_functional_calls_use_the_given_parameters(name):
     """TorchRL's target networks run the same module on other weights."""
 
     class Holder(LossModule):
@@ -331,7 +331,7 @@ def test_functional_calls_see_the_given_parameters(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_a_network_cannot_serve_is_refused(name):
+def test_unsupported_images_and_actions_are_refused(name):
     with pytest.raises(ValueError, match="x, y and rz, not z, ry, rx"):
         build(name, components=("x", "y", "z", "rz", "ry", "rx"))
     with pytest.raises(ValidationError):

@@ -42,7 +42,7 @@ def numpy_crop(image, row, column, size, yaw=0.0):
 
 @pytest.mark.parametrize("size", [8, 7])
 @pytest.mark.parametrize("yaw", [0.0, math.pi / 2, 0.4, -2.0])
-def test_patches_equal_a_crop_in_numpy(size, yaw):
+def test_patches_equal_crops_in_numpy(size, yaw):
     images = torch.rand(4, 1, 20, 20, generator=torch.Generator().manual_seed(0))
     pixels = torch.tensor([[10, 4], [0, 0], [19, 10], [7, 18]])
     actual = patches(images, pixels, size, torch.full((4,), yaw))
@@ -53,8 +53,8 @@ def test_patches_equal_a_crop_in_numpy(size, yaw):
         assert torch.equal(patches(images, pixels, size), actual)
 
 
-def test_a_turned_patch_is_what_the_environment_shows_as_in_hand():
-    """So a yaw's index means the same to the networks, the in-hand image and the gripper."""
+def test_a_rotated_patch_equals_the_in_hand_image_of_the_environment():
+    """Networks, in-hand image and gripper use the same convention of the yaw."""
     image = torch.rand(1, 1, 30, 30)
     for yaw in yaws_rad(5, True, torch.device("cpu")):
         patch = patches(image, torch.tensor([[13, 17]]), 24, yaw[None])
@@ -62,7 +62,7 @@ def test_a_turned_patch_is_what_the_environment_shows_as_in_hand():
         np.testing.assert_allclose(patch[0, 0].numpy(), expected, atol=2e-5)
 
 
-def test_an_odd_patch_has_the_pixel_in_its_middle_and_an_even_one_four_means():
+def test_an_odd_patch_is_a_crop_and_an_even_patch_averages_four_pixels():
     image = torch.rand(1, 1, 16, 16)
     odd = patches(image, torch.tensor([[5, 9]]), 5)[0, 0]
     torch.testing.assert_close(odd, image[0, 0, 3:8, 7:12], atol=1e-5, rtol=0)
@@ -71,7 +71,7 @@ def test_an_odd_patch_has_the_pixel_in_its_middle_and_an_even_one_four_means():
     torch.testing.assert_close(even, expected, atol=1e-5, rtol=0)
 
 
-def test_a_view_at_a_quarter_turn_is_the_scene_turned_back():
+def test_a_view_at_a_quarter_turn_shows_the_scene_rotated_back():
     image = torch.rand(1, 1, 12, 12)
     grid = sampling_grid(torch.full((1, 2), 6.0), torch.tensor([math.pi / 2]), 12, 12)
     torch.testing.assert_close(
@@ -95,7 +95,7 @@ def test_centre_fit_keeps_the_centre(size):
     assert fitted.sum() == pytest.approx(float(centre_fit(image, shared).sum()), rel=1e-5)
 
 
-def test_in_hand_encoders_say_which_sizes_they_take():
+def test_in_hand_encoders_refuse_unsupported_sizes():
     assert InHandMap(1, 24, 0.1).out_size == 8
     assert InHandMap(1, 40, 0.1).out_size == 16
     for size, last in ((24, 6), (40, 5), (32, 4), (20, 5)):
@@ -118,7 +118,7 @@ def dynamic(kernel_size=3, count=3, group="D4"):
 
 
 @pytest.mark.parametrize(("group", "kernel_size"), [("D4", 3), ("C8", 3), ("C8", 1)])
-def test_dynamic_filter_equals_a_loop_over_escnns_layer(group, kernel_size):
+def test_dynamic_filter_equals_a_loop_over_escnn_layers(group, kernel_size):
     torch.manual_seed(0)
     gspace, layer, coefficients = dynamic(kernel_size, group=group)
     x = torch.randn(4, layer.count * layer.size, 9, 9)
@@ -135,7 +135,7 @@ def test_dynamic_filter_equals_a_loop_over_escnns_layer(group, kernel_size):
     assert layer(x[:0], coefficients[:0]).shape == (0, *x.shape[1:])
 
 
-def test_dynamic_filters_gradient_equals_a_loops():
+def test_gradient_of_the_dynamic_filter_equals_that_of_a_loop():
     torch.manual_seed(0)
     _, layer, coefficients = dynamic()
     x = torch.randn(4, layer.count * layer.size, 6, 6)
@@ -159,7 +159,7 @@ def test_dynamic_filters_gradient_equals_a_loops():
         torch.testing.assert_close(actual, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_without_features_the_generator_makes_a_he_initialised_filter():
+def test_zero_features_give_a_he_initialised_filter():
     torch.manual_seed(0)
     gspace, layer, _ = dynamic(count=16)
     generator = filter_generator(64, layer)
@@ -188,7 +188,7 @@ def test_values_of_yaws_shift_by_one_per_step(half, order, size):
     np.testing.assert_allclose(step, np.roll(np.eye(size), 1, axis=0), atol=1e-12)
 
 
-def test_dihedral_fields_of_one_layer_turn_and_flip():
+def test_a_layer_of_dihedral_fields_is_equivariant_under_turns_and_flips():
     """The lift to regular fields permutes eight channels, and their maximum is invariant."""
     torch.manual_seed(0)
     gspace = planar_rotations_and_flips(4)

@@ -27,7 +27,7 @@ def layout(sequence="pxyr", levels=(PIXELS, YAWS), half_rotation=True):
 
 
 class Table(SpatialQNetwork):
-    """Values from tables: the second level's depend on the pixel that was chosen."""
+    """A network with values from tables; those of the second level depend on the chosen pixel."""
 
     levels = (PIXELS, YAWS)
 
@@ -54,7 +54,7 @@ def observation(count, holding=None):
 @pytest.mark.parametrize("half_rotation", [True, False])
 @pytest.mark.parametrize("sequence", ["pxyr", "rxy", "ypxr"])
 @pytest.mark.parametrize("levels", [(PIXELS, YAWS), (VOLUME,)], ids=["asr", "fcn"])
-def test_every_choice_becomes_an_action_and_comes_back(sequence, levels, half_rotation):
+def test_indices_and_actions_are_converted_both_ways(sequence, levels, half_rotation):
     actions = layout(sequence, levels, half_rotation)
     shapes = [size for level in levels for size in level.shape]
     every = torch.tensor(list(itertools.product(*map(range, shapes))))
@@ -69,7 +69,7 @@ def test_every_choice_becomes_an_action_and_comes_back(sequence, levels, half_ro
     assert torch.equal(actions.ravel(every, 0).unique(), torch.arange(math.prod(levels[0].shape)))
 
 
-def test_an_index_means_the_middle_of_its_pixel():
+def test_an_index_is_the_centre_of_its_pixel():
     actions = layout()
     action = actions.to_action(
         torch.tensor([[0, 0, 0], [5, 7, 3]]), torch.tensor([[False], [True]])
@@ -82,7 +82,7 @@ def test_an_index_means_the_middle_of_its_pixel():
     torch.testing.assert_close(action, torch.tensor(expected), atol=1e-7, rtol=0)
 
 
-def test_the_nearest_pixel_and_yaw_stand_for_an_action():
+def test_an_action_is_converted_to_the_nearest_pixel_and_yaw():
     actions = layout()
     low = torch.tensor([0.0, 0.25, -0.2, 0.0])
     corner = torch.tensor([0.0, 0.65, 0.2, 0.0])
@@ -97,14 +97,14 @@ def test_the_nearest_pixel_and_yaw_stand_for_an_action():
     assert full.to_indices(torch.tensor([0.0, 0.4, 0.0, math.pi]))[2] == 2
 
 
-def test_levels_must_choose_what_the_action_has():
+def test_levels_must_have_the_components_of_the_action():
     with pytest.raises(ValueError, match="chooses x, y, rz; the action sequence 'pxy' has x, y"):
         layout("pxy")
     with pytest.raises(ValueError, match="no grid for the component 'z'"):
         layout("pxyz", (Level(("x", "y", "z"), (6, 8, 5)),))
 
 
-def test_greedy_takes_the_best_pixel_and_then_the_best_yaw_there():
+def test_greedy_chooses_the_best_pixel_and_then_its_best_yaw():
     network = Table()
     values = SpatialValues(network, layout())
     holding = torch.tensor([[False], [True]])
@@ -117,7 +117,7 @@ def test_greedy_takes_the_best_pixel_and_then_the_best_yaw_there():
         assert value[primitive, 0] == network.yaws[primitive, row, column, yaw]
 
 
-def test_levels_are_taken_as_the_action_chose_them():
+def test_later_levels_are_conditioned_on_the_choices_of_the_action():
     network = Table()
     actions = layout()
     values = SpatialValues(network, actions)
@@ -137,7 +137,7 @@ def policy(epsilon=0.0, seed=0):
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
-def test_only_the_action_leaves_the_policy_for_any_batch_shape(shape):
+def test_the_policy_writes_only_the_action_for_any_batch_shape(shape):
     state = TensorDict(
         {
             "pixels": torch.zeros(*shape, 1, 6, 8),
@@ -152,7 +152,7 @@ def test_only_the_action_leaves_the_policy_for_any_batch_shape(shape):
     assert (out["action"][..., 0] == 1).all()
 
 
-def test_exploration_goes_to_what_stands_there_and_keeps_the_primitive():
+def test_exploration_chooses_pixels_of_objects_and_keeps_the_primitive():
     pixels, in_hand, holding = observation(4000)
     pixels[:, 0, 2, 3] = pixels[:, 0, 4, 5] = 0.03
     holding[::2] = True
@@ -171,7 +171,7 @@ def test_exploration_goes_to_what_stands_there_and_keeps_the_primitive():
     assert (share - 0.25).abs().max() < 0.04
 
 
-def test_on_an_empty_ground_exploration_goes_anywhere_and_the_seed_repeats_it():
+def test_exploration_of_an_empty_scene_is_uniform_and_reproducible():
     results = []
     for seed in (0, 0, 1):
         with set_exploration_type(ExplorationType.RANDOM):

@@ -124,7 +124,7 @@ def test_initial_coefficients_have_the_he_scale():
     assert not layer.bias.any()
 
 
-def test_weight_change_shows_at_once_in_eval_mode():
+def test_changed_weights_take_effect_in_eval_mode():
     ours, *_ = build(CASES[1])
     ours.eval()
     x = torch.randn(1, 24, 7, 7)

@@ -18,7 +18,7 @@ SIZES = (7, 3)
 
 
 class TwoLevels(nn.Module):
-    """Linear values; the second level's depend on the choice at the first."""
+    """Linear values; those of the second level depend on the choice at the first."""
 
     in_keys = ("pixels", "holding")
 
@@ -79,7 +79,7 @@ def huber(error):
 
 
 def by_hand(loss, data, kind, weight=0.1, margin=0.1, betas=(100.0, 1.0), importance=None):
-    """The losses by a loop over samples, levels and actions."""
+    """The losses, computed by a loop over samples, levels and actions."""
     online = {k: loss.value_network_params[k].detach().double() for k in ("first", "second")}
     target = {k: loss.target_value_network_params[k].double() for k in ("first", "second")}
     td, priorities, terms = 0.0, [], []
@@ -148,7 +148,7 @@ def test_importance_weights_are_applied_divided_by_their_largest():
     assert float(out["loss_demonstration"].detach()) == pytest.approx(demonstration, rel=1e-5)
 
 
-def test_without_a_violating_action_the_strict_margin_is_zero_and_pulls_at_nothing():
+def test_the_strict_margin_is_zero_without_a_violating_action():
     q = torch.tensor([[0.0, 1.0, 0.3], [0.5, 0.2, 0.55]], requires_grad=True)
     chosen, experts = torch.tensor([1, 2]), torch.tensor([True, False])
     value = strict_large_margin(q, chosen, experts, margin=0.1)
@@ -157,7 +157,7 @@ def test_without_a_violating_action_the_strict_margin_is_zero_and_pulls_at_nothi
     assert not q.grad.any()
 
 
-def test_the_strict_margin_presses_on_every_violation_and_counts_the_whole_batch():
+def test_the_strict_margin_has_gradients_for_every_violation_and_averages_the_batch():
     # expert's 0.5: 0.45 and 0.9 violate a margin of 0.1, by 0.05 and 0.5; 0.4 just not
     q = torch.tensor([[0.5, 0.45, 0.9, 0.39999], [9.0, 0.0, 0.0, 0.0]], requires_grad=True)
     chosen = torch.tensor([0, 1])
@@ -168,7 +168,7 @@ def test_the_strict_margin_presses_on_every_violation_and_counts_the_whole_batch
     assert not q.grad[1].any()
 
 
-def test_the_margin_of_dqfd_presses_on_the_worst_violation_of_experts_alone():
+def test_the_margin_of_dqfd_has_gradients_for_the_worst_violation_of_experts_only():
     q = torch.tensor([[0.5, 0.45, 0.9], [9.0, 0.0, 0.0]], requires_grad=True)
     value = large_margin(q, torch.tensor([0, 1]), torch.tensor([True, False]), margin=0.1)
     assert value.item() == pytest.approx(0.5)
@@ -205,7 +205,7 @@ def test_the_target_network_gets_no_gradient_and_the_network_does():
     assert not any(v.requires_grad for v in loss.target_value_network_params.values(True, True))
 
 
-def test_plain_dqn_does_without_the_expert_flag_and_others_say_what_is_missing():
+def test_only_plain_dqn_works_without_the_expert_flag():
     data = batch().exclude("is_expert")
     loss = make_loss(demonstrations="none")
     assert "is_expert" not in loss.in_keys
@@ -243,7 +243,7 @@ def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum(demonstra
 
 
 @pytest.mark.parametrize("function", [large_margin, strict_large_margin])
-def test_other_samples_than_demonstrations_have_no_margin_loss(function):
+def test_samples_that_are_not_demonstrations_have_no_margin_loss(function):
     q, chosen = torch.rand(6, 5), torch.arange(6) % 5
     is_expert = torch.tensor([True, False] * 3)
     losses = function(q, chosen, is_expert, 2.0, reduction="none")

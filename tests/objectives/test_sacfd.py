@@ -27,7 +27,7 @@ def affine(row_weights, bias, x):
 
 
 def by_hand(loss, data, gamma, alpha, target_entropy, demonstration_weight):
-    """Every number of the loss, with Python floats and loops only."""
+    """The terms of the loss, computed with Python floats and loops."""
 
     def parameters(name):
         tree = getattr(loss, name)
@@ -88,7 +88,7 @@ def by_hand(loss, data, gamma, alpha, target_entropy, demonstration_weight):
 @pytest.mark.parametrize("weights", [(0.2, 0.8, 0.4, 0.1), None], ids=["weights", "uniform"])
 @pytest.mark.parametrize("experts", [(True, False, True, False), (False,) * 4, (True,) * 4])
 @pytest.mark.parametrize("demonstration_weight", [1.0, 0.3])
-def test_numbers_worked_out_by_hand(experts, weights, demonstration_weight):
+def test_losses_equal_a_calculation_in_python(experts, weights, demonstration_weight):
     loss = make(
         alpha_init=0.2, target_entropy=-1.5, demonstration_weight=demonstration_weight
     ).make_value_estimator(ValueEstimators.TD0, gamma=0.9)
@@ -103,7 +103,7 @@ def test_numbers_worked_out_by_hand(experts, weights, demonstration_weight):
     torch.testing.assert_close(data[keys.TD_ERROR], expected_priorities, rtol=1e-6, atol=0)
 
 
-def test_defaults_are_the_papers():
+def test_defaults_are_those_of_the_paper():
     loss = make()
     assert float(loss.value_estimator.gamma) == pytest.approx(0.99)
     assert float(loss.alpha) == pytest.approx(0.01)
@@ -239,7 +239,7 @@ def test_renamed_keys():
         renamed.set_keys(colour="red")
 
 
-def test_dispatch_takes_keyword_tensors():
+def test_forward_accepts_keyword_tensors():
     loss, data = make(), batch(weights=None)
     expected = loss(data.clone())
     named = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in loss.in_keys}
@@ -264,7 +264,7 @@ def test_coefficients_can_be_scheduled_and_saved():
     torch.testing.assert_close(other(data.clone())["loss_actor"], after["loss_actor"])
 
 
-def test_refusals():
+def test_invalid_arguments_are_refused():
     with pytest.raises(ValueError, match="alpha_init"):
         make(alpha_init=0.0)
     with pytest.raises(NotImplementedError):
@@ -272,7 +272,7 @@ def test_refusals():
 
 
 def test_with_tanh_normal_actor_and_image_networks():
-    """The real thing: TorchRL's actor on the plain network, one joint backward pass."""
+    """One joint backward pass with TorchRL's actor on the plain network."""
     from ba_torchrl.modules.base import NETWORKS
     from tests.specs import actor_critic_spec
 

@@ -1,4 +1,4 @@
-"""The record of what environments compute: equal for equal code, different for any change."""
+"""Fingerprints of environments: equal for equal code, different for any change."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""The table of times: its rows, not its times."""
+"""The rows of the table of measurements; the times are not tested."""
 
 import subprocess
 import sys

@@ -24,7 +24,7 @@ class FakeLogger:
 
 @pytest.fixture
 def fake_backend(monkeypatch):
-    """Every backend seems installed; returns the logger and how it was asked for."""
+    """Pretend that every backend is installed; return the fake logger and its arguments."""
     logger, calls = FakeLogger(), []
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
     monkeypatch.setattr(
@@ -34,7 +34,7 @@ def fake_backend(monkeypatch):
 
 
 class TestScalarLog:
-    def test_is_tidy_and_survives_a_kill(self, tmp_path):
+    def test_has_one_row_per_scalar_and_survives_a_kill(self, tmp_path):
         log = ScalarLog(tmp_path / "run")
         log.write(0, {"eval/success_rate": 0.25})
         log.write(50, {"train/loss": torch.tensor([1 / 3]), "eval/success_rate": 1})
@@ -52,7 +52,7 @@ class TestScalarLog:
         log.close()
         log.close()
 
-    def test_resumes_after_a_torn_row(self, tmp_path):
+    def test_resumes_after_an_incomplete_row(self, tmp_path):
         log = ScalarLog(tmp_path)
         for step in (1, 2, 3):
             log.write(step, {"a,b": step / 10})
@@ -86,20 +86,20 @@ class TestScalarLog:
 
 
 class TestMakeLogger:
-    def test_csv_needs_none(self, tmp_path):
+    def test_csv_has_no_logger(self, tmp_path):
         assert make_logger("csv", tmp_path, "run", {}) is None
 
     @pytest.mark.parametrize("backend", ["tensorboard", "wandb"])
-    def test_missing_package_names_the_way_out(self, tmp_path, monkeypatch, backend):
+    def test_a_missing_package_is_an_error_with_the_fix(self, tmp_path, monkeypatch, backend):
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
         with pytest.raises(ImportError, match=rf"pip install 'ba-torchrl\[{backend}\]'"):
             ScalarLog(tmp_path, backend)
 
-    def test_unknown(self, tmp_path):
+    def test_an_unknown_backend_is_refused(self, tmp_path):
         with pytest.raises(ValueError, match="known are csv, tensorboard and wandb"):
             make_logger("paper", tmp_path, "run", {})
 
-    def test_tensorboard_for_real(self, tmp_path):
+    def test_tensorboard_writes_scalars(self, tmp_path):
         pytest.importorskip("tensorboard")
         log = ScalarLog(tmp_path, "tensorboard", {"seed": 0, "env": {"robot": "kuka"}})
         log.write(1, {"loss": 0.5})
@@ -108,7 +108,7 @@ class TestMakeLogger:
 
 
 class TestReadScalars:
-    def test_other_files(self, tmp_path):
+    def test_other_files_are_refused(self, tmp_path):
         path = tmp_path / "scalars.csv"
         with pytest.raises(FileNotFoundError):
             read_scalars(path)
@@ -124,7 +124,7 @@ class TestReadScalars:
         assert read_scalars(tmp_path) == {}
 
 
-def test_a_progress_bar_in_a_file_writes_now_and_then_only(capsys):
+def test_a_progress_bar_in_a_file_is_updated_rarely(capsys):
     with progress_bar(total=1000, unit="step") as bar:
         for _ in range(1000):
             bar.update()

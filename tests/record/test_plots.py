@@ -79,7 +79,7 @@ def test_refuses_other_curves(tmp_path, curves, message):
         plot_learning_curve(curves, tmp_path / "curve.png")
 
 
-def test_missing_package_names_the_way_out(tmp_path, monkeypatch):
+def test_a_missing_package_is_an_error_with_the_fix(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"pip install 'ba-torchrl\[recipes\]'"):
         plot_learning_curve({"a": curve(600)}, tmp_path / "curve.png")

@@ -23,8 +23,8 @@ UPDATES = (100, 200, 300)
 BLUE, ORANGE = (0, 114, 178), (213, 94, 0)
 
 
-def leave_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equi", **changes):
-    """Write what a finished run leaves; ``rates`` are those of the curve."""
+def write_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equi", **changes):
+    """Write the files of a finished run; ``rates`` are the success rates of the curve."""
     folder.mkdir(parents=True)
     config = {"task": task, "seed": seed, "env": {"obs_size": 64}, "run_dir": str(folder)}
     config |= changes.pop("config", {})
@@ -67,7 +67,7 @@ def leave_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equ
 def test_figures_over_seeds(tmp_path):
     curves = {0: (0.1, 0.8, 0.9), 1: (0.3, 0.9, 1.0), 2: (0.2, 0.6, 0.7)}
     for seed, rates in curves.items():
-        leave_run(tmp_path / f"seed{seed}", rates, seed=seed)
+        write_run(tmp_path / f"seed{seed}", rates, seed=seed)
     (section,), unfinished = load_sections([tmp_path])
     assert unfinished == []
     (row,) = summarize(section)
@@ -97,18 +97,18 @@ def test_standard_error_and_interval_against_plain_arithmetic():
     assert high - low == pytest.approx(2 * 1.96 * many.std(ddof=1) / 20, rel=0.1)
 
 
-def test_a_rate_that_is_never_reached_has_no_time(tmp_path):
-    leave_run(tmp_path / "a", (0.1, 0.2, 0.3))
+def test_a_rate_that_is_never_reached_gives_nan(tmp_path):
+    write_run(tmp_path / "a", (0.1, 0.2, 0.3))
     (section,), _ = load_sections([tmp_path])
     assert np.isnan(summarize(section)[0]["updates_to_80"])
 
 
-def test_all_tasks_together_count_the_methods_that_ran_on_all(tmp_path):
+def test_the_row_of_all_tasks_has_methods_that_ran_on_all_of_them(tmp_path):
     for seed, (limits, pick) in enumerate([(1.0, 0.5), (0.8, 0.1)]):
         rates = (0.0, 0.0)
-        leave_run(tmp_path / f"reach{seed}", (*rates, limits), seed=seed)
-        leave_run(tmp_path / f"pick{seed}", (*rates, pick), seed=seed, task=PICK)
-    leave_run(tmp_path / "other", (0.0, 0.0, 0.0), label="sac cnn")
+        write_run(tmp_path / f"reach{seed}", (*rates, limits), seed=seed)
+        write_run(tmp_path / f"pick{seed}", (*rates, pick), seed=seed, task=PICK)
+    write_run(tmp_path / "other", (0.0, 0.0, 0.0), label="sac cnn")
     (section,), _ = load_sections([tmp_path])
     rows = summarize(section)
     assert [(row["task"], row["method"]) for row in rows] == [
@@ -125,10 +125,10 @@ def test_all_tasks_together_count_the_methods_that_ran_on_all(tmp_path):
 
 
 def test_runs_with_other_settings_are_not_averaged(tmp_path):
-    leave_run(tmp_path / "a", (0, 0, 0), seed=0)
-    leave_run(tmp_path / "b", (0, 0, 0), seed=1)
-    leave_run(tmp_path / "c", (1, 1, 1), seed=0, config={"env": {"obs_size": 128}})
-    leave_run(tmp_path / "d", (0, 0, 0), seed=2, config={"threads": 4, "device": "cuda"})
+    write_run(tmp_path / "a", (0, 0, 0), seed=0)
+    write_run(tmp_path / "b", (0, 0, 0), seed=1)
+    write_run(tmp_path / "c", (1, 1, 1), seed=0, config={"env": {"obs_size": 128}})
+    write_run(tmp_path / "d", (0, 0, 0), seed=2, config={"threads": 4, "device": "cuda"})
     (section,), _ = load_sections([tmp_path])
     found = {group.method: [run.result.seed for run in group.runs] for group in section.groups}
     assert found == {
@@ -137,16 +137,16 @@ def test_runs_with_other_settings_are_not_averaged(tmp_path):
     }
 
 
-def test_benchmarks_are_reported_apart_and_loose_runs_last(tmp_path):
+def test_benchmarks_have_sections_and_other_runs_are_last(tmp_path):
     for name in (None, "close_loop_4d", "close_loop_3d"):
-        leave_run(tmp_path / str(name), (0, 0, 1), benchmark=name)
+        write_run(tmp_path / str(name), (0, 0, 1), benchmark=name)
     sections, _ = load_sections([tmp_path])
     assert [section.title for section in sections] == ["close_loop_3d", "close_loop_4d", "runs"]
 
 
 def test_two_runs_of_one_seed_are_refused(tmp_path):
     for name in ("a", "b"):
-        leave_run(tmp_path / name, (0, 0, 1))
+        write_run(tmp_path / name, (0, 0, 1))
     with pytest.raises(ValueError, match=r"settings and seed: .*/a, .*/b"):
         load_sections([tmp_path])
 
@@ -162,7 +162,7 @@ def test_folders_without_results_are_refused(tmp_path):
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path):
-    folder = leave_run(tmp_path / "a", (0.25, 0.5, 1.0), seed=3)
+    folder = write_run(tmp_path / "a", (0.25, 0.5, 1.0), seed=3)
     result = read_result(folder)
     assert [point.success_rate for point in result.curve] == [0.25, 0.5, 1.0]
     assert result.final.mean_length == 9.0
@@ -176,7 +176,7 @@ def test_differences_ignore_fields_that_do_not_change_learning():
 
 
 class Page(HTMLParser):
-    """Collects what a test asks for, and that every element is closed."""
+    """Parser of the page that also checks that every element is closed."""
 
     def __init__(self, path):
         super().__init__()
@@ -200,13 +200,13 @@ class Page(HTMLParser):
             self.rows[-1].append(data)
 
 
-def test_a_report_is_curves_tables_and_a_page(tmp_path):
+def test_a_report_has_curves_tables_and_a_page(tmp_path):
     runs = tmp_path / "runs"
     for task in (REACH, PICK):
         for seed in range(2):
             name = f"{task.split('/')[-1]}{seed}"
-            leave_run(runs / f"equi{name}", (0.2 + 0.2 * seed, 0.7, 0.9), seed=seed, task=task)
-            leave_run(
+            write_run(runs / f"equi{name}", (0.2 + 0.2 * seed, 0.7, 0.9), seed=seed, task=task)
+            write_run(
                 runs / f"cnn{name}",
                 (0.1, 0.2 + 0.1 * seed, 0.4),
                 seed=seed,
@@ -261,7 +261,7 @@ def test_a_report_is_curves_tables_and_a_page(tmp_path):
 
 
 def test_one_seed_has_no_shading_and_the_report_states_it(tmp_path):
-    leave_run(tmp_path / "runs/a", (0.2, 0.7, 0.9))
+    write_run(tmp_path / "runs/a", (0.2, 0.7, 0.9))
     path = write_report([tmp_path / "runs"], tmp_path / "report")
     image = imageio.imread(path.parent / "close_loop_4d.png")[..., :3].astype(int)
     shade = 0.2 * np.array(BLUE) + 0.8 * 255
@@ -272,7 +272,7 @@ def test_one_seed_has_no_shading_and_the_report_states_it(tmp_path):
         assert "neither shading nor interval" in text
         assert "±" in text
     assert "| 1 | 0.900 | – |" in (path.parent / "table.md").read_text()
-    leave_run(tmp_path / "runs/b", (0.2, 0.7, 0.9), seed=1)
+    write_run(tmp_path / "runs/b", (0.2, 0.7, 0.9), seed=1)
     path = write_report([tmp_path / "runs"], tmp_path / "report")
     assert "neither shading" not in (path.parent / "table.md").read_text()
 
@@ -301,9 +301,9 @@ def test_panels_share_colours_and_keep_their_names(tmp_path):
         plot_panels({"a": {"third": (x, x)}}, tmp_path / "p.png", names=["first"])
 
 
-def test_the_recipe_takes_folders_as_they_are(tmp_path):
+def test_the_recipe_reports_several_folders(tmp_path):
     for name in ("one", "two"):
-        leave_run(tmp_path / name / "run", (0.2, 0.7, 0.9), benchmark=name)
+        write_run(tmp_path / name / "run", (0.2, 0.7, 0.9), benchmark=name)
     command = [sys.executable, "recipes/report.py", f"{tmp_path}/one", f"{tmp_path}/two"]
     done = subprocess.run(
         [*command, f"folder={tmp_path}/out"], cwd=ROOT, capture_output=True, text=True

@@ -1,4 +1,4 @@
-"""docs/tasks.md is what `recipes/tasks.py` writes, and names the conditions of success."""
+"""docs/tasks.md equals the output of `recipes/tasks.py` and lists the conditions of success."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from ba_torchrl.record.task_page import task_page
 PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 
 
-def test_the_page_is_written_from_the_sources():
+def test_the_page_is_up_to_date():
     assert PAGE.read_text(encoding="utf-8") == task_page(), "run `python recipes/tasks.py`"
 
 
@@ -21,7 +21,7 @@ def test_a_section_has_description_conditions_and_parameters():
     assert "block_picking" not in page
 
 
-def test_every_task_is_there():
+def test_the_page_has_every_task():
     page = PAGE.read_text(encoding="utf-8")
     ours = [task for task in ba_torchrl.list_tasks() if not task.startswith("mine/")]
     assert [task for task in ours if f"### `{task}`" not in page] == []

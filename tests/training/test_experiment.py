@@ -119,7 +119,7 @@ def test_a_crash_while_saving_keeps_the_last_checkpoint(tmp_path, monkeypatch):
     assert find_checkpoint(config.folder).name.endswith("1")
 
 
-def test_the_best_checkpoint_outlives_the_rotation(tmp_path):
+def test_the_best_checkpoint_is_kept(tmp_path):
     config = tiny(tmp_path)
     checkpoints = Checkpoints(
         config.folder, build_algorithm(config), config.torch_device, keep_last=1
@@ -151,7 +151,7 @@ def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
     assert seeds[0] == seeds[1] != seeds[2]
 
 
-def test_a_missing_checkpoint_is_explained(tmp_path):
+def test_a_folder_without_a_run_is_an_error(tmp_path):
     with pytest.raises(ConfigError, match=r"config\.json and checkpoints"):
         load(tmp_path)
 
@@ -180,7 +180,7 @@ def test_a_missing_checkpoint_is_explained(tmp_path):
         ({"network": {"name": "fcn"}}, "network for open_loop tasks"),
     ],
 )
-def test_wrong_configurations_fail_before_anything_starts(tmp_path, changes, message):
+def test_wrong_configurations_fail_before_the_run_starts(tmp_path, changes, message):
     with pytest.raises(ConfigError, match=message):
         tiny(tmp_path, **changes)
     assert not (tmp_path / "run").exists()
@@ -230,7 +230,7 @@ def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view, reason)
     assert not (tmp_path / "run").exists()
 
 
-def test_another_view_can_be_learnt_from(tmp_path):
+def test_another_view_can_be_used_for_training(tmp_path):
     config = tiny(tmp_path, env={**TINY["env"], "view_type": "camera_center_xyzr"})
     assert Experiment(config, progress=False).run().updates == 6
 

@@ -36,7 +36,7 @@ UNIFORM = {**TINY["algorithm"], "replay": "uniform"}
 
 
 class Interrupted(BaseException):
-    """Not an error that anything would handle."""
+    """An exception that no code handles."""
 
 
 def raise_interrupted(*_):
@@ -52,7 +52,7 @@ def run(config):
 
 
 def interrupt(config, after):
-    """Run until so many updates are done, then stop without warning; return the experiment."""
+    """Run for a number of updates, then interrupt the run; return the experiment."""
     experiment = Experiment(config, progress=False)
     update = experiment.algorithm.update
 
@@ -68,7 +68,7 @@ def interrupt(config, after):
 
 
 def interrupt_between_state_and_checkpoint(config):
-    """Run until the first state is saved, and no further; return the experiment."""
+    """Interrupt a run directly after its first state is saved; return the experiment."""
     experiment = Experiment(config, progress=False)
 
     def stop(updates, success_rate):
@@ -81,7 +81,7 @@ def interrupt_between_state_and_checkpoint(config):
 
 
 def resumed(config):
-    """Return an experiment that went back to the last evaluation and no further."""
+    """Return an experiment that is restored to its last evaluation and not continued."""
     experiment = Experiment(config.model_copy(update={"resume": True}), progress=False)
     assert experiment._resume()
     experiment.close()
@@ -119,7 +119,7 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", [TINY["algorithm"], UNIFORM], ids=["prioritized", "uniform"])
-def test_learner_replay_priorities_and_generators_come_back_bit_by_bit(tmp_path, algorithm):
+def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_path, algorithm):
     config = config_for(tmp_path, algorithm=algorithm)
     first = interrupt_between_state_and_checkpoint(config)  # nothing has happened since
     expected = torch.random.get_rng_state()
@@ -253,7 +253,7 @@ def test_a_changed_configuration_is_refused_by_name(tmp_path):
     assert (config.folder / "config.json").read_bytes() == before
 
 
-def test_how_and_where_it_runs_may_change(tmp_path):
+def test_fields_that_do_not_affect_learning_may_change(tmp_path):
     config = config_for(tmp_path)
     interrupt(config, after=4)
     moved = tmp_path / "moved"
@@ -275,7 +275,7 @@ def test_how_and_where_it_runs_may_change(tmp_path):
 
 
 def pretend_cuda(folder):
-    """Let the files of an interrupted run say that its learner was on a GPU."""
+    """Change the files of an interrupted run as if its learner had been on a GPU."""
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "device": "cuda"}))
     schemas = list((folder / "resume").rglob("state.json"))

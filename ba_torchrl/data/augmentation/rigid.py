@@ -31,8 +31,7 @@ ATTEMPTS = 10
 
 
 class RigidTransform(NamedTuple):
-    """Rigid transforms of the plane about the workspace's centre: reflect y, then rotate, then
-    translate."""
+    """Rigid transforms about the workspace's centre: reflect y, then rotate, then translate."""
 
     mirrored: Tensor
     """bool [B]."""
@@ -218,7 +217,7 @@ class RigidAugmentation(nn.Module):
     def _transform_actions(
         self, action: Tensor, transform: RigidTransform
     ) -> tuple[Tensor, Tensor]:
-        """Return transformed actions [B, A], and where the wrapped yaw swaps the fingers, bool
+        """Return transformed actions [B, A], and whether their wrapped yaw swaps the fingers
         [B]."""
         moved = action.double()
         moved[:, self._xy] = self._positions(action, transform)

@@ -55,8 +55,7 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         return index
 
     def _writable_indices(self, data: TensorDictBase) -> Tensor | None:
-        """Return the indices that can be overwritten, oldest first; None if TorchRL's order
-        applies."""
+        """Return the indices to overwrite, oldest first; None if TorchRL's order applies."""
         storage = self._storage
         if len(storage) + len(data) <= storage.max_size or keys.IS_EXPERT not in data:
             return None

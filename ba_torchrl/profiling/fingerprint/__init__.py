@@ -1,1 +1,1 @@
-"""Records of what environments and training compute, to compare before and after a change."""
+"""Records of the results of environments and training, for comparison before and after a change."""

@@ -56,7 +56,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "other_order": {"action_sequence": "ryxp"},
     **{f"num_objects_{n}": {"num_objects": n} for n in (1, 2, 3, 4, 5, 8, 12, 18)},
 }
-"""Variants of every task with the robot kuka; a refusal is recorded too."""
+"""Variants of every task with the robot kuka; a refused configuration is recorded as well."""
 SLOW_TASKS = ("close_loop/object_grasping", "open_loop/bin_packing", "open_loop/object_grasping")
 """Tasks with slow resets, of which fewer actions are recorded."""
 VIEW_TASKS = ("close_loop/block_picking", "close_loop/drawer_opening")

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Return what differs between two records of a case, as lines of text; [] if nothing does."""
+    """Return the differences of two records of a case as lines of text, [] if there are none."""
     lines = _fact_lines("", old["facts"], new["facts"])
     for name in [*old["traces"], *(name for name in new["traces"] if name not in old["traces"])]:
         before, after = old["traces"].get(name), new["traces"].get(name)

@@ -19,9 +19,9 @@ from ba_torchrl.profiling.fingerprint.marks import digest, mark, marks, spec_fac
 MAX_STEPS = 200
 """Upper bound on the length of an episode."""
 TILT = 0.2
-"""Random tilts, as a share of the largest ones."""
+"""Random tilts, as a fraction of the largest ones."""
 NOISE = 0.3
-"""Standard deviation of the noise on expert actions, as a share of half the action's range."""
+"""Standard deviation of the noise on expert actions, as a fraction of half the action's range."""
 
 
 class Actions:

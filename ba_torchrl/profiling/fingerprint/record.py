@@ -35,7 +35,7 @@ RUNNERS: dict[str, Callable[[Case, dict[str, Any], dict[str, Any]], None]] = {
 
 
 def run_case(case: Case) -> dict[str, Any]:
-    """Run a case and return its record; refusals and failures are recorded too."""
+    """Run a case and return its record, also of a refused configuration or a failure."""
     torch.set_num_threads(1)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     torch.manual_seed(case.seed)

@@ -36,7 +36,7 @@ def reverse_in_hand(image, axes):
 
 
 def spot(x, y):
-    """A heightmap with a smooth bump at a place, metres."""
+    """A heightmap with a smooth bump at a position, metres."""
     rows = 0.25 + (torch.arange(SIZE) + 0.5) * STEP_M
     columns = -0.2 + (torch.arange(SIZE) + 0.5) * STEP_M
     squared = (rows[:, None] - x) ** 2 + (columns[None] - y) ** 2
@@ -44,7 +44,7 @@ def spot(x, y):
 
 
 def centre_of(image):
-    """Where the bump of a heightmap is, metres."""
+    """Position of the bump in a heightmap, metres."""
     rows = 0.25 + (torch.arange(SIZE) + 0.5) * STEP_M
     columns = -0.2 + (torch.arange(SIZE) + 0.5) * STEP_M
     weight = image[0] / image.sum()
@@ -100,7 +100,7 @@ def test_a_shift_by_whole_pixels_moves_rows_along_x():
     ("transforms", "settings"),
     [("translation", {}), ("cn", {"order": 12}), ("d4", {}), ("se2", {})],
 )
-def test_the_action_stays_on_what_it_aims_at(transforms, settings):
+def test_the_action_follows_its_target_in_the_image(transforms, settings):
     places = [(0.45 + 0.01 * i, -0.06 + 0.012 * i) for i in range(10)] * 6
     data = batch(places)
     out = augmentation(transforms, layout(), seed=0, **settings)(data)
@@ -114,7 +114,7 @@ def test_the_action_stays_on_what_it_aims_at(transforms, settings):
 
 
 def bar(yaw):
-    """A heightmap of a bar through the middle, along a direction of the xy plane."""
+    """A heightmap of a bar through the centre, along a direction in the xy plane."""
     grid = (torch.arange(SIZE) - SIZE / 2 + 0.5) * STEP_M
     x, y = grid[:, None], grid[None]
     across = -math.sin(yaw) * x + math.cos(yaw) * y
@@ -132,7 +132,7 @@ def direction_of(image):
 
 
 @pytest.mark.parametrize("transforms", ["cn", "d4", "se2"])
-def test_the_yaw_turns_with_the_scene(transforms):
+def test_the_yaw_rotates_with_the_scene(transforms):
     yaws = [0.1 + 0.28 * i for i in range(11)] * 5
     data = batch([(0.45, 0.0)] * len(yaws), yaws)
     data["pixels"] = torch.stack([bar(yaw) for yaw in yaws])
@@ -145,14 +145,14 @@ def test_the_yaw_turns_with_the_scene(transforms):
     assert len(out["action"][:, 3].unique()) > 20
 
 
-def test_a_full_turn_is_kept_where_half_turns_differ():
+def test_yaws_span_a_full_turn_without_half_rotation():
     data = batch([(0.45, 0.0)] * 400, [0.2] * 400)
     out = augmentation("cn", layout(half_rotation=False), seed=0, order=4)(data)
     found = sorted({round(float(yaw), 4) for yaw in out["action"][:, 3]})
     assert found == pytest.approx([0.2 + k * math.pi / 2 for k in range(4)], abs=1e-4)
 
 
-def test_tilts_change_sides_when_a_half_turn_is_taken_back():
+def test_tilts_change_sign_when_the_yaw_wraps():
     actions = layout("pxyrrr")
     data = batch([(0.45, 0.0)] * 200)
     # components: p x y rz ry rx
@@ -171,7 +171,7 @@ def test_tilts_change_sides_when_a_half_turn_is_taken_back():
 
 
 def view(turn, mirrored=False):
-    """A pick, at 0.3 from x to y, of an odd shape in a scene that is mirrored, then turned."""
+    """A pick at a yaw of 0.3 of an asymmetric object in a scene that is reflected, then rotated."""
     heights = np.zeros((65, 65))
     heights[30:42, 29:34], heights[31:34, 33:48], heights[37:40, 31:33] = 0.03, 0.05, 0.07
     yaw = -0.3 if mirrored else 0.3
@@ -182,7 +182,7 @@ def view(turn, mirrored=False):
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("turn", range(4))
 @pytest.mark.parametrize(("mode", "share"), [("raw", 1e-6), ("sub", 1e-6), ("proj", 0.12)])
-def test_the_in_hand_image_is_what_the_moved_scene_would_have_shown(mode, share, turn, mirrored):
+def test_the_in_hand_image_equals_that_of_the_transformed_scene(mode, share, turn, mirrored):
     def seen(turn, mirrored=False, over=False):
         heights, yaw = view(turn, mirrored)
         yaw = yaw % math.pi if over else yaw
@@ -225,7 +225,7 @@ def test_the_in_hand_image_follows_the_gripper(channels):
     assert min(counts) > 5
 
 
-def test_the_in_hand_image_stays_where_half_turns_differ():
+def test_the_in_hand_image_is_unchanged_without_half_rotation():
     data = batch([(0.45, 0.0)] * 20)
     turned = augmentation("cn", layout(half_rotation=False), seed=0)(data)
     assert torch.equal(turned["in_hand"], data["in_hand"])
@@ -240,7 +240,7 @@ def test_actions_stay_within_the_workspace():
 
 
 @pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
-def test_the_share_of_moved_transitions(probability):
+def test_the_fraction_of_transformed_transitions(probability):
     data = batch([(0.45, 0.05)] * 600)
     module = RigidAugmentation(
         "translation", layout(), open_loop_images(), seed=0, probability=probability
@@ -249,7 +249,7 @@ def test_the_share_of_moved_transitions(probability):
     assert abs(float(moved) - probability) < 0.06
 
 
-def test_the_seed_and_a_saved_state_repeat_the_draws():
+def test_the_seed_and_a_saved_state_determine_the_draws():
     data = batch([(0.45, 0.05)] * 5)
     first, second = (augmentation("se2", layout(), seed=3) for _ in range(2))
     assert torch.equal(first(data)["action"], second(data)["action"])

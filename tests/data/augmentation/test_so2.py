@@ -36,7 +36,7 @@ def batch(n=32, size=32, actions=5):
 
 
 def blob(x, y, size=64):
-    """A hump at world coordinates in [-0.5, 0.5]: rows follow x, columns y."""
+    """A bump at world coordinates in [-0.5, 0.5], rows along x and columns along y."""
     centres = (torch.arange(size) + 0.5) / size - 0.5
     gx, gy = torch.meshgrid(centres, centres, indexing="ij")
     return torch.exp(-((gx - x) ** 2 + (gy - y) ** 2) / (2 * 0.04**2))
@@ -65,7 +65,7 @@ def test_quarter_turns_are_bit_exact(k, size):
 
 
 @pytest.mark.parametrize("angle", [0.3, math.pi / 4, 2.0, 4.0, 6.1])
-def test_a_marked_spot_and_the_vector_to_it_turn_together(angle):
+def test_a_position_and_the_vector_to_it_rotate_together(angle):
     x, y = 0.21, -0.13
     turned = rotate_images(blob(x, y)[None, None], angles(angle))
     vector = rotate_displacement(torch.tensor([[x, y]]), angles(angle))[0]
@@ -77,7 +77,7 @@ def test_a_marked_spot_and_the_vector_to_it_turn_together(angle):
     assert vector.tolist() == pytest.approx(expected, abs=1e-6)
 
 
-def test_small_angles_join_the_quarter_turn_continuously():
+def test_rotation_is_continuous_at_quarter_turns():
     image = blob(0.2, 0.1)[None, None]
     for k in range(4):
         exact = rotate_images(image, angles(k * math.pi / 2))
@@ -85,7 +85,7 @@ def test_small_angles_join_the_quarter_turn_continuously():
         torch.testing.assert_close(near, exact, atol=1e-2, rtol=0)
 
 
-def test_outside_repeats_the_border():
+def test_pixels_outside_the_image_repeat_the_border():
     image = torch.full((1, 1, 32, 32), 0.25)
     assert torch.allclose(rotate_images(image, angles(0.7)), image, atol=1e-6)
 
@@ -167,7 +167,7 @@ def test_draws_come_from_the_modules_own_generator():
     assert not torch.equal(other[keys.PIXELS], first[keys.PIXELS])
 
 
-def test_bad_arguments():
+def test_invalid_arguments_are_refused():
     with pytest.raises(ValueError, match="probability"):
         SO2Augmentation(IMAGES, "pxyz", seed=0, probability=1.5)
     with pytest.raises(ValueError, match="no x and y"):

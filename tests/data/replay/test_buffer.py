@@ -63,7 +63,7 @@ def assert_same(stored, original):
 
 
 def frames_needed(transitions):
-    """Different frames among transitions, by their codes."""
+    """Number of distinct frames of transitions, by their codes."""
     codes = set()
     for t in transitions:
         for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
@@ -85,7 +85,7 @@ def test_a_plain_episode_shares_its_frames():
 
 @pytest.mark.parametrize("capacity", [7, 16, 50])
 def test_random_interleavings_and_wrap_around(capacity):
-    """Four environments step side by side, end at their own times, between whole episodes."""
+    """Interleave four environments with different episode lengths, and complete episodes."""
     rb, rng = buffer(capacity), np.random.default_rng(1)
     expected = [None] * capacity
     cursor = 0
@@ -120,7 +120,7 @@ def test_random_interleavings_and_wrap_around(capacity):
     assert_same(sample, torch.stack([expected[i] for i in sample["index"].tolist()]))
 
 
-def test_a_batch_larger_than_the_capacity_keeps_its_end():
+def test_a_batch_larger_than_the_capacity_keeps_its_last_transitions():
     rb, rng = buffer(6), np.random.default_rng(2)
     data = episode(20, rng)
     rb.extend(data)
@@ -160,7 +160,7 @@ def test_frame_table_counts_frees_and_reuses():
 
 
 @pytest.mark.parametrize("kind", ["noise", "flat", "ramp"])
-def test_any_frame_comes_back_as_it_was(kind):
+def test_any_frame_is_restored_exactly(kind):
     table, rng = FrameTable(torch.Size([1, 128, 128])), np.random.default_rng(4)
     frame = {
         "noise": rng.integers(0, 256, 128 * 128, dtype=np.uint8),
@@ -198,7 +198,7 @@ def test_incompressible_images_fit_as_well():
 
 @pytest.mark.parametrize("task", [t for t in ba_torchrl.list_tasks() if t.startswith("close_loop")])
 def test_memory_of_expert_episodes(task):
-    """100,000 transitions of 128 px take 0.5 GB at most, however short the episodes are."""
+    """100,000 transitions of 128 px take 0.5 GB at most, also with short episodes."""
     env = ba_torchrl.make_vector_env(task, 1, parallel=False, seed=0, expert=True)
     pixels = env.observation_spec[keys.PIXELS]
     quantizer = DepthQuantizer(float(pixels.space.high.max()))
@@ -240,7 +240,7 @@ def test_overwriting_reuses_frames():
 
 
 @pytest.mark.parametrize("prioritized", [True, False])
-def test_samples_come_as_float_metres_with_index(prioritized):
+def test_samples_are_float_metres_with_an_index(prioritized):
     rb, rng = buffer(prioritized=prioritized), np.random.default_rng(7)
     data = torch.cat([episode(6, rng, expert=True), episode(6, rng)])
     rb.extend(data)
@@ -283,7 +283,7 @@ def test_faults_never_enter():
     assert len(rb) == rb.write_count == 5
 
 
-def test_schema_drift_is_refused():
+def test_transitions_with_another_schema_are_refused():
     rb, rng = buffer(), np.random.default_rng(10)
     data = episode(4, rng)
     rb.extend(data)
@@ -349,7 +349,7 @@ def test_an_empty_replay_can_be_saved(tmp_path):
         other.sample()
 
 
-def test_empty_forgets_everything():
+def test_empty_removes_everything():
     rb, rng = buffer(), np.random.default_rng(12)
     rb.extend(episode(5, rng))
     rb.empty()

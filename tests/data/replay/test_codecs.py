@@ -22,7 +22,7 @@ def test_every_code_survives_a_round_trip():
     assert torch.equal(quantizer.encode(quantizer.decode(codes)), codes)
 
 
-def test_quantising_twice_changes_nothing_more():
+def test_quantisation_is_idempotent():
     quantizer = DepthQuantizer(0.32)
     once = quantizer(torch.rand(2, 1, 16, 16) * 0.32)
     assert torch.equal(quantizer(once), once)
@@ -50,13 +50,13 @@ def test_any_shape_and_floating_type(shape, dtype):
     assert torch.equal(depth, original)
 
 
-def test_the_acting_policy_sees_what_the_replay_returns():
+def test_the_codec_as_a_module_returns_the_decoded_image():
     quantizer = DepthQuantizer(0.32)
     depth = torch.rand(1, 8, 8) * 0.32
     assert torch.equal(quantizer(depth), quantizer.decode(quantizer.encode(depth)))
 
 
-def test_refusals():
+def test_invalid_arguments_are_refused():
     with pytest.raises(ValueError, match="positive"):
         DepthQuantizer(0)
     with pytest.raises(TypeError, match="floating"):
@@ -64,7 +64,7 @@ def test_refusals():
 
 
 @pytest.mark.parametrize("high_m", [0.1, 0.24, 0.25, 0.3])
-def test_half_precision_errs_by_half_its_spacing(high_m):
+def test_the_error_of_half_precision_is_half_its_spacing(high_m):
     codec = HalfPrecision(high_m)
     heights = torch.linspace(0, high_m, 400_001)[:-1]
     error = (codec(heights) - heights).abs().max().item()

@@ -17,7 +17,7 @@ EPS = 1e-6
 
 
 def back_ends():
-    """Our trees, and TorchRL's native ones where its extension loads."""
+    """The NumPy trees, and TorchRL's native ones if its extension loads."""
     yield pytest.param((segment_tree.SumTree, segment_tree.MinTree), id="numpy")
     yield pytest.param((segment_tree.SumTreeFp32, segment_tree.MinTreeFp32), id="numpy-fp32")
     native = prioritized.SumSegmentTreeFp64, prioritized.MinSegmentTreeFp64
@@ -144,7 +144,7 @@ def test_new_transitions_get_largest_error_and_bonus():
     assert leaves(sampler, 4) == pytest.approx(expected)
 
 
-def test_largest_error_does_not_run_away():
+def test_the_largest_error_excludes_the_bonus():
     buffer, sampler = make([True] * 4, bonus=1.0, capacity=16)
     for i in range(200):
         buffer.extend(transitions([i % 2 == 0]))
@@ -155,7 +155,7 @@ def test_largest_error_does_not_run_away():
     assert leaves(sampler, 16).max() <= (1 + EPS + 1) ** 0.6 + 1e-9
 
 
-def test_overwritten_place_follows_the_new_flag():
+def test_an_overwritten_transition_has_the_bonus_of_the_new_flag():
     buffer, sampler = make([True, True], capacity=2)
     buffer.extend(transitions([False]))
     assert leaves(sampler, 2) == pytest.approx(formula([1, 1], [0, 1], 1.0))
@@ -198,7 +198,7 @@ def test_checkpoint_continues_the_same_draws(on_disk, tmp_path):
         wrong.load_state_dict(state)
 
 
-def test_large_checkpoint_is_quick():
+def test_a_large_checkpoint_is_saved_and_loaded_fast():
     """TorchRL writes leaf by leaf: 28 s for this size with NumPy trees."""
     import time
 
@@ -219,7 +219,7 @@ def test_anneal_covers_the_run():
         assert sampler.beta == pytest.approx(beta)
 
 
-def test_refusals():
+def test_invalid_arguments_are_refused():
     buffer, sampler = make(FLAGS)
     with pytest.raises(ValueError, match="not finite"):
         buffer.update_priority(torch.tensor([0]), torch.tensor([float("nan")]))

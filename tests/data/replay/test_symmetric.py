@@ -11,7 +11,7 @@ CODEC = HalfPrecision(0.25)
 
 
 def transitions(numbers, is_expert):
-    """Transitions whose action is their number, and whose images show it."""
+    """Transitions whose action and images have the value of their number."""
     count = len(numbers)
     value = torch.tensor(numbers, dtype=torch.float32)
 
@@ -53,7 +53,7 @@ def filled(**settings):
     return made
 
 
-def test_every_batch_is_half_and_half():
+def test_half_of_every_batch_are_demonstrations():
     made = filled()
     assert len(made) == 50
     seen = set()
@@ -68,7 +68,7 @@ def test_every_batch_is_half_and_half():
     assert seen == {*range(10), *range(50, 90)}  # uniform over both sides
 
 
-def test_it_is_a_replay_buffer_of_torchrl():
+def test_it_is_a_torchrl_replay_buffer():
     made = filled()
     assert isinstance(made, ReplayBuffer)
     batch, info = made.sample(6, return_info=True)
@@ -81,12 +81,12 @@ def test_it_is_a_replay_buffer_of_torchrl():
     assert torch.equal(other.sample()["action"], made.sample()["action"])
 
 
-def test_of_an_odd_batch_the_demonstrations_get_one_more():
+def test_a_batch_of_odd_size_has_one_demonstration_more():
     assert filled(batch_size=7).sample()["is_expert"].sum() == 4
 
 
 @pytest.mark.parametrize("is_expert", [True, False])
-def test_one_side_fills_the_batch_while_the_other_is_empty(is_expert):
+def test_one_buffer_fills_the_batch_while_the_other_is_empty(is_expert):
     made = replay()
     made.extend(transitions(range(5), is_expert))
     assert (made.sample()["is_expert"] == is_expert).all()
@@ -102,14 +102,14 @@ def test_demonstrations_are_never_overwritten():
     assert numbers == {*range(10), *range(380, 400)}
 
 
-def test_mixed_transitions_go_to_their_sides():
+def test_mixed_transitions_are_added_to_their_buffers():
     made = replay()
     mixed = torch.cat([transitions([1], True), transitions([2, 3], False), transitions([4], True)])
     made.extend(mixed)
     assert len(made.expert) == len(made.online) == 2
 
 
-def test_images_come_back_within_the_codec_s_error():
+def test_images_are_restored_within_the_error_of_the_codec():
     made = filled()
     batch = made.sample()
     for key, offset in [
@@ -123,7 +123,7 @@ def test_images_come_back_within_the_codec_s_error():
         assert (batch[key] - expected).abs().max() <= CODEC.max_error_m
 
 
-def test_the_seed_repeats_the_draws_and_a_saved_replay_goes_on(tmp_path):
+def test_the_seed_determines_the_draws_and_a_saved_replay_continues_them(tmp_path):
     first, same, other = filled(seed=1), filled(seed=1), filled(seed=2)
     batch = first.sample()["action"]
     assert torch.equal(batch, same.sample()["action"])
@@ -138,7 +138,7 @@ def test_the_seed_repeats_the_draws_and_a_saved_replay_goes_on(tmp_path):
     assert numbers == {*range(10), *range(50, 90)}
 
 
-def test_an_empty_or_a_full_replay_says_so():
+def test_an_empty_or_a_full_replay_raises():
     with pytest.raises(RuntimeError, match="empty"):
         replay().sample()
     made = replay(capacity=6)

@@ -34,7 +34,7 @@ def numbers_in(made):
 
 
 @pytest.mark.parametrize("kind", ["uniform", "prioritized"])
-def test_demonstrations_stay_in_a_full_replay(kind):
+def test_demonstrations_are_kept_in_a_full_replay(kind):
     made = replay(kind=kind)
     made.extend(transitions(range(30), True))
     for start in range(100, 200, 5):
@@ -44,7 +44,7 @@ def test_demonstrations_stay_in_a_full_replay(kind):
     assert made.sample().batch_size == (8,)
 
 
-def test_demonstrations_that_come_later_stay_too():
+def test_demonstrations_that_are_added_later_are_kept():
     made = replay(8)
     made.extend(transitions(range(6), False))
     made.extend(torch.cat([transitions([100], True), transitions([6, 7], False)]))
@@ -54,7 +54,7 @@ def test_demonstrations_that_come_later_stay_too():
     assert sorted(numbers_in(made)) == [*range(34, 40), 100, 101]
 
 
-def test_of_a_batch_larger_than_the_room_the_newest_and_the_demonstrations_stay():
+def test_a_batch_that_exceeds_the_capacity_keeps_demonstrations_and_the_newest():
     made = replay(8)
     made.extend(transitions([0, 1], True))
     batch = torch.cat([transitions([2], True), transitions(range(10, 30), False)])
@@ -70,7 +70,7 @@ def test_without_demonstrations_the_oldest_is_overwritten():
     assert sorted(numbers_in(made)) == list(range(22, 30))
 
 
-def test_demonstrations_without_room_are_refused():
+def test_demonstrations_that_exceed_the_capacity_are_refused():
     made = replay(8)
     made.extend(transitions(range(6), True))
     with pytest.raises(ConfigError, match="raise buffer_size"):

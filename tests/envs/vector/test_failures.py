@@ -90,7 +90,7 @@ class TestFailures:
         assert_lost(result, 1, before)
 
     @BUFFERS
-    def test_a_death_before_a_full_reset_leaves_no_trace(self, make_fakes, use_buffers):
+    def test_a_death_before_a_full_reset_is_not_reported(self, make_fakes, use_buffers):
         env = make_fakes(2, use_buffers=use_buffers)
         env.reset()
         os.kill(env.worker_pids[1], signal.SIGKILL)
@@ -183,7 +183,7 @@ class TestFailures:
         state = env.reset()
         assert_stepped(env.step(act(env, state.clone())), 0, state)
 
-    def test_a_question_that_cannot_be_answered_is_an_error_and_no_end(self, make_fakes):
+    def test_an_unanswered_command_is_an_error(self, make_fakes):
         env = make_fakes(2)
         state = env.reset()
         assert list(env.horizon) == [1000, 1000]

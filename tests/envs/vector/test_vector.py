@@ -41,7 +41,7 @@ class TestSeeds:
 
     @pytest.mark.parametrize("parallel", [False, True])
     @pytest.mark.parametrize("seed", [-1, 1.5, True])
-    def test_refuses_what_is_no_seed(self, make_fakes, parallel, seed):
+    def test_refuses_invalid_seeds(self, make_fakes, parallel, seed):
         env = make_fakes(1, parallel=parallel)
         with pytest.raises(ValueError, match="natural number"):
             env.set_seed(seed)
@@ -70,7 +70,7 @@ class TestResets:
         assert after["step_count"].flatten().tolist() == [1, 1]
 
     @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
-    def test_rollout_goes_on_past_ends(self, make_fakes, options):
+    def test_rollout_continues_after_done(self, make_fakes, options):
         env = make_fakes(horizon=3, **options)
         rollout = env.rollout(7, break_when_any_done=False)
         assert rollout.batch_size == (2, 7)
@@ -100,7 +100,9 @@ class TestActions:
             (None, "there is no action"),
         ],
     )
-    def test_bad_ones_move_nothing(self, make_fakes, options, method, action, message):
+    def test_invalid_actions_are_refused_before_a_step(
+        self, make_fakes, options, method, action, message
+    ):
         env = make_fakes(2, **options)
         state = env.reset()
         bad = state.clone() if action is None else state.clone().set("action", action)
@@ -118,7 +120,7 @@ class TestActions:
         state["_step"] = torch.tensor([True, False])
         assert env.step(state)["next", "step_count"].flatten().tolist() == [1, 0]
 
-    def test_beyond_the_bounds_are_the_environments_business(self, make_fakes):
+    def test_actions_beyond_the_bounds_reach_the_environment(self, make_fakes):
         env = make_fakes(2)
         assert env.step(act(env, env.reset(), 5.0))["next", "reward"].flatten().tolist() == [10, 10]
 

@@ -1,4 +1,4 @@
-"""Runs of a grid in processes of their own: failures, interruptions, resumption."""
+"""Runs of a grid in separate processes: failures, interruptions, resumption."""
 
 import fcntl
 import json
@@ -74,7 +74,7 @@ def result_of(run):
 
 @pytest.fixture
 def fake(tmp_path, monkeypatch):
-    """Return a function that runs a grid with a worker that follows orders from a file."""
+    """Return a function that runs a grid with a fake worker, whose behaviour is set by a file."""
     script = tmp_path / "worker.py"
     script.write_text(FAKE_WORKER)
     monkeypatch.setattr(jobs, "POLL_S", 0.02)

@@ -1,4 +1,4 @@
-"""Which runs a grid consists of."""
+"""The runs of a grid."""
 
 import pytest
 
