@@ -66,8 +66,25 @@ _CLOSE_LOOP = {"control": "close_loop"}
 _OPEN_LOOP = {"control": "open_loop"}
 
 
+_GENERAL_FIELDS: set[str] = set()
+"""Names of the fields of `EnvConfig`."""
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
+
+
 class TaskParameters(StrictModel):
     """The parameters that one task adds to `EnvConfig`; a task without any uses this class."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_as_tuples(cls, values: Any) -> Any:
+        """Convert lists to tuples: YAML and JSON have lists only."""
+        if not isinstance(values, dict):
+            return values
+        own = cls.model_fields.keys() - _GENERAL_FIELDS
+        return {name: _as_tuple(value) if name in own else value for name, value in values.items()}
 
 
 class EnvConfig(StrictModel):
@@ -239,9 +256,21 @@ class EnvConfig(StrictModel):
                 raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")
 
 
+_GENERAL_FIELDS.update(EnvConfig.model_fields)
+
+
 @cache
 def env_config_model(parameters: type[TaskParameters]) -> type[EnvConfig]:
-    """Return `EnvConfig` with the fields of a task's own parameters added."""
+    """Return `EnvConfig` with the fields of a task's own parameters added.
+
+    Raises:
+        TypeError: the task declares a parameter of `EnvConfig` again.
+    """
     if not parameters.model_fields:
         return EnvConfig
+    if repeated := parameters.model_fields.keys() & EnvConfig.model_fields.keys():
+        raise TypeError(
+            f"{parameters.__qualname__} repeats parameters of every environment: "
+            f"{', '.join(sorted(repeated))}"
+        )
     return type(EnvConfig.__name__, (parameters, EnvConfig), {"__module__": __name__})

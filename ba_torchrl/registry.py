@@ -90,8 +90,8 @@ class Registry(Generic[T]):
             close = difflib.get_close_matches(str(name), self._entries, n=1)
             hint = f" Did you mean {close[0]!r}?" if close else ""
             raise UnknownNameError(
-                f"unknown {self.kind} {name!r}.{hint} Known: {', '.join(self)}. A {self.kind} from "
-                "outside the package is known once its module is imported (recipes: "
+                f"unknown {self.kind} {name!r}.{hint} Known: {', '.join(self)}. Entries from "
+                "outside the package are known once their module is imported (recipes: "
                 "plugins=[module]; worker processes: register_modules=[module])"
             ) from None
 

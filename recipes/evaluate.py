@@ -36,7 +36,7 @@ def main(settings: DictConfig) -> None:
         config.task,
         settings.num_envs,
         parallel=settings.parallel,
-        register_modules=config.plugins,
+        register_modules=[*settings.plugins, *config.plugins],
         **{**config.env, "seed": seed},
     )
     try:

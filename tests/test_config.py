@@ -1,7 +1,9 @@
+import json
+
 import pytest
 
 import ba_torchrl
-from ba_torchrl.config import EnvConfig, parse
+from ba_torchrl.config import EnvConfig, TaskParameters, env_config_model, parse
 from ba_torchrl.errors import ConfigError, UnknownNameError
 from ba_torchrl.registry import Registry
 
@@ -30,6 +32,24 @@ def test_unknown_parameter_names_the_nearest_and_all_known():
 def test_wrong_values_say_what_is_allowed(values, message):
     with pytest.raises(ConfigError, match=message):
         parse(EnvConfig, values, "configuration")
+
+
+def test_a_tuple_among_the_parameters_of_a_task_is_a_list_in_json():
+    class Parameters(TaskParameters):
+        sizes: tuple[tuple[float, float], ...] = ((1.0, 2.0),)
+
+    model = env_config_model(Parameters)
+    config = parse(model, {"sizes": [[3.0, 4.0], [5.0, 6.0]]}, "c")
+    assert config.sizes == ((3.0, 4.0), (5.0, 6.0))
+    assert parse(model, json.loads(config.model_dump_json()), "c") == config
+
+
+def test_a_parameter_of_a_task_cannot_repeat_one_of_every_environment():
+    class Parameters(TaskParameters):
+        max_steps: int = 3
+
+    with pytest.raises(TypeError, match=r"Parameters repeats .*: max_steps"):
+        env_config_model(Parameters)
 
 
 def test_scale_takes_a_number_or_a_pair():

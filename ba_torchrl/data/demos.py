@@ -112,7 +112,7 @@ def expert_scores(
         **{**env, "seed": seed, "expert": True},
     )
     try:
-        played = collect_episodes(envs, expert_policy, episodes, seed=seed, exclude=[keys.PIXELS])
+        played = collect_episodes(envs, expert_policy, episodes, seed=seed, results_only=True)
     finally:
         envs.close()
     solved = [episode for episode in played if is_success(episode)]

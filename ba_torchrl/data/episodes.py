@@ -15,6 +15,9 @@ logger = logging.getLogger(__name__)
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
+RESULT_KEYS = (keys.REWARD, keys.SUCCESS, keys.FAULT, keys.TERMINATED, keys.TRUNCATED, keys.DONE)
+"""Entries of a step that hold the result of an episode."""
+
 
 def quotas(episodes: int, num_envs: int) -> list[int]:
     """Return the number of episodes of each environment; the numbers differ by at most one."""
@@ -28,7 +31,7 @@ def collect_episodes(
     episodes: int,
     *,
     seed: int | None = None,
-    exclude: Sequence[str] = (),
+    results_only: bool = False,
     on_episode: Callable[[TensorDict], None] | None = None,
     max_lost: int = 100,
 ) -> list[TensorDict]:
@@ -42,7 +45,7 @@ def collect_episodes(
         policy: writes the action.
         episodes: total number of episodes.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        exclude: entries to drop, such as the pixels when only results are needed.
+        results_only: keep only the entries of `RESULT_KEYS`.
         on_episode: called with each episode when it ends, for progress bars.
         max_lost: largest number of episodes that may be lost to faults.
 
@@ -60,8 +63,9 @@ def collect_episodes(
     state = env.reset() if seed is None else env.reset(seed=seed)
     while any(len(done) < quota for done, quota in zip(finished, wanted, strict=True)):
         step, state = env.step_and_maybe_reset(policy(state))
-        kept = step.exclude(*exclude, *((keys.NEXT, key) for key in exclude)).unbind(0)
-        for i, transition in enumerate(kept):
+        if results_only:
+            step = step.select(*((keys.NEXT, key) for key in RESULT_KEYS))
+        for i, transition in enumerate(step.unbind(0)):
             if len(finished[i]) == wanted[i]:
                 continue
             current[i].append(transition.clone())

@@ -180,7 +180,7 @@ class ManipulationEnv(EnvBase):
         Empty after a simulator fault.
         """
         if self._conditions is None:
-            self._conditions = self.scene.task.evaluate()
+            self._conditions = self.scene.task.conditions()
         return dict(self._conditions)
 
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
@@ -324,17 +324,16 @@ class ManipulationEnv(EnvBase):
         """Declaration of each image that is observed, by key."""
         seen = {key: image.to_tensor_spec() for key, image in self.images.items()}
         largest = self._episodes.largest_scene
-        seen = merge_entries([seen, *(extra.specs(largest) for extra in self._observations)])
-        observation = {
-            **seen,
+        general = {
             keys.HOLDING: flag(),
             keys.SUCCESS: flag(),
             keys.FAULT: flag(),
             keys.STEP_COUNT: Unbounded(shape=(1,), dtype=torch.int64),
         }
         if self.config.expert:
-            observation[keys.EXPERT_ACTION] = action.clone()
-        self.observation_spec = Composite(observation)
+            general[keys.EXPERT_ACTION] = action.clone()
+        extras = (extra.specs(largest) for extra in self._observations)
+        self.observation_spec = Composite(merge_entries([seen, *extras, general]))
         self.action_spec = action
         self.reward_spec = Bounded(0.0, 1.0, shape=(1,), dtype=torch.float32)
         self.full_done_spec = Composite(

@@ -117,6 +117,7 @@ class Episodes:
         for _ in range(RESET_ATTEMPTS):
             scene.world.restore_pristine()
             self._place_robot(scene)
+            scene.task.terrain.initialize_episode(rng)
             scene.task.initialize_episode(rng)
             scene.world.settle(max_steps=SETTLE_STEPS)
             if scene.task.is_valid_start():
@@ -139,8 +140,8 @@ def evaluate_at_rest(scene: Scene) -> tuple[dict[str, bool], bool]:
     """
     if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
         raise SimulationError("a body's position is not finite")
-    conditions = scene.task.evaluate()
+    conditions = scene.task.conditions()
     if all(conditions.values()):
         scene.world.settle(max_steps=SETTLE_STEPS)
-        conditions = scene.task.evaluate()
+        conditions = scene.task.conditions()
     return conditions, scene.task.is_valid()

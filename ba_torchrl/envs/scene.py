@@ -41,6 +41,7 @@ class SceneState:
     robot: Any
     controller: Any
     task: Any
+    terrain: Any
     hidden: tuple[bool, ...]
     """Whether each body is inactive."""
 
@@ -66,6 +67,7 @@ class Scene:
             self.robot.get_state(),
             self.controller.get_state(),
             self.task.get_state(),
+            self.task.terrain.get_state(),
             tuple(body.is_hidden for body in self.world.bodies),
         )
 
@@ -79,6 +81,7 @@ class Scene:
             self.world.load(state.world)
         else:
             self.world.restore(state.world)
+        self.task.terrain.set_state(state.terrain)
         self.task.set_state(state.task)
         self.robot.set_state(state.robot)
         self.controller.set_state(state.controller)

@@ -23,7 +23,7 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
         "# Tasks",
         "",
         "Written by `recipes/tasks.py` from the sources. Success is the conjunction of the",
-        "conditions, measured once the scene is at rest. `env.conditions` and Gymnasium's `info`",
+        "conditions in a valid scene at rest. `env.conditions` and Gymnasium's `info`",
         "hold them after every step.",
     ]
     for control, title in CONTROLS.items():
@@ -43,12 +43,12 @@ def _section(task: str) -> list[str]:
     conditions, steps, actions = list(env.conditions), env.max_steps, env.action_sequence
     env.close()
     least, most = cls.num_objects_range
-    numbers = range(least, most + 1, cls.num_objects_step)
+    numbers = ", ".join(map(str, range(least, most + 1, cls.num_objects_step)))
     rows = [
         ("success", ", ".join(f"`{name}`" for name in conditions)),
         ("steps", f"{steps}"),
         ("action", f"`{actions}` by default"),
-        ("objects", f"{cls.num_objects} ({', '.join(map(str, numbers))})"),
+        ("`num_objects`", f"{cls.num_objects}" + (f" ({numbers})" if least < most else "")),
         ("scale", "{:g} to {:g} (limits {:g} to {:g})".format(*cls.scale_range, *cls.scale_limits)),
     ]
     rows += [

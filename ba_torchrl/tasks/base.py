@@ -135,7 +135,11 @@ class Task(ABC):
 
     @abstractmethod
     def evaluate(self) -> dict[str, bool]:
-        """Return the named conditions of success in the present scene."""
+        """Return the conditions of success in the present scene.
+
+        Returns:
+            Bools, named ``is_...``; success is their conjunction.
+        """
 
     @abstractmethod
     def expert_command(self) -> GripperCommand | PickPlaceCommand:
@@ -151,9 +155,24 @@ class Task(ABC):
         """The poses in the vector observation; by default those of the objects."""
         return [(body.position, body.yaw_rad) for body in self.objects]
 
+    def conditions(self) -> dict[str, bool]:
+        """Return the conditions of `evaluate` after a check of names and types.
+
+        Raises:
+            TypeError: there are none, or they are not bools whose names begin with "is_".
+        """
+        conditions = self.evaluate()
+        are_named = all(name.startswith("is_") and name != "is_success" for name in conditions)
+        if not conditions or not are_named or any(type(v) is not bool for v in conditions.values()):
+            raise TypeError(
+                f"{type(self).__name__}.evaluate must return bools whose names begin with 'is_', "
+                f"other than 'is_success', not {conditions}"
+            )
+        return conditions
+
     def is_success(self) -> bool:
-        """Whether every condition of `evaluate` holds."""
-        return all(self.evaluate().values())
+        """Whether every condition of success holds."""
+        return all(self.conditions().values())
 
     def is_valid(self) -> bool:
         """Whether every object is inside the workspace or held."""

@@ -109,7 +109,10 @@ class Terrain(ABC):
     # -- heights -----------------------------------------------------------------------------
 
     def gap_below_m(self, body: Body) -> float:
-        """Return the height of the lowest point of a body above the surface below its origin."""
+        """Return the height of the lowest point of a body above the surface below its origin.
+
+        This and `lowest_tool_m` assume that the surface is level; one with slopes overrides them.
+        """
         return vertical_extent(body)[0] - self.height_m(body.position[:2])
 
     def lowest_tool_m(

@@ -14,6 +14,7 @@ from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import EnvConfig, StrictModel, parse
 from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import Source, source_config
+from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import MAIN, load_plugins
@@ -187,6 +188,7 @@ class ExperimentConfig(StrictModel):
             (ROBOTS, self.env_config.robot),
             (NETWORKS, self.network["name"]),
             (ALGORITHMS, self.algorithm["name"]),
+            *((OBSERVATIONS, name) for name in self.env_config.observations),
         )
         modules = (registry.plugin_module(name) for registry, name in used)
         found = [name for name in modules if name is not None and name not in MAIN]

@@ -74,7 +74,7 @@ def evaluate(
             policy,
             episodes,
             seed=seed,
-            exclude=(keys.PIXELS, keys.IN_HAND, keys.EXPERT_ACTION),
+            results_only=True,
             on_episode=on_episode,
         )
     rate = success_rate(played)

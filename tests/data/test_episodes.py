@@ -4,7 +4,13 @@ import torch
 import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.episodes import collect_episodes, mean_length, quotas, success_rate
+from ba_torchrl.data.episodes import (
+    RESULT_KEYS,
+    collect_episodes,
+    mean_length,
+    quotas,
+    success_rate,
+)
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.errors import ConfigError
 
@@ -53,12 +59,13 @@ def test_episodes_are_whole_and_repeat_with_the_seed(expert_env):
     assert not torch.equal(first[0]["pixels"][0], other[0]["pixels"][0])
 
 
-def test_excluded_entries_are_not_kept(expert_env):
+def test_results_without_observations(expert_env):
     (episode,) = collect_episodes(
-        expert_env, lambda td: td.set("action", td["expert_action"]), 1, exclude=("pixels",)
+        expert_env, lambda td: td.set("action", td["expert_action"]), 1, results_only=True
     )
-    assert "pixels" not in episode.keys()  # noqa: SIM118 -- a TensorDict
-    assert ("next", "pixels") not in episode.keys(include_nested=True)
+    assert set(episode.keys()) == {"next"}
+    assert set(episode["next"].keys()) == {*RESULT_KEYS}
+    assert success_rate([episode]) == 1.0
 
 
 def test_transitions_are_flat_and_flagged(expert_env):

@@ -6,6 +6,7 @@ import torch
 
 import ba_torchrl
 from ba_torchrl.envs import keys
+from ba_torchrl.tasks.close_loop.block_picking import BlockPicking
 
 
 @pytest.mark.parametrize("task", ba_torchrl.list_tasks())
@@ -48,6 +49,15 @@ def test_conditions_are_those_of_a_restored_state():
     env.set_state(state)
     assert env.conditions == before
     env.close()
+
+
+@pytest.mark.parametrize(
+    "conditions", [{}, {"grasped": True}, {"is_success": True}, {"is_grasped": 1}]
+)
+def test_ill_formed_conditions_are_refused(monkeypatch, conditions):
+    monkeypatch.setattr(BlockPicking, "evaluate", lambda task: conditions)
+    with pytest.raises(TypeError, match=r"BlockPicking.evaluate must return bools"):
+        ba_torchrl.make("close_loop/block_picking", obs_size=32)
 
 
 def test_the_info_of_gymnasium_has_the_conditions():

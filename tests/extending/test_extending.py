@@ -24,9 +24,15 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 
 HERE = Path(__file__).parent
-MODULES = ("bridge", "plateau", "tall_block", "two_views", "wrist_camera")
+MODULES = ("bridge", "plateau", "variants", "tall_block", "two_views", "wrist_camera")
 
-NEW_TASKS = ("mine/bridge", "mine/stack_on_plateau", "mine/tall_block")
+NEW_TASKS = (
+    "mine/bridge",
+    "mine/stack_on_plateau",
+    "mine/stack_on_random_plateau",
+    "mine/stack_of_any_colour",
+    "mine/tall_block",
+)
 MOST_LINES = {"bridge": 35, "plateau": 60, "tall_block": 70, "wrist_camera": 40}
 
 
@@ -107,6 +113,44 @@ def test_a_terrain_raises_what_stands_on_it():
     x, y, _ = bodies[0].position
     body = env.scene.controller.pick((x, y, 0.0), downward(0.0))
     assert body is bodies[0]
+    env.close()
+
+
+def test_the_random_parts_of_a_terrain_belong_to_the_episode_and_its_state():
+    env = ba_torchrl.make("mine/stack_on_random_plateau", seed=0, obs_size=64)
+    heights = []
+    for _ in range(3):
+        image = env.reset()[keys.PIXELS]
+        terrain = env.scene.task.terrain
+        heights.append(terrain.height_m((0.0, 0.0)))
+        assert float(image.min()) == pytest.approx(heights[-1], abs=1e-6)
+    assert len(set(heights)) == 3
+    state = env.get_state()
+    env.reset()
+    env.set_state(state)
+    assert terrain.height_m((0.0, 0.0)) == heights[-1]
+    env.close()
+
+
+def test_the_variants_of_a_close_loop_structure_belong_to_its_state():
+    env = ba_torchrl.make("mine/stack_of_any_colour", seed=0, obs_size=32)
+    env.reset()
+    task, state = env.scene.task, env.get_state()
+    before = [body.id for body in task.objects]
+    drawn = []
+    for _ in range(4):
+        env.reset()
+        drawn.append([body.id for body in task.objects])
+    assert any(ids != before for ids in drawn)
+    env.set_state(state)
+    assert [body.id for body in task.objects] == before
+    env.close()
+
+
+def test_a_close_loop_structure_of_more_pieces_than_have_a_spacing():
+    env = ba_torchrl.make("mine/stack_of_any_colour", seed=0, obs_size=32, num_objects=5)
+    env.reset()
+    assert len(env.scene.task.objects) == 5
     env.close()
 
 

@@ -1,5 +1,9 @@
-"""A task and a robot as a user writes them."""
+"""A task, a robot and an observation as a user writes them."""
 
+import torch
+from torchrl.data import Unbounded
+
+from ba_torchrl.envs.observations import OBSERVATIONS, Observation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.tasks.base import TASKS
@@ -16,3 +20,16 @@ class ReachNear(BlockReaching):
 @ROBOTS.register("mine/kuka")
 class MyKuka(Kuka):
     """The Kuka arm under another name."""
+
+
+@OBSERVATIONS.register("mine/opening")
+class Opening(Observation):
+    """The opening of the gripper, 0 to 1."""
+
+    def specs(self, scene):
+        """Return the specification of the opening."""
+        return {"opening": Unbounded(shape=(1,), dtype=torch.float32)}
+
+    def observe(self, scene):
+        """Return the opening."""
+        return {"opening": torch.tensor([scene.robot.opening()])}

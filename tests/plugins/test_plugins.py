@@ -1,4 +1,4 @@
-"""Tasks, robots, networks and algorithms from a user's own module, as a user tries them.
+"""Tasks, robots, observations, networks and algorithms from a user's own module.
 
 Everything runs in processes of its own: a registered task stays registered.
 """
@@ -276,6 +276,36 @@ config = ExperimentConfig.parse(
 print(json.dumps(config.plugins))
 """
     assert last_line(run(folder, "-c", code)) == list(PLUGINS)
+
+
+def test_a_run_with_an_observation_of_a_plugin_records_it(folder):
+    code = """
+import json, my_tasks
+from ba_torchrl.training.config import ExperimentConfig
+config = ExperimentConfig.parse(
+    {
+        "task": "close_loop/block_reaching",
+        "env": {"obs_size": 16, "observations": ["mine/opening"]},
+        "algorithm": {"name": "sac"},
+        "network": {"name": "cnn"},
+    }
+)
+print(json.dumps(config.plugins))
+"""
+    assert last_line(run(folder, "-c", code)) == ["my_tasks"]
+
+
+def test_spawned_workers_import_the_module_of_an_observation(folder):
+    code = """
+import json, ba_torchrl, my_tasks
+env = ba_torchrl.make_vector_env(
+    "close_loop/block_reaching", 1, observations=["mine/opening"], obs_size=16, seed=0
+)
+rollout = env.rollout(3)
+env.close()
+print(json.dumps(list(rollout["opening"].shape)))
+"""
+    assert last_line(run(folder, "-c", code)) == [1, 3, 1]
 
 
 def test_a_benchmark_with_a_plugin_runs_its_jobs(folder):

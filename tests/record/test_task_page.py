@@ -17,7 +17,7 @@ def test_a_section_has_description_conditions_and_parameters():
     assert "### `close_loop/object_grasping`" in page
     assert "- success: `is_grasped`, `is_lifted`" in page
     assert "- `object_set`: 'random'" in page
-    assert "- objects: 5 (1, 2, 3," in page
+    assert "- `num_objects`: 5 (1, 2, 3," in page
     assert "block_picking" not in page
 
 

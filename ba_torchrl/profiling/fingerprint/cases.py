@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import ba_torchrl
+from ba_torchrl.tasks.base import TASKS
 
 PARTS = ("envs", "training")
 ROBOTS = ("kuka", "panda", "ur5", "ur5_robotiq")
@@ -227,7 +228,7 @@ def _env_cases() -> Iterator[Case]:
     short = {"expert": 1, "random": 5, "near": 5}
     brief = {"expert": 1, "random": 2, "near": 2}
     for task in ba_torchrl.list_tasks():
-        is_open = task.startswith("open_loop")
+        is_open = TASKS[task].control == "open_loop"
         turning, fixed = ("pxyr", "pxy") if is_open else ("pxyzr", "pxyz")
         for robot in ROBOTS:
             plan = long if robot == "kuka" else brief if task in SLOW_TASKS else short
@@ -284,7 +285,7 @@ def _training_cases() -> Iterator[Case]:
 def _training_case(
     name: str, task: str, algorithm: str, network: str, file: str = "train", **changes: Any
 ) -> Case:
-    small = SMALL_CLOSE_LOOP if task.startswith("close_loop") else SMALL_OPEN_LOOP
+    small = SMALL_CLOSE_LOOP if TASKS[task].control == "close_loop" else SMALL_OPEN_LOOP
     config = {
         "file": file,
         "task": task,

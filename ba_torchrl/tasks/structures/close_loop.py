@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -45,7 +45,8 @@ class CloseLoopStructureTask(CloseLoopControl, Task):
         3: Spacing(2.4, 2.4),
         4: Spacing(1.6, 2.0),
     }
-    """Space around each piece at the start, in blocks, by the number of pieces."""
+    """Space around each piece at the start, in blocks, by the number of pieces; that of the largest
+    number also for more."""
 
     @abstractmethod
     def blueprint(self) -> Blueprint:
@@ -68,7 +69,8 @@ class CloseLoopStructureTask(CloseLoopControl, Task):
         """
         self.structure.draw(rng)
         pieces = self.structure.pieces
-        padding, distance = self.spacing_blocks[len(pieces)]
+        spacings = self.spacing_blocks
+        padding, distance = spacings.get(len(pieces), spacings[max(spacings)])
         spacing = Spacing(padding * self.block_m, distance * self.block_m)
         points = self.random_points(rng, [spacing] * len(pieces))
         for (body, piece), xy in zip(pieces.items(), points, strict=True):
@@ -84,6 +86,14 @@ class CloseLoopStructureTask(CloseLoopControl, Task):
     def objects(self) -> Sequence[Body]:
         """The pieces."""
         return list(self.structure.pieces)
+
+    def get_state(self) -> Any:
+        """Return which variants of the pieces are in the scene."""
+        return self.structure.get_state()
+
+    def set_state(self, state: Any) -> None:
+        """Restore a state of `get_state`."""
+        self.structure.set_state(state)
 
     def evaluate(self) -> dict[str, bool]:
         """Return whether the structure stands and whether no piece is held."""

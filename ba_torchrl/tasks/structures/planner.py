@@ -48,7 +48,7 @@ class StructurePlanner:
         world: the world of the bodies.
         pieces: the kind of each body; there may be more bodies than slots.
         block_m: edge of a block, the scale of the tolerances.
-        support_ids: PyBullet ids of the bodies that form the ground; the floor if None.
+        support_ids: PyBullet ids of the bodies that form the ground.
 
     Raises:
         ValueError: there are too few bodies of a kind.
@@ -60,13 +60,13 @@ class StructurePlanner:
         world: World,
         pieces: Mapping[Body, Piece],
         block_m: float,
-        support_ids: frozenset[int] | None = None,
+        support_ids: frozenset[int],
     ) -> None:
         self.blueprint = blueprint
         self.world = world
         self.pieces = dict(pieces)
         self.block_m = block_m
-        self.support_ids = frozenset((world.floor,)) if support_ids is None else support_ids
+        self.support_ids = support_ids
         needed = Counter(slot.piece.kind for slot in blueprint.slots)
         found = Counter(piece.kind for piece in self.pieces.values())
         for kind, count in needed.items():

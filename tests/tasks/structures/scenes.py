@@ -52,7 +52,7 @@ class Scene:
             self.bodies[kind] = [world.add(SHAPES[kind], f"{kind} {i}") for i in range(count)]
         kinds = {slot.piece.kind: slot.piece for slot in blueprint.slots}
         pieces = {body: kinds[kind] for kind, bodies in self.bodies.items() for body in bodies}
-        self.planner = StructurePlanner(blueprint, world, pieces, B)
+        self.planner = StructurePlanner(blueprint, world, pieces, B, frozenset((world.floor,)))
         self.cubes = self.bodies.get("cube", [])
         self.scatter(np.random.default_rng(0))
 

@@ -18,7 +18,7 @@ def test_a_planner_needs_a_body_for_every_slot():
     with World() as world:
         cube = world.add(SHAPES["cube"], "cube")
         with pytest.raises(ValueError, match="needs 2 of 'cube'"):
-            StructurePlanner(tower(CUBE, CUBE), world, {cube: CUBE}, B)
+            StructurePlanner(tower(CUBE, CUBE), world, {cube: CUBE}, B, frozenset((world.floor,)))
 
 
 def test_only_pieces_that_must_stay_upright_can_tip(scene):
