@@ -10,11 +10,8 @@ import numpy as np
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.tasks.base import BLOCK_M, Task
+from ba_torchrl.tasks.colors import RED
 from ba_torchrl.tasks.workspace import Workspace
-
-RED: Color = (0.82, 0.22, 0.2, 1.0)
-BLUE: Color = (0.2, 0.4, 0.8, 1.0)
-GREEN: Color = (0.35, 0.7, 0.35, 1.0)
 
 PAIR_ATTEMPTS = 2000
 """Random layouts before a `PlacementError`. The least likely one, that of two pulling blocks with

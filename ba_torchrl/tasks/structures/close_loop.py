@@ -15,7 +15,8 @@ from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.shapes import Color
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.clearance import grasp_clearance_m
-from ba_torchrl.tasks.close_loop_task import BLUE, GREEN, RED, CloseLoopControl
+from ba_torchrl.tasks.close_loop_task import CloseLoopControl
+from ba_torchrl.tasks.colors import BLUE, GREEN, RED
 from ba_torchrl.tasks.motion_primitives import IS_OPEN, OPEN, lift, nearest_equivalent_yaw
 from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import Blueprint

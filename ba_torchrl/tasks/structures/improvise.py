@@ -16,8 +16,9 @@ from ba_torchrl.sim.assets.hulls import convex_hull, surface_samples, volume_and
 from ba_torchrl.sim.assets.random_shapes import UNIT_M, read_shape, shape_path
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
+from ba_torchrl.tasks.colors import BLUE
 from ba_torchrl.tasks.structures.blueprint import Piece, Span
-from ba_torchrl.tasks.structures.parts import BLUE, CUBOID
+from ba_torchrl.tasks.structures.parts import CUBOID
 
 NUMBERS = (2, 5, 27, 32, 66, 75, 83, 116, 118, 131, 137, 142, 143, 149, 154, 176, 187, 199, 200)
 """PyBullet's numbers of the shapes of figure 12."""

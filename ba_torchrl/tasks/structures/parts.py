@@ -11,6 +11,7 @@ from dataclasses import replace
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, transform_mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
+from ba_torchrl.tasks.colors import BLUE, GREEN, ORANGE, RED
 from ba_torchrl.tasks.structures.blueprint import Piece, Span
 from ba_torchrl.tasks.workspace import Spacing
 
@@ -21,10 +22,6 @@ EAVES = 0.2
 CYLINDER_SIDES = 16
 """Number of sides of the polygon that approximates the circle."""
 
-RED: Color = (0.82, 0.22, 0.2, 1.0)
-BLUE: Color = (0.2, 0.4, 0.8, 1.0)
-GREEN: Color = (0.35, 0.7, 0.35, 1.0)
-ORANGE: Color = (0.9, 0.55, 0.15, 1.0)
 
 SHORT_SPACING, LONG_SPACING = 2.4, 3.4
 """Space at the start, in blocks, around pieces one block long, and around roof and cuboid."""
