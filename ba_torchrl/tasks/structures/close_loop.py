@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from ba_torchrl.tasks.motion_primitives import IS_OPEN, OPEN, lift, nearest_equi
 from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.free_space import PlacementArea
+from ba_torchrl.tasks.structures.goal import StructureGoal
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.terrain import Terrain
@@ -34,7 +34,7 @@ COLORS: tuple[Color, ...] = (RED, BLUE, (0.9, 0.6, 0.2, 1.0), GREEN)
 """Colors of the cubes, from the bottom up."""
 
 
-class CloseLoopStructureTask(CloseLoopControl, Task):
+class CloseLoopStructureTask(StructureGoal, CloseLoopControl, Task):
     """Pieces at random poses on the ground; success when they form the blueprint's structure.
 
     The episode ends when a piece that must stay upright tips over: a gripper that points down
@@ -77,28 +77,6 @@ class CloseLoopStructureTask(CloseLoopControl, Task):
         for (body, piece), xy in zip(pieces.items(), points, strict=True):
             fixed_yaw = -piece.grasp_yaws_rad[0] % math.pi
             self.stand(body, xy, fixed_yaw + self.random_yaw(rng, piece.yaw_period_rad))
-
-    @property
-    def planner(self) -> StructurePlanner:
-        """The planner that compares the pieces with the blueprint."""
-        return self.structure.planner
-
-    @property
-    def objects(self) -> Sequence[Body]:
-        """The pieces."""
-        return list(self.structure.pieces)
-
-    def get_state(self) -> Any:
-        """Return which variants of the pieces are in the scene."""
-        return self.structure.get_state()
-
-    def set_state(self, state: Any) -> None:
-        """Restore a state of `get_state`."""
-        self.structure.set_state(state)
-
-    def evaluate(self) -> dict[str, bool]:
-        """Return whether the structure stands and whether no piece is held."""
-        return self.planner.evaluate(self.robot.held_body())
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -15,15 +14,15 @@ from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction
+from ba_torchrl.tasks.structures.goal import StructureGoal
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
-from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.structures.structure import Structure
 
 WINDOW_SHARE = 0.375
 """Half the width of the window for a long piece, as a multiple of its length."""
 
 
-class StructureTask(OpenLoopControl, Task):
+class StructureTask(StructureGoal, OpenLoopControl, Task):
     """Pieces at random poses on the ground; success when they form the blueprint's structure."""
 
     can_be_deconstructed = True
@@ -67,31 +66,9 @@ class StructureTask(OpenLoopControl, Task):
             yaw = self.random_yaw(rng, 2 * math.pi) - piece.grasp_yaws_rad[0]
             self.stand(body, xy, yaw)
 
-    @property
-    def planner(self) -> StructurePlanner:
-        """The planner that compares the pieces with the blueprint."""
-        return self.structure.planner
-
-    @property
-    def objects(self) -> Sequence[Body]:
-        """The pieces."""
-        return list(self.structure.pieces)
-
-    def get_state(self) -> Any:
-        """Return the indices of the active variants of the pieces."""
-        return self.structure.get_state()
-
-    def set_state(self, state: Any) -> None:
-        """Activate variants of the pieces by their indices."""
-        self.structure.set_state(state)
-
     def deconstruction(self) -> Deconstruction:
         """Return the task that takes the structure apart."""
         return Deconstruction(self)
-
-    def evaluate(self) -> dict[str, bool]:
-        """Return whether the structure stands and whether no piece is held."""
-        return self.planner.evaluate(self.robot.held_body())
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""

@@ -1,4 +1,4 @@
-"""What holds for every object set of the package."""
+"""Requirements on every object set of the package."""
 
 import numpy as np
 import pytest
