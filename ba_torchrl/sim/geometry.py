@@ -81,6 +81,46 @@ def quaternion_product(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
+def matrix_quaternion(rows: Matrix) -> Quaternion:
+    """Return the unit quaternion of a rotation matrix, given by its rows."""
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = rows
+    # four times the squares of the components; the largest one is a safe divisor
+    squares = (
+        1 + m00 - m11 - m22,
+        1 - m00 + m11 - m22,
+        1 - m00 - m11 + m22,
+        1 + m00 + m11 + m22,
+    )
+    largest = squares.index(max(squares))
+    products = (
+        (squares[0], m01 + m10, m02 + m20, m21 - m12),
+        (m01 + m10, squares[1], m12 + m21, m02 - m20),
+        (m02 + m20, m12 + m21, squares[2], m10 - m01),
+        (m21 - m12, m02 - m20, m10 - m01, squares[3]),
+    )[largest]
+    scale = 0.5 / math.sqrt(squares[largest])
+    x, y, z, w = (scale * product for product in products)
+    return x, y, z, w
+
+
+def surface_quaternion(normal: Vector, yaw_rad: float = 0.0) -> Quaternion:
+    """Return the orientation of a frame on a surface.
+
+    Args:
+        normal: unit normal of the surface, not horizontal; the z axis of the frame.
+        yaw_rad: heading of the x axis in the horizontal plane.
+    """
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    x_axis = perpendicular((cos, sin, -(cos * normal[0] + sin * normal[1]) / normal[2]), normal)
+    return axes_quaternion(x_axis, normal)
+
+
+def axes_quaternion(x_axis: Vector, z_axis: Vector) -> Quaternion:
+    """Return the orientation of the frame with two perpendicular unit vectors as axes."""
+    y_axis = cross(z_axis, x_axis)
+    return matrix_quaternion(tuple(zip(x_axis, y_axis, z_axis, strict=True)))
+
+
 # -- tool frames: z is the approach direction, the fingers open along x -------------------------
 
 

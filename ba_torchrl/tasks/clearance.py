@@ -7,18 +7,21 @@ direction in which the fingers close. Only bodies higher than the fingertips cou
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body, world_vertices
-from ba_torchrl.sim.geometry import PlanarFrame, Vector
+from ba_torchrl.sim.geometry import PlanarFrame, Pose, Vector, downward, rotation_array
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.tasks.footprints import Rectangle, gap_m
 
 Range = tuple[float, float]
 """Ends of an interval along the direction in which the fingers close."""
+
+VerticesOf = Callable[[Body], np.ndarray]
+"""Function that returns the vertices [V, 3] of a body in the frame where clearances are taken."""
 
 INNER_MARGIN_M = 3e-3
 """Margin on the inner side of each finger."""
@@ -100,6 +103,22 @@ def passing_height_m(gripper: Gripper) -> float:
     return max(PASSING_HEIGHT_M, PASSING_GAP_M - gripper.lowest_tip_m)
 
 
+def tool_view(tool: Pose) -> VerticesOf:
+    """Return a function for the vertices of bodies in a frame in which a tool points straight down.
+
+    The frame has the tool's position; the tool's yaw in it is zero.
+
+    Args:
+        tool: pose of the tool in the world.
+    """
+    to_view = np.array(downward(0.0)) @ rotation_array(tool.orientation).T
+
+    def vertices(body: Body) -> np.ndarray:
+        return (world_vertices(body) - tool.position) @ to_view.T + tool.position
+
+    return vertices
+
+
 # -- clearances --------------------------------------------------------------------------------
 
 
@@ -110,6 +129,7 @@ def path_clearance_m(
     ranges_m: Sequence[Range],
     others: Sequence[Body],
     at: Vector | None = None,
+    vertices: VerticesOf = world_vertices,
 ) -> float:
     """Return the clearance between the fingertips on their path to a body, and other bodies.
 
@@ -120,12 +140,13 @@ def path_clearance_m(
         ranges_m: ranges that the fingers occupy, relative to the origin of the body.
         others: the other bodies.
         at: assumed position of the body; its present one if None.
+        vertices: by default those in the world frame; for a tilted tool, see `tool_view`.
     """
     bx, by, bz = body.position if at is None else at
     frame = PlanarFrame(bx, by, yaw_rad)
     gap = math.inf
     for other in others:
-        corners = world_vertices(other)
+        corners = vertices(other)
         if corners[:, 2].max() < bz + gripper.lowest_tip_m:
             continue
         along, across = frame.to_local(corners[:, 0], corners[:, 1])
@@ -142,6 +163,7 @@ def grasp_clearance_m(
     others: Sequence[Body],
     opening: float = 1.0,
     at: Vector | None = None,
+    vertices: VerticesOf = world_vertices,
 ) -> float:
     """Return the clearance between the fingers, opened around a body's origin, and other bodies.
 
@@ -152,13 +174,18 @@ def grasp_clearance_m(
         others: the other bodies.
         opening: opening of the gripper, 0 to 1.
         at: assumed position of the body; its present one if None.
+        vertices: by default those in the world frame; for a tilted tool, see `tool_view`.
     """
     ranges = finger_ranges_m(gripper, opening)
-    return path_clearance_m(gripper, body, yaw_rad, ranges, others, at)
+    return path_clearance_m(gripper, body, yaw_rad, ranges, others, at, vertices)
 
 
 def hand_clearance_m(
-    robot: Robot, tool: PlanarFrame, tool_z_m: float, others: Sequence[Body]
+    robot: Robot,
+    tool: PlanarFrame,
+    tool_z_m: float,
+    others: Sequence[Body],
+    vertices: VerticesOf = world_vertices,
 ) -> float:
     """Return the clearance between the hand above the palm and other bodies.
 
@@ -167,10 +194,11 @@ def hand_clearance_m(
         tool: frame of the tool.
         tool_z_m: height of the tool.
         others: the other bodies; only those higher than the palm count.
+        vertices: by default those in the world frame; for a tilted tool, see `tool_view`.
     """
     gap = math.inf
     for other in others:
-        corners = world_vertices(other)
+        corners = vertices(other)
         if corners[:, 2].max() > tool_z_m + robot.gripper.palm_height_m:
             local = np.stack(tool.to_local(corners[:, 0], corners[:, 1]), axis=1)
             gaps = np.maximum(local.min(axis=0), -local.max(axis=0)) - robot.hand_half_extents_m

@@ -7,16 +7,16 @@ is on the ground, how low the tool may go. A terrain may change between episodes
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body, vertical_extent
-from ba_torchrl.sim.geometry import Matrix, Pose, yaw_quaternion
+from ba_torchrl.sim.geometry import Matrix, PlanarFrame, Pose, yaw_quaternion
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.workspace import Area, Spacing, Workspace
+from ba_torchrl.tasks.workspace import Area, Region, Spacing, Workspace
 
 
 class Terrain(ABC):
@@ -52,18 +52,51 @@ class Terrain(ABC):
         """
 
     @property
+    def base_ids(self) -> frozenset[int]:
+        """PyBullet ids of the bodies of the surface on which a structure may stand."""
+        return self.support_ids
+
+    @property
     def spawn_area(self) -> Area:
         """The area where objects start."""
         return Area(self.workspace.x, self.workspace.y)
 
     @property
-    def build_area(self) -> Area:
-        """The area where experts place objects on the ground."""
+    def build_area(self) -> Region:
+        """The area where experts build structures on the ground."""
         return Area(self.workspace.x, self.workspace.y)
+
+    @property
+    def aside_area(self) -> Region:
+        """The area where experts place other objects on the ground."""
+        return self.build_area
 
     def can_hold(self, xy: tuple[float, float], radius_m: float) -> bool:
         """Whether an object with this radius is in full contact with the surface at a point."""
         return True
+
+    @property
+    def goal_frame(self) -> PlanarFrame | None:
+        """Centre and heading of the place where a container stands; None if it stands anywhere."""
+        return None
+
+    def contact_pose(self, xy: tuple[float, float], radius_m: float) -> Pose:
+        """Return `surface_pose` for an object of a radius, which may cover several faces."""
+        return self.surface_pose(xy)
+
+    def uneven_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
+        """Return how uneven the surface is below objects of a radius at points [N, 2], [N] metres.
+
+        Zero where an object is in full contact.
+        """
+        return np.zeros(len(points))
+
+    def overhang_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
+        """Return a deficit of sites [N, 2] at which a base would leave the build area, [N] metres.
+
+        Zero where the border of the build area is no obstacle.
+        """
+        return np.zeros(len(points))
 
     def initialize_episode(self, rng: np.random.Generator) -> None:  # noqa: B027 -- optional
         """Draw the random parts of the terrain, before the objects are placed."""
@@ -86,7 +119,9 @@ class Terrain(ABC):
         return self.random_points(rng, [Spacing(padding_m, 0.0)])[0]
 
     def random_points(
-        self, rng: np.random.Generator, spacings: Sequence[Spacing]
+        self,
+        rng: np.random.Generator,
+        spacings: Sequence[Spacing],
     ) -> list[tuple[float, float]]:
         """Return random points of the spawn area that keep their distances.
 
@@ -98,8 +133,42 @@ class Terrain(ABC):
             PlacementError: no layout was found.
         """
         return self.spawn_area.random_points(
-            rng, spacings, lambda point, spacing: self.can_hold(point, spacing.padding_m / 2)
+            rng,
+            spacings,
+            lambda point, spacing: self.can_hold(point, spacing.padding_m / 2),
         )
+
+    def random_base_points(
+        self, rng: np.random.Generator, spacings: Sequence[Spacing]
+    ) -> list[tuple[float, float]]:
+        """Return random points of the build area that keep their distances, as `random_points`."""
+        return self.random_points(rng, spacings)
+
+    def scatter(
+        self,
+        rng: np.random.Generator,
+        bodies: Sequence[Body],
+        spacings: Sequence[Spacing],
+        draw_yaw: Callable[[Body], float],
+        *,
+        base: Body,
+    ) -> None:
+        """Place bodies at random poses on the ground, apart from each other.
+
+        Args:
+            rng: random generator.
+            bodies: the bodies.
+            spacings: space that each body needs.
+            draw_yaw: returns a random yaw of a body.
+            base: one of the bodies, on which a structure can stand. It starts in the build area if
+                structures can only stand in a part of the ground.
+
+        Raises:
+            PlacementError: no layout was found.
+        """
+        points = self.random_points(rng, spacings)
+        for body, xy in zip(bodies, points, strict=True):
+            self.stand(body, xy, draw_yaw(body))
 
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Place a body on the surface, its z axis along the normal."""

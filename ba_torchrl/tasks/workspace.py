@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import PlanarFrame, Vector
 
 LAYOUT_ATTEMPTS = 2000
 """Random layouts before a `PlacementError`; bowl and block fit in about one of ten."""
@@ -59,6 +59,8 @@ class ActionLimits:
     """Rotation about the vertical; 0 if the gripper cannot turn."""
     yaw_range_rad: tuple[float, float] | None = None
     """Range to which the yaw of the gripper is clipped; None without bounds."""
+    can_tilt: bool = False
+    """Whether the gripper can approach along any direction instead of only straight down."""
 
 
 class Spacing(NamedTuple):
@@ -70,17 +72,55 @@ class Spacing(NamedTuple):
     """Least distance between its centre and those of the objects placed before it."""
 
 
+class Region(Protocol):
+    """A convex part of the horizontal plane, metres."""
+
+    def shrunk(self, border_m: float) -> Self:
+        """Return the region less a border of this width."""
+
+    def outside_m(self, points: np.ndarray) -> np.ndarray:
+        """Return how far points [N, 2] are outside of the region, [N]; 0 inside."""
+
+    def sites(self, step_m: float) -> np.ndarray:
+        """Return a grid of points [S, 2] of the region."""
+
+    def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
+        """Return a random point at least half of ``padding_m`` from the border.
+
+        Raises:
+            PlacementError: the region is too small.
+        """
+
+    @property
+    def heading_rad(self) -> float | None:
+        """Heading of a region so narrow that pieces must be aligned with it; None otherwise."""
+
+
 class Area(NamedTuple):
     """An axis-aligned rectangle of the horizontal plane, metres."""
 
     x: tuple[float, float]
     y: tuple[float, float]
 
+    @property
+    def heading_rad(self) -> None:
+        """None: pieces may have any yaw."""
+        return None
+
+    def outside_m(self, points: np.ndarray) -> np.ndarray:
+        """Return how far points [N, 2] are outside of the area, along x or along y, [N]."""
+        low, high = np.array([self.x, self.y]).T
+        return np.maximum(np.maximum(low - points, points - high), 0.0).max(axis=1)
+
+    def sites(self, step_m: float) -> np.ndarray:
+        """Return a grid of points [S, 2]."""
+        return np.array([(a, b) for a in _grid(*self.x, step_m) for b in _grid(*self.y, step_m)])
+
     def shrunk(self, border_m: float) -> Area:
         """Return the area less a border of this width."""
         return Area(*((low + border_m, high - border_m) for low, high in self))
 
-    def random_point(self, rng: np.random.Generator, padding_m: float) -> tuple[float, float]:
+    def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
         """Return a uniformly random point at least half of ``padding_m`` from the border.
 
         Raises:
@@ -128,3 +168,70 @@ class Area(NamedTuple):
             f"no room for {len(spacings)} objects apart from each other: enlarge `workspace`, or "
             "lower `num_objects` or `object_scale_range`"
         )
+
+
+class OrientedArea(NamedTuple):
+    """A rectangle at any heading, cut off at the borders of an axis-aligned one.
+
+    Shrunk by more than half its width, it is the line along its centre.
+    """
+
+    frame: PlanarFrame
+    """Centre and heading."""
+    half_x: float
+    half_y: float
+    within: Area
+    """The points of the rectangle outside of it do not belong to the area."""
+
+    @property
+    def heading_rad(self) -> float | None:
+        """Heading of an area that is only a line; None for a wider one."""
+        return None if self.half_y else self.frame.yaw_rad
+
+    def shrunk(self, border_m: float) -> OrientedArea:
+        """Return the area less a border of this width."""
+        return self._replace(
+            half_x=max(self.half_x - border_m, 0.0),
+            half_y=max(self.half_y - border_m, 0.0),
+            within=self.within.shrunk(border_m),
+        )
+
+    def outside_m(self, points: np.ndarray) -> np.ndarray:
+        """Return how far points [N, 2] are outside of the area, along one of the axes, [N]."""
+        along, across = self.frame.to_local(*points.T)
+        outside = np.maximum(np.abs(along) - self.half_x, np.abs(across) - self.half_y)
+        return np.maximum(np.maximum(outside, 0.0), self.within.outside_m(points))
+
+    def sites(self, step_m: float) -> np.ndarray:
+        """Return a grid of points [S, 2], parallel to the rectangle."""
+        grid = np.array(
+            [
+                self.frame.to_world(a, b)
+                for a in _grid(-self.half_x, self.half_x, step_m)
+                for b in _grid(-self.half_y, self.half_y, step_m)
+            ]
+        )
+        inside = self.within.outside_m(grid) == 0
+        return grid[inside] if inside.any() else grid
+
+    def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
+        """Return a uniformly random point at least half of ``padding_m`` from the border.
+
+        Raises:
+            PlacementError: no point was found.
+        """
+        area = self.shrunk(padding_m / 2)
+        for _ in range(LAYOUT_ATTEMPTS):
+            local = (float(rng.uniform(-half, half)) for half in (area.half_x, area.half_y))
+            point = area.frame.to_world(*local)
+            if not area.within.outside_m(np.array([point])).any():
+                return point
+        raise PlacementError(
+            f"an object that keeps {padding_m / 2:.3f} m from the border does not fit: enlarge "
+            "`workspace` or lower `object_scale_range`"
+        )
+
+
+def _grid(low: float, high: float, step_m: float) -> list[float]:
+    count = max(1, round((high - low) / step_m))
+    return [low + (high - low) * i / count for i in range(count + 1)]

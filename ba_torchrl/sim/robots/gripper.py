@@ -101,6 +101,31 @@ class Gripper:
         gaps, heights = zip(*self.tip_arc, strict=True)
         return float(np.interp(half_gap_m, gaps, heights))
 
+    def tip_points(self, rotation: Matrix | None = None, opening: float = 1.0) -> np.ndarray:
+        """Return points of the surface of both fingers on their path as they close.
+
+        They are on the lower faces of the fingertips and on the outer sides of the fingers.
+
+        Args:
+            rotation: of the tool; None means straight down.
+            opening: of the fingers before they close, 0 to 1.
+
+        Returns:
+            [N, 3] metres, relative to the tool point, along the axes of the world.
+        """
+        widest = max(opening * self.half_gap_m, self.tip_arc[0][0])
+        depth_m = self.finger_depth_m
+        profile = [(0.0, 0.0), (depth_m / 2, 0.0)]
+        profile += [(depth_m, height) for height in (0.0, GRASP_HEIGHT_M, 2 * GRASP_HEIGHT_M)]
+        local = [
+            (side * (min(gap, widest) + depth), edge * self.half_width_m, -z - height)
+            for gap, z in self.tip_arc
+            for depth, height in profile
+            for side in (-1.0, 1.0)
+            for edge in (-1.0, 0.0, 1.0)
+        ]
+        return np.array(local) @ np.array(downward(0.0) if rotation is None else rotation).T
+
     def lowest_tool_m(self, rotation: Matrix | None = None, opening: float = 1.0) -> float:
         """Return the least height of the tool at which the fingers close clear of the floor.
 

@@ -91,6 +91,8 @@ def random_rectangle(
 ) -> Rectangle:
     """Return a rectangle with a random centre and yaw, its corners inside the workspace.
 
+    On a terrain with a fixed place for it, it is there.
+
     Args:
         task: gives the workspace, and whether orientations are random.
         rng: random generator.
@@ -101,6 +103,9 @@ def random_rectangle(
     Raises:
         PlacementError: the workspace is too small.
     """
+    frame = task.terrain.goal_frame
+    if frame is not None:
+        return Rectangle(*frame, half_x, half_y)
     yaw = fixed_yaw_rad + task.random_yaw(rng, 2 * math.pi)
     ex, ey = Rectangle(0.0, 0.0, yaw, half_x, half_y).extents_m(0.0)
     point = []

@@ -1,0 +1,231 @@
+"""A bumpy surface of nine pyramids with a platform on it (appendix C)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import PlanarFrame
+from ba_torchrl.sim.meshes import Mesh
+from ba_torchrl.sim.shapes import Box, Color, Solid
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.footprints import Rectangle
+from ba_torchrl.tasks.sloped_terrain import SlopedTerrain
+from ba_torchrl.tasks.workspace import Area, OrientedArea, Workspace
+
+SLOPE_RAD = (0.0, math.pi / 12)
+"""Range of the slope of a pyramid."""
+PYRAMIDS_PER_ROW = 3
+BASE_SHARE = 0.5
+"""Edge of a pyramid's base, as a multiple of the workspace's width."""
+VARIANTS = 27
+"""Pyramids of evenly spaced slopes, of which every episode uses nine."""
+UNDERGROUND_M = 0.02
+"""Depth of the pyramids' bases below the ground, so that the shallowest has a thickness."""
+FRICTION = 1.0
+COLORS: tuple[Color, Color] = ((0.8, 0.75, 0.64, 1.0), (0.72, 0.67, 0.56, 1.0))
+PLATFORM_COLOR: Color = (0.6, 0.66, 0.72, 1.0)
+CLEARANCE_M = 0.03
+"""Least distance of an object from the platform at the start, with space for a finger."""
+
+
+class BumpLayout(NamedTuple):
+    """The random parts of the bumps."""
+
+    pyramids: tuple[int, ...]
+    """Numbers of the pyramids, row by row."""
+    heading_rad: float
+    """Heading of the rows."""
+    platform: PlanarFrame
+    """Centre and heading of the platform."""
+
+
+class Bumps(SlopedTerrain):
+    """Nine square pyramids side by side, and a platform as high as the highest pyramid can be.
+
+    Args:
+        world: not sealed yet.
+        workspace: bounds of the task; its centre is that of the pyramids.
+        platform_m: extents of the platform along its x and y axis.
+        random_orientation: whether the platform has a random heading.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        workspace: Workspace,
+        platform_m: tuple[float, float],
+        *,
+        random_orientation: bool,
+    ) -> None:
+        super().__init__(world, workspace)
+        self.platform_m = platform_m
+        self.random_orientation = random_orientation
+        self.base_m = BASE_SHARE * workspace.width
+        low, high = SLOPE_RAD
+        self.slopes_rad = [low + (i + 0.5) / VARIANTS * (high - low) for i in range(VARIANTS)]
+        """Slope of each pyramid of the pool."""
+        self.top_m = self.base_m / 2 * math.tan(high)
+        """Height of the platform."""
+        self.pool = BodyPool(
+            world,
+            [
+                _pyramid(self.base_m, slope, COLORS[i % len(COLORS)])
+                for i, slope in enumerate(self.slopes_rad)
+            ],
+            [f"pyramid {i + 1}" for i in range(VARIANTS)],
+        )
+        size = (*platform_m, self.top_m + UNDERGROUND_M)
+        self.platform = world.add(
+            Box(size_m=size, mass_kg=0.0, friction=FRICTION, color=PLATFORM_COLOR), "platform"
+        )
+        self._set_layout(
+            BumpLayout(tuple(range(PYRAMIDS_PER_ROW**2)), 0.0, PlanarFrame(*workspace.center, 0.0))
+        )
+
+    @property
+    def support_ids(self) -> frozenset[int]:
+        """PyBullet ids of the floor, all pyramids and the platform."""
+        pyramids = (body.id for body in self.pool.bodies)
+        return frozenset((self.world.floor, self.platform.id, *pyramids))
+
+    @property
+    def base_ids(self) -> frozenset[int]:
+        """PyBullet id of the platform."""
+        return frozenset((self.platform.id,))
+
+    @property
+    def build_area(self) -> OrientedArea:
+        """The platform."""
+        half_x, half_y = (size / 2 for size in self.platform_m)
+        return OrientedArea(self.layout.platform, half_x, half_y, self.spawn_area)
+
+    @property
+    def aside_area(self) -> Area:
+        """The whole workspace; `uneven_m` excludes the platform."""
+        return self.spawn_area
+
+    @property
+    def goal_frame(self) -> PlanarFrame:
+        """Centre and heading of the platform."""
+        return self.layout.platform
+
+    def initialize_episode(self, rng: np.random.Generator) -> None:
+        """Draw the pyramids, their heading, and the pose of the platform inside the workspace."""
+        pyramids = rng.choice(VARIANTS, size=PYRAMIDS_PER_ROW**2, replace=False)
+        heading = float(rng.uniform(0.0, math.pi))
+        yaw = float(rng.uniform(0.0, 2 * math.pi)) if self.random_orientation else math.pi / 2
+        half_x, half_y = (size / 2 for size in self.platform_m)
+        extents = Rectangle(0.0, 0.0, yaw, half_x, half_y).extents_m(0.0)
+        center = (
+            float(rng.uniform(low + extent, high - extent))
+            for (low, high), extent in zip(self.spawn_area, extents, strict=True)
+        )
+        self._set_layout(BumpLayout(tuple(pyramids.tolist()), heading, PlanarFrame(*center, yaw)))
+
+    def get_state(self) -> BumpLayout:
+        """Return the layout."""
+        return self.layout
+
+    def set_state(self, state: BumpLayout) -> None:
+        """Restore the layout; the world restores the poses of pyramids and platform."""
+        self.layout = state
+        self.pool.set_state(state.pyramids)
+
+    def heights_m(self, points: np.ndarray) -> np.ndarray:
+        """Return the heights [N] of the surface at points [N, 2], metres."""
+        grid = np.stack(self._frame.to_local(*points.T)) / self.base_m + PYRAMIDS_PER_ROW / 2
+        cells = np.clip(np.floor(grid).astype(np.int64), 0, PYRAMIDS_PER_ROW - 1)
+        offsets = np.abs(grid - cells - 0.5).max(axis=0)
+        slopes = np.tan([self.slopes_rad[i] for i in self.layout.pyramids])
+        slopes = slopes[PYRAMIDS_PER_ROW * cells[0] + cells[1]]
+        heights = slopes * self.base_m * np.maximum(0.5 - offsets, 0.0)
+        on_platform = self.build_area.outside_m(points) == 0
+        return np.where(on_platform, self.top_m, heights)
+
+    def uneven_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
+        """Return how far objects of a radius reach over the platform, [N] metres."""
+        area = self.build_area
+        along, across = np.abs(np.stack(area.frame.to_local(*points.T)))
+        gap = np.maximum(along - area.half_x, across - area.half_y)
+        return np.maximum(radius_m + CLEARANCE_M - gap, 0.0)
+
+    def is_flush(self, outline: np.ndarray) -> bool:
+        """Whether an outline [V, 2] is clear of the platform."""
+        area = self.build_area
+        along, across = np.stack(area.frame.to_local(*outline.T))
+        gaps = (
+            max(values.min() - half, -half - values.max())
+            for values, half in ((along, area.half_x), (across, area.half_y))
+        )
+        return max(gaps) > CLEARANCE_M
+
+    def random_base_pose(
+        self, rng: np.random.Generator, body: Body, draw_yaw: Callable[[Body], float]
+    ) -> None:
+        """Return None: all objects start off the platform."""
+        return None
+
+    # ----------------------------------------------------------------------------------------
+
+    @property
+    def _frame(self) -> PlanarFrame:
+        """The frame at the centre of the pyramids, its x axis along the rows."""
+        return PlanarFrame(*self.workspace.center, self.layout.heading_rad)
+
+    def _set_layout(self, layout: BumpLayout) -> None:
+        """Move the pyramids and the platform to a layout."""
+        self.layout = layout
+        self.pool.clear()
+        half = (PYRAMIDS_PER_ROW - 1) / 2
+        for cell, number in enumerate(layout.pyramids):
+            row, column = divmod(cell, PYRAMIDS_PER_ROW)
+            x, y = self._frame.to_world((row - half) * self.base_m, (column - half) * self.base_m)
+            body = self.pool.bodies[number]
+            self.pool.activate(body)
+            body.place((x, y, 0.0), layout.heading_rad)
+        x, y, yaw = layout.platform
+        self.platform.place((x, y, (self.top_m - UNDERGROUND_M) / 2), yaw)
+
+
+class OnBumps:
+    """Mixin of an open-loop task: the goal is on a platform on a bumpy surface (appendix C).
+
+    All objects start beside the platform.
+    """
+
+    default_action_sequence: ClassVar[str | None] = "pxyzrrr"
+    default_in_hand_mode: ClassVar[str] = "proj"
+    required_action_components: ClassVar[frozenset[str]] = frozenset(("z", "rz", "ry", "rx"))
+    platform_m: ClassVar[tuple[float, float]]
+    """Extents of the platform at the default scale of the objects."""
+
+    def make_terrain(self) -> Bumps:
+        """Load the pyramids and the platform."""
+        unit = self.settings.scale / self.scale_range[0]
+        size_m = (unit * self.platform_m[0], unit * self.platform_m[1])
+        return Bumps(
+            self.world,
+            self.settings.workspace,
+            size_m,
+            random_orientation=self.settings.random_orientation,
+        )
+
+
+def _pyramid(base_m: float, slope_rad: float, color: Color) -> Solid:
+    """Return a square pyramid whose base's upper edge is at height 0, on a block underground."""
+    half = base_m / 2
+    corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
+    vertices = [(x, y, z) for z in (-UNDERGROUND_M, 0.0) for x, y in corners]
+    vertices.append((0.0, 0.0, half * math.tan(slope_rad)))
+    faces = [(0, 2, 1), (0, 3, 2)]
+    for i in range(4):
+        j = (i + 1) % 4
+        faces += [(i, j, j + 4), (i, j + 4, i + 4), (i + 4, j + 4, 8)]
+    mesh = Mesh(np.array(vertices), np.array(faces, dtype=np.int64))
+    return Solid(parts=(mesh,), mass_kg=0.0, friction=FRICTION, color=color)

@@ -1,0 +1,247 @@
+"""Terrain with slopes, given by the heights of its surface."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ba_torchrl.errors import PlacementError
+from ba_torchrl.sim.bodies import Body, world_vertices
+from ba_torchrl.sim.geometry import (
+    Matrix,
+    PlanarFrame,
+    Pose,
+    Vector,
+    surface_quaternion,
+)
+from ba_torchrl.sim.robots.gripper import FLOOR_CLEARANCE_M, Gripper
+from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Spacing
+
+PROBE_M = 1e-4
+"""Distance at which the slope at a point is measured."""
+FLAT_M = 2e-4
+"""Largest deviation of the surface from a plane that counts as full contact."""
+UNEVEN_WEIGHT = 10.0
+"""Deficit of a site per metre of unevenness or overhang."""
+POSE_ATTEMPTS = 50
+"""Random poses of a body before a new layout is begun."""
+FOOTPRINT_POINTS = 9
+"""Points along each side of the grid that represents the footprint of a body."""
+
+_BEARINGS = 2 * math.pi * np.arange(16) / 16
+_RING = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS)], axis=1)
+"""[16, 2] points of the unit circle."""
+
+
+class SlopedTerrain(Terrain):
+    """A surface of plane faces; subclasses return its heights."""
+
+    @abstractmethod
+    def heights_m(self, points: np.ndarray) -> np.ndarray:
+        """Return the heights [N] of the surface at points [N, 2], metres."""
+
+    def height_m(self, xy: tuple[float, float]) -> float:
+        """Return the height of the surface at a point, metres."""
+        return float(self.heights_m(np.array([xy]))[0])
+
+    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
+        """Return the pose of a frame on the surface, whose z axis is the normal at the point."""
+        _, slopes, _ = self._planes(np.array([xy]), PROBE_M)
+        return Pose((*xy, self.height_m(xy)), surface_quaternion(_normal(slopes[0]), yaw_rad))
+
+    def contact_pose(self, xy: tuple[float, float], radius_m: float) -> Pose:
+        """Return a frame on the plane that approximates the surface within a radius from above."""
+        heights, slopes, deviations = self._planes(np.array([xy]), radius_m)
+        height = float(heights[0] + deviations[0])
+        return Pose((*xy, height), surface_quaternion(_normal(slopes[0])))
+
+    def uneven_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
+        """Return the weighted deviation of the surface from a plane within a radius, [N] metres."""
+        *_, deviations = self._planes(points, radius_m)
+        return np.where(deviations > FLAT_M, UNEVEN_WEIGHT * deviations, 0.0)
+
+    def overhang_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
+        """Return the weighted distance by which objects of a radius leave the build area, [N]."""
+        return UNEVEN_WEIGHT * self.build_area.shrunk(radius_m).outside_m(points)
+
+    @abstractmethod
+    def is_flush(self, outline: np.ndarray) -> bool:
+        """Whether a body with an outline may start there.
+
+        Args:
+            outline: [V, 2] points of the ground, metres.
+        """
+
+    @abstractmethod
+    def random_base_pose(
+        self, rng: np.random.Generator, body: Body, draw_yaw: Callable[[Body], float]
+    ) -> tuple[tuple[float, float], float] | None:
+        """Return position and yaw of a body in the build area; None if no body starts there.
+
+        Args:
+            rng: random generator.
+            body: the body.
+            draw_yaw: returns a random yaw of a body.
+
+        Raises:
+            PlacementError: it does not fit.
+        """
+
+    def random_base_points(
+        self, rng: np.random.Generator, spacings: Sequence[Spacing]
+    ) -> list[tuple[float, float]]:
+        """Return random points of the build area, as far from its border as it allows.
+
+        Raises:
+            PlacementError: no layout was found.
+        """
+        for _ in range(LAYOUT_ATTEMPTS):
+            points = [self.build_area.random_point(rng, spacing.padding_m) for spacing in spacings]
+            if all(
+                math.dist(point, other) >= spacing.distance_m
+                for i, (point, spacing) in enumerate(zip(points, spacings, strict=True))
+                for other in points[:i]
+            ):
+                return points
+        raise PlacementError("no room for the structure: enlarge `workspace`")
+
+    def scatter(
+        self,
+        rng: np.random.Generator,
+        bodies: Sequence[Body],
+        spacings: Sequence[Spacing],
+        draw_yaw: Callable[[Body], float],
+        *,
+        base: Body,
+    ) -> None:
+        """Place bodies at random poses where they may start, apart from each other.
+
+        Args:
+            rng: random generator.
+            bodies: the bodies.
+            spacings: space that each body needs.
+            draw_yaw: returns a random yaw of a body.
+            base: one of the bodies, which starts in the build area if any does.
+
+        Raises:
+            PlacementError: no layout was found.
+        """
+        for _ in range(LAYOUT_ATTEMPTS // POSE_ATTEMPTS):
+            poses: dict[Body, tuple[tuple[float, float], float]] = {}
+            pose = self.random_base_pose(rng, base, draw_yaw)
+            if pose is not None:
+                poses[base] = pose
+            for body, spacing in zip(bodies, spacings, strict=True):
+                if body in poses:
+                    continue
+                others = [xy for xy, _ in poses.values()]
+                pose = self._random_pose(rng, body, spacing, draw_yaw, others)
+                if pose is None:
+                    break
+                poses[body] = pose
+            else:
+                for body, (xy, yaw) in poses.items():
+                    self.stand(body, xy, yaw)
+                return
+        raise PlacementError(
+            f"no room for {len(bodies)} objects apart from each other on this terrain: enlarge "
+            "`workspace`, or lower `num_objects` or `object_scale_range`"
+        )
+
+    def _random_pose(
+        self,
+        rng: np.random.Generator,
+        body: Body,
+        spacing: Spacing,
+        draw_yaw: Callable[[Body], float],
+        others: Sequence[tuple[float, float]],
+    ) -> tuple[tuple[float, float], float] | None:
+        """Return a random position and yaw at which a body may start; None if none was found."""
+        for _ in range(POSE_ATTEMPTS):
+            xy = self.spawn_area.random_point(rng, spacing.padding_m)
+            if any(math.dist(xy, other) < spacing.distance_m for other in others):
+                continue
+            yaw = draw_yaw(body)
+            if self.is_flush(footprint(body, xy, yaw)):
+                return xy, yaw
+        return None
+
+    def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
+        """Place a body on the plane that approximates the surface below it, from above."""
+        low, high = body.shape.bounds_m
+        local = np.stack(
+            np.meshgrid(
+                *(
+                    np.linspace(a, b, FOOTPRINT_POINTS)
+                    for a, b in zip(low[:2], high[:2], strict=True)
+                )
+            ),
+            axis=-1,
+        ).reshape(-1, 2)
+        points = np.stack(PlanarFrame(*xy, yaw_rad).to_world(*local.T), axis=1)
+        heights = self.heights_m(points)
+        offsets = np.column_stack([points - xy, np.ones(len(points))])
+        slope_x, slope_y, height = np.linalg.lstsq(offsets, heights, rcond=None)[0]
+        height += float((heights - offsets @ (slope_x, slope_y, height)).max())
+        surface = Pose(
+            (*xy, float(height)), surface_quaternion(_normal((slope_x, slope_y)), yaw_rad)
+        )
+        body.set_pose(*surface.compose(Pose((0.0, 0.0, -low[2]))))
+
+    def gap_below_m(self, body: Body) -> float:
+        """Return the least height of a body's vertices above the surface below them."""
+        corners = world_vertices(body)
+        return float((corners[:, 2] - self.heights_m(corners[:, :2])).min())
+
+    def lowest_tool_m(
+        self,
+        gripper: Gripper,
+        xy: tuple[float, float],
+        rotation: Matrix | None = None,
+        opening: float = 1.0,
+    ) -> float:
+        """Return the least height of the tool at which the fingers close above the surface.
+
+        The lower faces of the fingertips are above the surface all along their path.
+        """
+        points = gripper.tip_points(rotation, opening)
+        return float((self.heights_m(points[:, :2] + xy) - points[:, 2]).max()) + FLOOR_CLEARANCE_M
+
+    def _planes(
+        self, points: np.ndarray, radius_m: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the least-squares planes of the surface on circles about points.
+
+        Args:
+            points: [N, 2].
+            radius_m: radius of the circles.
+
+        Returns:
+            Heights [N] of the planes at the points, their slopes [N, 2], and the largest height [N]
+            of the surface above them, at the points or on the circles.
+        """
+        ring = self.heights_m((points[:, None] + radius_m * _RING).reshape(-1, 2))
+        ring = ring.reshape(len(points), len(_RING))
+        heights = ring.mean(axis=1)
+        slopes = ring @ _RING * (2 / len(_RING) / radius_m)
+        above = np.maximum(
+            (ring - heights[:, None] - radius_m * slopes @ _RING.T).max(axis=1),
+            self.heights_m(points) - heights,
+        )
+        return heights, slopes, above
+
+
+def footprint(body: Body, xy: tuple[float, float], yaw_rad: float) -> np.ndarray:
+    """Return the vertices [V, 2] of an upright body at a position and yaw, seen from above."""
+    return np.stack(PlanarFrame(*xy, yaw_rad).to_world(*body.shape.vertices[:, :2].T), axis=1)
+
+
+def _normal(slopes: np.ndarray) -> Vector:
+    """Return the unit normal of a plane from its slopes along x and y."""
+    dx, dy = map(float, slopes)
+    norm = math.sqrt(dx * dx + dy * dy + 1.0)
+    return -dx / norm, -dy / norm, 1.0 / norm
