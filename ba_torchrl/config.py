@@ -112,9 +112,9 @@ class EnvConfig(StrictModel):
     """Pixels along each side of the image."""
     in_hand_size: int = Field(default=24, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
     """Open loop: pixels along each side of the in-hand image."""
-    in_hand_mode: str = Field(default="raw", json_schema_extra=_OPEN_LOOP)
+    in_hand_mode: str | None = Field(default=None, json_schema_extra=_OPEN_LOOP)
     """Open loop: content of the in-hand image: "raw", "sub" or "proj"; see
-    `ba_torchrl.sim.vision.in_hand`."""
+    `ba_torchrl.sim.vision.in_hand`. By default "raw", and "proj" in six degrees of freedom."""
     top_down_approach: bool = Field(default=False, json_schema_extra=_OPEN_LOOP)
     """Open loop: approach vertically also with a tilted gripper."""
     fast_mode: bool = True

@@ -23,7 +23,7 @@ from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics
-from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.base import TASKS, Task
 from ba_torchrl.tasks.structures.undo import UndoRecorder
 from ba_torchrl.tasks.workspace import ActionLimits
 
@@ -50,7 +50,8 @@ class OpenLoopEnv(ManipulationEnv):
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 
     def __init__(self, task_id: str, config: EnvConfig) -> None:
-        self._in_hand_kind = IN_HAND_MODES[config.in_hand_mode]()
+        mode = config.in_hand_mode or TASKS[task_id].default_in_hand_mode
+        self._in_hand_kind = IN_HAND_MODES[mode]()
         super().__init__(task_id, config)
 
     def _configure(self) -> None:
@@ -65,8 +66,13 @@ class OpenLoopEnv(ManipulationEnv):
 
     @property
     def action_limits(self) -> ActionLimits:
-        """Displacement and rotation of one action: unlimited, or zero for an angle it lacks."""
-        return ActionLimits(math.inf, math.pi if "r" in self.action_sequence else 0.0)
+        """Displacement and rotations of one action: unlimited, or none for an angle it lacks."""
+        components = set(self.actions.components)
+        return ActionLimits(
+            math.inf,
+            math.pi if "rz" in components else 0.0,
+            can_tilt={"ry", "rx"} <= components,
+        )
 
     @property
     def pixel_m(self) -> float:

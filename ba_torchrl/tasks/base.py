@@ -78,6 +78,8 @@ class Task(ABC):
     """Components of the action, as named by the action space, that every solution needs."""
     default_action_sequence: ClassVar[str | None] = None
     """Default `action_sequence`; None for the default of the control."""
+    default_in_hand_mode: ClassVar[str] = "raw"
+    """Default `in_hand_mode`."""
     terminates_at_limit: ClassVar[bool] = False
     """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import Matrix
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.base import BLOCK_M, Task, TaskSettings
 from ba_torchrl.tasks.terrain import Terrain
@@ -29,13 +30,14 @@ class OpenLoopControl:
     robot: Robot
     terrain: Terrain
 
-    def lowest_tool_m(self, xy: tuple[float, float]) -> float:
+    def lowest_tool_m(self, xy: tuple[float, float], rotation: Matrix | None = None) -> float:
         """Return the least height of a pick, at which the fingers close above the ground, metres.
 
         Args:
             xy: position of the tool, metres.
+            rotation: rotation of the tool; None if it points down.
         """
-        return self.terrain.lowest_tool_m(self.robot.gripper, xy)
+        return self.terrain.lowest_tool_m(self.robot.gripper, xy, rotation)
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a pick without z, metres.

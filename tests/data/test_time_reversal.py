@@ -154,9 +154,9 @@ def test_the_inverse_action_restores_the_pose_of_the_body():
     assert undo.primitive == PICK
     assert undo[1:4] == pytest.approx((0.3, -0.104, 0.015))
     assert undo.rz_rad == pytest.approx(math.pi / 2)
-    assert held.undo_command(None, None, lowest_tool_m=lambda _: 0.014) == undo
-    assert held.undo_command(None, None, lowest_tool_m=lambda _: 0.017) == undo._replace(z_m=0.017)
-    place = before.undo_command(body, grasp, lowest_tool_m=lambda _: 0.2)
+    assert held.undo_command(None, None, lowest_tool_m=lambda *_: 0.014) == undo
+    assert held.undo_command(None, None, lowest_tool_m=lambda *_: 0.017) == undo._replace(z_m=0.017)
+    place = before.undo_command(body, grasp, lowest_tool_m=lambda *_: 0.2)
     assert place.z_m == pytest.approx(0.05)
 
 

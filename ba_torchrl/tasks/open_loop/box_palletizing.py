@@ -10,15 +10,24 @@ import numpy as np
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, vertical_extent
+from ba_torchrl.sim.geometry import (
+    PlanarFrame,
+    Pose,
+    downward_quaternion,
+    quaternion_matrix,
+    surface_quaternion,
+)
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
+from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
+from ba_torchrl.tasks.pick_place_commands import LEVEL_RAD, no_op, pick_command
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 from ba_torchrl.tasks.structures.parts import CUBOID
+from ba_torchrl.tasks.structures.tilted_grasps import in_resting_frame, is_reachable
 
 PALLET_M = (0.232, 0.192, 0.03)
 """Extents of the pallet; all lengths are at the appendix's size."""
@@ -172,9 +181,23 @@ class BoxPalletizing(PackingTask):
             return level, grasps[body].clearance_m > 0, grasps[body].clearance_m
 
         body = max(unstacked, key=priority)
-        return pick_command(grasps[body].tool)
+        return pick_command(self._along_normal(grasps[body]))
 
     # ----------------------------------------------------------------------------------------
+
+    def _along_normal(self, grasp: TopDownGrasp) -> Pose:
+        """Return the tool of a grasp, tilted like the box if the gripper can tilt that far."""
+        body = grasp.body
+        if not self.action_limits.can_tilt or CUBOID.tilt_rad(body) < LEVEL_RAD:
+            return grasp.tool
+        normal = tuple(row[2] for row in quaternion_matrix(CUBOID.resting_frame(body)))
+        surface = surface_quaternion(normal, grasp.yaw_rad)
+        rows = quaternion_matrix(in_resting_frame(CUBOID, body))
+        top_m = float((body.shape.vertices @ rows[2]).max())
+        x, y = PlanarFrame(*body.position[:2], grasp.yaw_rad).to_local(*grasp.position[:2])
+        offset = Pose((x, y, top_m - GRASP_DEPTH_M * self.unit), downward_quaternion(0.0))
+        tool = Pose(body.position, surface).compose(offset)
+        return tool if is_reachable(self.robot, tool) else grasp.tool
 
     def _activate_next_box(self) -> None:
         """Place the next box where it arrives."""

@@ -25,6 +25,9 @@ class PieceState(NamedTuple):
     position: Vector
     tilt_rad: float
     on_ground: bool
+    """Whether it touches the ground."""
+    on_base: bool
+    """Whether it touches ground on which a structure may stand."""
     supports: frozenset[Body]
     """The pieces that it rests on."""
 
@@ -34,7 +37,11 @@ Assignment = tuple[Body | None, ...]
 
 
 def read_piece_states(
-    world: World, pieces: Mapping[Body, Piece], ground: frozenset[int], block_m: float
+    world: World,
+    pieces: Mapping[Body, Piece],
+    ground: frozenset[int],
+    base: frozenset[int],
+    block_m: float,
 ) -> dict[Body, PieceState]:
     """Return the state of every piece, with the contacts of the last physics step.
 
@@ -42,6 +49,7 @@ def read_piece_states(
         world: the world of the bodies.
         pieces: the kind of each body.
         ground: PyBullet ids of the bodies that form the ground.
+        base: those of them on which a structure may stand.
         block_m: edge of a block. A support is at least half of it lower than the piece.
     """
     by_id = {body.id: body for body in pieces}
@@ -64,6 +72,7 @@ def read_piece_states(
             body.position,
             piece.tilt_rad(body),
             not ground.isdisjoint(touched),
+            not base.isdisjoint(touched),
             frozenset(supports),
         )
     return states
@@ -188,7 +197,7 @@ class SlotAssigner:
         if supports:
             if state.on_ground or not state.supports.issuperset(supports):
                 return False
-        elif not state.on_ground or state.supports:
+        elif not state.on_base or state.supports:
             return False
         if partner is not None:
             return partner > number or self._is_pair(body, number, partner, assignment)

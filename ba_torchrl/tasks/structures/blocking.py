@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.bodies import Body, vertical_extent
+from ba_torchrl.sim.geometry import IDENTITY, Quaternion, Vector
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.tasks.structures.blueprint import Piece
 from ba_torchrl.tasks.structures.free_space import extent_along_m
@@ -23,6 +23,10 @@ class GraspQueries:
 
     clears_blocked_pieces: bool = False
     """Whether pieces that block the grasp of another piece are removed."""
+
+    def rise_m(self, body: Body) -> float:
+        """Return the height of a piece's origin above its support when it is released."""
+        return body.position[2] - vertical_extent(body)[0]
 
     def pick_cost_m(self, body: Body) -> float:
         """Return the cost of picking a piece, as a distance that is added to that of its move."""
@@ -60,6 +64,8 @@ class Move(NamedTuple):
     yaw_period_rad: float
     onto: tuple[Body, ...]
     """The bodies that will support it; empty for the ground."""
+    surface: Quaternion = IDENTITY
+    """Orientation of a frame whose z axis is the normal of the surface that will support it."""
 
 
 class GraspCandidate(NamedTuple):
@@ -72,6 +78,10 @@ class GraspCandidate(NamedTuple):
     """Range that the far finger sweeps as it closes, for a grasp with a shift."""
     near_finger_range_m: tuple[float, float] = (0.0, 0.0)
     """Range in which the near finger descends beside the piece, for a grasp with a shift."""
+    along_m: float = 0.0
+    """Position of the tool perpendicular to the closing axis, along the length of the piece."""
+    tool: Quaternion | None = None
+    """Orientation of a tilted tool; None for a tool that points straight down."""
 
 
 def edge_grasps(

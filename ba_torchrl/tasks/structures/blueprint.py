@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Vector, quaternion_matrix
+from ba_torchrl.sim.geometry import Quaternion, Vector, axes_quaternion, cross, quaternion_matrix
 from ba_torchrl.sim.shapes import Shape
 from ba_torchrl.tasks.workspace import Spacing
 
@@ -57,6 +57,20 @@ class Piece:
         if abs(y_axis[2]) <= abs(x_axis[2]):  # the y axis is closer to horizontal than the x axis
             return math.atan2(y_axis[1], y_axis[0]) - math.pi / 2
         return math.atan2(x_axis[1], x_axis[0])
+
+    def resting_frame(self, body: Body) -> Quaternion:
+        """Return the orientation of the frame of the side on which a body lies.
+
+        Its z axis is the direction of `up` closest to the vertical. For a body that lies level, the
+        heading of its x axis is `yaw_rad`.
+        """
+        rows = quaternion_matrix(body.pose.orientation)
+        up = max(self.up, key=lambda up: sum(d * u for d, u in zip(rows[2], up, strict=True)))
+        z_axis = tuple(sum(r * u for r, u in zip(row, up, strict=True)) for row in rows)
+        x_axis, y_axis, _ = zip(*rows, strict=True)
+        if abs(y_axis[2]) <= abs(x_axis[2]):
+            x_axis = cross(y_axis, z_axis)
+        return axes_quaternion(x_axis, z_axis)
 
     def grasp_yaws(self, body: Body) -> list[float]:
         """Return the yaws of the gripper at which the fingers close on a body."""

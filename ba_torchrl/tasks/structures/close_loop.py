@@ -59,7 +59,7 @@ class CloseLoopStructureTask(StructureGoal, CloseLoopControl, Task):
             self.blueprint(),
             self.world,
             self.block_m,
-            self.terrain.support_ids,
+            self.terrain,
             largest_first=False,
         )
 
@@ -119,11 +119,8 @@ def assemble(
             distance = math.dist((x, y), body.position[:2])
             return distance + (0.0 if clearance > 0 else BLOCKED_COST_M)
 
-    area = PlacementArea(
-        *terrain.build_area.shrunk(1.2 * planner.block_m),
-        gap_m=planner.block_m,
-        height_m=terrain.height_m,
-    )
+    region = terrain.build_area.shrunk(1.2 * planner.block_m)
+    area = PlacementArea(terrain, region, region, gap_m=planner.block_m)
     move = planner.next_move(area, held, Queries())
     if move is None:
         return lift(limits.step_m, OPEN)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import PlanarFrame, YawPose, downward_pose
+from ba_torchrl.sim.geometry import PlanarFrame, Pose, YawPose, downward_pose, quaternion_yaw
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TaskSettings
@@ -24,6 +24,7 @@ from ba_torchrl.tasks.structures.assignment import mean_position
 from ba_torchrl.tasks.structures.blueprint import Slot
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.structures.tilted_grasps import release_pose
 from ba_torchrl.tasks.terrain import Terrain
 from ba_torchrl.tasks.workspace import Spacing
 
@@ -69,6 +70,8 @@ class Deconstruction(OpenLoopTask):
 
     def __init__(self, task: Deconstructible) -> None:
         self.task = task
+        self._heading_rad: float | None = None
+        """Heading with which the structure is aligned on a narrow strip of ground."""
         super().__init__(task.settings, task.world, task.robot, task.terrain)
         self.finger_opening = task.finger_opening
 
@@ -94,7 +97,9 @@ class Deconstruction(OpenLoopTask):
             and (planner.blueprint.partner(i) is None or planner.blueprint.partner(i) > i)
         ]
         width_m = 2 * max(map(footprint_radius_m, bodies)) + self.block_m
-        points = self.random_points(rng, [Spacing(width_m, width_m)] * len(on_ground))
+        spacings = [Spacing(width_m, width_m)] * len(on_ground)
+        points = self.terrain.random_base_points(rng, spacings)
+        self._heading_rad = self.terrain.build_area.shrunk(width_m / 2).heading_rad
         centers = dict(zip(on_ground, points, strict=True))
         for number, slot in enumerate(slots):
             self._place_in_slot(number, slot, bodies, centers.get(number), rng)
@@ -168,10 +173,12 @@ class Deconstruction(OpenLoopTask):
             return round(2 * (z - self.terrain.height_m((x, y))) / self.block_m)
 
         top = max(map(level, pieces))
+        candidates = [body for body in pieces if level(body) == top]
+        if self.action_limits.can_tilt:
+            return self.task.expert.pick(min(candidates, key=self.task.expert.pick_cost_m))
         options = [
             (self.task.expert.clearance_m(body, yaw), -i, body, yaw)
-            for i, body in enumerate(pieces)
-            if level(body) == top
+            for i, body in enumerate(candidates)
             for yaw in self.task.expert.grasp_yaws(body)
         ]
         _, _, body, yaw = max(options, key=lambda option: option[:2])
@@ -209,6 +216,8 @@ class Deconstruction(OpenLoopTask):
         else:
             xy = center
         yaw = self.random_yaw(rng, 2 * math.pi) - piece.grasp_yaws_rad[0]
+        if not supports and self._heading_rad is not None:
+            yaw = self._heading_rad + math.pi / 2 - piece.grasp_yaws_rad[0]
         if len(supports) == 2:
             (ax, ay, _), (bx, by, _) = (support.position for support in supports)
             yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
@@ -237,6 +246,8 @@ class Deconstruction(OpenLoopTask):
         if slots[number].on:  # along the y axis of their own support
             support = bodies[slots[number].on[0]]
             yaw = planner.pieces[support].yaw_rad(support)
+        elif self._heading_rad is not None:
+            yaw = self._heading_rad - math.pi / 2
         else:
             yaw = self.random_yaw(rng, 2 * math.pi) - bridge.piece.grasp_yaws_rad[0]
         line = np.array([-math.sin(yaw), math.cos(yaw)])
@@ -282,28 +293,35 @@ class Deconstruction(OpenLoopTask):
         extents = [_extents_m(world_vertices(other)[:, :2]) for other in others]
         outline = world_vertices(held)[:, :2] - held.position[:2]
         border = footprint_radius_m(held) + self.block_m / 4
-        area = self.terrain.build_area.shrunk(border)
-        rise_m = held.position[2] - vertical_extent(held)[0]
+        area = self.terrain.aside_area.shrunk(border)
+        rise_m = self.task.expert.rise_m(held)
+        radius_m = footprint_radius_m(held)
         rng = self._generator()
         best, place = -math.inf, None
         for _ in range(SITES):
-            x, y = (float(rng.uniform(low, high)) for low, high in area)
-            z = self.terrain.height_m((x, y)) + rise_m
+            x, y = area.random_point(rng)
+            surface = self.terrain.contact_pose((x, y), radius_m)
+            origin = surface.compose(Pose((0.0, 0.0, rise_m)))
             yaw = self._tool_yaw(held, tool.yaw_rad, rng)
             margin = min(
                 math.dist((x, y), other.position[:2]) - APART_BLOCKS * self.block_m - GAP_M
                 for other in others
             )
+            margin -= float(self.terrain.uneven_m(np.array([(x, y)]), radius_m)[0])
             if margin <= best:
                 continue
             frame = PlanarFrame(x, y, yaw - tool.yaw_rad)
             own = _extents_m(np.stack(frame.to_world(*outline.T), axis=1))
             gap = min(_gap_m(own, other) for other in extents)
-            clearance = self.task.expert.clearance_m(held, yaw, (x, y, z))
+            clearance = self.task.expert.clearance_m(held, yaw, origin.position)
             margin = min(margin, gap - GAP_M - SITE_GAP_M, clearance - RELEASE_CLEARANCE_M)
             if margin > best:
                 best = margin
-                target = pose.moved_to((x, y, z), yaw - tool.yaw_rad)
+                target = pose.moved_to(origin.position, yaw - tool.yaw_rad)
+                if self.action_limits.can_tilt:
+                    piece = self.task.planner.pieces[held]
+                    frame_yaw = quaternion_yaw(piece.resting_frame(held)) + yaw - tool.yaw_rad
+                    target = release_pose(piece, held, origin, frame_yaw)
                 place = place_command(tool, pose, target)
             if margin >= 0:
                 break

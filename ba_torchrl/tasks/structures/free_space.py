@@ -2,51 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, world_vertices
+from ba_torchrl.sim.geometry import Pose
+from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.workspace import Region
 
 SITE_STEP_M = 0.02
 """Grid spacing of the sites that are compared."""
 
 
 class PlacementArea(NamedTuple):
-    """The area of the ground where pieces may be placed."""
+    """The parts of the ground where pieces may be placed."""
 
-    x: tuple[float, float]
-    y: tuple[float, float]
+    terrain: Terrain
+    building: Region
+    """Where structures stand."""
+    aside: Region
+    """Where other pieces are placed."""
     gap_m: float
     """Gap wanted between the bounding circles of two pieces."""
-    height_m: Callable[[tuple[float, float]], float]
-    """Height of the ground at a point, metres."""
     line_yaw_rad: float | None = None
     """Direction of the line between the two supports of a bridge; None if it is free."""
 
+    def origin_pose(self, site: tuple[float, float], rise_m: float, radius_m: float) -> Pose:
+        """Return a frame whose z axis is the surface normal, at the origin of a piece at a site.
 
-def nearest_free_position(body: Body, others: Sequence[Body], area: PlacementArea) -> Vector:
-    """Return where to place a body's origin: the nearest site with the least deficit.
+        Args:
+            site: point of the ground, metres.
+            rise_m: distance of the origin above the surface, along the normal.
+            radius_m: radius of the piece.
+        """
+        surface = self.terrain.contact_pose(site, radius_m)
+        return surface.compose(Pose((0.0, 0.0, rise_m)))
 
-    The body stands on the ground in its present orientation.
+
+def nearest_free_site(
+    body: Body, others: Sequence[Body], area: PlacementArea, *, in_structure: bool
+) -> tuple[float, float]:
+    """Return where to place a body: the nearest site with the least deficit.
 
     Args:
         body: the body to place.
         others: the bodies to keep a gap to.
         area: where to place it.
+        in_structure: whether the body is the base of a structure, instead of placed aside.
     """
-    x, y, z = body.position
-    sites = np.array([(a, b) for a in _grid(*area.x) for b in _grid(*area.y)])
+    x, y, _ = body.position
+    region = area.building if in_structure else area.aside
+    sites = region.sites(SITE_STEP_M)
     distances = np.hypot(sites[:, 0] - x, sites[:, 1] - y)
-    best = np.lexsort((distances, placement_deficit_m(sites, body, others, area)))[0]
-    site = tuple(sites[best].tolist())
-    return (*site, area.height_m(site) + z - vertical_extent(body)[0])
+    deficits = placement_deficit_m(sites, body, others, area, in_structure=in_structure)
+    return tuple(sites[np.lexsort((distances, deficits))[0]].tolist())
 
 
 def placement_deficit_m(
-    sites: np.ndarray, body: Body, others: Sequence[Body], area: PlacementArea
+    sites: np.ndarray,
+    body: Body,
+    others: Sequence[Body],
+    area: PlacementArea,
+    *,
+    in_structure: bool,
 ) -> np.ndarray:
     """Return the deficit of sites: the distance outside the area, plus the missing part of the gap.
 
@@ -55,25 +75,24 @@ def placement_deficit_m(
         body: the body to place.
         others: the bodies to keep a gap to.
         area: where to place it.
+        in_structure: whether the body is part of a structure, instead of placed aside.
 
     Returns:
         [S] metres; zero for sites with enough free space.
     """
-    low, high = np.array([area.x, area.y]).T
-    outside = np.maximum(np.maximum(low - sites, sites - high), 0.0).max(axis=1)
+    radius_m = footprint_radius_m(body)
+    if in_structure:
+        outside = area.building.outside_m(sites) + area.terrain.overhang_m(sites, radius_m)
+    else:
+        outside = area.aside.outside_m(sites) + area.terrain.uneven_m(sites, radius_m)
     if not others:
         return outside
     centers = np.array([other.position[:2] for other in others])
     distances = np.hypot(*(sites[:, None] - centers).transpose(2, 0, 1))
     clearance = (distances - [footprint_radius_m(other) for other in others]).min(axis=1)
-    return outside + np.maximum(area.gap_m + footprint_radius_m(body) - clearance, 0.0)
+    return outside + np.maximum(area.gap_m + radius_m - clearance, 0.0)
 
 
 def extent_along_m(body: Body, directions: np.ndarray) -> np.ndarray:
     """Return the extent [N] of a body from its origin along horizontal unit vectors [N, 2]."""
     return ((world_vertices(body)[:, :2] - body.position[:2]) @ directions.T).max(axis=0)
-
-
-def _grid(low: float, high: float) -> list[float]:
-    count = max(1, round((high - low) / SITE_STEP_M))
-    return [low + (high - low) * i / count for i in range(count + 1)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -56,6 +57,7 @@ UP = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
 """The sides on which a random shape may lie."""
 
 
+@cache
 def any_shape() -> Piece:
     """Return the piece with all random shapes as its variants."""
     return replace(SHAPE, variants=tuple(shape_piece(shape) for _, shape in random_shapes()))

@@ -43,9 +43,7 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
 
     def load_scene(self) -> None:
         """Load the pieces."""
-        self.structure = Structure(
-            self.blueprint(), self.world, self.block_m, self.terrain.support_ids
-        )
+        self.structure = Structure(self.blueprint(), self.world, self.block_m, self.terrain)
         self.expert = PickPlaceExpert(
             self.structure,
             self.robot,
@@ -58,13 +56,17 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Place the pieces at random poses, apart from each other.
 
-        With fixed orientations, a gripper at yaw 0 can grasp each of them.
+        With fixed orientations, a gripper at yaw 0 can grasp each of them. On a terrain that only
+        supports a structure in a part of it, one piece of the lowest layer starts there.
         """
         self.structure.draw(rng)
-        points = self.random_points(rng, self.structure.spacings(self.start_gap_m))
-        for (body, piece), xy in zip(self.structure.pieces.items(), points, strict=True):
-            yaw = self.random_yaw(rng, 2 * math.pi) - piece.grasp_yaws_rad[0]
-            self.stand(body, xy, yaw)
+        self.terrain.scatter(
+            rng,
+            list(self.structure.pieces),
+            self.structure.spacings(self.start_gap_m),
+            lambda body: self._random_yaw_of(body, rng),
+            base=self.structure.base_body(),
+        )
 
     def deconstruction(self) -> Deconstruction:
         """Return the task that takes the structure apart."""
@@ -96,6 +98,10 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
         low, high = held.shape.bounds_m
         longest = max(high[0] - low[0], high[1] - low[1])
         return max(super().window_m(held), WINDOW_SHARE * longest)
+
+    def _random_yaw_of(self, body: Body, rng: np.random.Generator) -> float:
+        """Return a random yaw of a piece; with fixed orientations, one for a gripper at yaw 0."""
+        return self.random_yaw(rng, 2 * math.pi) - self.structure.pieces[body].grasp_yaws_rad[0]
 
     def _rests_on_pieces(self, body: Body) -> bool:
         """Whether a slot for this kind of piece is supported by other pieces."""

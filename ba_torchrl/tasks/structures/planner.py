@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, vertical_extent
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.structures.assignment import (
     Assignment,
@@ -26,7 +26,7 @@ from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece,
 from ba_torchrl.tasks.structures.free_space import (
     PlacementArea,
     extent_along_m,
-    nearest_free_position,
+    nearest_free_site,
     placement_deficit_m,
 )
 
@@ -49,6 +49,7 @@ class StructurePlanner:
         pieces: the kind of each body; there may be more bodies than slots.
         block_m: edge of a block, the scale of the tolerances.
         support_ids: PyBullet ids of the bodies that form the ground.
+        base_ids: those of them on which a structure may stand; by default all.
 
     Raises:
         ValueError: there are too few bodies of a kind.
@@ -61,12 +62,14 @@ class StructurePlanner:
         pieces: Mapping[Body, Piece],
         block_m: float,
         support_ids: frozenset[int],
+        base_ids: frozenset[int] | None = None,
     ) -> None:
         self.blueprint = blueprint
         self.world = world
         self.pieces = dict(pieces)
         self.block_m = block_m
         self.support_ids = support_ids
+        self.base_ids = support_ids if base_ids is None else base_ids
         needed = Counter(slot.piece.kind for slot in blueprint.slots)
         found = Counter(piece.kind for piece in self.pieces.values())
         for kind, count in needed.items():
@@ -124,9 +127,11 @@ class StructurePlanner:
         assignments, most = assigner.largest_assignments()
         if most == len(self.blueprint.slots):
             if held in self.pieces:
-                return self._to_ground(held, area)
+                return self._to_ground(held, area, queries)
             misplaced = min(map(assigner.misplaced, assignments), key=len)
-            return self._to_ground(min(misplaced, key=pick_cost_m), area) if misplaced else None
+            if not misplaced:
+                return None
+            return self._to_ground(min(misplaced, key=pick_cost_m), area, queries)
         bodies_above = assigner.bodies_above()
         blocking = GraspBlocking(self.pieces, bodies_above, held, queries)
         holds_piece = held in self.pieces
@@ -160,13 +165,15 @@ class StructurePlanner:
                     best = cost, move
         assert best is not None  # the lowest empty slot always has a choice
         move = best[1]
-        return move if isinstance(move, Move) else self._to_ground(move, area)
+        return move if isinstance(move, Move) else self._to_ground(move, area, queries)
 
     # ----------------------------------------------------------------------------------------
 
     def _assigner(self, held: Body | None) -> SlotAssigner:
         """Return the assigner for the present states of the pieces."""
-        states = read_piece_states(self.world, self.pieces, self.support_ids, self.block_m)
+        states = read_piece_states(
+            self.world, self.pieces, self.support_ids, self.base_ids, self.block_m
+        )
         return SlotAssigner(self.blueprint, self.pieces, states, self.block_m, held)
 
     def _choices(
@@ -228,11 +235,11 @@ class StructurePlanner:
         rest = [other for other in self.pieces if other is not body and other not in assignment]
         if not supports:
             if neighbor is None:
-                return self._to_ground(body, area), 0.0
+                return self._to_ground(body, area, queries, in_structure=True), 0.0
             return self._to_ground_beside(body, neighbor, bridge, area, rest, queries)
         x, y, _ = mean_position(assignment[i].position for i in self._centering_slots(number))
         z = max(vertical_extent(support)[1] for support in supports)
-        z += body.position[2] - vertical_extent(body)[0]
+        z += queries.rise_m(body)
         yaw, period = None, piece.yaw_period_rad
         if len(supports) == 2:
             (ax, ay, _), (bx, by, _) = (support.position for support in supports)
@@ -305,7 +312,7 @@ class StructurePlanner:
             queries: answers about the gripper.
         """
         piece = self.pieces[body]
-        x, y, z = body.position
+        x, y, _ = body.position
         center = np.array(neighbor.position[:2])
         start = math.atan2(y - center[1], x - center[0])
         if area.line_yaw_rad is None:
@@ -325,7 +332,7 @@ class StructurePlanner:
             yaw = -side
         sites = center + radii[:, None] * directions
         others = [other for other in self.pieces if other is not body and other is not neighbor]
-        deficits = placement_deficit_m(sites, body, others, area)
+        deficits = placement_deficit_m(sites, body, others, area, in_structure=True)
         length = max(
             (
                 np.ptp(other.shape.vertices[:, 1])
@@ -340,13 +347,31 @@ class StructurePlanner:
         distances = np.hypot(sites[:, 0] - x, sites[:, 1] - y)
         best = int(np.lexsort((radii + distances, deficits.round(6)))[0])
         site = tuple(sites[best].tolist())
-        position = (*site, area.height_m(site) + z - vertical_extent(body)[0])
+        origin = area.origin_pose(site, queries.rise_m(body), footprint_radius_m(body))
         target_yaw = None if yaw is None else float(yaw + bearings[best])
-        move = Move(body, piece, position, target_yaw, piece.yaw_period_rad, ())
+        move = Move(body, piece, origin.position, target_yaw, piece.yaw_period_rad, ())
         return move, float(deficits[best])
 
-    def _to_ground(self, body: Body, area: PlacementArea) -> Move:
-        """Return the move of a body to the nearest free position on the ground."""
+    def _to_ground(
+        self,
+        body: Body,
+        area: PlacementArea,
+        queries: GraspQueries,
+        *,
+        in_structure: bool = False,
+    ) -> Move:
+        """Return the move of a body to the nearest free site on the ground.
+
+        Args:
+            body: the body to move.
+            area: where pieces may be placed on the ground.
+            queries: answers about the gripper.
+            in_structure: whether the body is the base of the structure, instead of placed aside.
+        """
+        piece = self.pieces[body]
         others = [other for other in self.pieces if other is not body]
-        position = nearest_free_position(body, others, area)
-        return Move(body, self.pieces[body], position, None, self.pieces[body].yaw_period_rad, ())
+        site = nearest_free_site(body, others, area, in_structure=in_structure)
+        origin = area.origin_pose(site, queries.rise_m(body), footprint_radius_m(body))
+        heading = area.building.heading_rad if in_structure else None
+        yaw = None if heading is None else heading + math.pi / 2 - piece.grasp_yaws_rad[0]
+        return Move(body, piece, origin.position, yaw, piece.yaw_period_rad, (), origin.orientation)

@@ -16,6 +16,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
 from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.terrain import Terrain
 from ba_torchrl.tasks.workspace import Spacing
 
 
@@ -36,7 +37,7 @@ class Structure:
         blueprint: the structure; its pieces have shapes or variants.
         world: not sealed yet.
         block_m: edge of a block, metres.
-        support_ids: PyBullet ids of the bodies that form the ground.
+        terrain: the ground.
         largest_first: whether pieces are placed at random in order of the space that they need, the
             largest first; otherwise from the bottom slot up.
     """
@@ -46,14 +47,14 @@ class Structure:
         blueprint: Blueprint,
         world: World,
         block_m: float,
-        support_ids: frozenset[int],
+        terrain: Terrain,
         *,
         largest_first: bool = True,
     ) -> None:
         self.blueprint = blueprint
         self.world = world
         self.block_m = block_m
-        self.support_ids = support_ids
+        self.terrain = terrain
         pieces = [slot.piece for slot in blueprint.slots]
         if largest_first:
             pieces.reverse()
@@ -106,6 +107,11 @@ class Structure:
             largest_radius_m = max(largest_radius_m, radius)
         return spacings
 
+    def base_body(self) -> Body:
+        """Return a body that can fill the first slot."""
+        kind = self.blueprint.slots[0].piece.kind
+        return next(body for body, piece in self.pieces.items() if piece.kind == kind)
+
     def get_state(self) -> tuple[int, ...]:
         """Return the indices of the active variants."""
         return self._pool.get_state()
@@ -131,7 +137,12 @@ class Structure:
         self.pieces: dict[Body, Piece] = {**self._fixed, **drawn}
         """The bodies in the scene, in the order in which they are placed."""
         self.planner = StructurePlanner(
-            self.blueprint, self.world, self.pieces, self.block_m, self.support_ids
+            self.blueprint,
+            self.world,
+            self.pieces,
+            self.block_m,
+            self.terrain.support_ids,
+            self.terrain.base_ids,
         )
 
 

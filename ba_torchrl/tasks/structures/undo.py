@@ -8,8 +8,11 @@ from typing import NamedTuple
 
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import ORIGIN, Pose
+from ba_torchrl.sim.geometry import ORIGIN, Matrix, Pose, tool_rotation
 from ba_torchrl.tasks.pick_place_commands import pick_command, place_command
+
+LowestToolHeight = Callable[[tuple[float, float], Matrix], float]
+"""Function of x and y of the tool and its rotation, which returns its least height."""
 
 MOVED_M = 5e-3
 """Largest displacement of a body that counts as unmoved."""
@@ -38,7 +41,7 @@ class UndoRecorder(NamedTuple):
         self,
         held: Body | None,
         grasp: Pose | None,
-        lowest_tool_m: Callable[[tuple[float, float]], float] = lambda xy: -math.inf,
+        lowest_tool_m: LowestToolHeight = lambda xy, rotation: -math.inf,
     ) -> PickPlaceCommand | None:
         """Return the command that undoes the action since the recording.
 
@@ -49,7 +52,8 @@ class UndoRecorder(NamedTuple):
         Args:
             held: the body in the gripper now.
             grasp: pose of the held body in the frame of the tool now.
-            lowest_tool_m: returns for x and y the least height of the tool for a pick, metres.
+            lowest_tool_m: returns for x and y and the rotation of the tool its least height for a
+                pick, metres.
 
         Returns:
             None if the action neither picked nor placed a body, or moved another body.
@@ -63,4 +67,5 @@ class UndoRecorder(NamedTuple):
         if self.held is None:
             return place_command(Pose(ORIGIN), grasp, self.poses[body])
         command = pick_command(body.pose.compose(self.grasp.inverse()))
-        return command._replace(z_m=max(command.z_m, lowest_tool_m((command.x_m, command.y_m))))
+        lowest_m = lowest_tool_m((command.x_m, command.y_m), tool_rotation(*command.angles_rad))
+        return command._replace(z_m=max(command.z_m, lowest_m))

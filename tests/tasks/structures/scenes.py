@@ -10,10 +10,13 @@ from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, Span
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.parts import CUBE, CUBOID, ROOF
 from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.terrain import Flat
+from ba_torchrl.tasks.workspace import Area, Workspace
 
 B = 0.03
 SPAN = Span(1.5 * B, 1.75 * B, 2.2 * B)
-AREA = PlacementArea((0.3, 0.6), (-0.15, 0.15), gap_m=B, height_m=lambda xy: 0.0)
+REGION = Area((0.3, 0.6), (-0.15, 0.15))
+AREA = PlacementArea(Flat(None, Workspace(*REGION, (0.0, 0.4))), REGION, REGION, gap_m=B)
 SHAPES = {
     "cube": Box(size_m=(B, B, B)),
     "cuboid": Box(size_m=(B, 4 * B, B)),

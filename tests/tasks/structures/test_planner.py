@@ -141,8 +141,8 @@ def test_pieces_are_put_down_in_the_area_with_clearance(scene):
         s.scatter(np.random.default_rng(seed))
         triangle.place((0.6, 0.15, 0.2))
         x, y, z = s.planner.next_move(AREA, held=triangle).position
-        assert AREA.x[0] <= x <= AREA.x[1]
-        assert AREA.y[0] <= y <= AREA.y[1]
+        assert AREA.aside.x[0] <= x <= AREA.aside.x[1]
+        assert AREA.aside.y[0] <= y <= AREA.aside.y[1]
         assert z == pytest.approx(B / 2, abs=1e-6)
         half_diagonal = B / math.sqrt(2)  # of each cube
         for cube in s.cubes:

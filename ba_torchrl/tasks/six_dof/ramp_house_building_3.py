@@ -1,0 +1,17 @@
+"""House Building 3 with ramps (appendix C)."""
+
+from __future__ import annotations
+
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.open_loop.house_building_3 import HouseBuilding3
+from ba_torchrl.tasks.ramps import OnRamps
+
+
+@TASKS.register("ramp/house_building_3")
+class RampHouseBuilding3(OnRamps, HouseBuilding3):
+    """House Building 3 with two ramps: the structure stands between them.
+
+    The distance between the ramps is 4 to 20 cm, their slopes are 0 to 30 degrees, the heights of
+    their lower edges 0 to 1 cm. The episode ends early when a piece leaves the workspace. Appendix
+    C.
+    """
