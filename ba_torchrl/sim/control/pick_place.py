@@ -2,8 +2,9 @@
 
 The arm is teleported to the approach if it is free, the fingers are teleported to the smallest
 opening without contact, and a held body is teleported with the hand. Grasping, lifting, lowering
-and releasing are simulated, so that a grasp holds only by friction. With ``teleport`` off, all
-motions are simulated.
+and releasing are simulated, so that a grasp holds only by friction. A body that slips between the
+fingers is not teleported: its motions are simulated until it is at rest in the gripper or falls.
+With ``teleport`` off, all motions are simulated.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import Contact, is_any_within, outer_contacts, vertical_force_n
-from ba_torchrl.sim.control.close_loop import move_fingers, quintic_time_scaling
+from ba_torchrl.sim.contacts import contacts, is_any_within
+from ba_torchrl.sim.control.close_loop import move_fingers
 from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.tool_motion import ToolMotion
 from ba_torchrl.sim.geometry import (
     Matrix,
     Pose,
@@ -26,10 +28,6 @@ from ba_torchrl.sim.geometry import (
 )
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
-
-PEAK_ACCELERATION = 10 / math.sqrt(3)
-"""Greatest acceleration of `quintic_time_scaling` for a unit distance and a unit duration."""
-
 
 LowestToolHeight = Callable[[Gripper, tuple[float, float], Matrix, float], float]
 """Function of the gripper, x and y of the tool, its rotation and the opening. It returns the least
@@ -76,6 +74,7 @@ class PickPlace:
         self.top_down = top_down
         self.lowest_tool_m = lowest_tool_m
         self.limits = limits or PickPlaceLimits()
+        self.motion = ToolMotion(robot, self.limits)
         self.held: Body | None = None
         """The held body, which is hidden from cameras."""
         self.grasp: Pose | None = None
@@ -100,17 +99,20 @@ class PickPlace:
             The held body; None if the grasp failed or the pose is out of reach.
         """
         robot, limits = self.robot, self.limits
+        slips = False
         robot.set_opening(self.opening)
         if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
             self._close_fingers()
+            grasps = self._touched_poses()
             reached = robot.tool_frame().position
             above = self._approach_point(reached, rotation, limits.lift_height_m)
-            self._move_straight(reached, above, rotation, limits.min_motion_steps)
+            self.motion.move_straight(reached, above, rotation, None, limits.min_motion_steps)
             body = robot.held_body()
             if body is not None:
                 self._attach(body)
-                self._retreat(rotation)
-        self._return_home()
+                slips = self._has_slipped(grasps.get(body))
+                slips = self._retreat(rotation, simulate=slips or not self.teleport)
+        self._return_home(simulate=slips or not self.teleport)
         if self.held is None:
             robot.set_opening(self.opening)
         return self.held
@@ -127,12 +129,14 @@ class PickPlace:
         if self._approach(position, rotation, self.limits.pre_place_height_m):
             reached = self.robot.tool_frame().position
             down = self._approach_point(reached, rotation, -self.limits.pre_place_height_m)
-            self._move_straight(reached, down, rotation, self.limits.lowering_steps)
+            self.motion.move_straight(
+                reached, down, rotation, self.held, self.limits.lowering_steps
+            )
             self._detach()
             self._open_fingers()
             if not self.teleport:
-                self._retreat(rotation)
-        self._return_home()
+                self._retreat(rotation, simulate=True)
+        self._return_home(simulate=not self.teleport)
         if self.held is None:
             self.robot.set_opening(self.opening)
 
@@ -167,10 +171,29 @@ class PickPlace:
             self.held.is_hidden = False
         self.held = self.grasp = None
 
+    def _pose_in_tool_frame(self, body: Body) -> Pose:
+        return bullet_compose(bullet_inverse(self.robot.tool_frame()), body.pose)
+
     def _measure_grasp(self) -> None:
         """Measure the pose of the held body in the tool frame."""
-        to_tool = bullet_inverse(self.robot.tool_frame())
-        self.grasp = bullet_compose(to_tool, self.held.pose)
+        self.grasp = self._pose_in_tool_frame(self.held)
+
+    def _touched_poses(self) -> dict[Body, Pose]:
+        """Return the poses in the tool frame of the bodies that the hand touches."""
+        touched = {contact.other_id for contact in contacts(self.world.client, self.robot.id)}
+        return {
+            body: self._pose_in_tool_frame(body) for body in self.world.bodies if body.id in touched
+        }
+
+    def _has_slipped(self, before: Pose | None) -> bool:
+        """Whether the held body has moved in the tool frame by more than `max_slip_m`.
+
+        Args:
+            before: its pose in the tool frame before a motion; None if the hand did not touch it.
+        """
+        if before is None:
+            return True
+        return math.dist(before.position, self.grasp.position) > self.limits.max_slip_m
 
     def _teleport(self, joints: Sequence[float]) -> None:
         """Teleport the arm and the held body, which keeps its pose in the tool frame."""
@@ -245,16 +268,23 @@ class PickPlace:
             self._teleport(path[0])
         else:
             self._move_to_approach(end, rotation)
-        self._move_straight(
-            self._approach_point(end, rotation, limits.approach_distance_m), end, rotation, None
-        )
+        start = self._approach_point(end, rotation, limits.approach_distance_m)
+        self.motion.move_straight(start, end, rotation, self.held)
         self.update_grasp()
         return True
 
-    def _retreat(self, rotation: Matrix) -> None:
-        """Retract the tool against the approach direction, simulated unless the path is free."""
+    def _retreat(self, rotation: Matrix, *, simulate: bool) -> bool:
+        """Retract the tool against the approach direction.
+
+        Args:
+            rotation: of the tool.
+            simulate: simulate the motion even if the path is free.
+
+        Returns:
+            Whether the held body slipped between the fingers.
+        """
         start = self.robot.tool_frame().position
-        if self.teleport:
+        if not simulate:
             joints_at_start = self.robot.joints
             for distance in reversed(self.limits.approach_samples_m):
                 joints = self._solve_joints(
@@ -266,15 +296,13 @@ class PickPlace:
                 if self._is_in_contact():
                     break
             else:
-                return
+                return False
             self._teleport(joints_at_start)
-        self._move_straight(
-            start,
-            self._approach_point(start, rotation, self.limits.approach_distance_m),
-            rotation,
-            None,
-        )
+        before = self.grasp
+        end = self._approach_point(start, rotation, self.limits.approach_distance_m)
+        self.motion.move_straight(start, end, rotation, self.held)
         self.update_grasp()
+        return self.held is not None and self._has_slipped(before)
 
     def _move_to_approach(self, end: Vector, rotation: Matrix) -> None:
         """Simulate a motion to the start of an approach, at the transit height first."""
@@ -283,88 +311,30 @@ class PickPlace:
         joints = self._solve_joints(high, rotation)
         if joints is None:
             high, joints = start, self._solve_joints(start, rotation)
-        self._move_joints(joints)
-        self._move_straight(high, start, rotation, None)
+        self.motion.move_joints(joints, self.held)
+        self.motion.move_straight(high, start, rotation, self.held)
 
-    def _return_home(self) -> None:
-        """Move the arm to its home configuration, simulated without `teleport`."""
-        if self.teleport:
-            self._teleport(self.robot.home_joints)
-        else:
-            x, y, z = self.robot.tool_frame().position
-            rotation = self._tool_rotation()
-            if z < self.limits.transit_height_m:
-                self._move_straight((x, y, z), (x, y, self.limits.transit_height_m), rotation, None)
-            self._move_joints(self.robot.home_joints)
-            self.update_grasp()
-
-    def _move_straight(
-        self, start: Vector, end: Vector, rotation: Matrix, count: int | None
-    ) -> None:
-        """Simulate a straight motion of the tool.
-
-        The motion ends where it is out of reach, or, if downward, at the force limit.
+    def _return_home(self, *, simulate: bool) -> None:
+        """Move the arm to its home configuration.
 
         Args:
-            start: position of the tool point at the start, metres.
-            end: position of the tool point at the end, metres.
-            rotation: of the tool.
-            count: number of physics steps; None means the least within the acceleration limits.
+            simulate: simulate the motion instead of teleporting the arm.
         """
-        limits = self.limits
-        if count is None:
-            acceleration = limits.acceleration_m_s2
-            if self.held is not None:
-                acceleration = limits.held_acceleration_m_s2
-            count = max(
-                limits.min_motion_steps, self._num_steps(math.dist(start, end), acceleration)
-            )
-        goes_down = end[2] < start[2]
-        for i in range(1, count + 1):
-            fraction = quintic_time_scaling(i / count)
-            point = tuple(s + fraction * (e - s) for s, e in zip(start, end, strict=True))
-            joints = self._solve_joints(point, rotation)
-            if joints is None:
-                return
-            before = self.robot.joints
-            self.robot.command(joints)
-            self.world.step()
-            if goes_down and vertical_force_n(self._outer_contacts()) > limits.max_vertical_force_n:
-                self.robot.command(before)
-                self.world.step()
-                return
-
-    def _move_joints(self, joints: Sequence[float]) -> None:
-        """Simulate a joint-space motion of the arm with quintic time scaling."""
-        start = self.robot.joints
-        deltas = [e - s for s, e in zip(start, joints, strict=True)]
-        limits = self.limits
-        acceleration = (
-            limits.joint_acceleration_rad_s2
-            if self.held is None
-            else limits.held_joint_acceleration_rad_s2
-        )
-        count = max(2, self._num_steps(max(map(abs, deltas)), acceleration))
-        for i in range(1, count + 1):
-            fraction = quintic_time_scaling(i / count)
-            self.robot.command([s + fraction * d for s, d in zip(start, deltas, strict=True)])
-            self.world.step()
-
-    def _num_steps(self, length: float, acceleration: float) -> int:
-        """Return the least number of steps of a quintic motion within an acceleration limit."""
-        duration_s = math.sqrt(PEAK_ACCELERATION * length / acceleration)
-        return math.ceil(duration_s / self.world.physics.time_step_s)
+        if not simulate:
+            self._teleport(self.robot.home_joints)
+            return
+        x, y, z = self.robot.tool_frame().position
+        high = (x, y, self.limits.transit_height_m)
+        if z < self.limits.transit_height_m:
+            self.motion.move_straight((x, y, z), high, self._tool_rotation(), self.held)
+        self.motion.move_joints(self.robot.home_joints, self.held)
+        self.update_grasp()
 
     # -- contacts ----------------------------------------------------------------------------
 
-    def _outer_contacts(self) -> list[Contact]:
-        """Return the contacts of the hand and the held body with other bodies."""
-        held = () if self.held is None else (self.held.id,)
-        return outer_contacts(self.world.client, self.robot.id, *held)
-
     def _is_in_contact(self) -> bool:
         self.world.detect_collisions()
-        return is_any_within(self._outer_contacts(), self.limits.contact_margin_m)
+        return is_any_within(self.motion.outer_contacts(self.held), self.limits.contact_margin_m)
 
     # -- fingers -----------------------------------------------------------------------------
 
