@@ -81,7 +81,7 @@ class OpenLoopEnv(ManipulationEnv):
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
-            lowest_tool_m=task.terrain.lowest_tool_m,
+            surface=task.terrain,
         )
 
     @property

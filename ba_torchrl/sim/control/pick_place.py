@@ -10,13 +10,14 @@ With ``teleport`` off, all motions are simulated.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.control.close_loop import move_fingers
 from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.support_surface import Floor, SupportSurface
 from ba_torchrl.sim.control.tool_motion import ToolMotion
 from ba_torchrl.sim.geometry import (
     Matrix,
@@ -27,11 +28,9 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.sim.robots.gripper import Gripper
 
-LowestToolHeight = Callable[[Gripper, tuple[float, float], Matrix, float], float]
-"""Function of the gripper, x and y of the tool, its rotation and the opening. It returns the least
-height of the tool at which the fingers close clear of the support surface."""
+MAX_UNCHECKED_TILT_COSINE = 0.86
+"""Within 30 degrees of the vertical, neither hand nor arm can reach below the fingertips."""
 
 
 class HeldState(NamedTuple):
@@ -52,8 +51,7 @@ class PickPlace:
         opening: of the fingers before a pick and after a place, 0 to 1.
         top_down: approach vertically even with a tilted tool, instead of along the z axis of the
             tool.
-        lowest_tool_m: least height of the tool above the support surface; None means that above
-            the floor of the world.
+        surface: support surface; None means the floor of the world.
         limits: distances, accelerations and step counts.
     """
 
@@ -64,7 +62,7 @@ class PickPlace:
         teleport: bool = True,
         opening: float = 1.0,
         top_down: bool = False,
-        lowest_tool_m: LowestToolHeight | None = None,
+        surface: SupportSurface | None = None,
         limits: PickPlaceLimits | None = None,
     ) -> None:
         self.robot = robot
@@ -72,13 +70,15 @@ class PickPlace:
         self.teleport = teleport
         self.opening = opening
         self.top_down = top_down
-        self.lowest_tool_m = lowest_tool_m
+        self.surface = surface or Floor(self.world.floor)
         self.limits = limits or PickPlaceLimits()
         self.motion = ToolMotion(robot, self.limits)
         self.held: Body | None = None
         """The held body, which is hidden from cameras."""
         self.grasp: Pose | None = None
         """Pose of the held body in the tool frame."""
+        self.is_out_of_reach = False
+        """Whether the last pick or place was out of reach, so that the arm did not move."""
 
     def reset(self) -> None:
         """Teleport the arm to its home configuration with an empty, open gripper."""
@@ -227,16 +227,38 @@ class PickPlace:
     def _clear_of_surface(self, position: Vector, rotation: Matrix) -> Vector:
         """Return the point, raised if necessary so that the fingers close clear of the surface."""
         x, y, z = position
-        gripper = self.robot.gripper
-        if self.lowest_tool_m is None:
-            return x, y, max(z, gripper.lowest_tool_m(rotation, self.opening))
-        return x, y, max(z, self.lowest_tool_m(gripper, (x, y), rotation, self.opening))
+        lowest = self.surface.lowest_tool_m(self.robot.gripper, (x, y), rotation, self.opening)
+        return x, y, max(z, lowest)
 
     def _tool_rotation(self) -> Matrix:
         return quaternion_matrix(self.robot.tool_frame().orientation)
 
     def _solve_joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
+
+    def _plan_approach(self, end: Vector, rotation: Matrix) -> list[list[float]] | None:
+        """Return the arm joints at samples of an approach, the first one at its start.
+
+        Args:
+            end: position of the tool point at the end of the approach, metres.
+            rotation: of the tool.
+
+        Returns:
+            Joint angles in radians; None if the approach is out of reach: a sample has no inverse
+            kinematics, or hand or arm penetrate the support surface at the start or at the end.
+        """
+        distances = (self.limits.approach_distance_m, *self.limits.approach_samples_m, 0.0)
+        path = [
+            self._solve_joints(self._approach_point(end, rotation, distance), rotation)
+            for distance in distances
+        ]
+        if any(joints is None for joints in path):
+            return None
+        is_steep = -rotation[2][2] > MAX_UNCHECKED_TILT_COSINE
+        supports = self.surface.support_ids
+        if not is_steep and any(self.robot.penetrates(supports, path[i]) for i in (0, -1)):
+            return None
+        return path
 
     def _approach(self, position: Vector, rotation: Matrix, clearance_m: float) -> bool:
         """Move the tool along the approach line to a target, or to a clearance before it.
@@ -249,28 +271,30 @@ class PickPlace:
         Returns:
             Whether the approach is within reach; if not, the arm does not move.
         """
-        limits = self.limits
         end = self._approach_point(position, rotation, clearance_m)
-        distances = (limits.approach_distance_m, *limits.approach_samples_m, 0.0)
-        path = [
-            self._solve_joints(self._approach_point(end, rotation, distance), rotation)
-            for distance in distances
-        ]
-        if any(joints is None for joints in path):
+        path = self._plan_approach(end, rotation)
+        self.is_out_of_reach = path is None
+        if path is None:
             return False
-        if self.teleport:
-            for joints in path[1:]:
-                self._teleport(joints)
-                if self._is_in_contact():
-                    break
-            else:
-                return True
-            self._teleport(path[0])
-        else:
-            self._move_to_approach(end, rotation)
-        start = self._approach_point(end, rotation, limits.approach_distance_m)
+        if self.teleport and self._teleport_along(path[1:]):
+            return True
+        start = self._approach_point(end, rotation, self.limits.approach_distance_m)
+        if not self.teleport or not self._teleport_along(path[:1]):
+            self._descend_to(start, rotation)
         self.motion.move_straight(start, end, rotation, self.held)
         self.update_grasp()
+        return True
+
+    def _teleport_along(self, path: Sequence[Sequence[float]]) -> bool:
+        """Teleport through joint positions until the first contact.
+
+        Returns:
+            Whether all of them are free of contacts.
+        """
+        for joints in path:
+            self._teleport(joints)
+            if self._is_in_contact():
+                return False
         return True
 
     def _retreat(self, rotation: Matrix, *, simulate: bool) -> bool:
@@ -286,16 +310,11 @@ class PickPlace:
         start = self.robot.tool_frame().position
         if not simulate:
             joints_at_start = self.robot.joints
-            for distance in reversed(self.limits.approach_samples_m):
-                joints = self._solve_joints(
-                    self._approach_point(start, rotation, distance), rotation
-                )
-                if joints is None:
-                    break
-                self._teleport(joints)
-                if self._is_in_contact():
-                    break
-            else:
+            path = [
+                self._solve_joints(self._approach_point(start, rotation, distance), rotation)
+                for distance in reversed(self.limits.approach_samples_m)
+            ]
+            if None not in path and self._teleport_along(path):
                 return False
             self._teleport(joints_at_start)
         before = self.grasp
@@ -304,14 +323,21 @@ class PickPlace:
         self.update_grasp()
         return self.held is not None and self._has_slipped(before)
 
-    def _move_to_approach(self, end: Vector, rotation: Matrix) -> None:
-        """Simulate a motion to the start of an approach, at the transit height first."""
-        start = self._approach_point(end, rotation, self.limits.approach_distance_m)
+    def _descend_to(self, start: Vector, rotation: Matrix) -> None:
+        """Move above the start of an approach, and simulate the descent to it.
+
+        Args:
+            start: position of the tool point at the start of the approach, metres.
+            rotation: of the tool.
+        """
         high = (*start[:2], max(self.limits.transit_height_m, start[2]))
         joints = self._solve_joints(high, rotation)
         if joints is None:
             high, joints = start, self._solve_joints(start, rotation)
-        self.motion.move_joints(joints, self.held)
+        if self.teleport:
+            self._teleport(joints)
+        else:
+            self.motion.move_joints(joints, self.held)
         self.motion.move_straight(high, start, rotation, self.held)
 
     def _return_home(self, *, simulate: bool) -> None:
