@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import contacts, is_any_within
-from ba_torchrl.sim.control.close_loop import move_fingers
+from ba_torchrl.sim.control.close_loop import OPENING_TOLERANCE, move_fingers
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.control.support_surface import Floor, SupportSurface
 from ba_torchrl.sim.control.tool_motion import ToolMotion
@@ -98,8 +98,7 @@ class PickPlace:
         Returns:
             The held body; None if the grasp failed or the pose is out of reach.
         """
-        robot, limits = self.robot, self.limits
-        slips = False
+        robot, limits, slips = self.robot, self.limits, False
         robot.set_opening(self.opening)
         if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
             self._close_fingers()
@@ -112,6 +111,8 @@ class PickPlace:
                 self._attach(body)
                 slips = self._has_slipped(grasps.get(body))
                 slips = self._retreat(rotation, simulate=slips or not self.teleport)
+            elif robot.opening() > OPENING_TOLERANCE:
+                slips = self._retreat_with_bad_grasp(rotation)
         self._return_home(simulate=slips or not self.teleport)
         if self.held is None:
             robot.set_opening(self.opening)
@@ -230,9 +231,6 @@ class PickPlace:
         lowest = self.surface.lowest_tool_m(self.robot.gripper, (x, y), rotation, self.opening)
         return x, y, max(z, lowest)
 
-    def _tool_rotation(self) -> Matrix:
-        return quaternion_matrix(self.robot.tool_frame().orientation)
-
     def _solve_joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
 
@@ -323,6 +321,23 @@ class PickPlace:
         self.update_grasp()
         return self.held is not None and self._has_slipped(before)
 
+    def _retreat_with_bad_grasp(self, rotation: Matrix) -> bool:
+        """Simulate a retreat with fingers that are not closed but hold no body.
+
+        Fingers that an obstacle has stopped go on closing, and a body that is wedged between them
+        may align with them or fall. What is then not held is released.
+
+        Returns:
+            Whether a body is held, which may still slip.
+        """
+        self._retreat(rotation, simulate=True)
+        body = self.robot.held_body()
+        if body is None:
+            move_fingers(self.robot, self.opening, self.limits.max_closing_steps)
+            return False
+        self._attach(body)
+        return True
+
     def _descend_to(self, start: Vector, rotation: Matrix) -> None:
         """Move above the start of an approach, and simulate the descent to it.
 
@@ -349,10 +364,11 @@ class PickPlace:
         if not simulate:
             self._teleport(self.robot.home_joints)
             return
-        x, y, z = self.robot.tool_frame().position
-        high = (x, y, self.limits.transit_height_m)
-        if z < self.limits.transit_height_m:
-            self.motion.move_straight((x, y, z), high, self._tool_rotation(), self.held)
+        tool = self.robot.tool_frame()
+        high = (*tool.position[:2], self.limits.transit_height_m)
+        if tool.position[2] < high[2]:
+            rotation = quaternion_matrix(tool.orientation)
+            self.motion.move_straight(tool.position, high, rotation, self.held)
         self.motion.move_joints(self.robot.home_joints, self.held)
         self.update_grasp()
 
