@@ -164,7 +164,7 @@ class PickPlace:
         """Make a grasped body the held body."""
         self.held = body
         body.is_hidden = True
-        self._measure_grasp()
+        self.grasp = self._pose_in_tool_frame(self.held)
 
     def _detach(self) -> None:
         """Make the held body an ordinary body, without moving it."""
@@ -174,10 +174,6 @@ class PickPlace:
 
     def _pose_in_tool_frame(self, body: Body) -> Pose:
         return bullet_compose(bullet_inverse(self.robot.tool_frame()), body.pose)
-
-    def _measure_grasp(self) -> None:
-        """Measure the pose of the held body in the tool frame."""
-        self.grasp = self._pose_in_tool_frame(self.held)
 
     def _touched_poses(self) -> dict[Body, Pose]:
         """Return the poses in the tool frame of the bodies that the hand touches."""
@@ -213,7 +209,7 @@ class PickPlace:
             return
         for _ in range(self.limits.max_regrasp_steps):
             if self.robot.held_body() is self.held:
-                self._measure_grasp()
+                self.grasp = self._pose_in_tool_frame(self.held)
                 return
             self.world.step()
         self._detach()
