@@ -273,7 +273,9 @@ class PickPlace:
         if self.teleport and self._teleport_along(path[1:]):
             return True
         start = self._approach_point(end, rotation, self.limits.approach_distance_m)
-        if not self.teleport or not self._teleport_along(path[:1]):
+        if self.teleport:
+            self._teleport(path[0])
+        if not self.teleport or not self.motion.is_clear(self.held):
             self._descend_to(start, rotation)
         self.motion.move_straight(start, end, rotation, self.held)
         self.update_grasp()
@@ -318,10 +320,9 @@ class PickPlace:
         return self.held is not None and self._has_slipped(before)
 
     def _retreat_with_bad_grasp(self, rotation: Matrix) -> bool:
-        """Simulate a retreat with fingers that are not closed but hold no body.
+        """Simulate a retreat with fingers that are neither closed nor hold a body.
 
-        Fingers that an obstacle has stopped go on closing, and a body that is wedged between them
-        may align with them or fall. What is then not held is released.
+        On the way, fingers stopped by an obstacle go on closing. What is then not held is released.
 
         Returns:
             Whether a body is held, which may still slip.

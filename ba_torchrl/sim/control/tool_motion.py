@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import Contact, outer_contacts, vertical_force_n
+from ba_torchrl.sim.contacts import Contact, nearest_points, outer_contacts, vertical_force_n
 from ba_torchrl.sim.control.close_loop import quintic_time_scaling
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.geometry import Matrix, Vector
@@ -99,6 +99,25 @@ class ToolMotion:
         """Return the contacts of the hand and the held body with other bodies."""
         held_ids = () if held is None else (held.id,)
         return outer_contacts(self.world.client, self.robot.id, *held_ids)
+
+    def is_clear(self, held: Body | None) -> bool:
+        """Whether hand and held body are clear of all other bodies at their current poses.
+
+        This computes closest points instead of contact points: those of bodies that penetrate each
+        other affect later steps through caches of the engine that no saved state contains.
+
+        Args:
+            held: the held body.
+        """
+        client, robot = self.world.client, self.robot
+        own = [robot.id] if held is None else [robot.id, held.id]
+        others = {self.world.floor, *(body.id for body in self.world.bodies)} - {*own}
+        return not any(
+            point.body_id != robot.id or point.link not in robot.non_colliding_links
+            for body_id in own
+            for other_id in sorted(others)
+            for point in nearest_points(client, body_id, other_id, self.limits.contact_margin_m)
+        )
 
     def _num_steps(self, length: float, acceleration: float) -> int:
         """Return the least number of steps of a quintic motion within an acceleration limit."""
