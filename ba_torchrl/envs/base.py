@@ -19,12 +19,7 @@ from ba_torchrl.envs.checks import checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import enabled_observations, merge_entries
-from ba_torchrl.envs.scene import (
-    Controller,
-    Scene,
-    build_scene,
-    check_action_limits,
-)
+from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
 from ba_torchrl.envs.settings import check_action_components, check_task_parameters
 from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.registry import Registry
@@ -87,7 +82,7 @@ class ManipulationEnv(EnvBase):
         self._memory: dict[str, Any] = {}
         """Parts of observations from earlier steps; the dictionary is replaced, never modified."""
         self._ends: dict[str, bool] = {}
-        """Success, fault and done flags of the last step, by key."""
+        """Flags of the last step, by key."""
         self._conditions: dict[str, bool] | None = None
         """The conditions of success after the last step, None before the first."""
         self._step_count = 0
@@ -182,6 +177,11 @@ class ManipulationEnv(EnvBase):
         if self._conditions is None:
             self._conditions = self.scene.task.conditions()
         return dict(self._conditions)
+
+    @property
+    def is_out_of_reach(self) -> bool:
+        """Whether the arm could not reach the pose of the last action; see `Controller`."""
+        return self._ends.get(keys.IS_OUT_OF_REACH, False)
 
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return an RGB image of the scene, [height, width, 3] uint8."""
@@ -308,6 +308,7 @@ class ManipulationEnv(EnvBase):
             keys.TERMINATED: terminated,
             keys.TRUNCATED: truncated,
             keys.DONE: terminated or truncated,
+            keys.IS_OUT_OF_REACH: scene.controller.is_out_of_reach,
         }
         reward = float(self._ends[keys.SUCCESS])
         return self._tensordict(self._observation, reward=reward, **self._ends)

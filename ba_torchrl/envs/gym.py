@@ -26,8 +26,9 @@ INFO_KEYS = (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT, keys.EXPERT_ACTION)
 class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     """A task as a Gymnasium environment with a dictionary of observations.
 
-    ``info`` holds ``success``, ``fault``, ``step_count`` and, with ``expert=True``,
-    ``expert_action``; ``is_success`` is ``success`` under the name that Stable-Baselines3 logs.
+    ``info`` holds ``success``, ``fault``, ``step_count``, the conditions of success and, with
+    ``expert=True``, ``expert_action``; ``is_success`` is ``success`` under the name that
+    Stable-Baselines3 logs; ``is_out_of_reach`` tells an action that the arm cannot execute.
 
     Args:
         task: as listed by `ba_torchrl.list_tasks`.
@@ -123,6 +124,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         }
         info["is_success"] = info[keys.SUCCESS]
         info |= self.torchrl_env.conditions
+        info[keys.IS_OUT_OF_REACH] = self.torchrl_env.is_out_of_reach
         if keys.EXPERT_ACTION in state:
             info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
         return observation, info

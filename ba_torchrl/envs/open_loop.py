@@ -33,10 +33,11 @@ class OpenLoopEnv(ManipulationEnv):
     """A task under open-loop control (paper section 3.2, appendix A.1, G.1).
 
     An action is a pose and a primitive. A pick with an object in the gripper and a place without
-    one have no effect but count as steps. Without the z component, the height is computed from the
-    heightmap around the target. Without the primitive, an empty gripper picks and a gripper that
-    holds an object places. The image is the heightmap of the workspace, without the arm and the
-    held object.
+    one have no effect but count as steps. The same holds for poses out of reach: those without
+    inverse kinematics, and those at which hand or arm would penetrate the ground. Without the z
+    component, the height is computed from the heightmap around the target. Without the primitive,
+    an empty gripper picks and a gripper that holds an object places. The image is the heightmap of
+    the workspace, without the arm and the held object.
 
     Raises:
         ConfigError: the task or the robot does not support the parameters, or the workspace is not
@@ -87,7 +88,7 @@ class OpenLoopEnv(ManipulationEnv):
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
-            lowest_tool_m=task.terrain.lowest_tool_m,
+            surface=task.terrain,
         )
 
     @property
@@ -133,6 +134,7 @@ class OpenLoopEnv(ManipulationEnv):
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         command = self.actions.decode(action)
         controller = scene.controller
+        controller.is_out_of_reach = False
         before_action = self._record_undo(scene)
         holding = controller.held is not None
         primitive = command.primitive

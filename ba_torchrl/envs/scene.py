@@ -26,6 +26,10 @@ MARK_M = 1e-3
 class Controller(Protocol):
     """Executes actions; each control defines the methods for its actions."""
 
+    is_out_of_reach: bool
+    """Whether the pose of the last action was out of reach. The arm then does not move in open
+    loop, and moves up to the end of its reach in close loop."""
+
     def get_state(self) -> Any:
         """Return the state that persists between actions."""
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pybullet
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import IDENTITY, ORIGIN, Pose, Quaternion, Vector, yaw_quaternion
+from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Shape, Solid
+
+LINK_MARGIN_M = 1e-3
+"""PyBullet's collision margin of a hull; that of a link, other than the base, cannot be changed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +70,10 @@ class ArticulatedLink(Body):
                 frictionAnchor=1,
                 physicsClientId=client,
             )
-            if shape.collision_margin_m is not None:
-                pybullet.changeDynamics(
-                    self.id, link, collisionMargin=shape.collision_margin_m, physicsClientId=client
-                )
+        if -1 in self.links and shape.collision_margin_m is not None:
+            pybullet.changeDynamics(
+                self.id, -1, collisionMargin=shape.collision_margin_m, physicsClientId=client
+            )
 
     @property
     def is_static(self) -> bool:
@@ -134,16 +139,6 @@ class ArticulatedLink(Body):
                 self.id, link, group, mask, physicsClientId=self.client
             )
 
-    def bounding_box(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the axis-aligned bounding box, metres."""
-        boxes = [
-            pybullet.getAABB(self.id, link, physicsClientId=self.client) for link in self.links
-        ]
-        return (
-            tuple(min(low[axis] for low, _ in boxes) for axis in range(3)),
-            tuple(max(high[axis] for _, high in boxes) for axis in range(3)),
-        )
-
 
 class ArticulatedBody:
     """A fixed link and a sliding link: one PyBullet body with one prismatic joint.
@@ -176,7 +171,7 @@ class ArticulatedBody:
         moving = _convex_parts(slider)
         # in linkParentIndices, 0 is the base and links count from 1
         parents = [0, *[0] * len(fixed), *[1] * (len(moving) - 1)]
-        parts = [moving[0], *fixed, *moving[1:]]
+        parts = [_without_link_margin(part) for part in (moving[0], *fixed, *moving[1:])]
         share = slider.mass_kg / len(moving)
         self.id = pybullet.createMultiBody(
             baseMass=0.0,
@@ -260,3 +255,19 @@ def _convex_parts(shape: Shape) -> list[Shape]:
     if not isinstance(shape, Solid):
         return [shape]
     return [replace(shape, parts=(part,), surface=None) for part in shape.parts]
+
+
+def _without_link_margin(part: Shape) -> Shape:
+    """Return the collision geometry of a link, which PyBullet encloses in a fixed margin.
+
+    A hull is smaller by the difference between that margin and the shape's own. This is exact for
+    boxes and cylinders along the axes of the frame.
+    """
+    if part.collision_margin_m is None:
+        return part
+    (mesh,) = part.parts
+    low, high = np.array(part.bounds_m)
+    excess_m = LINK_MARGIN_M - part.collision_margin_m
+    factors = np.maximum(high - low - 2 * excess_m, 0.0) / (high - low)
+    center = (low + high) / 2
+    return replace(part, parts=(Mesh(center + factors * (mesh.vertices - center), mesh.faces),))

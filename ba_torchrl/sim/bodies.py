@@ -134,8 +134,12 @@ class Body:
         return is_any_within(contacts(self.client, self.id, other.id))
 
     def bounding_box(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the axis-aligned bounding box, metres."""
-        return pybullet.getAABB(self.id, physicsClientId=self.client)
+        """Return the lower and upper corner of the axis-aligned bounding box, metres.
+
+        It contains the surface exactly; PyBullet's is larger by up to 35 mm for a rotated body.
+        """
+        vertices = world_vertices(self)
+        return tuple(vertices.min(axis=0).tolist()), tuple(vertices.max(axis=0).tolist())
 
 
 def world_vertices(body: Body) -> np.ndarray:

@@ -86,6 +86,16 @@ def test_the_bounding_box_check_is_stricter_than_the_point_check(make):
         assert env.scene.task.is_valid() is valid
 
 
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.3, 0.8, 1.2])
+def test_the_bounding_box_of_a_bowl_does_not_depend_on_its_yaw(make, yaw_rad):
+    env = make("block_in_bowl", workspace_check="bounding_box")
+    env.scene.task.bowl.place((0.49, 0.0, 1e-3), yaw_rad)
+    env.scene.task.block.place((0.35, 0.1, 0.025))
+    assert env.scene.task.is_valid()
+    env.scene.task.bowl.place((0.53, 0.0, 1e-3), yaw_rad)
+    assert not env.scene.task.is_valid()
+
+
 def test_fixed_orientations_are_at_yaw_zero(make):
     env = make("block_pulling", random_orientation=False)
     for _ in range(5):

@@ -45,6 +45,8 @@ class CloseLoopController:
         self.teleport = teleport
         self.limits = limits or MotionLimits()
         self._target_opening = 1.0
+        self.is_out_of_reach = False
+        """Whether the last motion ended where its path left the reach of the arm."""
 
     def reset(self, pose: YawPose, opening: float = 1.0) -> None:
         """Teleport the tool to a pose, without simulation.
@@ -82,6 +84,7 @@ class CloseLoopController:
             yaw_rad: target yaw of the tool.
         """
         robot, limits = self.robot, self.limits
+        self.is_out_of_reach = False
         self._unwind_wrist()
         path = _Path(robot, robot.tool_pose(), (position, yaw_rad))
         held = robot.held_body()
@@ -216,7 +219,7 @@ class CloseLoopController:
         for fraction in fractions:
             joints = path.joints_at(fraction)
             if joints is None:
-                has_arrived = False
+                self.is_out_of_reach, has_arrived = True, False
                 break
             before = robot.joints
             robot.command(joints)

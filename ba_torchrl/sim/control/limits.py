@@ -57,6 +57,9 @@ class PickPlaceLimits:
     """Physics steps after closing, in which the grasp force and the contact points build up."""
     lift_height_m: float = 0.005
     """Height by which a grasp is lifted before it is checked."""
+    max_slip_m: float = 0.002
+    """Displacement of a held body in the tool frame, in a simulated motion, above which it slips. A
+    body that is accelerated by `held_acceleration_m_s2` alone lags by 3 mm behind the lift."""
     min_motion_steps: int = 4
     """Least number of physics steps of a simulated straight motion."""
     transit_height_m: float = 0.3

@@ -2,20 +2,23 @@
 
 The arm is teleported to the approach if it is free, the fingers are teleported to the smallest
 opening without contact, and a held body is teleported with the hand. Grasping, lifting, lowering
-and releasing are simulated, so that a grasp holds only by friction. With ``teleport`` off, all
-motions are simulated.
+and releasing are simulated, so that a grasp holds only by friction. A body that slips between the
+fingers is not teleported: its motions are simulated until it is at rest in the gripper or falls.
+With ``teleport`` off, all motions are simulated.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import Contact, is_any_within, outer_contacts, vertical_force_n
-from ba_torchrl.sim.control.close_loop import move_fingers, quintic_time_scaling
+from ba_torchrl.sim.contacts import contacts, is_any_within
+from ba_torchrl.sim.control.close_loop import OPENING_TOLERANCE, move_fingers
 from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.support_surface import Floor, SupportSurface
+from ba_torchrl.sim.control.tool_motion import ToolMotion
 from ba_torchrl.sim.geometry import (
     Matrix,
     Pose,
@@ -25,15 +28,9 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.sim.robots.gripper import Gripper
 
-PEAK_ACCELERATION = 10 / math.sqrt(3)
-"""Greatest acceleration of `quintic_time_scaling` for a unit distance and a unit duration."""
-
-
-LowestToolHeight = Callable[[Gripper, tuple[float, float], Matrix, float], float]
-"""Function of the gripper, x and y of the tool, its rotation and the opening. It returns the least
-height of the tool at which the fingers close clear of the support surface."""
+MAX_UNCHECKED_TILT_COSINE = 0.86
+"""Within 30 degrees of the vertical, neither hand nor arm can reach below the fingertips."""
 
 
 class HeldState(NamedTuple):
@@ -54,8 +51,7 @@ class PickPlace:
         opening: of the fingers before a pick and after a place, 0 to 1.
         top_down: approach vertically even with a tilted tool, instead of along the z axis of the
             tool.
-        lowest_tool_m: least height of the tool above the support surface; None means that above
-            the floor of the world.
+        surface: support surface; None means the floor of the world.
         limits: distances, accelerations and step counts.
     """
 
@@ -66,7 +62,7 @@ class PickPlace:
         teleport: bool = True,
         opening: float = 1.0,
         top_down: bool = False,
-        lowest_tool_m: LowestToolHeight | None = None,
+        surface: SupportSurface | None = None,
         limits: PickPlaceLimits | None = None,
     ) -> None:
         self.robot = robot
@@ -74,12 +70,15 @@ class PickPlace:
         self.teleport = teleport
         self.opening = opening
         self.top_down = top_down
-        self.lowest_tool_m = lowest_tool_m
+        self.surface = surface or Floor(self.world.floor)
         self.limits = limits or PickPlaceLimits()
+        self.motion = ToolMotion(robot, self.limits)
         self.held: Body | None = None
         """The held body, which is hidden from cameras."""
         self.grasp: Pose | None = None
         """Pose of the held body in the tool frame."""
+        self.is_out_of_reach = False
+        """Whether the last pick or place was out of reach, so that the arm did not move."""
 
     def reset(self) -> None:
         """Teleport the arm to its home configuration with an empty, open gripper."""
@@ -99,18 +98,22 @@ class PickPlace:
         Returns:
             The held body; None if the grasp failed or the pose is out of reach.
         """
-        robot, limits = self.robot, self.limits
+        robot, limits, slips = self.robot, self.limits, False
         robot.set_opening(self.opening)
         if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
             self._close_fingers()
+            grasps = self._touched_poses()
             reached = robot.tool_frame().position
             above = self._approach_point(reached, rotation, limits.lift_height_m)
-            self._move_straight(reached, above, rotation, limits.min_motion_steps)
+            self.motion.move_straight(reached, above, rotation, None, limits.min_motion_steps)
             body = robot.held_body()
             if body is not None:
                 self._attach(body)
-                self._retreat(rotation)
-        self._return_home()
+                slips = self._has_slipped(grasps.get(body))
+                slips = self._retreat(rotation, simulate=slips or not self.teleport)
+            elif robot.opening() > OPENING_TOLERANCE:
+                slips = self._retreat_with_bad_grasp(rotation)
+        self._return_home(simulate=slips or not self.teleport)
         if self.held is None:
             robot.set_opening(self.opening)
         return self.held
@@ -127,12 +130,14 @@ class PickPlace:
         if self._approach(position, rotation, self.limits.pre_place_height_m):
             reached = self.robot.tool_frame().position
             down = self._approach_point(reached, rotation, -self.limits.pre_place_height_m)
-            self._move_straight(reached, down, rotation, self.limits.lowering_steps)
+            self.motion.move_straight(
+                reached, down, rotation, self.held, self.limits.lowering_steps
+            )
             self._detach()
             self._open_fingers()
             if not self.teleport:
-                self._retreat(rotation)
-        self._return_home()
+                self._retreat(rotation, simulate=True)
+        self._return_home(simulate=not self.teleport)
         if self.held is None:
             self.robot.set_opening(self.opening)
 
@@ -159,7 +164,7 @@ class PickPlace:
         """Make a grasped body the held body."""
         self.held = body
         body.is_hidden = True
-        self._measure_grasp()
+        self.grasp = self._pose_in_tool_frame(self.held)
 
     def _detach(self) -> None:
         """Make the held body an ordinary body, without moving it."""
@@ -167,10 +172,25 @@ class PickPlace:
             self.held.is_hidden = False
         self.held = self.grasp = None
 
-    def _measure_grasp(self) -> None:
-        """Measure the pose of the held body in the tool frame."""
-        to_tool = bullet_inverse(self.robot.tool_frame())
-        self.grasp = bullet_compose(to_tool, self.held.pose)
+    def _pose_in_tool_frame(self, body: Body) -> Pose:
+        return bullet_compose(bullet_inverse(self.robot.tool_frame()), body.pose)
+
+    def _touched_poses(self) -> dict[Body, Pose]:
+        """Return the poses in the tool frame of the bodies that the hand touches."""
+        touched = {contact.other_id for contact in contacts(self.world.client, self.robot.id)}
+        return {
+            body: self._pose_in_tool_frame(body) for body in self.world.bodies if body.id in touched
+        }
+
+    def _has_slipped(self, before: Pose | None) -> bool:
+        """Whether the held body has moved in the tool frame by more than `max_slip_m`.
+
+        Args:
+            before: its pose in the tool frame before a motion; None if the hand did not touch it.
+        """
+        if before is None:
+            return True
+        return math.dist(before.position, self.grasp.position) > self.limits.max_slip_m
 
     def _teleport(self, joints: Sequence[float]) -> None:
         """Teleport the arm and the held body, which keeps its pose in the tool frame."""
@@ -189,7 +209,7 @@ class PickPlace:
             return
         for _ in range(self.limits.max_regrasp_steps):
             if self.robot.held_body() is self.held:
-                self._measure_grasp()
+                self.grasp = self._pose_in_tool_frame(self.held)
                 return
             self.world.step()
         self._detach()
@@ -204,16 +224,35 @@ class PickPlace:
     def _clear_of_surface(self, position: Vector, rotation: Matrix) -> Vector:
         """Return the point, raised if necessary so that the fingers close clear of the surface."""
         x, y, z = position
-        gripper = self.robot.gripper
-        if self.lowest_tool_m is None:
-            return x, y, max(z, gripper.lowest_tool_m(rotation, self.opening))
-        return x, y, max(z, self.lowest_tool_m(gripper, (x, y), rotation, self.opening))
-
-    def _tool_rotation(self) -> Matrix:
-        return quaternion_matrix(self.robot.tool_frame().orientation)
+        lowest = self.surface.lowest_tool_m(self.robot.gripper, (x, y), rotation, self.opening)
+        return x, y, max(z, lowest)
 
     def _solve_joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
+
+    def _plan_approach(self, end: Vector, rotation: Matrix) -> list[list[float]] | None:
+        """Return the arm joints at samples of an approach, the first one at its start.
+
+        Args:
+            end: position of the tool point at the end of the approach, metres.
+            rotation: of the tool.
+
+        Returns:
+            Joint angles in radians; None if the approach is out of reach: a sample has no inverse
+            kinematics, or hand or arm penetrate the support surface at the start or at the end.
+        """
+        distances = (self.limits.approach_distance_m, *self.limits.approach_samples_m, 0.0)
+        path = [
+            self._solve_joints(self._approach_point(end, rotation, distance), rotation)
+            for distance in distances
+        ]
+        if any(joints is None for joints in path):
+            return None
+        is_steep = -rotation[2][2] > MAX_UNCHECKED_TILT_COSINE
+        supports = self.surface.support_ids
+        if not is_steep and any(self.robot.penetrates(supports, path[i]) for i in (0, -1)):
+            return None
+        return path
 
     def _approach(self, position: Vector, rotation: Matrix, clearance_m: float) -> bool:
         """Move the tool along the approach line to a target, or to a clearance before it.
@@ -226,145 +265,115 @@ class PickPlace:
         Returns:
             Whether the approach is within reach; if not, the arm does not move.
         """
-        limits = self.limits
         end = self._approach_point(position, rotation, clearance_m)
-        distances = (limits.approach_distance_m, *limits.approach_samples_m, 0.0)
-        path = [
-            self._solve_joints(self._approach_point(end, rotation, distance), rotation)
-            for distance in distances
-        ]
-        if any(joints is None for joints in path):
+        path = self._plan_approach(end, rotation)
+        self.is_out_of_reach = path is None
+        if path is None:
             return False
+        if self.teleport and self._teleport_along(path[1:]):
+            return True
+        start = self._approach_point(end, rotation, self.limits.approach_distance_m)
         if self.teleport:
-            for joints in path[1:]:
-                self._teleport(joints)
-                if self._is_in_contact():
-                    break
-            else:
-                return True
             self._teleport(path[0])
-        else:
-            self._move_to_approach(end, rotation)
-        self._move_straight(
-            self._approach_point(end, rotation, limits.approach_distance_m), end, rotation, None
-        )
+        if not self.teleport or not self.motion.is_clear(self.held):
+            self._descend_to(start, rotation)
+        self.motion.move_straight(start, end, rotation, self.held)
         self.update_grasp()
         return True
 
-    def _retreat(self, rotation: Matrix) -> None:
-        """Retract the tool against the approach direction, simulated unless the path is free."""
-        start = self.robot.tool_frame().position
-        if self.teleport:
-            joints_at_start = self.robot.joints
-            for distance in reversed(self.limits.approach_samples_m):
-                joints = self._solve_joints(
-                    self._approach_point(start, rotation, distance), rotation
-                )
-                if joints is None:
-                    break
-                self._teleport(joints)
-                if self._is_in_contact():
-                    break
-            else:
-                return
-            self._teleport(joints_at_start)
-        self._move_straight(
-            start,
-            self._approach_point(start, rotation, self.limits.approach_distance_m),
-            rotation,
-            None,
-        )
-        self.update_grasp()
+    def _teleport_along(self, path: Sequence[Sequence[float]]) -> bool:
+        """Teleport through joint positions until the first contact.
 
-    def _move_to_approach(self, end: Vector, rotation: Matrix) -> None:
-        """Simulate a motion to the start of an approach, at the transit height first."""
-        start = self._approach_point(end, rotation, self.limits.approach_distance_m)
+        Returns:
+            Whether all of them are free of contacts.
+        """
+        for joints in path:
+            self._teleport(joints)
+            if self._is_in_contact():
+                return False
+        return True
+
+    def _retreat(self, rotation: Matrix, *, simulate: bool) -> bool:
+        """Retract the tool against the approach direction.
+
+        Args:
+            rotation: of the tool.
+            simulate: simulate the motion even if the path is free.
+
+        Returns:
+            Whether the held body slipped between the fingers.
+        """
+        start = self.robot.tool_frame().position
+        if not simulate:
+            joints_at_start = self.robot.joints
+            path = [
+                self._solve_joints(self._approach_point(start, rotation, distance), rotation)
+                for distance in reversed(self.limits.approach_samples_m)
+            ]
+            if None not in path and self._teleport_along(path):
+                return False
+            self._teleport(joints_at_start)
+        before = self.grasp
+        end = self._approach_point(start, rotation, self.limits.approach_distance_m)
+        self.motion.move_straight(start, end, rotation, self.held)
+        self.update_grasp()
+        return self.held is not None and self._has_slipped(before)
+
+    def _retreat_with_bad_grasp(self, rotation: Matrix) -> bool:
+        """Simulate a retreat with fingers that are neither closed nor hold a body.
+
+        On the way, fingers stopped by an obstacle go on closing. What is then not held is released.
+
+        Returns:
+            Whether a body is held, which may still slip.
+        """
+        self._retreat(rotation, simulate=True)
+        body = self.robot.held_body()
+        if body is None:
+            move_fingers(self.robot, self.opening, self.limits.max_closing_steps)
+            return False
+        self._attach(body)
+        return True
+
+    def _descend_to(self, start: Vector, rotation: Matrix) -> None:
+        """Move above the start of an approach, and simulate the descent to it.
+
+        Args:
+            start: position of the tool point at the start of the approach, metres.
+            rotation: of the tool.
+        """
         high = (*start[:2], max(self.limits.transit_height_m, start[2]))
         joints = self._solve_joints(high, rotation)
         if joints is None:
             high, joints = start, self._solve_joints(start, rotation)
-        self._move_joints(joints)
-        self._move_straight(high, start, rotation, None)
-
-    def _return_home(self) -> None:
-        """Move the arm to its home configuration, simulated without `teleport`."""
         if self.teleport:
-            self._teleport(self.robot.home_joints)
+            self._teleport(joints)
         else:
-            x, y, z = self.robot.tool_frame().position
-            rotation = self._tool_rotation()
-            if z < self.limits.transit_height_m:
-                self._move_straight((x, y, z), (x, y, self.limits.transit_height_m), rotation, None)
-            self._move_joints(self.robot.home_joints)
-            self.update_grasp()
+            self.motion.move_joints(joints, self.held)
+        self.motion.move_straight(high, start, rotation, self.held)
 
-    def _move_straight(
-        self, start: Vector, end: Vector, rotation: Matrix, count: int | None
-    ) -> None:
-        """Simulate a straight motion of the tool.
-
-        The motion ends where it is out of reach, or, if downward, at the force limit.
+    def _return_home(self, *, simulate: bool) -> None:
+        """Move the arm to its home configuration.
 
         Args:
-            start: position of the tool point at the start, metres.
-            end: position of the tool point at the end, metres.
-            rotation: of the tool.
-            count: number of physics steps; None means the least within the acceleration limits.
+            simulate: simulate the motion instead of teleporting the arm.
         """
-        limits = self.limits
-        if count is None:
-            acceleration = limits.acceleration_m_s2
-            if self.held is not None:
-                acceleration = limits.held_acceleration_m_s2
-            count = max(
-                limits.min_motion_steps, self._num_steps(math.dist(start, end), acceleration)
-            )
-        goes_down = end[2] < start[2]
-        for i in range(1, count + 1):
-            fraction = quintic_time_scaling(i / count)
-            point = tuple(s + fraction * (e - s) for s, e in zip(start, end, strict=True))
-            joints = self._solve_joints(point, rotation)
-            if joints is None:
-                return
-            before = self.robot.joints
-            self.robot.command(joints)
-            self.world.step()
-            if goes_down and vertical_force_n(self._outer_contacts()) > limits.max_vertical_force_n:
-                self.robot.command(before)
-                self.world.step()
-                return
-
-    def _move_joints(self, joints: Sequence[float]) -> None:
-        """Simulate a joint-space motion of the arm with quintic time scaling."""
-        start = self.robot.joints
-        deltas = [e - s for s, e in zip(start, joints, strict=True)]
-        limits = self.limits
-        acceleration = (
-            limits.joint_acceleration_rad_s2
-            if self.held is None
-            else limits.held_joint_acceleration_rad_s2
-        )
-        count = max(2, self._num_steps(max(map(abs, deltas)), acceleration))
-        for i in range(1, count + 1):
-            fraction = quintic_time_scaling(i / count)
-            self.robot.command([s + fraction * d for s, d in zip(start, deltas, strict=True)])
-            self.world.step()
-
-    def _num_steps(self, length: float, acceleration: float) -> int:
-        """Return the least number of steps of a quintic motion within an acceleration limit."""
-        duration_s = math.sqrt(PEAK_ACCELERATION * length / acceleration)
-        return math.ceil(duration_s / self.world.physics.time_step_s)
+        if not simulate:
+            self._teleport(self.robot.home_joints)
+            return
+        tool = self.robot.tool_frame()
+        high = (*tool.position[:2], self.limits.transit_height_m)
+        if tool.position[2] < high[2]:
+            rotation = quaternion_matrix(tool.orientation)
+            self.motion.move_straight(tool.position, high, rotation, self.held)
+        self.motion.move_joints(self.robot.home_joints, self.held)
+        self.update_grasp()
 
     # -- contacts ----------------------------------------------------------------------------
 
-    def _outer_contacts(self) -> list[Contact]:
-        """Return the contacts of the hand and the held body with other bodies."""
-        held = () if self.held is None else (self.held.id,)
-        return outer_contacts(self.world.client, self.robot.id, *held)
-
     def _is_in_contact(self) -> bool:
         self.world.detect_collisions()
-        return is_any_within(self._outer_contacts(), self.limits.contact_margin_m)
+        return is_any_within(self.motion.outer_contacts(self.held), self.limits.contact_margin_m)
 
     # -- fingers -----------------------------------------------------------------------------
 

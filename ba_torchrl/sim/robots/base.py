@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
 import pybullet
@@ -182,14 +182,15 @@ class Robot(ABC):
         Args:
             joints: radians.
         """
-        pybullet.resetJointStatesMultiDof(
-            self.id,
-            self.arm_joints,
-            [[q] for q in joints],
-            [[0.0]] * len(self.arm_joints),
-            physicsClientId=self.client,
-        )
+        self._set_arm([(q, 0.0) for q in joints])
         self.command(joints)
+
+    def _set_arm(self, states: Sequence[tuple[float, float]]) -> None:
+        """Set positions and velocities of the arm joints."""
+        positions, velocities = ([[value] for value in row] for row in zip(*states, strict=True))
+        pybullet.resetJointStatesMultiDof(
+            self.id, self.arm_joints, positions, velocities, physicsClientId=self.client
+        )
 
     def command(self, joints: Sequence[float]) -> None:
         """Set the targets of the arm's motors, which are reached in the next physics step.
@@ -225,6 +226,26 @@ class Robot(ABC):
         """Return the position of the tool frame and the yaw of its x axis, in [-pi, pi)."""
         tool = self.tool_frame()
         return tool.position, tool.yaw_rad
+
+    def penetrates(self, body_ids: Iterable[int], joints: Sequence[float]) -> bool:
+        """Whether a link other than base and fingers would penetrate bodies at a configuration.
+
+        The state of the arm is unchanged.
+
+        Args:
+            body_ids: PyBullet's ids of the bodies.
+            joints: of the arm, radians.
+        """
+        states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
+        self._set_arm([(q, 0.0) for q in joints])
+        points = [
+            point
+            for body_id in body_ids
+            for point in nearest_points(self.client, self.id, body_id, 0.0)
+            if point.link >= 0 and point.link not in self._finger_of_link
+        ]
+        self._set_arm([state[:2] for state in states])
+        return is_any_within(points, 0.0)
 
     # -- gripper -----------------------------------------------------------------------------
 

@@ -9,11 +9,15 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.colors import BLUE, RED
 from ba_torchrl.tasks.motion_primitives import STANDOFF_M, behind_point, push
+
+PRESS_M = 5e-3
+"""Distance that a pull continues after the blocks touch, if it must not push the other block."""
 
 
 @TASKS.register("close_loop/block_pulling")
@@ -56,8 +60,23 @@ class BlockPulling(CloseLoopTask):
             workspace=self.settings.workspace,
             limits=self.action_limits,
             opening=0.5,  # a corner of the block would fit between fully open fingers
-            stop_short_m=0.0,
+            stop_short_m=self._stop_short_m(pulled, other),
         )
+
+    def _stop_short_m(self, pulled: Body, other: Body) -> float:
+        """Return the distance before the other block's centre at which the pull ends.
+
+        If the outlines must stay in the workspace, an action ends where the blocks touch: a longer
+        one could push the other block across the border.
+        """
+        if not self.settings.bounding_box_check:
+            return 0.0
+        travel_m = (
+            gap_m(self.world.client, self.robot.id, pulled.id)
+            + gap_m(self.world.client, pulled.id, other.id)
+            + PRESS_M
+        )
+        return max(math.dist(self.robot.tool_pose()[0][:2], other.position[:2]) - travel_m, 0.0)
 
     def _cost(self, pulled: Body, other: Body) -> float:
         """Return the distance to the start of the pull, plus a cost for a start near the border.

@@ -7,7 +7,8 @@ import pybullet
 import pytest
 
 from ba_torchrl.sim.control.limits import PickPlaceLimits
-from ba_torchrl.sim.control.pick_place import PEAK_ACCELERATION, PickPlace, quintic_time_scaling
+from ba_torchrl.sim.control.pick_place import PickPlace
+from ba_torchrl.sim.control.tool_motion import PEAK_ACCELERATION, quintic_time_scaling
 from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box

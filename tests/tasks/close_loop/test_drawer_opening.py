@@ -316,3 +316,25 @@ def test_the_expert_is_as_fast_as_the_published_planner(make, config):
         assert state["success"]
         lengths.append(int(state["step_count"]))
     assert np.mean(lengths) <= 1.1 * 8.6
+
+
+@pytest.mark.parametrize("scale", [0.85, 1.0, 1.4])
+def test_the_collision_surface_is_that_of_the_image(make, scale):
+    """Rays hit floor, front and handle of the drawer, and the cabinet, at the rendered heights."""
+    scene = make(object_scale_range=scale).scene
+    scene.task.cabinet.place((0.45, 0.0, 0.0), 0.0, travel_m=0.15 * scale)
+    side, pixels = 0.9, 900
+    heights = scene.camera.heightmap((0.45, 0.0), side, pixels)
+    points = {
+        "cabinet": (0.02, 0.05),
+        "floor": (0.2, 0.0),
+        "rim": (0.2, 0.099),
+        "front": (0.255, 0.0),
+        "post": (0.28, 0.039),
+        "rod": (0.31, 0.0),
+    }
+    for part, point in points.items():
+        x, y = 0.45 + point[0] * scale, point[1] * scale
+        (hit,) = pybullet.rayTest((x, y, 0.25), (x, y, -0.1), physicsClientId=scene.world.client)
+        row, column = (int((c - m + side / 2) / side * pixels) for c, m in ((x, 0.45), (y, 0.0)))
+        assert hit[3][2] == pytest.approx(heights[row, column], abs=4e-4), part
