@@ -80,6 +80,8 @@ class PickPlace:
         """The held body, which is hidden from cameras."""
         self.grasp: Pose | None = None
         """Pose of the held body in the tool frame."""
+        self.on_contact: Callable[[], None] | None = None
+        """Called when the fingers have closed for a pick and before they open for a release."""
 
     def reset(self) -> None:
         """Teleport the arm to its home configuration with an empty, open gripper."""
@@ -103,6 +105,7 @@ class PickPlace:
         robot.set_opening(self.opening)
         if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
             self._close_fingers()
+            self._notify_contact()
             reached = robot.tool_frame().position
             above = self._approach_point(reached, rotation, limits.lift_height_m)
             self._move_straight(reached, above, rotation, limits.min_motion_steps)
@@ -128,6 +131,7 @@ class PickPlace:
             reached = self.robot.tool_frame().position
             down = self._approach_point(reached, rotation, -self.limits.pre_place_height_m)
             self._move_straight(reached, down, rotation, self.limits.lowering_steps)
+            self._notify_contact()
             self._detach()
             self._open_fingers()
             if not self.teleport:
@@ -152,6 +156,10 @@ class PickPlace:
         self.grasp = state.grasp
         if self.held is not None:
             self.held.is_hidden = True
+
+    def _notify_contact(self) -> None:
+        if self.on_contact is not None:
+            self.on_contact()
 
     # -- held body ---------------------------------------------------------------------------
 

@@ -1,0 +1,124 @@
+"""Colour images of a scene for people: the camera pose, and the arm of open-loop tasks.
+
+These images have no effect on the simulation: a pose of the arm for an image is set in a second
+world.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pybullet
+
+from ba_torchrl.envs.scene import Scene
+from ba_torchrl.sim.bodies import world_vertices
+from ba_torchrl.sim.geometry import Matrix, Vector, bullet_compose
+from ba_torchrl.sim.vision.framing import Viewpoint, fit_viewpoint
+from ba_torchrl.sim.vision.rgb import FOV_DEG
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.workspace import Workspace
+
+YAW_DEG = 78.0
+PITCH_DEG = -33.0
+
+
+class RelativePoint(NamedTuple):
+    """A point in relation to a workspace."""
+
+    dx: float
+    dy: float
+    """x and y from the centre, as fractions of the width."""
+    z_m: float
+
+    def within(self, workspace: Workspace) -> Vector:
+        """Return the point of a workspace, metres."""
+        x, y = workspace.center
+        return x + self.dx * workspace.width, y + self.dy * workspace.width, self.z_m
+
+
+def scene_viewpoint(world: World, workspace: Workspace, top_m: Vector, aspect: float) -> Viewpoint:
+    """Return the camera pose that shows the workspace, the static bodies in it and a point above.
+
+    It depends on nothing that moves, so that all images of an episode have the same.
+
+    Args:
+        world: the scene.
+        workspace: bounds of the task.
+        top_m: point that the image shows as well, such as the wrist of the arm.
+        aspect: width of the image divided by its height.
+    """
+    (x0, x1), (y0, y1) = workspace.x, workspace.y
+    points = [np.array([top_m, *itertools.product(workspace.x, workspace.y, [0.0])])]
+    for body in world.bodies:
+        if body.is_static and not body.is_hidden:
+            vertices = world_vertices(body)
+            (low_x, low_y, _), (high_x, high_y, _) = vertices.min(0), vertices.max(0)
+            if low_x < x1 and high_x > x0 and low_y < y1 and high_y > y0:
+                points.append(vertices)
+    return fit_viewpoint(np.concatenate(points), YAW_DEG, PITCH_DEG, FOV_DEG, aspect)
+
+
+class ArmDisplay:
+    """A second world with the bodies of a scene, for images with the arm in another pose.
+
+    Args:
+        build: builds the scene for objects of a scale.
+    """
+
+    def __init__(self, build: Callable[[float], Scene]) -> None:
+        self._build = build
+        self._scene: Scene | None = None
+        self._scale: float | None = None
+
+    def posed(self, scene: Scene, scale: float, position: Vector, rotation: Matrix) -> World:
+        """Return a world that equals a scene, with the arm and the held body at a pose.
+
+        The arm keeps its pose if the other one is out of reach.
+
+        Args:
+            scene: an open-loop scene.
+            scale: of its objects.
+            position: of the tool, metres.
+            rotation: of the tool.
+        """
+        if scale != self._scale:
+            self.close()
+            self._scene, self._scale = self._build(scale), scale
+        world, robot = self._scene.world, self._scene.robot
+        copy_poses(scene.world, world)
+        joints = robot.inverse_kinematics(position, rotation, scene.robot.joints)
+        held = scene.controller.held
+        if joints is not None:
+            robot.teleport(joints)
+            if held is not None:
+                body = world.bodies[scene.world.bodies.index(held)]
+                body.set_pose(*bullet_compose(robot.tool_frame(), scene.controller.grasp))
+        return world
+
+    def close(self) -> None:
+        """Close the world; the next call of `posed` builds another."""
+        if self._scene is not None:
+            self._scene.world.close()
+        self._scene = self._scale = None
+
+
+def copy_poses(source: World, target: World) -> None:
+    """Copy the poses and joint positions of all bodies, robot included, to a world of the same.
+
+    Args:
+        source: is not changed.
+        target: has the same bodies, loaded in the same order.
+    """
+    here, there = {"physicsClientId": source.client}, {"physicsClientId": target.client}
+    for index in range(pybullet.getNumBodies(**here)):
+        body = pybullet.getBodyUniqueId(index, **here)
+        pose = pybullet.getBasePositionAndOrientation(body, **here)
+        pybullet.resetBasePositionAndOrientation(body, *pose, **there)
+        for joint in range(pybullet.getNumJoints(body, **here)):
+            position = pybullet.getJointState(body, joint, **here)[0]
+            pybullet.resetJointState(body, joint, position, **there)
+    for body, copy in zip(source.bodies, target.bodies, strict=True):
+        copy.is_hidden = body.is_hidden
