@@ -105,7 +105,7 @@ class ManipulationEnv(EnvBase):
     """The action space; set by `_configure`."""
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine for ``physics_mode="fast"``."""
-    framed_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.3)
+    framed_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.28)
     """A point near the hand that `render` shows besides the workspace."""
     default_action_sequence: ClassVar[str]
     """Default `action_sequence`."""

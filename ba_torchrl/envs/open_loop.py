@@ -29,7 +29,7 @@ from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.structures.undo import UndoRecorder
 from ba_torchrl.tasks.workspace import ActionLimits
 
-DISPLAY_POINT = RelativePoint(-0.3, 0.3, 0.17)
+DISPLAY_POINT = RelativePoint(-0.3, 0.3, 0.15)
 """Position of the tool in images between actions."""
 DISPLAY_YAW_RAD = 0.7
 HOME_TOLERANCE_RAD = 1e-6

@@ -22,7 +22,9 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.workspace import Workspace
 
 YAW_DEG = 78.0
-PITCH_DEG = -33.0
+PITCH_DEG = -36.0
+MARGIN = 0.015
+"""Empty border of an image, as a fraction of its width and height."""
 
 
 class RelativePoint(NamedTuple):
@@ -58,7 +60,7 @@ def scene_viewpoint(world: World, workspace: Workspace, top_m: Vector, aspect: f
             (low_x, low_y, _), (high_x, high_y, _) = vertices.min(0), vertices.max(0)
             if low_x < x1 and high_x > x0 and low_y < y1 and high_y > y0:
                 points.append(vertices)
-    return fit_viewpoint(np.concatenate(points), YAW_DEG, PITCH_DEG, FOV_DEG, aspect)
+    return fit_viewpoint(np.concatenate(points), YAW_DEG, PITCH_DEG, FOV_DEG, aspect, MARGIN)
 
 
 class ArmDisplay:

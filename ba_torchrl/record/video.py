@@ -1,4 +1,4 @@
-"""Videos of episodes."""
+"""Videos of episodes: their frames, and their files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,39 @@ from pathlib import Path
 
 import numpy as np
 
+from ba_torchrl.envs.base import ManipulationEnv
+
 _SUFFIXES = (".mp4", ".gif")
+
+
+class FrameRecorder:
+    """Renders an environment into a list of frames.
+
+    An open-loop step gives two frames: the grasp or the release, recorded during the step, and the
+    scene after the step, recorded by `record`.
+
+    Args:
+        env: the environment.
+        width: number of columns of a frame.
+        height: number of rows of a frame.
+    """
+
+    def __init__(self, env: ManipulationEnv, width: int = 400, height: int = 400) -> None:
+        self.env = env
+        self.size = (width, height)
+        self.frames: list[np.ndarray] = []
+        """[height, width, 3] uint8 each, in the order of time."""
+        self.contacts: list[int] = []
+        """Indices of the frames that show a grasp or a release."""
+        env.on_contact = self._record_contact
+
+    def record(self) -> None:
+        """Append an image of the current scene."""
+        self.frames.append(self.env.render(*self.size))
+
+    def _record_contact(self) -> None:
+        self.contacts.append(len(self.frames))
+        self.record()
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> Path:

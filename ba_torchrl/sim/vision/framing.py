@@ -28,12 +28,17 @@ class Viewpoint(NamedTuple):
 
 
 def fit_viewpoint(
-    points_m: np.ndarray, yaw_deg: float, pitch_deg: float, fov_deg: float, aspect: float
+    points_m: np.ndarray,
+    yaw_deg: float,
+    pitch_deg: float,
+    fov_deg: float,
+    aspect: float,
+    margin: float = 0.0,
 ) -> Viewpoint:
     """Return the nearest camera pose at which an image of a perspective camera shows all points.
 
-    The horizontal extent of the points is centred. Where the image is higher than they are, the
-    lowest point is at its lower edge, which leaves space for the arm above.
+    Where the image is wider than the points, they are near its centre. Where it is higher, the
+    lowest point is at the lower margin, which leaves space for the arm above.
 
     Args:
         points_m: [N, 3] metres.
@@ -41,11 +46,12 @@ def fit_viewpoint(
         pitch_deg: pitch of the camera.
         fov_deg: vertical field of view.
         aspect: width of the image divided by its height.
+        margin: width of the empty border, as a fraction of the width and height of the image.
     """
     view = Viewpoint((0.0, 0.0, 0.0), 1.0, yaw_deg, pitch_deg).view_matrix()
     axes = np.reshape(view, (4, 4)).T[:3, :3]  # rows: right, up, backward
     right, up, backward = axes @ np.asarray(points_m, dtype=float).T
-    half_height = math.tan(math.radians(fov_deg) / 2)
+    half_height = (1 - 2 * margin) * math.tan(math.radians(fov_deg) / 2)
     half_width = half_height * aspect
     # In camera axes with the camera at c, the right edge requires
     # right - c_right <= half_width * (c_backward - backward); the other edges are similar.

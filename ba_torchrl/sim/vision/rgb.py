@@ -35,7 +35,7 @@ _SHADOW_BLUR = 2
 """Half width of the blur of the shadow map, pixels."""
 _SHADOW_DEPTH = 0.3
 """Fraction by which full shadow darkens the floor."""
-FOV_DEG = 40.0
+FOV_DEG = 28.0
 """Vertical field of view of `render_rgb`."""
 
 

@@ -21,16 +21,17 @@ def image_coordinates(points, viewpoint, aspect):
     return clip[:, :2] / clip[:, 3:]
 
 
+@pytest.mark.parametrize("margin", [0.0, 0.1])
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 4 / 3, 4.0])
 @pytest.mark.parametrize(("yaw_deg", "pitch_deg"), [(78, -33), (-20, -60), (200, -5)])
-def test_all_points_are_in_the_image_and_touch_its_edges(yaw_deg, pitch_deg, aspect):
-    viewpoint = fit_viewpoint(BOX, yaw_deg, pitch_deg, FOV_DEG, aspect)
-    xy = image_coordinates(BOX, viewpoint, aspect)
+def test_the_points_fill_the_image_up_to_the_margin(yaw_deg, pitch_deg, aspect, margin):
+    viewpoint = fit_viewpoint(BOX, yaw_deg, pitch_deg, FOV_DEG, aspect, margin)
+    xy = image_coordinates(BOX, viewpoint, aspect) / (1 - 2 * margin)
     assert np.abs(xy).max() <= 1 + 1e-5
-    assert xy[:, 1].min() == pytest.approx(-1, abs=1e-5)  # the lowest point is at the lower edge
-    assert xy[:, 0].min() == pytest.approx(-xy[:, 0].max(), abs=1e-5)  # centred
-    fills_width = xy[:, 0].max() == pytest.approx(1, abs=1e-5)
-    fills_height = xy[:, 1].max() == pytest.approx(1, abs=1e-5)
+    (left, bottom), (right, top) = xy.min(0), xy.max(0)
+    assert bottom == pytest.approx(-1, abs=1e-5)
+    fills_width = (left, right) == pytest.approx((-1, 1), abs=1e-5)
+    fills_height = top == pytest.approx(1, abs=1e-5)
     assert fills_width or fills_height
 
 
