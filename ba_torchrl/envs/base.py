@@ -105,8 +105,8 @@ class ManipulationEnv(EnvBase):
     """The action space; set by `_configure`."""
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine for ``physics_mode="fast"``."""
-    framed_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.28)
-    """A point near the hand that `render` shows besides the workspace."""
+    hand_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.28)
+    """A point of the hand that `render` shows besides the workspace."""
     default_action_sequence: ClassVar[str]
     """Default `action_sequence`."""
     default_half_rotation: ClassVar[bool]
@@ -188,8 +188,8 @@ class ManipulationEnv(EnvBase):
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return an RGB image of the scene, [height, width, 3] uint8."""
         world = self._rendered_world(self.scene)
-        top = self.framed_point.within(self.workspace)
-        viewpoint = scene_viewpoint(world, self.workspace, top, width / height)
+        hand = self.hand_point.above(self.scene.task.terrain)
+        viewpoint = scene_viewpoint(world, self.workspace, hand, width / height)
         floor = self.config.floor_color or DEFAULT_FLOOR_RGB
         return render_rgb(world, viewpoint, width, height, floor_rgb=floor)
 

@@ -52,7 +52,7 @@ class OpenLoopEnv(ManipulationEnv):
 
     default_action_sequence = "pxyr"
     default_half_rotation = True
-    framed_point = DISPLAY_POINT._replace(z_m=0.23)
+    hand_point = DISPLAY_POINT._replace(height_m=0.23)
     # a stack of four creeps by 0.5 mm and is at rest after three steps
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 
@@ -190,7 +190,7 @@ class OpenLoopEnv(ManipulationEnv):
         """Return the world of a scene; between actions, one with the arm above the workspace."""
         if math.dist(scene.robot.joints, scene.robot.home_joints) > HOME_TOLERANCE_RAD:
             return scene.world
-        position = DISPLAY_POINT.within(self.workspace)
+        position = DISPLAY_POINT.above(scene.task.terrain)
         return self._display.posed(
             scene, self._episodes.scale(), position, downward(DISPLAY_YAW_RAD)
         )

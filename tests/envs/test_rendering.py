@@ -34,8 +34,8 @@ def follow_expert(env, state):
 
 
 def viewpoint_of(env, aspect=4 / 3):
-    top = env.framed_point.within(env.workspace)
-    return scene_viewpoint(env.scene.world, env.workspace, top, aspect)
+    hand = env.hand_point.above(env.scene.task.terrain)
+    return scene_viewpoint(env.scene.world, env.workspace, hand, aspect)
 
 
 def red_pixels(image):
