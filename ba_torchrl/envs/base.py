@@ -188,8 +188,9 @@ class ManipulationEnv(EnvBase):
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return an RGB image of the scene, [height, width, 3] uint8."""
         world = self._rendered_world(self.scene)
-        hand = self.hand_point.above(self.scene.task.terrain)
-        viewpoint = scene_viewpoint(world, self.workspace, hand, width / height)
+        terrain = self.scene.task.terrain
+        hand = self.hand_point.above(terrain)
+        viewpoint = scene_viewpoint(world, terrain, hand, width / height)
         floor = self.config.floor_color or DEFAULT_FLOOR_RGB
         return render_rgb(world, viewpoint, width, height, floor_rgb=floor)
 

@@ -20,14 +20,11 @@ from ba_torchrl.sim.vision.framing import Viewpoint, fit_viewpoint
 from ba_torchrl.sim.vision.rgb import FOV_DEG
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain import Terrain
-from ba_torchrl.tasks.workspace import Workspace
 
 YAW_DEG = 78.0
 PITCH_DEG = -36.0
 MARGIN = 0.015
 """Empty border of an image, as a fraction of its width and height."""
-BEYOND = 0.3
-"""Distance from the workspace up to which images show static bodies, as a fraction of its width."""
 
 
 class RelativePoint(NamedTuple):
@@ -46,27 +43,28 @@ class RelativePoint(NamedTuple):
         return *xy, terrain.height_m(xy) + self.height_m
 
 
-def scene_viewpoint(world: World, workspace: Workspace, hand_m: Vector, aspect: float) -> Viewpoint:
+def scene_viewpoint(world: World, terrain: Terrain, hand_m: Vector, aspect: float) -> Viewpoint:
     """Return the camera pose that shows the workspace, the static bodies in it and the hand.
 
     It depends on nothing that moves, so that all images of an episode have the same.
 
     Args:
         world: the scene.
-        workspace: bounds of the task.
+        terrain: of the task; its bodies are shown in the workspace only.
         hand_m: point of the hand, which the image shows as well.
         aspect: width of the image divided by its height.
     """
-    (x0, x1), (y0, y1) = workspace.x, workspace.y
-    beyond = BEYOND * workspace.width
-    low, high = (x0 - beyond, y0 - beyond, 0.0), (x1 + beyond, y1 + beyond, workspace.z[1])
+    workspace = terrain.workspace
+    low, high = np.transpose([workspace.x, workspace.y])
     points = [np.array([hand_m, *itertools.product(workspace.x, workspace.y, [0.0])])]
     for body in world.bodies:
         if body.is_static and not body.is_hidden:
             vertices = world_vertices(body)
-            (low_x, low_y, _), (high_x, high_y, _) = vertices.min(0), vertices.max(0)
-            if low_x < x1 and high_x > x0 and low_y < y1 and high_y > y0:
-                points.append(np.clip(vertices, low, high))
+            xy = vertices[:, :2]
+            if body.id in terrain.support_ids:
+                points.append(np.hstack([xy.clip(low, high), vertices[:, 2:]]))
+            elif (xy.min(0) < high).all() and (xy.max(0) > low).all():
+                points.append(vertices)
     return fit_viewpoint(np.concatenate(points), YAW_DEG, PITCH_DEG, FOV_DEG, aspect, MARGIN)
 
 

@@ -1,6 +1,7 @@
 """`ManipulationEnv.render`: the workspace fills the image and shows the arm and the held object."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pybullet
@@ -10,7 +11,11 @@ import torch
 import ba_torchrl
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.rendering import scene_viewpoint
+from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.rgb import FOV_DEG, render_rgb
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.workspace import Workspace
 
 STACKING = "open_loop/block_stacking"
 
@@ -34,8 +39,8 @@ def follow_expert(env, state):
 
 
 def viewpoint_of(env, aspect=4 / 3):
-    hand = env.hand_point.above(env.scene.task.terrain)
-    return scene_viewpoint(env.scene.world, env.workspace, hand, aspect)
+    terrain = env.scene.task.terrain
+    return scene_viewpoint(env.scene.world, terrain, env.hand_point.above(terrain), aspect)
 
 
 def red_pixels(image):
@@ -78,6 +83,24 @@ def test_all_images_of_an_episode_have_the_same_camera_pose(make, task):
     while not state[keys.DONE]:
         state = follow_expert(env, state)
         np.testing.assert_allclose(np.hstack(viewpoint_of(env)), np.hstack(before), atol=1e-6)
+
+
+def test_bodies_of_the_terrain_are_shown_in_the_workspace_only():
+    workspace = Workspace(x=(0.25, 0.65), y=(-0.2, 0.2), z=(0.0, 0.4))
+    with World() as world:
+        table = world.add(Box(size_m=(2.0, 2.0, 0.01), mass_kg=0.0), "table")
+        table.place((0.45, 0.0, 0.005))
+        pallet = world.add(Box(size_m=(0.1, 0.1, 0.01), mass_kg=0.0), "pallet")
+        pallet.place((5.0, 5.0, 0.005))  # outside of the workspace
+        ground, object_on_it = (
+            scene_viewpoint(
+                world, SimpleNamespace(workspace=workspace, support_ids=ids), (0.45, 0, 0.2), 1.0
+            )
+            for ids in ({table.id}, set())
+        )
+    assert ground.distance_m < 1.2
+    assert object_on_it.distance_m > 3 * ground.distance_m
+    assert object_on_it.distance_m < 10
 
 
 @pytest.mark.parametrize("robot", ["kuka", "panda", "ur5"])
@@ -157,6 +180,16 @@ def test_objects_of_every_scale_are_drawn_at_their_size(make):
         seen[env.scene.task.settings.scale] = red_pixels(env.render()).sum()
     scales = sorted(seen)
     assert seen[scales[-1]] > 1.1 * seen[scales[0]]
+
+
+def test_the_arm_keeps_its_pose_if_the_other_one_is_out_of_reach(make):
+    env = make()
+    env.reset()
+    world = env._display.posed(env.scene, 0.6, (3.0, 0.0, 0.2), downward(0.0))
+    joints = env._display._scene.robot.measured_joints()
+    assert joints == env.scene.robot.measured_joints()
+    for body, copy in zip(env.scene.world.bodies, world.bodies, strict=True):
+        assert body.pose == copy.pose
 
 
 def test_closing_closes_the_second_world(make):
