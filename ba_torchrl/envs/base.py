@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,13 +20,14 @@ from ba_torchrl.envs.checks import checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import enabled_observations, merge_entries
+from ba_torchrl.envs.rendering import RelativePoint, scene_viewpoint
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
 from ba_torchrl.envs.settings import check_action_components, check_task_parameters
 from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
-from ba_torchrl.sim.world import Physics
+from ba_torchrl.sim.world import Physics, World
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
@@ -90,6 +92,8 @@ class ManipulationEnv(EnvBase):
         self.faults = 0
         """Number of simulator faults since construction."""
         self._consecutive_faults = 0
+        self.on_contact: Callable[[], None] | None = None
+        """Called in an open-loop step at each grasp and before each release, for videos."""
         self.base_seed = 0
         self._set_seed(config.seed)
         self._make_specs()
@@ -101,9 +105,8 @@ class ManipulationEnv(EnvBase):
     """The action space; set by `_configure`."""
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine for ``physics_mode="fast"``."""
-    camera_pose: ClassVar[tuple[float, float, float]] = (-0.06, 0.2, 1.05)
-    """Camera of `render`: x offset of its target from the workspace's centre, height of the target,
-    and distance of the camera, metres."""
+    hand_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.28)
+    """A point of the hand that `render` shows besides the workspace."""
     default_action_sequence: ClassVar[str]
     """Default `action_sequence`."""
     default_half_rotation: ClassVar[bool]
@@ -155,6 +158,10 @@ class ManipulationEnv(EnvBase):
     def _expert_action(self, scene: Scene) -> np.ndarray:
         """Return the expert's action."""
 
+    def _rendered_world(self, scene: Scene) -> World:
+        """Return the world that `render` shows."""
+        return scene.world
+
     # -- public ------------------------------------------------------------------------------
 
     @property
@@ -185,17 +192,12 @@ class ManipulationEnv(EnvBase):
 
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return an RGB image of the scene, [height, width, 3] uint8."""
-        x, y = self.workspace.center
+        world = self._rendered_world(self.scene)
+        terrain = self.scene.task.terrain
+        hand = self.hand_point.above(terrain)
+        viewpoint = scene_viewpoint(world, terrain, hand, width / height)
         floor = self.config.floor_color or DEFAULT_FLOOR_RGB
-        aside, z, distance = self.camera_pose
-        return render_rgb(
-            self.scene.world,
-            (x + aside, y, z),
-            width,
-            height,
-            distance_m=distance,
-            floor_rgb=floor,
-        )
+        return render_rgb(world, viewpoint, width, height, floor_rgb=floor)
 
     def get_state(self) -> EnvState:
         """Return the full state, for `set_state`.
@@ -350,10 +352,10 @@ class ManipulationEnv(EnvBase):
         except PlacementError as error:
             raise ConfigError(f"{self.task_id}: {error}") from None
 
-    def _build_scene(self, scale: float) -> Scene:
+    def _build_scene(self, scale: float, **changes: Any) -> Scene:
         return build_scene(
             self.task_id,
-            self.config,
+            self.config.model_copy(update=changes),
             workspace=self.workspace,
             limits=self.action_limits,
             scale=scale,

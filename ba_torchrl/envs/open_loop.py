@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,17 +16,23 @@ from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
 from ba_torchrl.envs.episodes import SETTLE_STEPS
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.envs.rendering import ArmDisplay, RelativePoint
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.control.pick_place import PickPlace
-from ba_torchrl.sim.geometry import tool_rotation
+from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
-from ba_torchrl.sim.world import Physics
+from ba_torchrl.sim.world import Physics, World
 from ba_torchrl.tasks.base import TASKS, Task
 from ba_torchrl.tasks.structures.undo import UndoRecorder
 from ba_torchrl.tasks.workspace import ActionLimits
+
+DISPLAY_POINT = RelativePoint(-0.3, 0.3, 0.15)
+"""Position of the tool in images between actions."""
+DISPLAY_YAW_RAD = 0.7
+HOME_TOLERANCE_RAD = 1e-6
 
 
 @CONTROLS.register("open_loop")
@@ -46,13 +53,14 @@ class OpenLoopEnv(ManipulationEnv):
 
     default_action_sequence = "pxyr"
     default_half_rotation = True
-    camera_pose = (0.0, 0.05, 0.85)
+    hand_point = DISPLAY_POINT._replace(height_m=0.23)
     # a stack of four creeps by 0.5 mm and is at rest after three steps
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 
     def __init__(self, task_id: str, config: EnvConfig) -> None:
         mode = config.in_hand_mode or TASKS[task_id].default_in_hand_mode
         self._in_hand_kind = IN_HAND_MODES[mode]()
+        self._display = ArmDisplay(partial(self._build_scene, render=False))
         super().__init__(task_id, config)
 
     def _configure(self) -> None:
@@ -83,13 +91,15 @@ class OpenLoopEnv(ManipulationEnv):
     # -- for the base class ------------------------------------------------------------------
 
     def _make_controller(self, robot: Robot, task: Task) -> PickPlace:
-        return PickPlace(
+        controller = PickPlace(
             robot,
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
             surface=task.terrain,
         )
+        controller.on_contact = self._call_on_contact
+        return controller
 
     @property
     def _required_tool_heights(self) -> tuple[float, ...]:
@@ -184,7 +194,25 @@ class OpenLoopEnv(ManipulationEnv):
     def _expert_action(self, scene: Scene) -> np.ndarray:
         return self.actions.encode(scene.task.expert_command())
 
+    def _rendered_world(self, scene: Scene) -> World:
+        """Return the world of a scene; between actions, one with the arm above the workspace."""
+        if math.dist(scene.robot.joints, scene.robot.home_joints) > HOME_TOLERANCE_RAD:
+            return scene.world
+        position = DISPLAY_POINT.above(scene.task.terrain)
+        return self._display.posed(
+            scene, self._episodes.scale(), position, downward(DISPLAY_YAW_RAD)
+        )
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close all worlds of this environment."""
+        self._display.close()
+        super().close(raise_if_closed=raise_if_closed)
+
     # ----------------------------------------------------------------------------------------
+
+    def _call_on_contact(self) -> None:
+        if self.on_contact is not None:
+            self.on_contact()
 
     def _record_undo(self, scene: Scene) -> tuple[UndoRecorder, np.ndarray] | None:
         """Return the recorder and the heightmap before an action; None without deconstruction."""

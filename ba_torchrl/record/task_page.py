@@ -6,9 +6,8 @@ import inspect
 from collections.abc import Sequence
 
 from ba_torchrl import make
+from ba_torchrl.record.headings import tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
-
-CONTROLS = {"close_loop": "Close loop", "open_loop": "Open loop"}
 
 
 def task_page(tasks: Sequence[str] | None = None) -> str:
@@ -26,10 +25,8 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
         "conditions in a valid scene at rest. `env.conditions` and Gymnasium's `info`",
         "hold them after every step.",
     ]
-    for control, title in CONTROLS.items():
-        ids = [task for task in tasks if TASKS[task].control == control]
-        if ids:
-            lines += ["", f"## {title}"]
+    for heading, ids in tasks_by_heading(tasks).items():
+        lines += ["", f"## {heading}"]
         for task in ids:
             lines += ["", *_section(task)]
     return "\n".join(lines) + "\n"

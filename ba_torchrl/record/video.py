@@ -1,4 +1,4 @@
-"""Videos of episodes."""
+"""Videos of episodes: their frames, and their files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,42 @@ from pathlib import Path
 
 import numpy as np
 
+from ba_torchrl.envs.base import ManipulationEnv
+
 _SUFFIXES = (".mp4", ".gif")
+_GIF_COLORS = 128
+_PALETTE_STRIDE = 4
+"""Distance of the pixels from which the colours of a GIF are chosen."""
+
+
+class FrameRecorder:
+    """Renders an environment into a list of frames.
+
+    An open-loop step gives two frames: the grasp or the release, recorded during the step, and the
+    scene after the step, recorded by `record`.
+
+    Args:
+        env: the environment.
+        width: number of columns of a frame.
+        height: number of rows of a frame.
+    """
+
+    def __init__(self, env: ManipulationEnv, width: int = 400, height: int = 400) -> None:
+        self.env = env
+        self.size = (width, height)
+        self.frames: list[np.ndarray] = []
+        """[height, width, 3] uint8 each, in the order of time."""
+        self.contacts: list[int] = []
+        """Indices of the frames that show a grasp or a release."""
+        env.on_contact = self._record_contact
+
+    def record(self) -> None:
+        """Append an image of the current scene."""
+        self.frames.append(self.env.render(*self.size))
+
+    def _record_contact(self) -> None:
+        self.contacts.append(len(self.frames))
+        self.record()
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> Path:
@@ -41,7 +76,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
         raise ImportError("writing videos needs pip install 'ba-torchrl[recipes]'") from error
     path.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".gif":
-        imageio.mimwrite(path, pictures, duration=1000 / fps, loop=0)
+        imageio.mimwrite(path, _with_common_colors(pictures), duration=1000 / fps, loop=0)
         return path
     # yuv420p halves the resolution of chroma, hence even sizes; by default imageio resizes to
     # multiples of 16.
@@ -64,6 +99,22 @@ def _checked(frames: Sequence[np.ndarray] | np.ndarray) -> list[np.ndarray]:
                 f"{list(picture.shape)} {picture.dtype}, the first {list(pictures[0].shape)}"
             )
     return pictures
+
+
+def _with_common_colors(pictures: list[np.ndarray]) -> list[np.ndarray]:
+    """Return frames with `_GIF_COLORS` colours, which halves the size of a GIF."""
+    from PIL import Image
+
+    sample = np.vstack([picture[::_PALETTE_STRIDE, ::_PALETTE_STRIDE] for picture in pictures])
+    palette = Image.fromarray(sample).quantize(_GIF_COLORS, kmeans=2, dither=Image.Dither.NONE)
+    return [
+        np.asarray(
+            Image.fromarray(picture)
+            .quantize(palette=palette, dither=Image.Dither.NONE)
+            .convert("RGB")
+        )
+        for picture in pictures
+    ]
 
 
 def _even(picture: np.ndarray) -> np.ndarray:

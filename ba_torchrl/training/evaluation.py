@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl import make
 from ba_torchrl.data.episodes import Policy, collect_episodes, mean_length, success_rate
 from ba_torchrl.envs import keys
+from ba_torchrl.record.video import FrameRecorder
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def record_episodes(
     seed: int,
     hold_frames: int = 4,
 ) -> list[np.ndarray]:
-    """Play greedy episodes and render every step.
+    """Play greedy episodes and render every step, as a `FrameRecorder` does.
 
     Args:
         task: id of the task.
@@ -104,18 +105,18 @@ def record_episodes(
     Returns:
         Images [H, W, 3] uint8 in the order of time.
     """
-    frames: list[np.ndarray] = []
     env = make(task, **{**env_settings, "seed": seed})
+    recorder = FrameRecorder(env)
     act = env.rand_action if policy is None else policy
     try:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             for _ in range(episodes):
                 state = env.reset()
-                frames.append(env.render())
+                recorder.record()
                 while not state[keys.DONE]:
                     state = env.step(act(state))[keys.NEXT]
-                    frames.append(env.render())
-                frames += [frames[-1]] * hold_frames
+                    recorder.record()
+                recorder.frames += [recorder.frames[-1]] * hold_frames
     finally:
         env.close()
-    return frames
+    return recorder.frames

@@ -1,9 +1,51 @@
 import imageio.v3 as imageio
 import numpy as np
+import pytest
 
-from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
+from ba_torchrl import make
+from ba_torchrl.envs import keys
+from ba_torchrl.record import gallery
+from ba_torchrl.record.gallery import Strip, expert_strip, overview_figure, strip_figure
+from ba_torchrl.record.headings import tasks_by_heading
+from ba_torchrl.record.video import FrameRecorder
 
 TASK = "close_loop/block_reaching"
+BLUE = (20, 40, 220)
+
+
+@pytest.fixture
+def texts(monkeypatch):
+    """The texts of the last figure, as (text, left, bottom) in fractions of its size."""
+    found = []
+    write = gallery._Sheet.write
+
+    def recording(sheet, path):
+        found[:] = [(text.get_text(), *text.get_position()) for text in sheet.figure.texts]
+        return write(sheet, path)
+
+    monkeypatch.setattr(gallery._Sheet, "write", recording)
+    return found
+
+
+def plain_strip(count=2):
+    picture = np.full((40, 40, 3), BLUE, dtype=np.uint8)
+    return Strip([picture] * count, np.zeros((20, 20)))
+
+
+def blue_areas(path):
+    """Return the (row, column, height, width) of each blue area of a picture."""
+    picture = imageio.imread(path)[..., :3].astype(int)
+    blue = (np.abs(picture - BLUE) < 30).all(-1)
+    edges = np.diff(blue.any(1).astype(int), prepend=0, append=0)
+    areas = []
+    for top, bottom in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        sides = np.diff(blue[top:bottom].any(0).astype(int), prepend=0, append=0)
+        lefts, rights = np.flatnonzero(sides == 1), np.flatnonzero(sides == -1)
+        areas += [
+            (top, left, bottom - top, right - left)
+            for left, right in zip(lefts, rights, strict=True)
+        ]
+    return areas
 
 
 def test_a_strip_runs_from_the_first_scene_to_the_goal(tmp_path):
@@ -16,6 +58,17 @@ def test_a_strip_runs_from_the_first_scene_to_the_goal(tmp_path):
     assert picture.std() > 10
 
 
+def test_an_open_loop_strip_shows_a_grasp_and_repeats_no_image():
+    strip = expert_strip("open_loop/object_grasping", seed=0, pictures=4)
+    start, grasp, goal = strip.pictures
+    orange = [
+        ((image[..., 0] > 150) & (image[..., 1] < 110) & (image[..., 2] < 60))[:120].sum()
+        for image in (start, grasp, goal)
+    ]  # the wrist, which is in the image only at a grasp
+    assert orange[1] > orange[0] + 300
+    assert orange[1] > orange[2] + 300
+
+
 def test_a_deconstruction_starts_from_the_goal():
     task = "open_loop/house_building_2"
     built = expert_strip(task, seed=0, pictures=2)
@@ -23,14 +76,58 @@ def test_a_deconstruction_starts_from_the_goal():
     assert built.first_image.max() < 0.6 * apart.first_image.max()
 
 
-def test_an_overview_has_a_cell_for_each_task(tmp_path):
-    strip = expert_strip(TASK, seed=0, pictures=1)
-    path = overview_figure({str(i): strip for i in range(5)}, tmp_path / "all.png", columns=4)
-    picture = imageio.imread(path)[..., :3]
-    rows, columns = picture.shape[0] // 2, picture.shape[1] // 4
-    filled = [
-        picture[i * rows : (i + 1) * rows, j * columns : (j + 1) * columns].std() > 10
-        for i in range(2)
-        for j in range(4)
+def test_the_same_seed_gives_the_same_strip():
+    first, second = (expert_strip(TASK, seed=0, pictures=3) for _ in range(2))
+    np.testing.assert_array_equal(first.pictures, second.pictures)
+
+
+def test_tasks_are_listed_under_the_heading_of_their_group():
+    tasks = ["mine/push", "bump/a", "open_loop/b", "close_loop/c", "ramp/d", "open_loop/e"]
+    assert tasks_by_heading(tasks) == {
+        "Close loop": ["close_loop/c"],
+        "Open loop": ["open_loop/b", "open_loop/e"],
+        "Six degrees of freedom: ramps, bumps": ["bump/a", "ramp/d"],
+        "mine": ["mine/push"],
+    }
+
+
+def test_an_overview_has_start_and_goal_of_each_task_under_headings(tmp_path, texts):
+    tasks = [f"close_loop/task_{i}" for i in range(3)] + ["ramp/house", "bump/house"]
+    path = overview_figure(dict.fromkeys(tasks, plain_strip()), tmp_path / "all.png", columns=2)
+    areas = blue_areas(path)
+    assert len(areas) == 2 * len(tasks)
+    assert len({top for top, *_ in areas}) == 3  # two rows of close loop, one of ramps and bumps
+    heights, widths = {area[2] for area in areas}, {area[3] for area in areas}
+    assert max(heights | widths) - min(heights | widths) <= 2  # square
+    assert [text for text, *_ in texts] == [
+        "Close loop",
+        "task 0",
+        "task 1",
+        "task 2",
+        "Six degrees of freedom: ramps, bumps",
+        "ramp: house",
+        "bump: house",
     ]
-    assert filled == [True] * 5 + [False] * 3
+    size = imageio.imread(path).shape[0]
+    bottoms = [(1 - bottom) * size for _, _, bottom in texts]
+    assert bottoms[0] < bottoms[1] < areas[0][0]  # heading, title, images
+    assert areas[4][0] + areas[4][2] < bottoms[4] < bottoms[5] < areas[-1][0]
+
+
+def test_every_open_loop_step_has_a_frame_of_the_contact_and_one_after_it():
+    env = make("open_loop/block_stacking", num_objects=2, expert=True, seed=0)
+    recorder = FrameRecorder(env, 80, 80)
+    state = env.reset()
+    recorder.record()
+    while not state[keys.DONE]:
+        state = env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION]))[keys.NEXT]
+        recorder.record()
+    env.close()
+    assert len(recorder.frames) == 5
+    assert recorder.contacts == [1, 3]
+    assert recorder.frames[0].shape == (80, 80, 3)
+    changes = [
+        np.abs(a.astype(int) - b).sum()
+        for a, b in zip(recorder.frames, recorder.frames[1:], strict=False)
+    ]
+    assert min(changes) > 0

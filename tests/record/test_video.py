@@ -37,6 +37,25 @@ def test_gif_shows_the_frames(tmp_path):
     assert imageio.immeta(path)["loop"] == 0
 
 
+def test_a_gif_has_few_colours_that_are_the_same_in_all_frames(tmp_path):
+    ramp = np.linspace(0, 255, 64 * 64).reshape(64, 64)
+    video = [
+        np.stack([np.roll(ramp, 9 * t, 1), ramp.T, 255 - ramp], -1).astype(np.uint8)
+        for t in range(4)
+    ]
+    read = imageio.imread(write_video(tmp_path / "episode.gif", video, fps=4), index=None)
+    assert len(np.unique(read[..., :3].reshape(-1, 3), axis=0)) <= 128
+    assert np.abs(read[..., :3].astype(int) - video).mean() < 12
+
+
+def test_a_gif_keeps_the_colour_of_an_object_in_a_single_frame(tmp_path):
+    ramp = np.linspace(0, 255, 64 * 64).reshape(64, 64)
+    video = [np.repeat(np.roll(ramp, t)[..., None], 3, -1).astype(np.uint8) for t in range(20)]
+    video[7][10:30, 10:30] = (220, 90, 20)
+    read = imageio.imread(write_video(tmp_path / "episode.gif", video, fps=4), index=7)
+    assert np.abs(read[12:28, 12:28, :3].astype(int) - (220, 90, 20)).max() < 20
+
+
 @pytest.mark.parametrize(
     ("frames", "message"),
     [

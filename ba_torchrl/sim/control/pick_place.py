@@ -79,6 +79,8 @@ class PickPlace:
         """Pose of the held body in the tool frame."""
         self.is_out_of_reach = False
         """Whether the last pick or place was out of reach, so that the arm did not move."""
+        self.on_contact: Callable[[], None] | None = None
+        """Called when the fingers have closed for a pick and before they open for a release."""
 
     def reset(self) -> None:
         """Teleport the arm to its home configuration with an empty, open gripper."""
@@ -103,6 +105,7 @@ class PickPlace:
         if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
             self._close_fingers()
             grasps = self._touched_poses()
+            self._notify_contact()
             reached = robot.tool_frame().position
             above = self._approach_point(reached, rotation, limits.lift_height_m)
             self.motion.move_straight(reached, above, rotation, None, limits.min_motion_steps)
@@ -133,6 +136,7 @@ class PickPlace:
             self.motion.move_straight(
                 reached, down, rotation, self.held, self.limits.lowering_steps
             )
+            self._notify_contact()
             self._detach()
             self._open_fingers()
             if not self.teleport:
@@ -157,6 +161,10 @@ class PickPlace:
         self.grasp = state.grasp
         if self.held is not None:
             self.held.is_hidden = True
+
+    def _notify_contact(self) -> None:
+        if self.on_contact is not None:
+            self.on_contact()
 
     # -- held body ---------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ import pybullet
 
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.shapes import Decal
+from ba_torchrl.sim.vision.framing import Viewpoint
 from ba_torchrl.sim.vision.lens import Lens
 from ba_torchrl.sim.world import World
 
@@ -34,39 +35,31 @@ _SHADOW_BLUR = 2
 """Half width of the blur of the shadow map, pixels."""
 _SHADOW_DEPTH = 0.3
 """Fraction by which full shadow darkens the floor."""
-_FOV_DEG = 40.0
+FOV_DEG = 28.0
+"""Vertical field of view of `render_rgb`."""
 
 
 def render_rgb(
     world: World,
-    target_m: Vector,
+    viewpoint: Viewpoint,
     width: int = 480,
     height: int = 360,
-    distance_m: float = 1.05,
-    yaw_deg: float = 62.0,
-    pitch_deg: float = -27.0,
     floor_rgb: tuple[float, float, float] | None = DEFAULT_FLOOR_RGB,
 ) -> np.ndarray:
     """Render the scene with the robot, in colour and with shadows on the floor.
 
     Args:
         world: the scene.
-        target_m: point at the centre of the image.
+        viewpoint: pose of the camera.
         width: number of columns.
         height: number of rows.
-        distance_m: from the target to the camera; the image covers 0.73 times this distance from
-            top to bottom.
-        yaw_deg: yaw of the camera.
-        pitch_deg: pitch of the camera; negative angles look down.
         floor_rgb: colour of the floor, each component from 0 to 1; None keeps that of PyBullet.
 
     Returns:
         [height, width, 3] uint8.
     """
-    view = pybullet.computeViewMatrixFromYawPitchRoll(
-        target_m, distance_m, yaw_deg, pitch_deg, 0, 2
-    )
-    projection = pybullet.computeProjectionMatrixFOV(_FOV_DEG, width / height, 0.05, 10.0)
+    view = viewpoint.view_matrix()
+    projection = pybullet.computeProjectionMatrixFOV(FOV_DEG, width / height, 0.05, 10.0)
     rgb, _, segmentation = _render(world, width, height, view, projection, links=True)
     owner = np.where(segmentation >= 0, segmentation & 0xFFFFFF, -1)
     image = rgb.astype(np.float32)
@@ -76,7 +69,7 @@ def render_rgb(
     flat = np.isin(owner, [world.floor, *_decals(world)])
     rows, cols = np.nonzero(flat)
     points = _floor_points(view, width, height, rows, cols)
-    shadow = _shadow(world, target_m, points)
+    shadow = _shadow(world, viewpoint.target_m, points)
     image[rows, cols] *= (1 - _SHADOW_DEPTH * shadow)[:, None]
     return _smooth_edges(image, segmentation).round().astype(np.uint8)
 
@@ -168,7 +161,7 @@ def _floor_points(
     pose = np.reshape(view, (4, 4)).T
     rotation = pose[:3, :3]  # rows: right, up, backward
     eye = -rotation.T @ pose[:3, 3]
-    edge = math.tan(math.radians(_FOV_DEG) / 2)
+    edge = math.tan(math.radians(FOV_DEG) / 2)
     right = (2 * (cols + 0.5) / width - 1) * edge * width / height
     up = (1 - 2 * (rows + 0.5) / height) * edge
     rays = right[:, None] * rotation[0] + up[:, None] * rotation[1] - rotation[2]

@@ -4,10 +4,13 @@ import numpy as np
 
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import SceneMesh, depth_image
+from ba_torchrl.sim.vision.framing import Viewpoint
 from ba_torchrl.sim.vision.lens import oblique_lens
 from ba_torchrl.sim.vision.rgb import render_rgb, render_rgbd
 from ba_torchrl.sim.world import World
 from tests.sim.vision.boxes import CENTER, ray_depths
+
+VIEWPOINT = Viewpoint((0.0, 0.0, 0.1), 1.05, yaw_deg=62.0, pitch_deg=-27.0)
 
 
 def test_rgbd_depth_equals_the_depth_camera():
@@ -38,8 +41,8 @@ def test_rgb_images_have_a_light_floor_with_shadows_under_bodies():
         images = []
         for z in (0.3, -5.0):  # in the air, and out of view
             box.place((0.0, 0.0, z))
-            images.append(render_rgb(world, (0.0, 0.0, 0.1), 120, 90).astype(int))
-        colored = render_rgb(world, (0.0, 0.0, 0.1), 120, 90, floor_rgb=(0.2, 0.4, 0.2))
+            images.append(render_rgb(world, VIEWPOINT, 120, 90).astype(int))
+        colored = render_rgb(world, VIEWPOINT, 120, 90, floor_rgb=(0.2, 0.4, 0.2))
     with_box, empty = images
     assert (empty == empty[0, 0]).all()
     assert empty.min() > 225
