@@ -12,6 +12,7 @@ from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, downward_pose
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.clearance import grasp_clearance_m, hand_clearance_m, path_clearance_m
+from ba_torchrl.tasks.perturbation import perturbed_pick
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, GraspQueries, edge_grasps
 from ba_torchrl.tasks.structures.free_space import PlacementArea
@@ -74,11 +75,15 @@ class PickPlaceExpert(GraspQueries):
             return no_op(self.terrain.workspace, held is not None)
         if move.body is held:
             return self._place(move)
-        candidate = self._best_grasp(move.body)
-        yaw, z = candidate.yaw_rad, move.body.position[2]
-        x, y = _tool_xy(move.body.position, candidate)
+        body = self._unblocking(move.body)
+        candidate = self._best_grasp(body)
+        yaw, z = candidate.yaw_rad, body.position[2]
+        x, y = _tool_xy(body.position, candidate)
         z = max(z, self.terrain.lowest_tool_m(self.robot.gripper, (x, y)))
-        return pick_command(downward_pose((x, y, z), yaw))
+        grasp = downward_pose((x, y, z), yaw)
+        if self.limits.turn_rad and not self._is_free(body):
+            return perturbed_pick(self.structure.planner.world, body, grasp, can_turn=True)
+        return pick_command(grasp)
 
     def grasp_yaws(self, body: Body) -> list[float]:
         """Return the yaws of the gripper at which it can grasp a body."""
@@ -187,6 +192,30 @@ class PickPlaceExpert(GraspQueries):
             for candidate in tuple(candidates):
                 candidates += edge_grasps(gripper, body, candidate.yaw_rad, opening)
         return candidates
+
+    def _unblocking(self, body: Body) -> Body:
+        """Return the piece to pick so that a body can be picked.
+
+        This is the body itself if it has a grasp with clearance, else a piece outside of the
+        structure that blocks its grasps and has one. A gripper that cannot turn pushes them.
+        """
+        if not self.limits.turn_rad or self._is_free(body):
+            return body
+        placed = self.structure.planner.placed()
+        return next(
+            (
+                other
+                for other in self._others(body)
+                if other not in placed
+                and all(self.blocks_grasp(body, other, None))
+                and self._is_free(other)
+            ),
+            body,
+        )
+
+    def _is_free(self, body: Body) -> bool:
+        """Whether a grasp of a body has clearance."""
+        return self._grasp_quality(body, self._best_grasp(body))[2] > 0
 
     def _best_grasp(self, body: Body) -> GraspCandidate:
         return max(
