@@ -27,7 +27,7 @@ EXTRA = {
 SHARED = {"_malloc"}
 APART = {
     "__init__": BASE | {"tasks", "envs"},
-    "testing": BASE | {"testing", "tasks", "envs", "__init__"},
+    "testing": BASE | {"testing", "sim", "tasks", "envs", "__init__"},
     "modules": BASE | {"modules", "envs.keys", "envs.images"},
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},

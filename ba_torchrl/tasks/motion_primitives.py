@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import (
-    passing_height_m,
-)
+from ba_torchrl.tasks.clearance import half_gap_m, passing_height_m
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
@@ -22,6 +22,8 @@ IS_OPEN = 0.9
 """Least opening of an open gripper."""
 IS_CLOSED = 0.1
 """Largest opening of a closed gripper."""
+LEAST_SQUEEZE = 0.01
+"""Least difference between the opening of fingers that press on a body and the commanded one."""
 ALIGNED_M = 4e-3
 """Largest horizontal offset, along each axis, of a gripper that is aligned with its target."""
 ALIGNED_RAD = 0.08
@@ -82,6 +84,42 @@ def nearest_equivalent_yaw(
     return nearest
 
 
+def grasped_body(robot: Robot) -> Body | None:
+    """Return the body between fingers that press on it, None without one.
+
+    Open fingers can touch a wide body on both sides, too, but do not press on it.
+
+    Args:
+        robot: the robot.
+    """
+    is_pressing = robot.commanded_opening < robot.opening() - LEAST_SQUEEZE
+    return robot.held_body() if is_pressing else None
+
+
+def closing(robot: Robot) -> float:
+    """Return the opening to command for an empty gripper to close.
+
+    Fingers that something stopped open first: they close no further by the same command.
+
+    Args:
+        robot: the robot.
+    """
+    is_stopped = robot.commanded_opening < IS_CLOSED <= robot.opening()
+    return OPEN if is_stopped else CLOSED
+
+
+def release(body: Body, floor_m: float, limits: ActionLimits) -> GripperCommand:
+    """Return the next command to lower the held body to the floor and open the fingers.
+
+    Args:
+        body: the held body.
+        floor_m: height of the floor, metres.
+        limits: limits of an action.
+    """
+    gap = max(vertical_extent(body)[0] - floor_m, 0.0)
+    return lift(-gap, OPEN if gap <= limits.step_m else CLOSED)
+
+
 def lift(height_m: float, opening: float = CLOSED) -> GripperCommand:
     """Return the command of a vertical displacement.
 
@@ -110,7 +148,9 @@ def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
     is_centered = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
     is_aligned = is_centered and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
     if robot.opening() < IS_OPEN:
-        return lift(above_z - z if z < above_z and not is_centered else 0.0, OPEN)
+        # at the block, fingers open before the hand moves, unless something stops them
+        is_stopped = robot.commanded_opening >= IS_OPEN
+        return lift(max(above_z - z, 0.0) if is_stopped or not is_centered else 0.0, OPEN)
     if is_aligned:
         return move_toward(
             robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= limits.step_m else OPEN
@@ -135,7 +175,9 @@ def push(
     The line between the fingers is perpendicular to the line of the push. On the line behind the
     body the gripper pushes. Elsewhere it first moves behind the body, over its top if the body is
     an obstacle. The tolerance of the line is larger during the push than at the end of the
-    approach, so that the two phases do not alternate.
+    approach, so that the two phases do not alternate. A held body is released first, and the
+    fingers stay open until they are above it. A body at the border, which leaves no room behind it,
+    is grasped and dragged away from there.
 
     Args:
         robot: the robot.
@@ -151,6 +193,16 @@ def push(
     bx, by, _ = body.position
     length = math.dist((bx, by), goal)
     ux, uy = ((goal[0] - bx) / length, (goal[1] - by) / length) if length > 1e-6 else (1.0, 0.0)
+    behind = behind_point(robot, body, (ux, uy), workspace)
+    has_room = has_room_behind(robot, body, behind)
+    held = grasped_body(robot)
+    if held is body and not has_room:
+        travel = min(length, limits.step_m)
+        return GripperCommand(CLOSED, travel * ux, travel * uy, 0.0, 0.0)
+    if held is not None:
+        return release(held, workspace.z[0], limits)
+    if not has_room and fits_between_fingers(robot, body):
+        return grasp(robot, body, limits)
     along = (x - bx) * ux + (y - by) * uy
     offset = abs((y - by) * ux - (x - bx) * uy)
     across = math.atan2(uy, ux) + math.pi / 2
@@ -170,14 +222,15 @@ def push(
         target = (x + travel * gx / norm, y + travel * gy / norm, low_z)
         return move_toward(robot, target, target_yaw, opening)
 
-    behind = behind_point(robot, body, (ux, uy), workspace)
     over_z = body.position[2] + half + passing_height_m(robot.gripper)
     is_behind = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
     is_obstacle = not is_behind and _distance_to_segment(
         (bx, by), (x, y), behind
     ) < OBSTACLE_SHARE * math.dist(behind, (bx, by))
     if is_obstacle and z < over_z - 1e-3:
-        return lift(over_z - z, opening)
+        is_around = math.dist((x, y), (bx, by)) < footprint_radius_m(body)
+        stays_open = is_around and robot.commanded_opening >= IS_OPEN
+        return lift(over_z - z, OPEN if stays_open else opening)
     return move_toward(robot, (*behind, over_z if is_obstacle else low_z), target_yaw, opening)
 
 
@@ -209,6 +262,27 @@ def behind_point(
     back = max(limit, min(nearest, standoff_m))
     x, y, _ = workspace.clip((bx - back * direction[0], by - back * direction[1], 0.0))
     return x, y
+
+
+def has_room_behind(robot: Robot, body: Body, behind: tuple[float, float]) -> bool:
+    """Whether a gripper at the point from which to push a body does not touch the body.
+
+    Args:
+        robot: the robot.
+        body: the body.
+        behind: point of `behind_point`.
+    """
+    offset = np.subtract(behind, body.position[:2])
+    distance = float(np.hypot(*offset))
+    if distance == 0.0:
+        return False
+    extent = float(((world_vertices(body)[:, :2] - body.position[:2]) @ offset).max()) / distance
+    return distance > extent + robot.gripper.half_width_m
+
+
+def fits_between_fingers(robot: Robot, body: Body) -> bool:
+    """Whether open fingers fit around a block."""
+    return min(body.shape.bounds_m[1][:2]) < half_gap_m(robot.gripper)
 
 
 def _distance_to_segment(

@@ -9,24 +9,28 @@ from __future__ import annotations
 import functools
 import math
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from ba_torchrl import make, make_vector_env
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import ManipulationEnv
-from ba_torchrl.tasks.base import TASKS, Task
-
-IMAGE_SIZES = {"close_loop": 32, "open_loop": 128}
-"""Image size by control. Open-loop picks take their height from the image, in which a
-block must cover several pixels."""
-
-MAX_EPISODE_STEPS = 60
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.testing.episodes import (
+    MAX_EPISODE_STEPS,
+    action_at,
+    continues,
+    expert_policy,
+    make_small,
+    play_expert,
+    random_actions,
+)
+from ba_torchrl.testing.progress import check_progress
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -76,6 +80,7 @@ def check_task(
         robot=robot,
     )
     check_recovery(task, episodes=episodes, min_success_rate=min_recovery_rate, robot=robot)
+    check_progress(task, episodes=episodes, robot=robot)
 
 
 def check_specs(task: str, **config: Any) -> None:
@@ -284,12 +289,11 @@ def check_recovery(task: str, *, episodes: int, min_success_rate: float, **confi
     """
     if TASKS[task].terminates_at_limit:
         return
-    random_steps = {"close_loop": 8, "open_loop": 2}[TASKS[task].control]
     env = make_small(task, expert=True, **config)
     outcomes: list[bool] = []
     try:
         for seed in range(2 * episodes):
-            success = _recover(env, seed, random_steps)
+            success = _recover(env, seed)
             if success is not None:
                 outcomes.append(success)
             if len(outcomes) == episodes:
@@ -298,7 +302,7 @@ def check_recovery(task: str, *, episodes: int, min_success_rate: float, **confi
         env.close()
     assert len(outcomes) >= episodes / 2, f"{task}: random actions end most episodes"
     assert np.mean(outcomes) >= min_success_rate, (
-        f"{task}: after {random_steps} random actions the expert solves {sum(outcomes)} of "
+        f"{task}: after random actions the expert solves {sum(outcomes)} of "
         f"{len(outcomes)} episodes, a success rate below {min_success_rate:g}"
     )
 
@@ -345,50 +349,15 @@ def check_partial_resets(task: str, **config: Any) -> None:
 # -- parts -----------------------------------------------------------------------------------
 
 
-def make_small(task: str, **config: Any) -> ManipulationEnv:
-    """Make an environment with seed 0 and a small image."""
-    size = IMAGE_SIZES[TASKS[task].control]
-    return make(task, **{"obs_size": size, "seed": 0, **config})
-
-
-def continues(task: str) -> bool:
-    """Return whether an episode of a task can start from the last scene of the previous one."""
-    return TASKS[task].continues is not Task.continues
-
-
-def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
-    """Copy the expert's action. TorchRL requires the name of the argument."""
-    return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION])
-
-
-def play_expert(env: ManipulationEnv, episodes: int) -> list[TensorDict]:
-    """Return episodes [T] of the expert."""
-    return [
-        env.rollout(MAX_EPISODE_STEPS, expert_policy, auto_cast_to_device=False)
-        for _ in range(episodes)
-    ]
-
-
-def action_at(env: ManipulationEnv, fractions: Sequence[float]) -> torch.Tensor:
-    """Return the action at fractions, 0 to 1, of the components' ranges; they are cycled."""
-    low, high = env.action_spec.space.low, env.action_spec.space.high
-    place = torch.tensor([fractions[i % len(fractions)] for i in range(len(low))])
-    return low + place * (high - low)
-
-
 def _constant_policy(env: ManipulationEnv, *fractions: float) -> Policy:
     return lambda td: td.set(keys.ACTION, action_at(env, fractions))
 
 
-def _recover(env: ManipulationEnv, seed: int, random_steps: int) -> bool | None:
+def _recover(env: ManipulationEnv, seed: int) -> bool | None:
     """Return the expert's success after random actions; None if these end the episode."""
-    state = env.reset(seed=seed)
-    rng = np.random.default_rng(seed)
-    for _ in range(random_steps):
-        action = action_at(env, rng.uniform(0, 1, 7).astype(np.float32).tolist())
-        state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
-        if state[keys.DONE]:
-            return None
+    state = random_actions(env, env.reset(seed=seed), np.random.default_rng(seed))
+    if state[keys.DONE]:
+        return None
     while not state[keys.DONE]:
         state = env.step(expert_policy(state))[keys.NEXT]
     return bool(state[keys.SUCCESS])

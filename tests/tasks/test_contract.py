@@ -52,6 +52,21 @@ OTHERS_NOT_WITHOUT_YAW = {
 }
 """Tasks that robots other than kuka cannot solve without yaw actions, and why."""
 
+UNSOLVED = {
+    "open_loop/bin_packing": (0.1, "a dropped object may lie on the rim of the bin"),
+    "open_loop/covid_test": (0.25, "fingers do not fit between a wall and a swab that touches it"),
+}
+"""Tasks with disturbed scenes that the expert does not solve: their share, and why."""
+
+LONG_EPISODES = [task for task in TASKS if REGISTRY[task].needs_fresh_world]
+LONG_EPISODES.append("open_loop/box_palletizing")
+"""Tasks with slow episodes, of which the tests play fewer."""
+
+PROGRESS = [(task, {}) for task in TASKS] + [
+    ("close_loop/block_pulling", {"object_scale_range": (0.6, 0.6)}),  # fits between the fingers
+]
+"""Tasks and parameters of the check of disturbed scenes."""
+
 OPEN_LOOP = [task for task in TASKS if REGISTRY[task].control == "open_loop"]
 LOW = ["open_loop/improvise_house_building_3", "open_loop/covid_test"]
 """Tasks with objects so low that the fingers of a deep grasp would touch the floor."""
@@ -212,6 +227,22 @@ def check_recovery(task, episodes, margin):
         pytest.skip("an episode has no second step")
     least = SUCCESS.get(task, 0.99) - margin
     checks.check_recovery(task, episodes=episodes, min_success_rate=least)
+
+
+@pytest.mark.parametrize(("task", "config"), PROGRESS)
+def test_the_expert_repeats_no_action_in_an_unchanged_scene(task, config):
+    check_progress(task, episodes=4 if task in LONG_EPISODES else 10, **config)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "config"), PROGRESS)
+def test_the_expert_repeats_no_action_in_an_unchanged_scene_over_60_episodes(task, config):
+    check_progress(task, episodes=60, **config)
+
+
+def check_progress(task, episodes, **config):
+    rate = UNSOLVED[task][0] if task in UNSOLVED else 0.0
+    checks.check_progress(task, episodes=episodes, max_unsolved_rate=rate, **config)
 
 
 def test_the_expert_changes_nothing(task):

@@ -214,7 +214,10 @@ class CloseLoopController:
         Returns:
             Whether the motion reached the last fraction.
         """
-        robot = self.robot
+        robot, limits = self.robot, self.limits
+        vertical_n = limits.max_vertical_force_n
+        if path.goes_up:  # closing fingertips may have pressed on the floor with more
+            vertical_n = max(vertical_n, vertical_force_n(self._outer_contacts(held)))
         has_arrived = True
         for fraction in fractions:
             joints = path.joints_at(fraction)
@@ -224,7 +227,7 @@ class CloseLoopController:
             before = robot.joints
             robot.command(joints)
             self.world.step()
-            if self._is_overloaded(held):
+            if self._is_overloaded(held, vertical_n):
                 # without this, repeated actions would move the stiff arm deeper into the body
                 robot.command(before)
                 self.world.step()
@@ -235,11 +238,16 @@ class CloseLoopController:
             robot.command(measured)  # ends the force against the body that stopped the arm
         return has_arrived
 
-    def _is_overloaded(self, held: Body | None) -> bool:
-        """Whether the contact forces of the hand and the held body exceed a limit."""
+    def _is_overloaded(self, held: Body | None, vertical_n: float) -> bool:
+        """Whether the contact forces of the hand and the held body exceed a limit.
+
+        Args:
+            held: the held body.
+            vertical_n: limit of the vertical force.
+        """
         points = self._outer_contacts(held)
         return (
-            vertical_force_n(points) > self.limits.max_vertical_force_n
+            vertical_force_n(points) > vertical_n
             or lateral_force_n(points) > self.limits.max_lateral_force_n
         )
 
@@ -265,6 +273,7 @@ class _Path:
         self._rotation_rad = wrap_angle(end[1] - start[1])
         self.length_m = math.hypot(*self._delta)
         self.goes_down = self._delta[2] < -1e-4
+        self.goes_up = self._delta[2] > 1e-4
         self.angle_rad = abs(self._rotation_rad)
 
     def joints_at(self, fraction: float) -> list[float] | None:

@@ -10,7 +10,7 @@ With ``teleport`` off, all motions are simulated.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body

@@ -15,7 +15,7 @@ from ba_torchrl.sim.shapes import Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.colors import BLUE
-from ba_torchrl.tasks.motion_primitives import CLOSED, IS_OPEN, OPEN, move_toward
+from ba_torchrl.tasks.motion_primitives import CLOSED, OPEN, grasped_body, move_toward
 from ba_torchrl.tasks.transport import pick_up, travel
 from ba_torchrl.tasks.workspace import Spacing
 
@@ -96,7 +96,7 @@ class BlockInBowl(CloseLoopTask):
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, carry it over the rim and release it inside."""
-        if self.robot.held_body() is self.block and self.robot.opening() < IS_OPEN:
+        if grasped_body(self.robot) is self.block:
             return self._carry()
         return pick_up(
             self.robot,

@@ -12,7 +12,7 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import IS_OPEN, grasp, lift
+from ba_torchrl.tasks.motion_primitives import grasp, grasped_body, lift
 
 
 @TASKS.register("close_loop/block_picking")
@@ -46,7 +46,7 @@ class BlockPicking(CloseLoopTask):
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, then lift it."""
-        if self.robot.held_body() is self.block and self.robot.opening() < IS_OPEN:
+        if grasped_body(self.robot) is self.block:
             return lift(self.action_limits.step_m)
         return grasp(self.robot, self.block, self.action_limits)
 

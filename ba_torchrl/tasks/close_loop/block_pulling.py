@@ -14,7 +14,15 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.colors import BLUE, RED
-from ba_torchrl.tasks.motion_primitives import STANDOFF_M, behind_point, push
+from ba_torchrl.tasks.motion_primitives import (
+    STANDOFF_M,
+    behind_point,
+    has_room_behind,
+    push,
+)
+
+NO_ROOM_COST_M = 1.0
+"""Cost of a block with no room behind it for the gripper."""
 
 PRESS_M = 5e-3
 """Distance that a pull continues after the blocks touch, if it must not push the other block."""
@@ -88,7 +96,8 @@ class BlockPulling(CloseLoopTask):
         direction = ((ox - px) / length, (oy - py) / length)
         start = behind_point(self.robot, pulled, direction, self.settings.workspace)
         missing_m = STANDOFF_M - math.dist(start, (px, py))
-        return math.dist(start, self.robot.tool_pose()[0][:2]) + 2 * missing_m
+        cost_m = math.dist(start, self.robot.tool_pose()[0][:2]) + 2 * missing_m
+        return cost_m if has_room_behind(self.robot, pulled, start) else cost_m + NO_ROOM_COST_M
 
     @property
     def objects(self) -> Sequence[Body]:

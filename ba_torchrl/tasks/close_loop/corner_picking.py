@@ -20,8 +20,9 @@ from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     CLOSED,
     IS_CLOSED,
-    IS_OPEN,
     OPEN,
+    closing,
+    grasped_body,
     lift,
     move_toward,
     nearest_equivalent_yaw,
@@ -129,7 +130,7 @@ class CornerPicking(CloseLoopTask):
     def expert_command(self) -> GripperCommand:
         """Drag the block out of the corner until a grasp has clearance, then grasp and lift it."""
         robot, block, limits = self.robot, self.block, self.action_limits
-        if robot.held_body() is block and robot.opening() < IS_OPEN:
+        if grasped_body(robot) is block:
             return lift(limits.step_m)
         yaw = robot.tool_pose()[1]
         touching = contacts(self.world.client, robot.id, block.id)
@@ -206,8 +207,8 @@ class CornerPicking(CloseLoopTask):
         if not is_clear or robot.opening() >= IS_CLOSED:
             low_z = wall_top + self._tips_below_m + TRAVEL_CLEARANCE_M
             if z < low_z - 1e-3:
-                return lift(low_z - z)
-        return move_toward(robot, (*target, low_z), target_yaw, CLOSED)
+                return lift(low_z - z, closing(robot))
+        return move_toward(robot, (*target, low_z), target_yaw, closing(robot))
 
     def _drag(self) -> GripperCommand:
         """Drag the block away from both walls, straight towards its target."""

@@ -21,6 +21,8 @@ from ba_torchrl.tasks.motion_primitives import (
     IS_CLOSED,
     IS_OPEN,
     OPEN,
+    closing,
+    grasped_body,
     lift,
     move_toward,
 )
@@ -57,7 +59,7 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
         If no object can be grasped, push one until it can.
         """
         robot, limits, planner = self.robot, self.action_limits, self.planner
-        if robot.opening() < IS_OPEN and robot.held_body() is not None:
+        if grasped_body(robot) is not None:
             return lift(limits.step_m)
         heights = planner.heights()
         tool = robot.tool_pose()
@@ -105,8 +107,8 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
         if is_closed and offset <= ALIGNED_M:
             return move_toward(robot, push.start, yaw, CLOSED)
         if z < over_z - 1e-3:
-            return lift(over_z - z, CLOSED)
-        return move_toward(robot, (sx, sy, over_z), yaw, CLOSED)
+            return lift(over_z - z, closing(robot))
+        return move_toward(robot, (sx, sy, over_z), yaw, closing(robot))
 
     def grasped_object(self) -> Body | None:
         """Return the held object if the tool is higher than 15 cm."""

@@ -20,6 +20,7 @@ from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.footprints import Rectangle, narrowest, outline
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
+from ba_torchrl.tasks.perturbation import perturbed_pick
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 
 BIN_M = (0.176, 0.144, 0.08)
@@ -188,7 +189,11 @@ class BinPacking(PackingTask):
             return clearance > 0, round(size, 7), clearance
 
         body = max(outside, key=order)
-        return pick_command(grasps[body].tool)
+        grasp = grasps[body]
+        if grasp.clearance_m <= 0:
+            can_turn = self.action_limits.turn_rad > 0
+            return perturbed_pick(self.world, body, grasp.tool, can_turn=can_turn)
+        return pick_command(grasp.tool)
 
     # ----------------------------------------------------------------------------------------
 

@@ -9,13 +9,13 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.sim import contacts
 from ba_torchrl.sim.bodies import Body, vertical_extent
-from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.geometry import YawPose, downward_pose
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import deactivate_body
-from ba_torchrl.tasks.clearance import grasp_clearance_m
+from ba_torchrl.tasks.clearance import OUTER_MARGIN_M, finger_extent_m, grasp_clearance_m
 from ba_torchrl.tasks.covid_layout import (
     GAP_M,
     TEST_AREA,
@@ -27,7 +27,9 @@ from ba_torchrl.tasks.covid_layout import (
     new_columns,
     new_rows,
 )
+from ba_torchrl.tasks.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
+from ba_torchrl.tasks.perturbation import perturbed_pick
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.transport import RELEASE_GAP_M
 
@@ -40,6 +42,8 @@ WINDOW_M = 0.01
 """Half the width of the window that is searched for the highest point, without a tube."""
 RIM_WINDOW_M = 0.052
 """The same with a tube: from the centre of the box of used tubes it contains a wall."""
+LEANING_M = 5e-3
+"""Height of a leaning tube or swab above its width."""
 TUBE_ATTEMPTS = 50
 """Random poses of a used tube that are compared."""
 REST_STEPS = 20
@@ -221,7 +225,9 @@ class CovidTest(OpenLoopTask):
             xy = tuple(float(rng.uniform(-half, half)) for half in self.used_half_m)
             yaw = math.pi / 2 + self.random_yaw(rng, 2 * math.pi)
             self.layout.lay(tube, self.layout.to_world(self.layout.test_area, xy), yaw)
-            if all(gap_m(self.world.client, other.id, tube.id) > GAP_M for other in others):
+            if all(
+                contacts.gap_m(self.world.client, other.id, tube.id) > GAP_M for other in others
+            ):
                 break
         self.world.settle(max_steps=REST_STEPS)
 
@@ -249,10 +255,14 @@ class CovidTest(OpenLoopTask):
         candidates = self._pick_candidates()
         if not candidates:
             return no_op(self.settings.workspace, is_holding=False)
-        body = max(candidates, key=self._clearance_m)
+        body = max(candidates, key=lambda body: (self._can_grasp(body), self._clearance_m(body)))
         x, y, _ = body.position
         z = vertical_extent(body)[0] + self._grasp_m
-        return pick_command(downward_pose((x, y, z), self._grasp_yaw(body)))
+        grasp = downward_pose((x, y, z), self._grasp_yaw(body))
+        if not self._can_grasp(body):
+            can_turn = self.action_limits.turn_rad > 0
+            return perturbed_pick(self.world, body, grasp, can_turn=can_turn)
+        return pick_command(grasp)
 
     def _pick_candidates(self) -> list[Body]:
         """Return the bodies of which one is picked next."""
@@ -308,6 +318,18 @@ class CovidTest(OpenLoopTask):
         z = z + held.position[2] - vertical_extent(held)[0]
         command = place_command(tool, held.pose, held.pose.moved_to((x, y, z), turn))
         return command._replace(z_m=max(command.z_m, rim_m + self._grasp_m + RELEASE_GAP_M))
+
+    def _can_grasp(self, body: Body) -> bool:
+        """Whether a tube or swab lies flat and nothing is between it and the open fingers."""
+        low, high = vertical_extent(body)
+        bottom, top = body.shape.bounds_m
+        if high - low > top[2] - bottom[2] + LEANING_M:
+            return False
+        gripper, x, y = self.robot.gripper, *body.position[:2]
+        reach_m = finger_extent_m(gripper, self.finger_opening) - OUTER_MARGIN_M
+        hand = Rectangle(x, y, self._grasp_yaw(body), reach_m, gripper.half_width_m)
+        others = [other for other in self.objects if other is not body]
+        return all(gap_m(hand, outline(other)) > 0 for other in (*others, *self.layout.walls))
 
     @property
     def _grasp_m(self) -> float:

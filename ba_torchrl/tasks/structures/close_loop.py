@@ -16,7 +16,7 @@ from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.clearance import grasp_clearance_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopControl
 from ba_torchrl.tasks.colors import BLUE, GREEN, RED
-from ba_torchrl.tasks.motion_primitives import IS_OPEN, OPEN, lift, nearest_equivalent_yaw
+from ba_torchrl.tasks.motion_primitives import OPEN, grasped_body, lift, nearest_equivalent_yaw
 from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.free_space import PlacementArea
@@ -102,7 +102,7 @@ def assemble(
         limits: limits of an action.
     """
     (x, y, _), yaw = robot.tool_pose()
-    held = robot.held_body() if robot.opening() < IS_OPEN else None
+    held = grasped_body(robot)
     pieces = list(planner.pieces)
 
     def yaws(body: Body) -> list[float]:

@@ -24,6 +24,7 @@ from ba_torchrl.tasks.clearance import (
     path_clearance_m,
     tool_view,
 )
+from ba_torchrl.tasks.perturbation import perturbed_pick
 from ba_torchrl.tasks.pick_place_commands import (
     LEVEL_RAD,
     carrying_pose,
@@ -104,7 +105,11 @@ class PickPlaceExpert(GraspQueries):
             return no_op(self.terrain.workspace, held is not None)
         if move.body is held:
             return self._place(move)
-        return self.pick(move.body)
+        body = self._unblocking(move.body)
+        if self.limits.turn_rad and not self._is_free(body):
+            grasp = self._tool_pose(body, self._best_grasp(body))
+            return perturbed_pick(self.structure.planner.world, body, grasp, can_turn=True)
+        return self.pick(body)
 
     def pick(self, body: Body) -> PickPlaceCommand:
         """Return the pick of a body at its best grasp."""
@@ -252,6 +257,30 @@ class PickPlaceExpert(GraspQueries):
                     else:
                         candidates.append(candidate._replace(shift_m=side * edge.shift_m))
         return candidates
+
+    def _unblocking(self, body: Body) -> Body:
+        """Return the piece to pick so that a body can be picked.
+
+        This is the body itself if it has a grasp with clearance, else a piece outside of the
+        structure that blocks its grasps and has one. A gripper that cannot turn pushes them.
+        """
+        if not self.limits.turn_rad or self._is_free(body):
+            return body
+        placed = self.structure.planner.placed()
+        return next(
+            (
+                other
+                for other in self._others(body)
+                if other not in placed
+                and all(self.blocks_grasp(body, other, None))
+                and self._is_free(other)
+            ),
+            body,
+        )
+
+    def _is_free(self, body: Body) -> bool:
+        """Whether a grasp of a body has clearance."""
+        return self._grasp_quality(body, self._best_grasp(body))[2] > 0
 
     def _best_grasp(self, body: Body) -> GraspCandidate:
         """Return the best grasp of a body; with tilts, the best of those that the arm reaches."""

@@ -1,0 +1,67 @@
+"""Environments and episodes of the contract checks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from ba_torchrl import make
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.tasks.base import TASKS, Task
+
+IMAGE_SIZES = {"close_loop": 32, "open_loop": 128}
+"""Image size by control. Open-loop picks take their height from the image, in which a
+block must cover several pixels."""
+
+MAX_EPISODE_STEPS = 60
+
+RANDOM_STEPS = {"close_loop": 8, "open_loop": 2}
+"""Number of random actions that disturb a scene, by control."""
+
+
+def make_small(task: str, **config: Any) -> ManipulationEnv:
+    """Make an environment with seed 0 and a small image."""
+    size = IMAGE_SIZES[TASKS[task].control]
+    return make(task, **{"obs_size": size, "seed": 0, **config})
+
+
+def continues(task: str) -> bool:
+    """Return whether an episode of a task can start from the last scene of the previous one."""
+    return TASKS[task].continues is not Task.continues
+
+
+def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
+    """Copy the expert's action. TorchRL requires the name of the argument."""
+    return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION])
+
+
+def play_expert(env: ManipulationEnv, episodes: int) -> list[TensorDict]:
+    """Return episodes [T] of the expert."""
+    return [
+        env.rollout(MAX_EPISODE_STEPS, expert_policy, auto_cast_to_device=False)
+        for _ in range(episodes)
+    ]
+
+
+def action_at(env: ManipulationEnv, fractions: Sequence[float]) -> torch.Tensor:
+    """Return the action at fractions, 0 to 1, of the components' ranges; they are cycled."""
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    place = torch.tensor([fractions[i % len(fractions)] for i in range(len(low))])
+    return low + place * (high - low)
+
+
+def random_actions(
+    env: ManipulationEnv, state: TensorDictBase, rng: np.random.Generator
+) -> TensorDictBase:
+    """Take random actions and return the entries of the last step, which may be done."""
+    for _ in range(RANDOM_STEPS[env.task_class.control]):
+        action = action_at(env, rng.uniform(0, 1, 7).astype(np.float32).tolist())
+        state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
+        if state[keys.DONE]:
+            break
+    return state

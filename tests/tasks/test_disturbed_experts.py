@@ -1,0 +1,117 @@
+"""Experts in scenes that a plain grasp or push does not solve."""
+
+import numpy as np
+import pytest
+
+from ba_torchrl.envs import keys
+from ba_torchrl.sim.control.close_loop import CloseLoopController
+from ba_torchrl.sim.robots.kuka import Kuka
+from ba_torchrl.sim.shapes import Box
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.footprints import outline
+from ba_torchrl.tasks.motion_primitives import grasped_body
+from ba_torchrl.testing.episodes import expert_policy
+from ba_torchrl.testing.progress import close_around_object
+
+
+def play(env, state):
+    while not state[keys.DONE]:
+        state = env.step(expert_policy(state))[keys.NEXT]
+    return bool(state[keys.SUCCESS])
+
+
+def idle(env, state):
+    """Return the state after an action without effect: a place without an object."""
+    action = (env.action_spec.space.low + env.action_spec.space.high) / 2
+    action[0] = 1.0
+    return env.step(state.set(keys.ACTION, action))[keys.NEXT]
+
+
+def put_beside(body, other, along_x=True, gap_m=1e-3):
+    """Place a body flush with a side of another body, at the same yaw."""
+    around = outline(other)
+    body.place((0.0, 0.0, 1.0), around.yaw_rad)
+    own = outline(body)
+    offset = (around.half_x + own.half_x + gap_m, 0.0)
+    if not along_x:
+        offset = (0.0, around.half_y + own.half_y + gap_m)
+    z = -body.shape.bounds_m[0][2]
+    body.place((*around.frame.to_world(*offset), z), around.yaw_rad)
+
+
+@pytest.mark.parametrize(
+    ("task", "config"),
+    [
+        ("close_loop/block_pushing", {}),
+        ("close_loop/block_pulling", {"object_scale_range": (0.6, 0.6)}),
+    ],
+)
+def test_a_push_releases_the_block_that_the_gripper_holds(make_env, task, config):
+    env = make_env(task, **config)
+    seeds = (1, 2, 3)
+    solved = [
+        play(env, close_around_object(env, env.reset(seed=seed), np.random.default_rng(seed)))
+        for seed in seeds
+    ]
+    assert all(solved)
+
+
+def test_a_body_that_opens_the_fingers_fully_is_grasped():
+    with World() as world:
+        robot = Kuka(world)
+        block = world.add(Box(size_m=(0.0742, 0.04, 0.05)), "block")
+        world.seal()
+        controller = CloseLoopController(robot)
+        controller.reset(((0.45, 0.0, 0.15), 0.0))
+        block.place((0.45, 0.0, 0.025))
+        controller.move_to((0.45, 0.0, 0.03), 0.0)
+        assert grasped_body(robot) is None
+        controller.grip(0.0)
+        assert robot.opening() > 0.9
+        assert grasped_body(robot) is block
+        controller.move_to((0.45, 0.0, 0.1), 0.0)
+        assert grasped_body(robot) is block
+        controller.grip(1.0)
+        assert grasped_body(robot) is None
+
+
+def test_a_hand_whose_fingertips_press_on_the_floor_moves_up(make_env):
+    env = make_env("close_loop/block_picking")
+    rng = np.random.default_rng(12)
+    state = close_around_object(env, env.reset(seed=12), rng)
+    height_m = env.scene.robot.tool_pose()[0][2]
+    assert height_m < 0.012
+    env.step(expert_policy(state))
+    assert env.scene.robot.tool_pose()[0][2] > height_m + 0.03
+
+
+@pytest.mark.parametrize(
+    ("task", "seed"),
+    [
+        ("house_building_4", 19),
+        ("improvise_house_building_2", 8),
+        ("improvise_house_building_2", 11),
+        ("improvise_house_building_2", 14),
+    ],
+)
+def test_a_piece_flush_with_the_roof_is_picked(make_env, task, seed):
+    env = make_env(f"open_loop/{task}", obs_size=128, max_steps=30)
+    state = env.reset(seed=seed)
+    roof, piece, *_ = sorted(env.scene.task.objects, key=lambda body: body.name != "roof 1")
+    put_beside(piece, roof)
+    env.scene.world.settle()
+    assert play(env, idle(env, state))
+
+
+def test_a_piece_beside_the_supports_of_a_bridge_is_removed_first(make_env):
+    env = make_env("open_loop/house_building_3", obs_size=128, max_steps=30)
+    state = env.reset(seed=0)
+    bodies = {body.name: body for body in env.scene.task.objects}
+    first, second, roof = (bodies[name] for name in ("cube 1", "cube 2", "roof 1"))
+    z = first.position[2]
+    first.place((0.45, -0.02, z))
+    second.place((0.45, 0.02, z))
+    put_beside(roof, second, along_x=False)
+    bodies["cuboid 1"].place((0.3, -0.1, z))
+    env.scene.world.settle()
+    assert play(env, idle(env, state))
