@@ -1,6 +1,6 @@
 """Compiled projections of the voxels below a heightmap in the frame of a tool."""
 
-# ruff: noqa: ANN001, ANN201 -- compiled functions
+# ruff: noqa: ANN001, ANN201, ANN202 -- compiled functions
 
 from __future__ import annotations
 
