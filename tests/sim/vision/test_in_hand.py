@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView, crop
+from tests.sim.vision.voxel_loop import project_by_loops
 
 SIZE = 24
 PIXEL_M = 0.4 / 128
@@ -124,38 +125,6 @@ def test_proj_counts_the_voxels_of_a_box():
     np.testing.assert_array_equal(image[2][10:14, 11:13], (levels < height).sum() + 1)
 
 
-def brute_force(heights, z_m, rz, ry, rx):
-    """Return the projections of a heightmap [n, n], voxel by voxel."""
-    n = len(heights)
-    middle = (n - 1) / 2
-
-    def turn(axis, angle):
-        cos, sin = math.cos(angle), math.sin(angle)
-        matrix = np.eye(3)
-        a, b = [other for other in range(3) if other != axis]
-        matrix[a, a] = matrix[b, b] = cos
-        matrix[a, b], matrix[b, a] = (-sin, sin) if axis != 1 else (sin, -sin)
-        return matrix
-
-    tool = turn(2, rz) @ turn(1, ry) @ turn(0, rx)
-    cells = set()
-    for i, j, k in np.ndindex(n, n, n):
-        if heights[i, j] > z_m + (k - middle) * PIXEL_M:
-            inside = tool.T @ (np.array([i, j, k]) - middle) + middle
-            # at 45 degrees some centres are halfway between two cells: the upper one
-            cell = tuple(math.floor(value + 0.5 + 1e-9) for value in inside)
-            if all(0 <= index < n for index in cell):
-                cells.add(cell)
-    image = np.zeros((3, n, n))
-    for i, j, k in np.ndindex(n, n, n):
-        kernel = [(max(i - a, 0), max(j - b, 0), max(k - c, 0)) for a, b, c in np.ndindex(2, 2, 2)]
-        if sum(cell in cells for cell in kernel) >= 4:
-            image[0, j, k] += 1
-            image[1, i, k] += 1
-            image[2, i, j] += 1
-    return image
-
-
 @pytest.mark.parametrize(
     ("size", "angles"),
     [
@@ -173,7 +142,7 @@ def test_proj_equals_a_loop_over_voxels(noise, size, angles):
     heights = crop(noise, (64.0, 64.0), size).round(5)
     rz, ry, rx = angles
     image = draw("proj", noise, z_m=0.05, rz=rz, ry=ry, rx=rx, size=size)
-    np.testing.assert_array_equal(image, brute_force(heights, 0.05, *angles))
+    np.testing.assert_array_equal(image, project_by_loops(heights, PIXEL_M, 0.05, *angles))
     assert 0.1 * size**3 < image[0].sum() < 0.9 * size**3
 
 
