@@ -36,14 +36,16 @@ class PoseGridConfig(StrictModel):
     """Hyper-parameters of the levels of z and the tilts; the defaults are the paper's.
 
     Args:
-        num_z: heights of the tool, evenly spaced over their range.
-        z_range_m: least and greatest height.
-        num_tilts: values of ry, and of rx, evenly spaced over their range.
+        num_z: heights of the tool, evenly spaced.
+        min_z_m: least height.
+        max_z_m: greatest height.
+        num_tilts: values of ry, and of rx, evenly spaced.
         max_tilt_rad: greatest tilt; the least is its negative.
     """
 
     num_z: int = Field(default=36, ge=2)
-    z_range_m: tuple[float, float] = (0.02, 0.20)
+    min_z_m: float = 0.02
+    max_z_m: float = 0.20
     num_tilts: int = Field(default=7, ge=2)
     max_tilt_rad: float = Field(default=math.pi / 8, gt=0)
 
@@ -51,7 +53,7 @@ class PoseGridConfig(StrictModel):
     def limits(self) -> dict[str, tuple[float, float]]:
         """First and last value on the grids of z and the tilts."""
         tilts = (-self.max_tilt_rad, self.max_tilt_rad)
-        return {"z": self.z_range_m, "ry": tilts, "rx": tilts}
+        return {"z": (self.min_z_m, self.max_z_m), "ry": tilts, "rx": tilts}
 
     def pose_levels(self) -> tuple[Level, Level, Level]:
         """Return the levels of z, ry and rx."""
