@@ -131,7 +131,7 @@ def project(patches: Tensor, pixel_m: float, z_m: Tensor, cells: Tensor) -> Tens
     # cell 0 collects the free voxels, and those that are rotated out of the cube
     index = cells.reshape(batch * count, -1) * is_occupied.flatten(1)
     voxels = torch.zeros((batch * count, size**3 + 1), dtype=torch.uint8, device=patches.device)
-    voxels = voxels.scatter_(1, index, 1)[:, 1:].unflatten(1, (size, size, size))
+    voxels = voxels.scatter_(1, index.long(), 1)[:, 1:].unflatten(1, (size, size, size))
     for axis in (1, 2, 3):  # the border is replicated
         before = torch.cat([voxels.narrow(axis, 0, 1), voxels.narrow(axis, 0, size - 1)], axis)
         voxels = voxels + before
