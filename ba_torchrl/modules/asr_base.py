@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pydantic import Field
@@ -72,6 +73,7 @@ class ASR(SpatialQNetwork):
         return self.heads[level - 1](view, state.in_hand, state.scene, state.holding)
 
 
+@dataclass(frozen=True)
 class PatchView:
     """Heights around the chosen pixel.
 
@@ -79,8 +81,7 @@ class PatchView:
         size: rows and columns of the patch.
     """
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    size: int
 
     def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
         """Return patches [B, 1, p, p], metres."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -81,6 +82,7 @@ def _spaced(first: float, last: float, count: int) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(count))
 
 
+@dataclass(frozen=True)
 class HeightView:
     """Heights around the chosen pixel, rotated into the chosen yaw if yaws are given.
 
@@ -89,11 +91,9 @@ class HeightView:
         rz_rad: yaw of each index; None for the axes of the scene.
     """
 
+    size: int
+    rz_rad: tuple[float, ...] | None = None
     channels: ClassVar[int] = 1
-
-    def __init__(self, size: int, rz_rad: tuple[float, ...] | None = None) -> None:
-        self.size = size
-        self.rz_rad = rz_rad
 
     def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
         """Return one patch per sample [B, 1, 1, p, p], metres."""
@@ -103,6 +103,7 @@ class HeightView:
         return patches(pixels, chosen[:, :2], self.size, yaw)[:, None]
 
 
+@dataclass(frozen=True)
 class UprightView:
     """Projections at the chosen pixel and yaw: at the chosen z, or at every z if none is chosen.
 
@@ -112,12 +113,10 @@ class UprightView:
         size: rows and columns of the projections.
     """
 
+    grid: PoseGrid
+    pixel_m: float
+    size: int
     channels: ClassVar[int] = 3
-
-    def __init__(self, grid: PoseGrid, pixel_m: float, size: int) -> None:
-        self.grid = grid
-        self.pixel_m = pixel_m
-        self.size = size
 
     def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
         """Return projections [B, K, 3, p, p], voxels."""
@@ -130,6 +129,7 @@ class UprightView:
         return project_upright(patch, self.pixel_m, z, yaws[chosen[:, 2]])
 
 
+@dataclass(frozen=True)
 class TiltedView:
     """Projections at the chosen pixel, yaw and z: at the chosen ry, or at every ry if none is
     chosen, with every rx.
@@ -140,12 +140,10 @@ class TiltedView:
         size: rows and columns of the projections.
     """
 
+    grid: PoseGrid
+    pixel_m: float
+    size: int
     channels: ClassVar[int] = 3
-
-    def __init__(self, grid: PoseGrid, pixel_m: float, size: int) -> None:
-        self.grid = grid
-        self.pixel_m = pixel_m
-        self.size = size
 
     def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
         """Return projections [B, K, 3, p, p], voxels; ry is the outer index of the poses."""
