@@ -117,6 +117,9 @@ class CloseLoopActions:
 ANGLES = {0: (), 1: ("rz",), 2: ("rz", "rx"), 3: ("rz", "ry", "rx")}
 """The angles that the letters r of an open-loop sequence denote, by their number."""
 
+TILTS = ("ry", "rx")
+"""The angles that change sign when half a turn about the tool's own axis swaps its fingers."""
+
 MAX_TILT_RAD = math.pi / 2
 
 
@@ -228,25 +231,41 @@ class OpenLoopActions:
         ]
         return np.array(action, dtype=np.float32)
 
-    def axis(self, name: str, count: int) -> GridAxis:
+    def axis(self, name: str, count: int, limits: tuple[float, float] | None = None) -> GridAxis:
         """Return the grid of a component.
 
         Args:
             name: of the component. x and y take the centres of pixels, so that an image of the
-                workspace and the action share their grid; yaws start from zero.
+                workspace and the action share their grid; yaws start from zero; z and the tilts
+                span their limits, ends included.
             count: number of values.
+            limits: first and last value of z (metres) or a tilt (radians); None for the range of
+                the component.
 
         Raises:
-            ValueError: there is no such grid.
+            ValueError: there is no such component, it takes no limits, or the limits are not
+                increasing or exceed the component's range.
         """
-        if name in ("x", "y"):
-            low, high = self.bounds_m["xy".index(name)]
+        if name not in self.components or name == "p":
+            raise ValueError(f"no grid for the component {name!r}")
+        low, high = dict(zip(self.components, self.ranges, strict=True))[name]
+        if name in ("x", "y", "rz"):
+            if limits is not None:
+                raise ValueError(f"the grid of {name} spans its whole range and takes no limits")
             step = (high - low) / count
+            if name == "rz":
+                return GridAxis(low, step, count, high - low)
             return GridAxis(low + step / 2, step, count)
-        if name == "rz":
-            turn = math.pi if self.half_rotation else 2 * math.pi
-            return GridAxis(0.0, turn / count, count, turn)
-        raise ValueError(f"no grid for the component {name!r}")
+        first, last = (low, high) if limits is None else limits
+        # bounds may be rounded to float32
+        if not low - 1e-6 <= first < last <= high + 1e-6:
+            raise ValueError(
+                f"the grid of {name} must increase within [{low:g}, {high:g}], got "
+                f"[{first:g}, {last:g}]"
+            )
+        if count < 2:
+            raise ValueError(f"the grid of {name} needs at least two values, got {count}")
+        return GridAxis(first, (last - first) / (count - 1), count)
 
     def wrap(self, rz: float, ry: float, rx: float) -> tuple[float, float, float]:
         """Return the equivalent angles within the ranges; tilts are clipped to theirs.

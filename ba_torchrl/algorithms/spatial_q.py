@@ -112,9 +112,10 @@ class SpatialQ(Learner):
             self.images,
             components=tuple(name for name in actions.components if name != "p"),
             half_rotation=actions.half_rotation,
+            side_m=actions.bounds_m[0][1] - actions.bounds_m[0][0],
         )
         net = network.build(spec)
-        self.actions = SpatialActions(actions, net.levels)
+        self.actions = SpatialActions(actions, net.levels, net.limits)
         values = SpatialValues(net, self.actions, list(self.images))
         return values.to(self.problem.device)
 

@@ -1,23 +1,29 @@
-"""Augmented state representation: a pixel, then a yaw given that pixel (appendix D.2, G.1)."""
+"""The plain network that chooses a pixel, then a yaw, then height and tilts if the action has them
+(appendix D.2, G.1; "ASR")."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import torch
 import torch.nn.functional as F
-from pydantic import Field
 from torch import Tensor, nn
 
+from ba_torchrl.modules.asr_base import ASR, ASRNetworkConfig, PatchView
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.cnn import initialise_plain
 from ba_torchrl.modules.in_hand_encoders import InHandMap
-from ba_torchrl.modules.patches import centre_fit, patches
-from ba_torchrl.modules.spatial import Level, SpatialQNetwork, SpatialSpec
+from ba_torchrl.modules.patches import centre_fit
+from ba_torchrl.modules.pose_values import PoseValues, SceneMapVector
+from ba_torchrl.modules.pose_views import (
+    HeightView,
+    PoseGridConfig,
+    TiltedView,
+    UprightView,
+    is_six_dof,
+)
+from ba_torchrl.modules.spatial import SpatialSpec
 from ba_torchrl.modules.spatial_inputs import (
     UNET_STRIDE,
     SpatialImageConfig,
-    require_unet_size,
     require_yaw,
     select_primitive,
 )
@@ -25,55 +31,6 @@ from ba_torchrl.modules.trunk import scaled_width
 from ba_torchrl.modules.unet import PlainPixelValues
 
 _LARGEST_MAP = 8
-
-
-class ASRState(NamedTuple):
-    """Inputs of the second level besides the pixel: the images and the first level's features."""
-
-    pixels: Tensor
-    in_hand: Tensor
-    holding: Tensor
-    scene: Tensor
-
-
-class ASR(SpatialQNetwork):
-    """Two levels of choices: all pixels, then the yaws at the chosen pixel.
-
-    Both levels share the first level's feature map, so the second level's loss also trains the
-    first level's encoder.
-
-    Args:
-        positions: (pixels, in_hand, holding) -> (values [B, 1, H, W], scene feature map).
-        yaws: (patch [B, 1, p, p], in_hand, scene feature map, holding) -> values [B, yaws].
-        levels: pixels and yaws.
-        patch_size: rows and columns of the patch around the chosen pixel that the second level
-            sees.
-    """
-
-    def __init__(
-        self, positions: nn.Module, yaws: nn.Module, levels: tuple[Level, Level], patch_size: int
-    ) -> None:
-        super().__init__()
-        self.positions = positions
-        self.yaws = yaws
-        self.levels = levels
-        self.patch_size = patch_size
-
-    def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, ASRState]:
-        """Return the Q values [B, H, W] of the pixels, and the state for `later`."""
-        values, scene = self.positions(pixels, in_hand, holding)
-        return values.squeeze(1), ASRState(pixels, in_hand, holding, scene)
-
-    def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
-        """Return the Q values [B, yaws] at the chosen pixels [B, 2].
-
-        Raises:
-            ValueError: there is no such level.
-        """
-        if level != 1:
-            raise ValueError(f"the later level of this network is 1, got {level}")
-        patch = patches(state.pixels, chosen[:, :2], self.patch_size)
-        return self.yaws(patch, state.in_hand, state.scene, state.holding)
 
 
 class PlainYawValues(nn.Module):
@@ -129,51 +86,52 @@ class PlainYawValues(nn.Module):
         return select_primitive(self.values(F.relu(self.linear(x))), holding)
 
 
-class ASRNetworkConfig(SpatialImageConfig):
-    """Hyper-parameters of both ASR networks.
-
-    Args:
-        num_rotations: yaws, evenly spaced.
-        patch_size: rows and columns of the patch around a pixel that the yaw values depend on; None
-            for the size of the in-hand image (24 in the paper). If the two sizes differ, the
-            in-hand image is cropped or zero-padded to the patch size about its centre.
-    """
-
-    num_rotations: int = Field(default=16, ge=2)
-    patch_size: int | None = Field(default=None, ge=1)
-
-    def _layout(self, name: str, spec: SpatialSpec) -> tuple[tuple[Level, Level], int]:
-        """Return the levels and the patch's size.
-
-        Raises:
-            ValueError: a size does not fit, or the action has other components than x, y and rz.
-        """
-        require_yaw(name, spec)
-        require_unet_size(name, spec.image_size)
-        patch_size = self.patch_size or spec.in_hand_size
-        if (patch_size - spec.in_hand_size) % 2:
-            raise ValueError(
-                f"patch_size and in_hand_size must share a centre, so differ by an even number of "
-                f"pixels; got {patch_size} and {spec.in_hand_size}"
-            )
-        pixels = Level(("x", "y"), (spec.image_size, spec.image_size))
-        return (pixels, Level(("rz",), (self.num_rotations,))), patch_size
-
-
 @NETWORKS.register("asr")
-class ASRConfig(ASRNetworkConfig):
-    """Hyper-parameters of the plain network that chooses a pixel, then a yaw."""
+class ASRConfig(ASRNetworkConfig, PoseGridConfig):
+    """Hyper-parameters of the plain network that chooses one component after the other.
+
+    The hyper-parameters of z and the tilts apply to actions in six degrees of freedom only.
+    """
 
     def build(self, spec: SpatialSpec) -> ASR:
         """Return a freshly initialised network.
 
         Args:
-            spec: shapes and the action's components: x, y and rz.
+            spec: shapes and the action's components: x, y and rz, or x, y, z, rz, ry and rx.
 
         Raises:
             ValueError: a size does not fit, or the action has other components.
         """
-        levels, patch_size = self._layout("asr", spec)
+        if is_six_dof(spec):
+            return self._build_for_poses(spec)
+        require_yaw("asr", spec)
+        levels, patch_size = self._planar_layout("asr", spec)
         positions = PlainPixelValues(spec, self, maps=1)
         yaws = PlainYawValues(spec, self, self.num_rotations, patch_size, positions.scene_channels)
-        return ASR(positions, yaws, levels, patch_size)
+        return ASR(positions, [(PatchView(patch_size), yaws)], levels)
+
+    def _build_for_poses(self, spec: SpatialSpec) -> ASR:
+        """Return the network of five levels; every later level has one view and all its values."""
+        planar, patch_size = self._planar_layout("asr", spec)
+        levels = (*planar, *self.pose_levels())
+        grid = self.pose_grid(self.num_rotations, spec.half_rotation)
+        positions = PlainPixelValues(spec, self, maps=1)
+        views = (
+            HeightView(patch_size),
+            HeightView(patch_size, grid.rz_rad),
+            UprightView(grid, spec.pixel_m, patch_size),
+            TiltedView(grid._replace(rx_rad=(0.0,)), spec.pixel_m, patch_size),
+        )
+        in_voxels = self.in_voxels(spec.pixel_m)
+        heads = [
+            PoseValues(
+                spec,
+                in_voxels,
+                view.channels,
+                level.shape[0],
+                patch_size,
+                SceneMapVector(positions.scene_channels, spec.image_size, self.width),
+            )
+            for view, level in zip(views, levels[1:], strict=True)
+        ]
+        return ASR(positions, list(zip(views, heads, strict=True)), levels, self.limits)

@@ -9,14 +9,14 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.modules.asr import ASR, ASRNetworkConfig
+from ba_torchrl.modules.asr_base import ASR, ASRNetworkConfig, PatchView
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.cnn import initialise_plain
 from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
 from ba_torchrl.modules.equi_unet import EquivariantPixelValues
 from ba_torchrl.modules.in_hand_encoders import InHandVector
 from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, select_primitive
+from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, require_yaw, select_primitive
 from ba_torchrl.modules.steerable import (
     SteerableConv2d,
     SteerableLinear,
@@ -57,12 +57,34 @@ _TRUNKS = {
 which exact equivariance under quarter turns requires."""
 
 
+class InvariantSceneVector(nn.Sequential):
+    """A vector that does not change when the scene feature map rotates with the scene.
+
+    Two linear layers on the maximum and the mean of each channel.
+
+    Args:
+        channels: of the map, each invariant except for the positions.
+        width: factor on the layers' widths, 1024 and 512.
+    """
+
+    def __init__(self, channels: int, width: float) -> None:
+        wide, narrow = scaled_width(1024, width), scaled_width(512, width)
+        super().__init__(nn.Linear(2 * channels, wide), nn.ReLU(), nn.Linear(wide, narrow))
+        self.out_features = narrow
+
+    def forward(self, scene: Tensor) -> Tensor:
+        """Return float32 [B, out_features] of a map [B, C, h, w]."""
+        scene = scene.float()
+        return super().forward(
+            torch.cat([scene.amax(dim=(-2, -1)), scene.mean(dim=(-2, -1))], dim=1)
+        )
+
+
 class EquivariantYawValues(nn.Module):
     """Q values of yaws, equivariant under rotations of the patch.
 
-    The scene feature map and the in-hand image determine the coefficients of a dynamic filter, so
-    they have to be invariant. The scene feature map rotates with the scene; it is reduced to the
-    maximum and the mean of each of its channels.
+    Invariant vectors of the scene feature map and the in-hand image determine the coefficients of a
+    dynamic filter.
 
     Args:
         gspace: images and their symmetry group.
@@ -89,7 +111,7 @@ class EquivariantYawValues(nn.Module):
         super().__init__()
         if patch_size not in _TRUNKS:
             raise ValueError(
-                f"network 'equi_asr' takes a patch_size of {' or '.join(map(str, _TRUNKS))} "
+                f"equivariant yaw values take a patch_size of {' or '.join(map(str, _TRUNKS))} "
                 f"pixels, got {patch_size}; where the in-hand image has another size, set it"
             )
         self.config = config
@@ -108,12 +130,10 @@ class EquivariantYawValues(nn.Module):
         self.held = DynamicSteerableConv2d(gspace, gspace.regular_repr, fields, 1)
         self.values = SteerableLinear(gspace, types, [(out_repr, 2)])
 
-        wide, narrow = scaled_width(1024, config.width), scaled_width(512, config.width)
+        narrow = scaled_width(512, config.width)
         self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width)
         self.hand_linear = nn.Linear(self.hand.out_features, narrow)
-        self.scene_linear = nn.Sequential(
-            nn.Linear(2 * scene_channels, wide), nn.ReLU(), nn.Linear(wide, narrow)
-        )
+        self.scene = InvariantSceneVector(scene_channels, config.width)
         self.apply(initialise_plain)
         self.coefficients = filter_generator(2 * narrow, self.held)
 
@@ -136,9 +156,7 @@ class EquivariantYawValues(nn.Module):
 
     def _coefficients(self, in_hand: Tensor, scene: Tensor) -> Tensor:
         hand = self.hand_linear(self.hand(self.config.in_hand(in_hand)))
-        scene = scene.float()
-        scene = torch.cat([scene.amax(dim=(-2, -1)), scene.mean(dim=(-2, -1))], dim=1)
-        return self.coefficients(F.relu(torch.cat([self.scene_linear(scene), hand], dim=1)))
+        return self.coefficients(F.relu(torch.cat([self.scene(scene), hand], dim=1)))
 
 
 @NETWORKS.register("equi_asr")
@@ -164,11 +182,12 @@ class EquiASRConfig(ASRNetworkConfig):
             ImportError: escnn is missing; the message names the fix.
             ValueError: a size does not fit, or the action has other components.
         """
-        levels, patch_size = self._layout("equi_asr", spec)
+        require_yaw("equi_asr", spec)
+        levels, patch_size = self._planar_layout("equi_asr", spec)
         gspace = planar_rotations_and_flips(self.group_order)
         positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
         gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
         yaws = EquivariantYawValues(
             gspace, yaw_repr, spec, self, patch_size, positions.scene_channels
         )
-        return ASR(positions, yaws, levels, patch_size)
+        return ASR(positions, [(PatchView(patch_size), yaws)], levels)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from torch import Tensor, nn
@@ -23,6 +24,7 @@ class SpatialSpec:
         components: components of the action except its primitive, in the order of the action: a
             subset of x, y, z, rz, ry, rx.
         half_rotation: whether yaws half a turn apart are equivalent.
+        side_m: edge of the square workspace, which the heightmap covers.
 
     Raises:
         ValueError: x or y is missing.
@@ -31,6 +33,7 @@ class SpatialSpec:
     images: Mapping[str, ImageSpec]
     components: tuple[str, ...]
     half_rotation: bool = True
+    side_m: float = 0.4
 
     def __post_init__(self) -> None:
         if not {"x", "y"} <= set(self.components):
@@ -40,6 +43,11 @@ class SpatialSpec:
     def image_size(self) -> int:
         """Rows and columns of the heightmap."""
         return self.images[keys.PIXELS].size
+
+    @property
+    def pixel_m(self) -> float:
+        """Edge of a pixel of the heightmap."""
+        return self.side_m / self.image_size
 
     @property
     def in_hand_size(self) -> int:
@@ -73,6 +81,9 @@ class SpatialQNetwork(nn.Module, ABC):
     """
 
     levels: tuple[Level, ...]
+    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    """First and last value on the grids of z (metres) and the tilts (radians); components without
+    an entry span the range of the action."""
 
     @abstractmethod
     def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from pydantic import Field
@@ -30,6 +30,7 @@ class SpatialImageConfig(StrictModel):
         precision: number format of the convolutions, see `compute_dtype`. Values of actions, the
             fully connected layers and the filters' coefficients are always float32.
         height_scale_m: height that is scaled to one. The floor stays zero, like the padding.
+        voxel_scale: number of voxels of a projection that is scaled to one.
         width: factor on every layer's width; 1 is the reference's size.
     """
 
@@ -38,6 +39,7 @@ class SpatialImageConfig(StrictModel):
 
     precision: Precision = "auto"
     height_scale_m: float = Field(default=1.0, gt=0)
+    voxel_scale: float = Field(default=1.0, gt=0)
     width: float = Field(default=1.0, gt=0)
 
     def heights(self, images: Tensor) -> Tensor:
@@ -45,8 +47,18 @@ class SpatialImageConfig(StrictModel):
         return self.images(images if self.height_scale_m == 1 else images / self.height_scale_m)
 
     def in_hand(self, images: Tensor) -> Tensor:
-        """Return in-hand images [B, C, h, w] in the compute dtype, heights (C = 1) scaled."""
-        return self.heights(images) if images.shape[1] == 1 else self.images(images)
+        """Return scaled heights (C = 1) or projections [B, C, h, w] in the compute dtype."""
+        if images.shape[1] == 1:
+            return self.heights(images)
+        return self.images(images if self.voxel_scale == 1 else images / self.voxel_scale)
+
+    def in_voxels(self, pixel_m: float) -> Self:
+        """Return a copy that scales heights like projections: their unit is a voxel.
+
+        Args:
+            pixel_m: edge of a pixel and a voxel.
+        """
+        return self.model_copy(update={"height_scale_m": pixel_m * self.voxel_scale})
 
     def images(self, images: Tensor) -> Tensor:
         """Return images [B, C, H, W] in the compute dtype, channels-last."""

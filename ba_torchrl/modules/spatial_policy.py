@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from ba_torchrl.actions import PLACE, OpenLoopActions
+from ba_torchrl.actions import PLACE, TILTS, GridAxis, OpenLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.spatial import Level, SpatialQNetwork
 
@@ -26,15 +27,22 @@ class SpatialActions:
     Args:
         actions: the environment's action vector.
         levels: the levels of choices, in their order.
+        limits: first and last value on the grids of z and the tilts, see `OpenLoopActions.axis`.
 
     Raises:
-        ValueError: the components of the levels are not those of the action.
+        ValueError: the components of the levels are not those of the action, or the limits exceed
+            its bounds.
     """
 
-    def __init__(self, actions: OpenLoopActions, levels: Sequence[Level]) -> None:
+    def __init__(
+        self,
+        actions: OpenLoopActions,
+        levels: Sequence[Level],
+        limits: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+    ) -> None:
         self.actions = actions
         self.levels = tuple(levels)
-        chosen = [name for level in levels for name in level.components]
+        self.components = chosen = [name for level in levels for name in level.components]
         wanted = [name for name in actions.components if name != "p"]
         if sorted(chosen) != sorted(wanted):
             raise ValueError(
@@ -42,7 +50,7 @@ class SpatialActions:
                 f"{actions.sequence!r} has {', '.join(wanted)}"
             )
         self.axes = [
-            actions.axis(name, count)
+            actions.axis(name, count, limits.get(name))
             for level in levels
             for name, count in zip(level.components, level.shape, strict=True)
         ]
@@ -70,16 +78,32 @@ class SpatialActions:
         return action.float()
 
     def to_indices(self, action: Tensor) -> Tensor:
-        """Return the nearest indices, int64 [..., n], of actions [..., A]."""
+        """Return the nearest indices, int64 [..., n], of actions [..., A].
+
+        Where the yaw of the nearest index is half a turn from the nearest yaw, the fingers are
+        swapped, and the tilts are negated: except for the fingers, the tool keeps its pose.
+        """
+        is_swapped = self._swaps_fingers(action)
         columns = []
-        for place, axis in zip(self._positions, self.axes, strict=True):
-            index = ((action[..., place].double() - axis.first) / axis.step).round().long()
+        for name, place, axis in zip(self.components, self._positions, self.axes, strict=True):
+            value = action[..., place].double()
+            if name in TILTS:
+                value = torch.where(is_swapped, -value, value)
+            index = _nearest_step(value, axis)
             if axis.period is None:
                 index = index.clamp(0, axis.count - 1)
             else:
                 index = index.remainder(axis.count)
             columns.append(index)
         return torch.stack(columns, dim=-1)
+
+    def _swaps_fingers(self, action: Tensor) -> Tensor:
+        """Return whether the nearest indices swap the fingers, bool [...], of actions [..., A]."""
+        if "rz" not in self.components or not self.actions.half_rotation:
+            return torch.zeros(action.shape[:-1], dtype=torch.bool, device=action.device)
+        rz = self.components.index("rz")
+        step = _nearest_step(action[..., self._positions[rz]].double(), self.axes[rz])
+        return step.div(self.axes[rz].count, rounding_mode="floor").remainder(2) == 1
 
     def nearest(self, action: Tensor) -> Tensor:
         """Return the grid actions nearest to actions [..., A]; the primitive is unchanged."""
@@ -108,6 +132,11 @@ class SpatialActions:
     def unravel(self, flat: Tensor, level: int) -> Tensor:
         """Return the indices [..., m] of a choice [...] among a level's flattened values."""
         return torch.stack(torch.unravel_index(flat, self.levels[level].shape), dim=-1)
+
+
+def _nearest_step(values: Tensor, axis: GridAxis) -> Tensor:
+    """Return the nearest int64 numbers of steps from an axis' first value, not wrapped."""
+    return ((values - axis.first) / axis.step).round().long()
 
 
 class SpatialValues(nn.Module):
@@ -218,16 +247,15 @@ class SpatialPolicy(nn.Module):
     def _random_indices(self, pixels: Tensor) -> Tensor:
         """Return random choices, int64 [B, n]."""
         actions = self.values.actions
-        components = [name for level in actions.levels for name in level.components]
         count, width = len(pixels), pixels.shape[-1]
         weights = (pixels[:, 0] > OBJECT_HEIGHT_M).flatten(1).float().cpu()
         weights[weights.sum(dim=1) == 0] = 1.0
         pixel = torch.multinomial(weights, 1, generator=self._generator)[:, 0]
         columns = {"x": pixel // width, "y": pixel % width}
-        for name, axis in zip(components, actions.axes, strict=True):
+        for name, axis in zip(actions.components, actions.axes, strict=True):
             if name not in columns:
                 columns[name] = torch.randint(axis.count, (count,), generator=self._generator)
-        return torch.stack([columns[name] for name in components], dim=-1)
+        return torch.stack([columns[name] for name in actions.components], dim=-1)
 
 
 def spatial_policy(policy: SpatialPolicy) -> TensorDictModule:

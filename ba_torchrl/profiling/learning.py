@@ -44,27 +44,31 @@ OPEN_LOOP = {
     "task": "open_loop/block_stacking",
     "algorithm": {"name": "spatial_q", "demonstrations": "sdqfd", "batch_size": 16},
 }
+SIX_DOF = {**OPEN_LOOP, "env": {"action_sequence": "pxyzrrr", "in_hand_mode": "proj"}}
 
 
 def _learner(experiment: dict[str, Any], network: dict[str, Any], obs_size: int) -> Algorithm:
     """Return a learner with the expert's transitions in its replay."""
+    env = {**experiment.get("env", {}), "obs_size": obs_size}
     config = ExperimentConfig.parse(
         {
             **experiment,
-            "env": {"obs_size": obs_size},
+            "env": env,
             "network": network,
             "seed": SEED,
             "device": "cpu",
         }
     )
     algorithm = build_algorithm(config)
-    algorithm.on_demonstrations(_expert_episodes(config.task, obs_size, 20)[1])
+    algorithm.on_demonstrations(_expert_episodes(config.task, 20, env)[1])
     return algorithm
 
 
-def _expert_episodes(task: str, obs_size: int, episodes: int) -> tuple[float, list[TensorDict]]:
+def _expert_episodes(
+    task: str, episodes: int, settings: dict[str, Any]
+) -> tuple[float, list[TensorDict]]:
     """Return the image's largest value and the expert's episodes."""
-    env = make_vector_env(task, 1, parallel=False, obs_size=obs_size, seed=SEED, expert=True)
+    env = make_vector_env(task, 1, parallel=False, seed=SEED, expert=True, **settings)
     high = float(env.observation_spec[keys.PIXELS].space.high.max())
     played = collect_demonstrations(env, episodes, seed=SEED)
     env.close()
@@ -131,11 +135,33 @@ def plain_spatial_update(bench: Bench) -> list[Row]:
     )
 
 
+@measurement("learning/equi_deictic_sdqfd_update")
+def equivariant_pose_update(bench: Bench) -> list[Row]:
+    """Update of the paper's equivariant learner in six degrees of freedom, ramps' image sizes."""
+    return _update(
+        bench,
+        "SDQfD Equi Deictic ASR update, batch 16, 128 px, 24 px in hand",
+        _learner(SIX_DOF, {"name": "equi_deictic_asr"}, 128),
+        Budget("", None, None),
+    )
+
+
+@measurement("learning/cnn_pose_sdqfd_update")
+def plain_pose_update(bench: Bench) -> list[Row]:
+    """Update of the paper's plain learner in six degrees of freedom, ramps' image sizes."""
+    return _update(
+        bench,
+        "SDQfD CNN ASR update in six degrees of freedom, batch 16, 128 px, 24 px in hand",
+        _learner(SIX_DOF, {"name": "asr"}, 128),
+        Budget("", None, None),
+    )
+
+
 def _replay_memory(
     bench: Bench, task: str, codecs: Callable[[float], dict[str, ImageCodec]], budget: Budget
 ) -> list[Row]:
     """Memory of the expert's episodes in the replay, scaled to the full capacity."""
-    high, episodes = _expert_episodes(task, 128, bench.repeats)
+    high, episodes = _expert_episodes(task, bench.repeats, {"obs_size": 128})
     storage = FrameStorage(CAPACITY, codecs(high))
     stored = 0
     for number in bench.rounds():

@@ -13,13 +13,21 @@ from tests.specs import spatial_spec
 
 pytest.importorskip("escnn")
 
-XY, XYR = ("x", "y"), ("x", "y", "rz")
-NAMES = [name for name in NETWORKS if NETWORKS[name].control == "open_loop"]
+XY, XYR, POSE = ("x", "y"), ("x", "y", "rz"), ("x", "y", "z", "rz", "ry", "rx")
+NAMES = [
+    name
+    for name in NETWORKS
+    if NETWORKS[name].control == "open_loop" and name != "equi_deictic_asr"
+]
+EVERY = [*NAMES, "asr/pose", "equi_deictic_asr/pose"]
 SMALL = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
 
 
 def build(name, size=32, in_hand_size=24, channels=1, components=XYR, half=True, **fields):
     torch.manual_seed(0)
+    name, _, is_pose = name.partition("/")
+    if is_pose:
+        components, fields = POSE, {"num_z": 5, "num_tilts": 3, **fields}
     spec = spatial_spec(size, in_hand_size, channels, components, half)
     return NETWORKS[name](**{**SMALL, **fields}).build(spec)
 
@@ -30,14 +38,17 @@ def batch(size=32, in_hand_size=24, channels=1, n=4, seed=0):
         torch.rand(n, 1, size, size, generator=generator),
         torch.rand(n, channels, in_hand_size, in_hand_size, generator=generator),
         torch.arange(n)[:, None] % 3 == 1,
-        torch.randint(size, (n, 2), generator=generator),
+        torch.cat(
+            [torch.randint(limit, (n, 2), generator=generator) for limit in (size, 4, 3)], dim=1
+        ),
     )
 
 
 def values_of(network, pixels, in_hand, holding, chosen):
     """The Q values of all levels."""
     first, state = network.first(pixels, in_hand, holding)
-    return [first, *(network.later(n, state, chosen) for n in range(1, len(network.levels)))]
+    later = range(1, len(network.levels))
+    return [first, *(network.later(n, state, chosen[:, : n + 1]) for n in later)]
 
 
 def count(module):
@@ -141,7 +152,7 @@ def test_rot_fcn_supports_ninety_pixels_as_in_the_paper():
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_values_depend_on_every_input_and_on_their_own_sample_only(name, channels):
     network = build(name, channels=channels)
     pixels, in_hand, holding, chosen = batch(channels=channels)
@@ -181,7 +192,7 @@ def test_pick_values_do_not_depend_on_the_in_hand_image(name):
 
 
 @pytest.mark.parametrize("primitive", [False, True])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_a_batch_with_a_single_primitive_has_gradients(name, primitive):
     network = build(name)
     pixels, in_hand, _, chosen = batch()
@@ -234,7 +245,7 @@ def test_the_second_level_depends_on_the_chosen_pixel(name):
         state = network.first(pixels, in_hand, holding)[1]
         here, there = network.later(1, state, chosen), network.later(1, state, (chosen + 16) % 32)
     assert ((here - there).abs().amax(dim=1) > 1e-3 * here.std()).all()
-    with pytest.raises(ValueError, match="later level of this network is 1"):
+    with pytest.raises(ValueError, match="later levels of this network are 1 to 1, got 2"):
         network.later(2, state, chosen)
 
 
@@ -243,7 +254,7 @@ def test_a_network_with_one_level_has_no_later_level():
         build("fcn").later(1, None, torch.zeros(4, 2, dtype=torch.long))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_bfloat16_is_close_to_float32(name):
     exact, rough = build(name), build(name, precision="bfloat16")
     rough.load_state_dict(exact.state_dict())
@@ -285,7 +296,7 @@ def test_scaled_heights_give_the_same_values(name):
         )
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_copies_and_pickles_are_small_and_equal(name):
     """Policies are copied for evaluation and sent to processes that may lack escnn."""
     network, inputs = build(name), batch()
@@ -301,7 +312,7 @@ def test_copies_and_pickles_are_small_and_equal(name):
             assert torch.equal(q, p)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY)
 def test_functional_calls_use_the_given_parameters(name):
     """TorchRL's target networks run the same module on other weights."""
 
@@ -332,8 +343,8 @@ def test_functional_calls_use_the_given_parameters(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_unsupported_images_and_actions_are_refused(name):
-    with pytest.raises(ValueError, match="x, y and rz, not z, ry, rx"):
-        build(name, components=("x", "y", "z", "rz", "ry", "rx"))
+    with pytest.raises(ValueError, match="x, y and rz, not z; use"):
+        build(name, components=("x", "y", "z", "rz"))
     with pytest.raises(ValidationError):
         NETWORKS[name](widht=2)
     with pytest.raises(ValidationError):

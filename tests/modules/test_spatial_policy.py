@@ -100,8 +100,84 @@ def test_an_action_is_converted_to_the_nearest_pixel_and_yaw():
 def test_levels_must_have_the_components_of_the_action():
     with pytest.raises(ValueError, match="chooses x, y, rz; the action sequence 'pxy' has x, y"):
         layout("pxy")
-    with pytest.raises(ValueError, match="no grid for the component 'z'"):
-        layout("pxyz", (Level(("x", "y", "z"), (6, 8, 5)),))
+
+
+SIX = (
+    PIXELS,
+    YAWS,
+    *(Level((name,), (count,)) for name, count in [("z", 5), ("ry", 7), ("rx", 3)]),
+)
+LIMITS = {"z": (0.02, 0.2), "ry": (-0.3, 0.3), "rx": (-0.4, 0.4)}
+
+
+def six(half_rotation=True, sequence="pxyzrrr"):
+    return SpatialActions(OpenLoopActions(sequence, BOUNDS, half_rotation), SIX, LIMITS)
+
+
+@pytest.mark.parametrize("half_rotation", [True, False])
+@pytest.mark.parametrize("sequence", ["pxyzrrr", "rzrpyxr"])
+def test_indices_of_six_degrees_of_freedom_are_converted_both_ways(sequence, half_rotation):
+    actions = six(half_rotation, sequence)
+    every = torch.tensor(list(itertools.product(*(range(axis.count) for axis in actions.axes))))
+    action = actions.to_action(every, torch.ones(len(every), 1, dtype=torch.bool))
+    assert torch.equal(actions.to_indices(action), every)
+    assert torch.equal(actions.nearest(action), action)
+    named = dict(zip(actions.actions.components, action.T, strict=True))
+    assert (named["p"] == 1).all()
+    for name, count in (("z", 5), ("ry", 7), ("rx", 3)):
+        values = torch.linspace(*LIMITS[name], count)
+        torch.testing.assert_close(named[name].unique(), values, atol=1e-6, rtol=0)
+
+
+def tool(action):
+    """Return the rotation matrix Rz Ry Rx of an action (p, x, y, z, rz, ry, rx)."""
+    (cz, cy, cx), (sz, sy, sx) = (f(action[4:].double()).tolist() for f in (torch.cos, torch.sin))
+    turns = (
+        [[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]],
+        [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]],
+        [[1, 0, 0], [0, cx, -sx], [0, sx, cx]],
+    )
+    return torch.linalg.multi_dot([torch.tensor(turn, dtype=torch.float64) for turn in turns])
+
+
+def test_a_yaw_close_to_half_a_turn_negates_the_tilts():
+    """The nearest grid action is then half a turn about the tool's own axis from the action."""
+    actions = six()
+    over = torch.tensor([0.0, 0.4, 0.0, 0.065, math.pi - 0.01, 0.2, -0.4])
+    assert actions.to_indices(over)[2:].tolist() == [0, 1, 1, 2]
+    near = actions.nearest(over)
+    expected = torch.tensor([0.0, near[1], near[2], 0.065, 0.0, -0.2, 0.4])
+    torch.testing.assert_close(near, expected, atol=1e-6, rtol=0)
+    swap = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(tool(near), tool(over) @ swap, atol=0.011, rtol=0)
+    unwrapped = over.clone()
+    unwrapped[4] -= math.pi / 4 * 0.6
+    assert actions.to_indices(unwrapped)[2:].tolist() == [3, 1, 5, 0]
+
+
+def test_a_yaw_close_to_a_whole_turn_keeps_the_tilts():
+    actions = six(half_rotation=False)
+    over = torch.tensor([0.0, 0.4, 0.0, 0.065, 2 * math.pi - 0.01, 0.2, -0.4])
+    assert actions.to_indices(over)[2:].tolist() == [0, 1, 5, 0]
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"z": (0.0, 0.2)}, r"grid of z must increase within \[0.01, 0.25\], got \[0, 0.2\]"),
+        ({"z": (0.2, 0.02)}, "grid of z must increase"),
+        ({"ry": (-0.3, 2.0)}, "grid of ry must increase within"),
+        ({"rz": (0.0, 1.0)}, "grid of rz spans its whole range"),
+    ],
+)
+def test_grids_outside_the_bounds_of_the_action_are_refused(limits, message):
+    with pytest.raises(ValueError, match=message):
+        SpatialActions(OpenLoopActions("pxyzrrr", BOUNDS), SIX, limits)
+
+
+def test_a_grid_of_z_without_limits_spans_the_bounds():
+    axis = OpenLoopActions("pxyzrrr", BOUNDS).axis("z", 5)
+    assert (axis.first, axis.first + 4 * axis.step) == pytest.approx((0.01, 0.25))
 
 
 def test_greedy_chooses_the_best_pixel_and_then_its_best_yaw():

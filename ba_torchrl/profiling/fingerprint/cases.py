@@ -94,6 +94,13 @@ SMALL_NETWORK: dict[str, dict[str, Any]] = {
         name: {"network.width": 0.25, "network.num_rotations": 4}
         for name in ("asr", "equi_asr", "equi_fcn", "fcn", "rot_fcn")
     },
+    "equi_deictic_asr": {
+        "network.width": 0.25,
+        "network.num_rotations": 4,
+        "network.num_z": 6,
+        "env.action_sequence": "pxyzrrr",
+        "env.in_hand_mode": "proj",
+    },
 }
 
 TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
@@ -168,6 +175,12 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     ),
     "whole rotation": (OPEN_LOOP_TASK, "sdqfd", "asr", {"env__half_rotation": False}),
     "in_hand proj": (OPEN_LOOP_TASK, "sdqfd", "asr", {"env__in_hand_mode": "proj"}),
+    "six degrees of freedom": (
+        OPEN_LOOP_TASK,
+        "sdqfd",
+        "asr",
+        {"env__action_sequence": "pxyzrrr", "env__in_hand_mode": "proj"},
+    ),
     "deconstruction": (
         "open_loop/house_building_1",
         "sdqfd",

@@ -14,6 +14,7 @@ import numpy as np
 
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.geometry import euler_matrix
+from ba_torchrl.sim.vision.voxels import project
 
 IN_HAND_MODES: Registry[type[InHandImage]] = Registry("in_hand_mode", "ba_torchrl.sim")
 
@@ -93,14 +94,8 @@ class ProjectedImage(InHandImage):
         heights = crop(view.before, view.center_px, size).round(5)
         middle = (size - 1) / 2
         levels = view.z_m + (np.arange(size) - middle) * view.pixel_m
-        occupied = np.argwhere(heights[:, :, None] > levels) - middle
         rotation = np.array(euler_matrix(view.rz_rad, view.ry_rad, view.rx_rad))
-        cells = np.rint(occupied @ rotation + middle).astype(np.int64)  # in the tool frame
-        cells = cells[((cells >= 0) & (cells < size)).all(axis=1)]
-        voxels = np.zeros((size, size, size), dtype=bool)
-        voxels[tuple(cells.T)] = True
-        voxels = _median_filter(voxels)
-        return np.stack([voxels.sum(axis=axis) for axis in range(3)]).astype(np.float64)
+        return project(heights, levels, rotation)
 
 
 def crop(
@@ -133,16 +128,3 @@ def crop(
         + (1 - u) * v * padded[i, j + 1]
         + u * v * padded[i + 1, j + 1]
     )
-
-
-def _median_filter(voxels: np.ndarray) -> np.ndarray:
-    """Return the median filter with a kernel of 2 x 2 x 2 voxels, where a tie is occupied.
-
-    The kernel of voxel (i, j, k) starts at (i - 1, j - 1, k - 1); the border is replicated.
-    """
-    padded = np.pad(voxels, ((1, 0), (1, 0), (1, 0)), mode="edge").astype(np.int8)
-    n = voxels.shape[0]
-    count = sum(
-        padded[a : a + n, b : b + n, c : c + n] for a in (0, 1) for b in (0, 1) for c in (0, 1)
-    )
-    return count >= 4

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView, crop
+from tests.sim.vision.voxel_loop import project_by_loops
 
 SIZE = 24
 PIXEL_M = 0.4 / 128
@@ -122,6 +123,27 @@ def test_proj_counts_the_voxels_of_a_box():
         np.testing.assert_array_equal(image[axis], smooth.sum(axis=axis))
     # a tie of the median counts as filled, which adds one level
     np.testing.assert_array_equal(image[2][10:14, 11:13], (levels < height).sum() + 1)
+
+
+@pytest.mark.parametrize(
+    ("size", "angles"),
+    [
+        (12, (0.0, 0.0, 0.0)),
+        (12, (math.pi / 4, 0.0, 0.0)),
+        (12, (3 * math.pi / 4, 0.0, math.pi / 12)),
+        (12, (math.pi / 2, -math.pi / 8, 0.0)),
+        (13, (0.7, 0.3, -0.4)),
+        (14, (2.9, -0.35, 0.2)),
+        (24, (1.1, 0.2, 0.3)),
+    ],
+    ids=str,
+)
+def test_proj_equals_a_loop_over_voxels(noise, size, angles):
+    heights = crop(noise, (64.0, 64.0), size).round(5)
+    rz, ry, rx = angles
+    image = draw("proj", noise, z_m=0.05, rz=rz, ry=ry, rx=rx, size=size)
+    np.testing.assert_array_equal(image, project_by_loops(heights, PIXEL_M, 0.05, *angles))
+    assert 0.1 * size**3 < image[0].sum() < 0.9 * size**3
 
 
 def test_proj_rotates_with_the_gripper():

@@ -1,5 +1,6 @@
 """The benchmarks in ``configs`` have the paper's values."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -129,3 +130,27 @@ def test_open_loop_benchmarks_have_the_values_of_the_paper(name):
         assert config.skips(task=PICK, algorithm="dqn", network="fcn")
         assert not config.skips(task=PICK, algorithm="dqn", network="equi_asr")
         assert not config.skips(task=PICK, algorithm="sdqfd", network="fcn")
+
+
+def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_paper():
+    config, common, runs = shipped("open_loop_6d", "network.width=0.1")
+    ramps = [task for task in config.tasks if task.startswith("ramp/")]
+    bumps = [task for task in config.tasks if task.startswith("bump/")]
+    assert (len(ramps), len(bumps)) == (7, 2)
+    assert set(config.tasks) <= set(TASKS)
+    assert len(runs) == 9 * (2 + 3) * 4
+    assert (common["total_updates"], common["eval_every"], common["num_envs"]) == (20_000, 500, 5)
+    for run in runs:
+        env, network, algorithm = run.env_config, run.network_config, run.algorithm_config
+        is_bump = run.task in bumps
+        assert (env.action_sequence, env.in_hand_mode) == ("pxyzrrr", "proj")
+        assert (env.obs_size, env.in_hand_size) == (128, 40 if is_bump else 24)
+        assert run.demonstrations == (200 if is_bump else 1000)
+        assert (network.num_rotations, network.num_z, network.num_tilts) == (16, 36, 7)
+        assert (network.min_z_m, network.max_z_m, network.patch_size) == (0.02, 0.20, None)
+        assert network.max_tilt_rad == pytest.approx(math.pi / 8)
+        assert (algorithm.learning_rate, algorithm.weight_decay) == (1e-4, 1e-5)
+        assert (algorithm.gamma, algorithm.batch_size) == (0.95, 16)
+    labels = {run.label for run in runs}
+    assert {"sdqfd equi_deictic_asr", "sdqfd asr", "adet equi_deictic_asr"} < labels
+    assert "adet asr" not in labels

@@ -1,0 +1,67 @@
+"""The equivariant network in six degrees of freedom (appendix D.2; "Equivariant Deictic ASR")."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from ba_torchrl.modules.asr_base import ASR, ASRNetworkConfig, PatchView
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.equi_asr import EquivariantYawValues, InvariantSceneVector
+from ba_torchrl.modules.equi_unet import EquivariantPixelValues
+from ba_torchrl.modules.pose_values import PoseValues
+from ba_torchrl.modules.pose_views import PoseGridConfig, TiltedView, UprightView, is_six_dof
+from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.steerable import planar_rotations_and_flips, planar_yaws
+
+
+@NETWORKS.register("equi_deictic_asr")
+class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
+    """Hyper-parameters of the network that sees the scene from every candidate pose.
+
+    Pixels and yaws are chosen by the equivariant networks of 'equi_asr'. Each z, ry and rx is
+    evaluated on the projections of the scene at the pose with that value, by shared weights; the
+    features of the scene are invariant, so these values do not change when scene and yaw rotate
+    together.
+
+    Args:
+        group_order: number of rotations of the dihedral group of the pixel values.
+    """
+
+    group_order: int = Field(default=4, ge=2)
+
+    def build(self, spec: SpatialSpec) -> ASR:
+        """Return a freshly initialised network.
+
+        Args:
+            spec: shapes and the action's components: x, y, z, rz, ry and rx.
+
+        Raises:
+            ImportError: escnn is missing; the message names the fix.
+            ValueError: a size does not fit, or the action has other components.
+        """
+        name = "equi_deictic_asr"
+        if not is_six_dof(spec):
+            raise ValueError(
+                f"network {name!r} chooses x, y, z, rz, ry and rx, and the action has "
+                f"{', '.join(spec.components)}; use 'equi_asr', or the action_sequence 'pxyzrrr'"
+            )
+        planar, patch_size = self._planar_layout(name, spec)
+        levels = (*planar, *self.pose_levels())
+        in_voxels = self.in_voxels(spec.pixel_m)
+        gspace = planar_rotations_and_flips(self.group_order)
+        positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
+        gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
+        yaws = EquivariantYawValues(
+            gspace, yaw_repr, spec, in_voxels, patch_size, positions.scene_channels
+        )
+        grid = self.pose_grid(self.num_rotations, spec.half_rotation)
+        views = (
+            UprightView(grid, spec.pixel_m, patch_size),
+            TiltedView(grid._replace(rx_rad=(0.0,)), spec.pixel_m, patch_size),
+            TiltedView(grid, spec.pixel_m, patch_size),
+        )
+        later = [(PatchView(patch_size), yaws)]
+        for view in views:
+            scene = InvariantSceneVector(positions.scene_channels, self.width)
+            later.append((view, PoseValues(spec, in_voxels, view.channels, 1, patch_size, scene)))
+        return ASR(positions, later, levels, self.limits)

@@ -1,0 +1,156 @@
+"""What the levels of six degrees of freedom see of the scene: patches and projections at poses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from ba_torchrl.config import StrictModel
+from ba_torchrl.modules.patches import patches
+from ba_torchrl.modules.projections import cell_table, project, project_upright
+from ba_torchrl.modules.spatial import Level, SpatialSpec
+
+POSE_COMPONENTS = ("x", "y", "rz", "z", "ry", "rx")
+"""Components of six degrees of freedom in the order of their choice (appendix D.2)."""
+
+
+class PoseGrid(NamedTuple):
+    """The values of each component, by index."""
+
+    z_m: tuple[float, ...]
+    rz_rad: tuple[float, ...]
+    ry_rad: tuple[float, ...]
+    rx_rad: tuple[float, ...]
+
+
+def is_six_dof(spec: SpatialSpec) -> bool:
+    """Return whether the action has a position and three angles."""
+    return set(spec.components) == set(POSE_COMPONENTS)
+
+
+class PoseGridConfig(StrictModel):
+    """Hyper-parameters of the levels of z and the tilts; the defaults are the paper's.
+
+    Args:
+        num_z: heights of the tool, evenly spaced.
+        min_z_m: least height.
+        max_z_m: greatest height.
+        num_tilts: values of ry, and of rx, evenly spaced.
+        max_tilt_rad: greatest tilt; the least is its negative.
+    """
+
+    num_z: int = Field(default=36, ge=2)
+    min_z_m: float = 0.02
+    max_z_m: float = 0.20
+    num_tilts: int = Field(default=7, ge=2)
+    max_tilt_rad: float = Field(default=math.pi / 8, gt=0)
+
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """First and last value on the grids of z and the tilts."""
+        tilts = (-self.max_tilt_rad, self.max_tilt_rad)
+        return {"z": (self.min_z_m, self.max_z_m), "ry": tilts, "rx": tilts}
+
+    def pose_levels(self) -> tuple[Level, Level, Level]:
+        """Return the levels of z, ry and rx."""
+        counts = {"z": self.num_z, "ry": self.num_tilts, "rx": self.num_tilts}
+        return tuple(Level((name,), (count,)) for name, count in counts.items())
+
+    def pose_grid(self, num_rotations: int, half_rotation: bool) -> PoseGrid:
+        """Return the values of z and the angles.
+
+        Args:
+            num_rotations: number of yaws.
+            half_rotation: whether the yaws span half a turn.
+        """
+        turn = math.pi if half_rotation else 2 * math.pi
+        values = {
+            level.components[0]: _spaced(*self.limits[level.components[0]], level.shape[0])
+            for level in self.pose_levels()
+        }
+        yaws = tuple(i * (turn / num_rotations) for i in range(num_rotations))
+        return PoseGrid(values["z"], yaws, values["ry"], values["rx"])
+
+
+def _spaced(first: float, last: float, count: int) -> tuple[float, ...]:
+    step = (last - first) / (count - 1)
+    return tuple(first + i * step for i in range(count))
+
+
+@dataclass(frozen=True)
+class HeightView:
+    """Heights around the chosen pixel, rotated into the chosen yaw if yaws are given.
+
+    Args:
+        size: rows and columns of the patch.
+        rz_rad: yaw of each index; None for the axes of the scene.
+    """
+
+    size: int
+    rz_rad: tuple[float, ...] | None = None
+    channels: ClassVar[int] = 1
+
+    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+        """Return one patch per sample [B, 1, 1, p, p], metres."""
+        yaw = None
+        if self.rz_rad is not None:
+            yaw = torch.tensor(self.rz_rad, dtype=pixels.dtype, device=pixels.device)[chosen[:, 2]]
+        return patches(pixels, chosen[:, :2], self.size, yaw)[:, None]
+
+
+@dataclass(frozen=True)
+class UprightView:
+    """Projections at the chosen pixel and yaw: at the chosen z, or at every z if none is chosen.
+
+    Args:
+        grid: values of the components.
+        pixel_m: edge of a pixel.
+        size: rows and columns of the projections.
+    """
+
+    grid: PoseGrid
+    pixel_m: float
+    size: int
+    channels: ClassVar[int] = 3
+
+    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+        """Return projections [B, K, 3, p, p], voxels."""
+        patch = patches(pixels, chosen[:, :2], self.size)[:, 0]
+        heights, yaws = (
+            torch.tensor(values, dtype=torch.float64, device=pixels.device)
+            for values in (self.grid.z_m, self.grid.rz_rad)
+        )
+        z = heights.expand(len(patch), -1) if chosen.shape[1] == 3 else heights[chosen[:, 3:4]]
+        return project_upright(patch, self.pixel_m, z, yaws[chosen[:, 2]])
+
+
+@dataclass(frozen=True)
+class TiltedView:
+    """Projections at the chosen pixel, yaw and z: at the chosen ry, or at every ry if none is
+    chosen, with every rx.
+
+    Args:
+        grid: values of the components; a single rx of zero for views before rx is chosen.
+        pixel_m: edge of a pixel.
+        size: rows and columns of the projections.
+    """
+
+    grid: PoseGrid
+    pixel_m: float
+    size: int
+    channels: ClassVar[int] = 3
+
+    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+        """Return projections [B, K, 3, p, p], voxels; ry is the outer index of the poses."""
+        patch = patches(pixels, chosen[:, :2], self.size)[:, 0]
+        table = cell_table(*self.grid[1:], self.size, pixels.device)
+        cells = table[chosen[:, 2], *chosen[:, 4:].unbind(1)]
+        cells = cells.reshape(len(patch), -1, *cells.shape[-3:])
+        heights = torch.tensor(self.grid.z_m, dtype=torch.float64, device=pixels.device)
+        z = heights[chosen[:, 3:4]].expand(-1, cells.shape[1])
+        return project(patch, self.pixel_m, z, cells)

@@ -1,0 +1,131 @@
+"""The deictic network in six degrees of freedom under rotations of the scene."""
+
+import pytest
+import torch
+
+pytest.importorskip("escnn")
+
+from ba_torchrl.modules.base import NETWORKS
+from tests.specs import spatial_spec
+
+SIZE = 64
+COMPONENTS = ("x", "y", "z", "rz", "ry", "rx")
+FIELDS = {
+    "width": 0.125,
+    "precision": "float32",
+    "num_rotations": 8,
+    "num_z": 6,
+    "num_tilts": 3,
+    "height_scale_m": 0.05,
+    "voxel_scale": 10.0,
+}
+
+
+def build(name="equi_deictic_asr", half_rotation=False):
+    torch.manual_seed(0)
+    return NETWORKS[name](**FIELDS).build(spatial_spec(SIZE, 24, 3, COMPONENTS, half_rotation))
+
+
+def batch(n=4, seed=0, yaws=8):
+    """Rough heightmaps with values at many levels, in-hand images, and one choice each."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.rand(n, 1, 16, 16, generator=generator) * 0.15
+    pixels = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
+    holding = torch.arange(n)[:, None] % 2 == 0
+    in_hand = torch.randint(24, (n, 3, 24, 24), generator=generator) * holding[..., None, None]
+    limits = (SIZE, SIZE, yaws, 6, 3, 3)
+    chosen = torch.stack([torch.randint(k, (n,), generator=generator) for k in limits], dim=1)
+    return pixels, in_hand.float(), holding, chosen
+
+
+def train(network, steps=4):
+    """Take a few optimiser steps towards random targets, so that biases are not zero."""
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3)
+    before = [parameter.detach().clone() for parameter in network.parameters()]
+    for step in range(steps):
+        *observation, chosen = batch(seed=step + 10)
+        values = values_of(network, observation, chosen)
+        loss = sum((q - torch.rand_like(q)).square().mean() for q in values)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert all(not torch.equal(p, q) for p, q in zip(network.parameters(), before, strict=True))
+
+
+def values_of(network, observation, chosen):
+    first, state = network.first(*observation)
+    return [first, *(network.later(n, state, chosen[:, : n + 1]) for n in range(1, 5))]
+
+
+def turned(observation, chosen, quarters, yaw_steps):
+    """The scene after quarter turns by torch.rot90, and the choices that rotate with it."""
+    pixels, in_hand, holding = observation
+    numbers = torch.arange(SIZE * SIZE).reshape(SIZE, SIZE)
+    position = torch.empty(SIZE * SIZE, dtype=torch.long)
+    position[torch.rot90(numbers, quarters).flatten()] = torch.arange(SIZE * SIZE)
+    pixel = position[chosen[:, 0] * SIZE + chosen[:, 1]]
+    moved = chosen.clone()
+    moved[:, 0], moved[:, 1] = pixel // SIZE, pixel % SIZE
+    moved[:, 2] = (chosen[:, 2] + yaw_steps) % 8
+    return (torch.rot90(pixels, quarters, (-2, -1)), in_hand, holding), moved
+
+
+def spread(values):
+    """Return the standard deviation of the values of a sample."""
+    return float((values - values.mean(dim=-1, keepdim=True)).std())
+
+
+def assert_equal(actual, expected):
+    """Compare to a small part of the spread, since constants are equivariant as well."""
+    assert spread(expected) > 1e-4
+    torch.testing.assert_close(actual, expected, atol=5e-3 * spread(expected), rtol=0)
+
+
+def assert_different(actual, expected):
+    assert (actual - expected).std() > 0.03 * spread(expected)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_rotating_the_scene_turns_pixels_shifts_yaws_and_keeps_the_other_values(quarters, trained):
+    network = build()
+    if trained:
+        train(network)
+    *observation, chosen = batch()
+    with torch.no_grad():
+        pixels, yaws, *others = values_of(network, observation, chosen)
+        found = values_of(network, *turned(observation, chosen, quarters, 2 * quarters))
+        assert_equal(found[0], torch.rot90(pixels, quarters, (-2, -1)))
+        assert_equal(found[1], yaws.roll(2 * quarters, dims=1))
+        for actual, expected in zip(found[2:], others, strict=True):
+            assert_equal(actual, expected)
+        # a yaw that does not rotate with the scene sees other projections
+        other = values_of(network, *turned(observation, chosen, quarters, 0))
+        for actual, expected in zip(other[2:], others, strict=True):
+            assert_different(actual, expected)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_a_quarter_turn_without_the_wrap_of_half_a_turn(trained):
+    """Yaws of less than a quarter turn keep the fingers in place."""
+    network = build(half_rotation=True)
+    if trained:
+        train(network)
+    *observation, chosen = batch(yaws=4)
+    with torch.no_grad():
+        _, yaws, *others = values_of(network, observation, chosen)
+        found = values_of(network, *turned(observation, chosen, 1, 4))
+    assert_equal(found[1], yaws.roll(4, dims=1))
+    for actual, expected in zip(found[2:], others, strict=True):
+        assert_equal(actual, expected)
+
+
+def test_the_plain_network_is_not_equivariant():
+    network = build("asr")
+    *observation, chosen = batch()
+    with torch.no_grad():
+        values = values_of(network, observation, chosen)
+        found = values_of(network, *turned(observation, chosen, 1, 2))
+    assert_different(found[1], values[1].roll(2, dims=1))
+    for actual, expected in zip(found[2:], values[2:], strict=True):
+        assert_different(actual, expected)
