@@ -88,13 +88,11 @@ class ManipulationEnv(EnvBase):
         self._conditions: dict[str, bool] | None = None
         """The conditions of success after the last step, None before the first."""
         self._step_count = 0
-        self._episode = 0
         self.faults = 0
         """Number of simulator faults since construction."""
         self._consecutive_faults = 0
         self.on_contact: Callable[[], None] | None = None
         """Called in an open-loop step at each grasp and before each release, for videos."""
-        self.base_seed = 0
         self._set_seed(config.seed)
         self._make_specs()
         self._check_feasible()
@@ -194,8 +192,7 @@ class ManipulationEnv(EnvBase):
         """Return an RGB image of the scene, [height, width, 3] uint8."""
         world = self._rendered_world(self.scene)
         terrain = self.scene.task.terrain
-        hand = self.hand_point.above(terrain)
-        viewpoint = scene_viewpoint(world, terrain, hand, width / height)
+        viewpoint = scene_viewpoint(world, terrain, self.hand_point.above(terrain), width / height)
         floor = self.config.floor_color or DEFAULT_FLOOR_RGB
         return render_rgb(world, viewpoint, width, height, floor_rgb=floor)
 

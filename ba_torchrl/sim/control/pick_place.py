@@ -49,8 +49,7 @@ class PickPlace:
         robot: the robot.
         teleport: teleport the arm, the fingers and the held body where they have no contacts.
         opening: of the fingers before a pick and after a place, 0 to 1.
-        top_down: approach vertically even with a tilted tool, instead of along the z axis of the
-            tool.
+        top_down: approach vertically even with a tilted tool, not along its z axis.
         surface: support surface; None means the floor of the world.
         limits: distances, accelerations and step counts.
     """
@@ -79,7 +78,7 @@ class PickPlace:
         """Pose of the held body in the tool frame."""
         self.is_out_of_reach = False
         """Whether the last pick or place was out of reach, so that the arm did not move."""
-        self.on_contact: Callable[[], None] | None = None
+        self.on_contact: Callable[[], None] = lambda: None
         """Called when the fingers have closed for a pick and before they open for a release."""
 
     def reset(self) -> None:
@@ -105,7 +104,7 @@ class PickPlace:
         if self._approach(self._clear_of_surface(position, rotation), rotation, 0.0):
             self._close_fingers()
             grasps = self._touched_poses()
-            self._notify_contact()
+            self.on_contact()
             reached = robot.tool_frame().position
             above = self._approach_point(reached, rotation, limits.lift_height_m)
             self.motion.move_straight(reached, above, rotation, None, limits.min_motion_steps)
@@ -131,12 +130,10 @@ class PickPlace:
             rotation: of the tool.
         """
         if self._approach(position, rotation, self.limits.pre_place_height_m):
-            reached = self.robot.tool_frame().position
-            down = self._approach_point(reached, rotation, -self.limits.pre_place_height_m)
-            self.motion.move_straight(
-                reached, down, rotation, self.held, self.limits.lowering_steps
-            )
-            self._notify_contact()
+            reached, limits = self.robot.tool_frame().position, self.limits
+            down = self._approach_point(reached, rotation, -limits.pre_place_height_m)
+            self.motion.move_straight(reached, down, rotation, self.held, limits.lowering_steps)
+            self.on_contact()
             self._detach()
             self._open_fingers()
             if not self.teleport:
@@ -151,20 +148,12 @@ class PickPlace:
         return HeldState(held, self.grasp)
 
     def set_state(self, state: HeldState) -> None:
-        """Restore the held body and its pose in the tool frame.
-
-        Args:
-            state: from `get_state`, in a world with the same bodies.
-        """
+        """Restore the state of `get_state`, of a world with the same bodies."""
         self._detach()
         self.held = None if state.held is None else self.world.bodies[state.held]
         self.grasp = state.grasp
         if self.held is not None:
             self.held.is_hidden = True
-
-    def _notify_contact(self) -> None:
-        if self.on_contact is not None:
-            self.on_contact()
 
     # -- held body ---------------------------------------------------------------------------
 

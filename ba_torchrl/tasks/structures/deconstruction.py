@@ -177,9 +177,9 @@ class Deconstruction(OpenLoopTask):
         if self.action_limits.can_tilt:
             return self.task.expert.pick(min(candidates, key=self.task.expert.pick_cost_m))
         options = [
-            (self.task.expert.clearance_m(body, yaw), -i, body, yaw)
+            (self.task.expert.grasps.clearance_m(body, yaw), -i, body, yaw)
             for i, body in enumerate(candidates)
-            for yaw in self.task.expert.grasp_yaws(body)
+            for yaw in self.task.expert.grasps.yaws(body)
         ]
         _, _, body, yaw = max(options, key=lambda option: option[:2])
         x, y, _ = body.position
@@ -313,7 +313,7 @@ class Deconstruction(OpenLoopTask):
             frame = PlanarFrame(x, y, yaw - tool.yaw_rad)
             own = _extents_m(np.stack(frame.to_world(*outline.T), axis=1))
             gap = min(_gap_m(own, other) for other in extents)
-            clearance = self.task.expert.clearance_m(held, yaw, origin.position)
+            clearance = self.task.expert.grasps.clearance_m(held, yaw, origin.position)
             margin = min(margin, gap - GAP_M - SITE_GAP_M, clearance - RELEASE_CLEARANCE_M)
             if margin > best:
                 best = margin

@@ -8,39 +8,31 @@ from collections.abc import Sequence
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, footprint_radius_m
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
     Pose,
     Vector,
-    downward_pose,
     quaternion_matrix,
     quaternion_yaw,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import (
-    grasp_clearance_m,
-    hand_clearance_m,
-    path_clearance_m,
-    tool_view,
-)
 from ba_torchrl.tasks.perturbation import perturbed_pick
 from ba_torchrl.tasks.pick_place_commands import (
-    LEVEL_RAD,
     carrying_pose,
     no_op,
     pick_command,
     place_command,
 )
-from ba_torchrl.tasks.structures.blocking import GraspCandidate, GraspQueries, edge_grasps
+from ba_torchrl.tasks.structures.blocking import GraspCandidate, GraspQueries
 from ba_torchrl.tasks.structures.free_space import PlacementArea
+from ba_torchrl.tasks.structures.grasp_selection import SUFFICIENT_CLEARANCE_M, GraspSelector
 from ba_torchrl.tasks.structures.planner import DEFICIT_WEIGHT, Move
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.structures.tilted_grasps import (
     in_resting_frame,
     is_reachable,
     release_pose,
-    tilted_tools,
 )
 from ba_torchrl.tasks.terrain import Terrain
 from ba_torchrl.tasks.workspace import ActionLimits
@@ -55,12 +47,6 @@ PUSHED_M = 0.16
 """Largest distance by which a finger that descends between two blocks pushes one of them."""
 BORDER_BLOCKS = 1.5
 """Distance of placements from the border of their area, in blocks."""
-RAISE_BLOCKS = 0.3
-"""Largest height, in blocks, by which a grasp is raised so that the fingers clear the ground."""
-LENGTH_SHARES = (-0.1, 0.1, -0.2, 0.2, -0.3, 0.3)
-"""Positions of grasps off the centre of a long piece, as a multiple of its length."""
-SUFFICIENT_CLEARANCE_M = 0.02
-"""Clearances above this are equally good."""
 
 
 class PickPlaceExpert(GraspQueries):
@@ -89,7 +75,7 @@ class PickPlaceExpert(GraspQueries):
         self.robot = robot
         self.terrain = terrain
         self.limits = limits
-        self.finger_opening = finger_opening
+        self.grasps = GraspSelector(structure, robot, terrain, limits, finger_opening)
         self.clears_blocked_pieces = clears_blocked_pieces
 
     @property
@@ -106,14 +92,14 @@ class PickPlaceExpert(GraspQueries):
         if move.body is held:
             return self._place(move)
         body = self._unblocking(move.body)
-        if self.limits.turn_rad and not self._is_free(body):
-            grasp = self._tool_pose(body, self._best_grasp(body))
+        if self.limits.turn_rad and not self.grasps.is_free(body):
+            grasp = self.grasps.tool_pose(body, self.grasps.best(body))
             return perturbed_pick(self.structure.planner.world, body, grasp, can_turn=True)
         return self.pick(body)
 
     def pick(self, body: Body) -> PickPlaceCommand:
         """Return the pick of a body at its best grasp."""
-        return pick_command(self._tool_pose(body, self._best_grasp(body)))
+        return pick_command(self.grasps.tool_pose(body, self.grasps.best(body)))
 
     def rise_m(self, body: Body) -> float:
         """Return the height of a piece's origin above its support when it is released.
@@ -125,25 +111,6 @@ class PickPlaceExpert(GraspQueries):
         rows = quaternion_matrix(in_resting_frame(self.structure.planner.pieces[body], body))
         return -float((body.shape.vertices @ rows[2]).min())
 
-    def grasp_yaws(self, body: Body) -> list[float]:
-        """Return the yaws of the gripper at which it can grasp a body."""
-        if not self.limits.turn_rad:
-            return [0.0]
-        return self.structure.planner.pieces[body].grasp_yaws(body)
-
-    def clearance_m(self, body: Body, yaw_rad: float, position: Vector | None = None) -> float:
-        """Return the clearance between the hand, opened around a body, and the other pieces.
-
-        Args:
-            body: the body.
-            yaw_rad: yaw of the gripper.
-            position: assumed position of the body; its present one if None.
-
-        Returns:
-            Metres; exact up to `SUFFICIENT_CLEARANCE_M`, infinite if no piece is near.
-        """
-        return self._clearance_m(body, GraspCandidate(yaw_rad), self._others(body), position)
-
     # -- queries of the planner --------------------------------------------------------------
 
     def pick_cost_m(self, body: Body) -> float:
@@ -151,8 +118,8 @@ class PickPlaceExpert(GraspQueries):
 
         A grasp that pushes a neighbour costs the distance by which that leaves the workspace.
         """
-        candidate = self._best_grasp(body)
-        deficit_m, _, clearance_m = self._grasp_quality(body, candidate)
+        candidate = self.grasps.best(body)
+        deficit_m, _, clearance_m = self.grasps.quality(body, candidate)
         if clearance_m > 0:
             return 0.0
         cost_m = BLOCKED_COST_M - DEFICIT_WEIGHT * deficit_m
@@ -178,7 +145,7 @@ class PickPlaceExpert(GraspQueries):
         centers = np.array([other.position[:2] for other in rest])
         yaws, halves = [], []
         for other in rest:
-            grasps = self.grasp_yaws(other)
+            grasps = self.grasps.yaws(other)
             low, high = other.shape.bounds_m
             load = tuple(max(-a, b) for a, b in zip(low[:2], high[:2], strict=True))
             own_yaw = self.structure.planner.pieces[other].yaw_rad(other)
@@ -205,14 +172,11 @@ class PickPlaceExpert(GraspQueries):
             coordinates = zip(at, other.position, position, strict=True)
             at = tuple(a + b - c for a, b, c in coordinates)
         return [
-            self._clearance_m(body, candidate, [other], at) <= 0
-            for candidate in self._grasp_candidates(body)
+            self.grasps.candidate_clearance_m(body, candidate, [other], at) <= 0
+            for candidate in self.grasps.candidates(body)
         ]
 
     # ----------------------------------------------------------------------------------------
-
-    def _others(self, body: Body) -> list[Body]:
-        return [other for other in self.structure.pieces if other is not body]
 
     def _placement_area(self) -> PlacementArea:
         border_m = BORDER_BLOCKS * self.block_m
@@ -225,144 +189,25 @@ class PickPlaceExpert(GraspQueries):
             line_yaw_rad=None if self.limits.turn_rad else math.pi / 2,
         )
 
-    def _grasp_candidates(self, body: Body) -> list[GraspCandidate]:
-        """Return the grasps of a body, the centred ones first.
-
-        A body on a slope is grasped along the normal of its side, as far as the arm can reach.
-        """
-        piece = self.structure.planner.pieces[body]
-        candidates = [GraspCandidate(yaw) for yaw in self.grasp_yaws(body)]
-        if self.limits.can_tilt and piece.tilt_rad(body) >= LEVEL_RAD:
-            tools = tilted_tools(piece, body)
-            candidates = [GraspCandidate(quaternion_yaw(tool), tool=tool) for tool in tools]
-        centered = tuple(candidates)
-        if self.limits.can_tilt and len(piece.grasp_yaws_rad) == 1:
-            yaw = piece.grasp_yaws_rad[0]
-            length_m = np.ptp(body.shape.vertices[:, :2] @ (-math.sin(yaw), math.cos(yaw)))
-            candidates += [
-                candidate._replace(along_m=float(share * length_m))
-                for share in LENGTH_SHARES
-                for candidate in centered
-            ]
-        # edge grasps not if the gripper turns straight down only: it finds a free yaw; and only on
-        # the ground: on others a body drags its support along
-        if (self.limits.can_tilt or not self.limits.turn_rad) and self._is_on_ground(body):
-            gripper, opening = self.robot.gripper, self.finger_opening
-            for candidate in centered:
-                for side, edge in zip(
-                    (1, -1), edge_grasps(gripper, body, candidate.yaw_rad, opening), strict=False
-                ):
-                    if candidate.tool is None:
-                        candidates.append(edge)
-                    else:
-                        candidates.append(candidate._replace(shift_m=side * edge.shift_m))
-        return candidates
-
     def _unblocking(self, body: Body) -> Body:
         """Return the piece to pick so that a body can be picked.
 
         This is the body itself if it has a grasp with clearance, else a piece outside of the
         structure that blocks its grasps and has one. A gripper that cannot turn pushes them.
         """
-        if not self.limits.turn_rad or self._is_free(body):
+        if not self.limits.turn_rad or self.grasps.is_free(body):
             return body
         placed = self.structure.planner.placed()
         return next(
             (
                 other
-                for other in self._others(body)
+                for other in self.grasps.others(body)
                 if other not in placed
                 and all(self.blocks_grasp(body, other, None))
-                and self._is_free(other)
+                and self.grasps.is_free(other)
             ),
             body,
         )
-
-    def _is_free(self, body: Body) -> bool:
-        """Whether a grasp of a body has clearance."""
-        return self._grasp_quality(body, self._best_grasp(body))[2] > 0
-
-    def _best_grasp(self, body: Body) -> GraspCandidate:
-        """Return the best grasp of a body; with tilts, the best of those that the arm reaches."""
-        ranked = sorted(
-            self._grasp_candidates(body),
-            key=lambda candidate: self._grasp_quality(body, candidate),
-            reverse=True,
-        )
-        if not self.limits.can_tilt:
-            return ranked[0]
-        reachable = (c for c in ranked if is_reachable(self.robot, self._tool_pose(body, c)))
-        return next(reachable, ranked[0])
-
-    def _is_on_ground(self, body: Body) -> bool:
-        return self.terrain.gap_below_m(body) < self.block_m / 4
-
-    def _grasp_quality(self, body: Body, candidate: GraspCandidate) -> tuple[float, float, float]:
-        """Return the quality of a grasp, by which grasps are compared.
-
-        Returns:
-            The clearance if it is negative, else 0; how close the grasp is to the centre, at most
-            0; and the clearance including that of the near finger.
-        """
-        if self.limits.can_tilt and self._raise_m(body, candidate) > RAISE_BLOCKS * self.block_m:
-            return -1.0, 0.0, -1.0
-        others = self._others(body)
-        clearance_m = least_m = self._clearance_m(body, candidate, others, None)
-        if candidate.shift_m:
-            gripper, yaw = self.robot.gripper, candidate.yaw_rad
-            near = (candidate.near_finger_range_m,)
-            least_m = min(clearance_m, path_clearance_m(gripper, body, yaw, near, others))
-        if candidate.tool is not None:  # the largest tilt with enough clearance comes first
-            least_m = min(least_m, SUFFICIENT_CLEARANCE_M)
-        centering = -abs(candidate.along_m) - bool(candidate.shift_m)
-        return min(clearance_m, 0.0), centering, least_m
-
-    def _tool_pose(self, body: Body, candidate: GraspCandidate) -> Pose:
-        """Return the pose of the tool for a grasp, raised so that the fingers clear the ground."""
-        x, y, z = _tool_position(body.position, candidate)
-        rotation = None if candidate.tool is None else quaternion_matrix(candidate.tool)
-        lowest = self.terrain.lowest_tool_m(self.robot.gripper, (x, y), rotation)
-        if candidate.tool is None:
-            return downward_pose((x, y, max(z, lowest)), candidate.yaw_rad)
-        return Pose((x, y, max(z, lowest)), candidate.tool)
-
-    def _raise_m(self, body: Body, candidate: GraspCandidate) -> float:
-        """Return the height by which a grasp is raised so that the fingers clear the ground."""
-        at = _tool_position(body.position, candidate)
-        return self._tool_pose(body, candidate).position[2] - at[2]
-
-    def _clearance_m(
-        self,
-        body: Body,
-        candidate: GraspCandidate,
-        others: Sequence[Body],
-        position: Vector | None,
-    ) -> float:
-        """Return the clearance between the hand, opened around a body, and some other bodies.
-
-        Of an edge grasp only the far finger counts.
-        """
-        at = body.position if position is None else position
-        x, y, z = grasp = _tool_position(at, candidate)
-        extent = math.hypot(*self.robot.hand_half_extents_m) + SUFFICIENT_CLEARANCE_M
-        others = [
-            other
-            for other in others
-            if math.dist(other.position[:2], (x, y)) < extent + footprint_radius_m(other)
-        ]
-        gripper, yaw = self.robot.gripper, candidate.yaw_rad
-        if candidate.tool is not None:
-            view, tool = tool_view(Pose(grasp, candidate.tool)), PlanarFrame(x, y, 0.0)
-            fingers = grasp_clearance_m(
-                gripper, body, 0.0, others, self.finger_opening, grasp, view
-            )
-            return min(fingers, hand_clearance_m(self.robot, tool, z, others, view))
-        if candidate.shift_m:
-            far = (candidate.far_finger_range_m,)
-            fingers = path_clearance_m(gripper, body, yaw, far, others, at)
-        else:
-            fingers = grasp_clearance_m(gripper, body, yaw, others, self.finger_opening, grasp)
-        return min(fingers, hand_clearance_m(self.robot, PlanarFrame(x, y, yaw), z, others))
 
     def _place(self, move: Move) -> PickPlaceCommand:
         """Return the place that brings the held body to the pose of a move."""
@@ -415,25 +260,15 @@ class PickPlaceExpert(GraspQueries):
         rotation = quaternion_matrix(tool.orientation)
         lowest = self.terrain.lowest_tool_m(gripper, (x, y), rotation, self.robot.opening())
         candidate = GraspCandidate(tool.yaw_rad, tool=tool.orientation)
-        clearance_m = self._clearance_m(
-            move.body, candidate, self._others(move.body), tool.position
+        clearance_m = self.grasps.candidate_clearance_m(
+            move.body, candidate, self.grasps.others(move.body), tool.position
         )
         return min(clearance_m, SUFFICIENT_CLEARANCE_M) - max(lowest - z, 0.0)
 
     def _release_yaw(self, move: Move, yaws_rad: Sequence[float]) -> float:
         """Return the first of the yaws at which the opening fingers have the largest clearance."""
         clearances = [
-            min(self.clearance_m(move.body, yaw, move.position), SUFFICIENT_CLEARANCE_M)
+            min(self.grasps.clearance_m(move.body, yaw, move.position), SUFFICIENT_CLEARANCE_M)
             for yaw in yaws_rad
         ]
         return yaws_rad[clearances.index(max(clearances))]
-
-
-def _tool_position(position: Vector, candidate: GraspCandidate) -> Vector:
-    """Return the position of the tool for a grasp of a body at a position."""
-    x, y, z = position
-    if candidate.tool is None:
-        frame = PlanarFrame(x, y, candidate.yaw_rad)
-        return *frame.to_world(candidate.shift_m, candidate.along_m), z
-    offset = (candidate.shift_m, -candidate.along_m, 0.0)  # the y axis of a tool is reversed
-    return Pose(position, candidate.tool).compose(Pose(offset)).position

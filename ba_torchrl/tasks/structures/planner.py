@@ -15,7 +15,6 @@ import numpy as np
 
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.structures.assignment import (
     Assignment,
     SlotAssigner,
@@ -26,6 +25,7 @@ from ba_torchrl.tasks.structures.blocking import GraspBlocking, GraspQueries, Mo
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece, Slot
 from ba_torchrl.tasks.structures.free_space import (
     PlacementArea,
+    beside_supports,
     extent_along_m,
     nearest_free_site,
     placement_deficit_m,
@@ -37,8 +37,6 @@ SITE_POINTS = 7
 """Points along a bridge that represent the footprint of a structure."""
 DEFICIT_WEIGHT = 10.0
 """Cost of a metre of missing clearance, as a multiple of the cost of a metre of distance."""
-LEVEL_M = 1e-3
-"""Tolerance of the height at which a bridge rests on a piece beside its supports."""
 BLOCKED_MOVES = 100
 """Cost, in moves, of picking a piece whose grasps are all blocked."""
 
@@ -208,7 +206,9 @@ class StructurePlanner:
                 if piece.kind != slot.piece.kind or body in assignment:
                     continue
                 others = [other for other in misplaced if other is not body]
-                others += self._beside_supports(body, number, assignment, assigner.held)
+                supports = [assignment[i] for i in slot.on]
+                loose = [b for b in self.pieces if b not in assignment and b is not assigner.held]
+                others += beside_supports(body, supports, loose)
                 removed = set(others).union(
                     bodies_above[body], *(bodies_above[other] for other in others)
                 )
@@ -218,36 +218,6 @@ class StructurePlanner:
                 for top in removed:
                     if not any(top in assigner.states[other].supports for other in removed):
                         yield len(removed), top, None
-
-    def _beside_supports(
-        self, body: Body, number: int, assignment: Assignment, held: Body | None
-    ) -> list[Body]:
-        """Return the pieces beside two supports on which a bridge would rest, too.
-
-        Args:
-            body: the bridge.
-            number: number of its slot.
-            assignment: the body in each slot.
-            held: the body in the gripper.
-        """
-        supports = [assignment[i] for i in self.blueprint.slots[number].on]
-        if len(supports) != 2:
-            return []
-        (ax, ay, _), (bx, by, _) = (support.position for support in supports)
-        low, high = body.shape.bounds_m
-        half_x, half_y = ((b - a) / 2 for a, b in zip(low[:2], high[:2], strict=True))
-        yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
-        bridge = Rectangle((ax + bx) / 2, (ay + by) / 2, yaw, half_x, half_y)
-        top = max(vertical_extent(support)[1] for support in supports) - LEVEL_M
-        return [
-            other
-            for other in self.pieces
-            if other is not body
-            and other is not held
-            and other not in assignment
-            and vertical_extent(other)[1] > top
-            and gap_m(bridge, outline(other)) < 0
-        ]
 
     def _to_slot(
         self,

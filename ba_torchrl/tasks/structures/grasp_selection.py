@@ -1,0 +1,221 @@
+"""Grasps of the pieces of a structure: candidates, their clearance and their reach."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ba_torchrl.sim.bodies import Body, footprint_radius_m
+from ba_torchrl.sim.geometry import (
+    PlanarFrame,
+    Pose,
+    Vector,
+    downward_pose,
+    quaternion_matrix,
+    quaternion_yaw,
+)
+from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.tasks.clearance import (
+    grasp_clearance_m,
+    hand_clearance_m,
+    path_clearance_m,
+    tool_view,
+)
+from ba_torchrl.tasks.pick_place_commands import LEVEL_RAD
+from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps
+from ba_torchrl.tasks.structures.structure import Structure
+from ba_torchrl.tasks.structures.tilted_grasps import is_reachable, tilted_tools
+from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.workspace import ActionLimits
+
+RAISE_BLOCKS = 0.3
+"""Largest height, in blocks, by which a grasp is raised so that the fingers clear the ground."""
+LENGTH_SHARES = (-0.1, 0.1, -0.2, 0.2, -0.3, 0.3)
+"""Positions of grasps off the centre of a long piece, as a multiple of its length."""
+SUFFICIENT_CLEARANCE_M = 0.02
+"""Clearances above this are equally good."""
+
+
+class GraspSelector:
+    """Compares the grasps of the pieces of a structure, in the present scene.
+
+    Args:
+        structure: the pieces.
+        robot: the robot.
+        terrain: the ground.
+        limits: limits of an action; a gripper that cannot turn grasps at yaw 0.
+        finger_opening: opening of the fingers before a pick, 0 to 1.
+    """
+
+    def __init__(
+        self,
+        structure: Structure,
+        robot: Robot,
+        terrain: Terrain,
+        limits: ActionLimits,
+        finger_opening: float,
+    ) -> None:
+        self.structure = structure
+        self.robot = robot
+        self.terrain = terrain
+        self.limits = limits
+        self.finger_opening = finger_opening
+
+    def yaws(self, body: Body) -> list[float]:
+        """Return the yaws of the gripper at which it can grasp a body."""
+        if not self.limits.turn_rad:
+            return [0.0]
+        return self.structure.planner.pieces[body].grasp_yaws(body)
+
+    def clearance_m(self, body: Body, yaw_rad: float, position: Vector | None = None) -> float:
+        """Return the clearance between the hand, opened around a body, and the other pieces.
+
+        Args:
+            body: the body.
+            yaw_rad: yaw of the gripper.
+            position: assumed position of the body; its present one if None.
+
+        Returns:
+            Metres; exact up to `SUFFICIENT_CLEARANCE_M`, infinite if no piece is near.
+        """
+        return self.candidate_clearance_m(
+            body, GraspCandidate(yaw_rad), self.others(body), position
+        )
+
+    def candidates(self, body: Body) -> list[GraspCandidate]:
+        """Return the grasps of a body, the centred ones first.
+
+        A body on a slope is grasped along the normal of its side, as far as the arm can reach.
+        """
+        piece = self.structure.planner.pieces[body]
+        candidates = [GraspCandidate(yaw) for yaw in self.yaws(body)]
+        if self.limits.can_tilt and piece.tilt_rad(body) >= LEVEL_RAD:
+            tools = tilted_tools(piece, body)
+            candidates = [GraspCandidate(quaternion_yaw(tool), tool=tool) for tool in tools]
+        centered = tuple(candidates)
+        if self.limits.can_tilt and len(piece.grasp_yaws_rad) == 1:
+            yaw = piece.grasp_yaws_rad[0]
+            length_m = np.ptp(body.shape.vertices[:, :2] @ (-math.sin(yaw), math.cos(yaw)))
+            candidates += [
+                candidate._replace(along_m=float(share * length_m))
+                for share in LENGTH_SHARES
+                for candidate in centered
+            ]
+        # edge grasps not if the gripper turns straight down only: it finds a free yaw; and only on
+        # the ground: on others a body drags its support along
+        if (self.limits.can_tilt or not self.limits.turn_rad) and self._is_on_ground(body):
+            gripper, opening = self.robot.gripper, self.finger_opening
+            for candidate in centered:
+                for side, edge in zip(
+                    (1, -1), edge_grasps(gripper, body, candidate.yaw_rad, opening), strict=False
+                ):
+                    if candidate.tool is None:
+                        candidates.append(edge)
+                    else:
+                        candidates.append(candidate._replace(shift_m=side * edge.shift_m))
+        return candidates
+
+    def is_free(self, body: Body) -> bool:
+        """Whether a grasp of a body has clearance."""
+        return self.quality(body, self.best(body))[2] > 0
+
+    def best(self, body: Body) -> GraspCandidate:
+        """Return the best grasp of a body; with tilts, the best of those that the arm reaches."""
+        ranked = sorted(
+            self.candidates(body),
+            key=lambda candidate: self.quality(body, candidate),
+            reverse=True,
+        )
+        if not self.limits.can_tilt:
+            return ranked[0]
+        reachable = (c for c in ranked if is_reachable(self.robot, self.tool_pose(body, c)))
+        return next(reachable, ranked[0])
+
+    def _is_on_ground(self, body: Body) -> bool:
+        return self.terrain.gap_below_m(body) < self.structure.block_m / 4
+
+    def quality(self, body: Body, candidate: GraspCandidate) -> tuple[float, float, float]:
+        """Return the quality of a grasp, by which grasps are compared.
+
+        Returns:
+            The clearance if it is negative, else 0; how close the grasp is to the centre, at most
+            0; and the clearance including that of the near finger.
+        """
+        if (
+            self.limits.can_tilt
+            and self._raise_m(body, candidate) > RAISE_BLOCKS * self.structure.block_m
+        ):
+            return -1.0, 0.0, -1.0
+        others = self.others(body)
+        clearance_m = least_m = self.candidate_clearance_m(body, candidate, others, None)
+        if candidate.shift_m:
+            gripper, yaw = self.robot.gripper, candidate.yaw_rad
+            near = (candidate.near_finger_range_m,)
+            least_m = min(clearance_m, path_clearance_m(gripper, body, yaw, near, others))
+        if candidate.tool is not None:  # the largest tilt with enough clearance comes first
+            least_m = min(least_m, SUFFICIENT_CLEARANCE_M)
+        centering = -abs(candidate.along_m) - bool(candidate.shift_m)
+        return min(clearance_m, 0.0), centering, least_m
+
+    def tool_pose(self, body: Body, candidate: GraspCandidate) -> Pose:
+        """Return the pose of the tool for a grasp, raised so that the fingers clear the ground."""
+        x, y, z = _tool_position(body.position, candidate)
+        rotation = None if candidate.tool is None else quaternion_matrix(candidate.tool)
+        lowest = self.terrain.lowest_tool_m(self.robot.gripper, (x, y), rotation)
+        if candidate.tool is None:
+            return downward_pose((x, y, max(z, lowest)), candidate.yaw_rad)
+        return Pose((x, y, max(z, lowest)), candidate.tool)
+
+    def _raise_m(self, body: Body, candidate: GraspCandidate) -> float:
+        """Return the height by which a grasp is raised so that the fingers clear the ground."""
+        at = _tool_position(body.position, candidate)
+        return self.tool_pose(body, candidate).position[2] - at[2]
+
+    def candidate_clearance_m(
+        self,
+        body: Body,
+        candidate: GraspCandidate,
+        others: Sequence[Body],
+        position: Vector | None,
+    ) -> float:
+        """Return the clearance between the hand, opened around a body, and some other bodies.
+
+        Of an edge grasp only the far finger counts.
+        """
+        at = body.position if position is None else position
+        x, y, z = grasp = _tool_position(at, candidate)
+        extent = math.hypot(*self.robot.hand_half_extents_m) + SUFFICIENT_CLEARANCE_M
+        others = [
+            other
+            for other in others
+            if math.dist(other.position[:2], (x, y)) < extent + footprint_radius_m(other)
+        ]
+        gripper, yaw = self.robot.gripper, candidate.yaw_rad
+        if candidate.tool is not None:
+            view, tool = tool_view(Pose(grasp, candidate.tool)), PlanarFrame(x, y, 0.0)
+            fingers = grasp_clearance_m(
+                gripper, body, 0.0, others, self.finger_opening, grasp, view
+            )
+            return min(fingers, hand_clearance_m(self.robot, tool, z, others, view))
+        if candidate.shift_m:
+            far = (candidate.far_finger_range_m,)
+            fingers = path_clearance_m(gripper, body, yaw, far, others, at)
+        else:
+            fingers = grasp_clearance_m(gripper, body, yaw, others, self.finger_opening, grasp)
+        return min(fingers, hand_clearance_m(self.robot, PlanarFrame(x, y, yaw), z, others))
+
+    def others(self, body: Body) -> list[Body]:
+        """Return the other pieces."""
+        return [other for other in self.structure.pieces if other is not body]
+
+
+def _tool_position(position: Vector, candidate: GraspCandidate) -> Vector:
+    """Return the position of the tool for a grasp of a body at a position."""
+    x, y, z = position
+    if candidate.tool is None:
+        frame = PlanarFrame(x, y, candidate.yaw_rad)
+        return *frame.to_world(candidate.shift_m, candidate.along_m), z
+    offset = (candidate.shift_m, -candidate.along_m, 0.0)  # the y axis of a tool is reversed
+    return Pose(position, candidate.tool).compose(Pose(offset)).position
