@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.footprints import Rectangle
 from ba_torchrl.tasks.sloped_terrain import SlopedTerrain
-from ba_torchrl.tasks.workspace import Area, OrientedArea, Workspace
+from ba_torchrl.tasks.workspace import Area, OrientedArea, Spacing, Workspace
 
 SLOPE_RAD = (0.0, math.pi / 12)
 """Range of the slope of a pyramid."""
@@ -30,6 +30,8 @@ UNDERGROUND_M = 0.02
 FRICTION = 1.0
 COLORS: tuple[Color, Color] = ((0.8, 0.75, 0.64, 1.0), (0.72, 0.67, 0.56, 1.0))
 PLATFORM_COLOR: Color = (0.6, 0.66, 0.72, 1.0)
+ROCKING_STEPS = 100
+"""Physics steps in which objects that lie on several faces stop rocking."""
 CLEARANCE_M = 0.03
 """Least distance of an object from the platform at the start, with space for a finger."""
 
@@ -164,6 +166,19 @@ class Bumps(SlopedTerrain):
             for values, half in ((along, area.half_x), (across, area.half_y))
         )
         return max(gaps) > CLEARANCE_M
+
+    def scatter(
+        self,
+        rng: np.random.Generator,
+        bodies: Sequence[Body],
+        spacings: Sequence[Spacing],
+        draw_yaw: Callable[[Body], float],
+        *,
+        base: Body,
+    ) -> None:
+        """Place bodies as `SlopedTerrain`, and let those on several faces come to rest."""
+        super().scatter(rng, bodies, spacings, draw_yaw, base=base)
+        self.world.step(ROCKING_STEPS)
 
     def random_base_pose(
         self, rng: np.random.Generator, body: Body, draw_yaw: Callable[[Body], float]

@@ -59,11 +59,18 @@ class Ramps(SlopedTerrain):
         world: not sealed yet.
         workspace: bounds of the task.
         least_gap_m: least distance between the ramps.
+
+    Raises:
+        ValueError: the least distance is larger than the largest.
     """
 
     def __init__(
         self, world: World, workspace: Workspace, *, least_gap_m: float = GAP_M[0]
     ) -> None:
+        if least_gap_m > GAP_M[1]:
+            raise ValueError(
+                f"pieces of {least_gap_m:.3f} m are wider than the widest gap, {GAP_M[1]} m"
+            )
         super().__init__(world, workspace)
         self.gap_range_m = (max(GAP_M[0], least_gap_m), GAP_M[1])
         self.ramps = [

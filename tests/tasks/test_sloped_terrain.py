@@ -1,0 +1,282 @@
+"""Ramps and bumps: the surface that tasks assume is the one that PyBullet collides with."""
+
+import math
+
+import numpy as np
+import pybullet
+import pytest
+
+from ba_torchrl.sim.bodies import world_vertices
+from ba_torchrl.sim.geometry import quaternion_matrix, tool_rotation
+from ba_torchrl.sim.robots.kuka import Kuka
+from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.bumps import Bumps
+from ba_torchrl.tasks.ramps import GAP_M, RampLayout, Ramps
+from ba_torchrl.tasks.sloped_terrain import footprint
+from ba_torchrl.tasks.terrain import Flat
+from ba_torchrl.tasks.workspace import Workspace
+
+WORKSPACE = Workspace((0.25, 0.65), (-0.1, 0.3), (0.0, 0.4))  # its centre is off the x axis
+SIX_DOF = [task for task in TASKS if task.startswith(("ramp/", "bump/"))]
+STRUCTURES = [task for task in SIX_DOF if task != "bump/box_palletizing"]
+
+
+@pytest.fixture
+def world():
+    with World() as world:
+        yield world
+
+
+def make_ramps(world, seed=0):
+    ramps = Ramps(world, WORKSPACE)
+    world.seal()
+    ramps.initialize_episode(np.random.default_rng(seed))
+    return ramps
+
+
+def make_bumps(world, seed=0):
+    bumps = Bumps(world, WORKSPACE, (0.13, 0.1), random_orientation=True)
+    world.seal()
+    bumps.initialize_episode(np.random.default_rng(seed))
+    return bumps
+
+
+def cast_down(world, points):
+    """Return height and normal of the first surface below each point, by rays."""
+    world.detect_collisions()
+    hits = pybullet.rayTestBatch(
+        [(*p, 1.0) for p in points], [(*p, -0.1) for p in points], physicsClientId=world.client
+    )
+    return np.array([hit[3][2] for hit in hits]), np.array([hit[4] for hit in hits])
+
+
+def bottom(body):
+    """Return the vertices [V, 3] of the side on which a body started."""
+    heights = body.shape.vertices[:, 2]
+    return world_vertices(body)[heights < heights.min() + 1e-4]
+
+
+def random_points(terrain, count, distance_m=1e-3):
+    """Return points around which the surface is a plane."""
+    rng = np.random.default_rng(1)
+    low, high = np.array([terrain.workspace.x, terrain.workspace.y]).T
+    points = rng.uniform(low, high, (count, 2))
+    return points[terrain._planes(points, distance_m)[2] < 1e-9]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("make", "margin_m"),
+    [(make_ramps, 1e-3), (make_bumps, 1.3e-3)],  # the accuracy of PyBullet's rays
+)
+def test_heights_and_normals_are_those_of_the_collision_shapes(world, make, margin_m, seed):
+    terrain = make(world, seed)
+    points = random_points(terrain, 300)
+    assert len(points) > 200
+    heights, normals = cast_down(world, points)
+    assert np.ptp(heights) > 0.01
+    assert terrain.heights_m(points) == pytest.approx(heights, abs=margin_m)
+    for point, normal in zip(points.tolist(), normals, strict=True):
+        pose = terrain.surface_pose(point, 0.7)
+        rotation = np.array(quaternion_matrix(pose.orientation))
+        assert rotation[:, 2] == pytest.approx(normal, abs=1e-3)
+        assert math.atan2(rotation[1, 0], rotation[0, 0]) == pytest.approx(0.7)
+        assert pose.position[2] == terrain.height_m(point)
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_no_heading_of_the_ramps_is_singular(world, quarter):
+    ramps = make_ramps(world)
+    layout = RampLayout(quarter * math.pi / 2, (0.03, 0.07), (0.0, 0.01), (0.3, 0.5))
+    ramps._set_layout(layout)
+    points = random_points(ramps, 200)
+    assert ramps.heights_m(points) == pytest.approx(cast_down(world, points)[0], abs=1e-3)
+    x, y = WORKSPACE.center
+    ahead = (math.cos(layout.heading_rad), math.sin(layout.heading_rad))
+    left, right = (
+        (x + side * -ahead[1] * 0.15, y + side * ahead[0] * 0.15) for side in (1.0, -1.0)
+    )
+    assert ramps.height_m(left) == pytest.approx(0.12 * math.tan(0.3))
+    assert ramps.height_m(right) == pytest.approx(0.01 + 0.08 * math.tan(0.5))
+
+
+def test_the_ramps_cover_the_ranges_of_the_paper(world):
+    ramps, rng = make_ramps(world), np.random.default_rng(0)
+    layouts = []
+    for _ in range(400):
+        ramps.initialize_episode(rng)
+        layouts.append(ramps.layout)
+    values = {
+        "gap": [sum(layout.distances_m) for layout in layouts],
+        "heading": [layout.heading_rad for layout in layouts],
+        "edge": [edge for layout in layouts for edge in layout.edges_m],
+        "slope": [slope for layout in layouts for slope in layout.slopes_rad],
+    }
+    ranges = {"gap": (0.04, 0.2), "heading": (0, 2 * math.pi), "edge": (0, 0.01)}
+    ranges["slope"] = (0, math.pi / 6)
+    for name, (low, high) in ranges.items():
+        span = high - low
+        assert low <= min(values[name]) < low + 0.05 * span
+        assert high - 0.05 * span < max(values[name]) <= high
+        assert np.mean(values[name]) == pytest.approx((low + high) / 2, abs=0.06 * span)
+    offsets = [abs(a - b) / 2 for a, b in (layout.distances_m for layout in layouts)]
+    assert 0.02 < max(offsets) <= 0.04
+
+
+def test_the_pyramids_have_slopes_up_to_15_degrees_and_the_platform_their_height(world):
+    bumps, rng = make_bumps(world), np.random.default_rng(0)
+    slopes, headings = [], []
+    for _ in range(60):
+        bumps.initialize_episode(rng)
+        slopes += [bumps.slopes_rad[i] for i in bumps.layout.pyramids]
+        headings.append(bumps.layout.heading_rad)
+    assert len(slopes) == 9 * 60
+    assert min(slopes) < 0.01
+    assert math.pi / 12 - 0.01 < max(slopes) < math.pi / 12
+    assert np.mean(slopes) == pytest.approx(math.pi / 24, rel=0.05)
+    assert max(headings) - min(headings) > 2.5
+    assert bumps.top_m == pytest.approx(0.1 * math.tan(math.pi / 12))
+    assert bumps.height_m(bumps.layout.platform[:2]) == bumps.top_m
+
+
+def test_on_level_ground_the_least_height_of_the_tool_is_that_of_a_flat_floor(world):
+    ramps = make_ramps(world)
+    gripper = Kuka(world).gripper if world._pristine is None else _gripper()
+    ramps._set_layout(RampLayout(0.0, (0.1, 0.1), (0.0, 0.0), (0.0, 0.0)))
+    flat = Flat(world, WORKSPACE)
+    for rotation in (None, tool_rotation(0.4, 0.3, -0.2)):
+        expected = flat.lowest_tool_m(gripper, (0.45, 0.1), rotation)
+        lowest = ramps.lowest_tool_m(gripper, (0.45, 0.1), rotation)
+        # the outer sides of tilted fingers are lower than the inner sides that Flat considers
+        extra = 0.0 if rotation is None else gripper.finger_depth_m
+        assert expected - 1e-12 <= lowest <= expected + extra
+
+
+def _gripper():
+    with World() as world:
+        return Kuka(world).gripper
+
+
+def test_a_tool_parallel_to_a_ramp_goes_lower_than_a_vertical_one(world):
+    ramps, gripper = make_ramps(world), _gripper()
+    slope = math.pi / 6
+    ramps._set_layout(RampLayout(0.0, (0.05, 0.05), (0.0, 0.0), (slope, 0.0)))
+    xy = (0.45, 0.1 + 0.12)  # on the ramp, which rises along +y
+    across = ramps.lowest_tool_m(gripper, xy, tool_rotation(math.pi / 2))
+    parallel = ramps.lowest_tool_m(gripper, xy, tool_rotation(math.pi / 2, -slope))
+    assert parallel + 0.01 < across
+
+
+@pytest.mark.parametrize("task", SIX_DOF)
+def test_objects_start_at_rest_on_the_surface(make_env, task):
+    env = make_env(task)
+    tilts = []
+    for _ in range(5):
+        env.reset()
+        scene = env.scene
+        terrain = scene.task.terrain
+        for body in scene.task.objects:
+            gap = terrain.gap_below_m(body)
+            assert -1.5e-3 < gap < 1.5e-3
+            tilts.append(body.tilt_rad)
+        poses = [body.pose for body in scene.task.objects]
+        scene.world.step(60)
+        for body, before in zip(scene.task.objects, poses, strict=True):
+            assert math.dist(body.position, before.position) < 2e-3
+    assert max(tilts) > 0.05
+
+
+@pytest.mark.parametrize("task", [task for task in SIX_DOF if task.startswith("ramp/")])
+def test_objects_lie_flush_on_one_side_of_each_edge(make_env, task):
+    env = make_env(task)
+    between = 0
+    for _ in range(8):
+        env.reset()
+        task_ = env.scene.task
+        terrain = task_.terrain
+        on_base = []
+        for body, piece in task_.structure.pieces.items():
+            _, across = terrain._frame.to_local(*bottom(body)[:, :2].T)
+            first, second = terrain.layout.distances_m
+            inside = (across < first).all() and (across > -second).all()
+            assert inside or (across > first).all() or (across < -second).all()
+            normal = quaternion_matrix(terrain.surface_pose(body.position[:2]).orientation)[2][2]
+            assert body.tilt_rad == pytest.approx(math.acos(min(normal, 1.0)), abs=0.06)
+            if inside:
+                on_base.append(piece.kind)
+        assert task_.structure.blueprint.slots[0].piece.kind in on_base
+        between += len(on_base)
+    assert between < 8 * len(task_.structure.pieces)  # the others start on the ramps, too
+
+
+def test_objects_start_beside_the_platform(make_env):
+    env = make_env("bump/house_building_4")
+    for _ in range(8):
+        env.reset()
+        terrain = env.scene.task.terrain
+        for body in env.scene.task.objects:
+            area = terrain.build_area
+            along, across = area.frame.to_local(*world_vertices(body)[:, :2].T)
+            assert not ((abs(along) < area.half_x) & (abs(across) < area.half_y)).any()
+
+
+@pytest.mark.parametrize("task", STRUCTURES)
+def test_the_heightmap_shows_the_terrain(make_env, task):
+    env = make_env(task, obs_size=64)
+    image = env.reset()["pixels"][0].numpy()
+    terrain = env.scene.task.terrain
+    x, y = (
+        low + (high - low) * (np.arange(64) + 0.5) / 64
+        for low, high in (env.workspace.x, env.workspace.y)
+    )
+    points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    ground = terrain.heights_m(points).reshape(64, 64)
+    objects = np.zeros((64, 64), dtype=bool)
+    for body in env.scene.task.objects:
+        distance = np.hypot(*(points - body.position[:2]).T)
+        objects |= (distance < 0.075).reshape(64, 64)
+    difference = np.abs(image - ground)[~objects]
+    assert (difference < 2e-3).mean() > 0.98  # all but pixels at an edge
+    assert (image - ground)[objects].max() > 0.015
+
+
+def test_an_object_on_a_ramp_is_grasped_along_its_normal(make_env):
+    env = make_env("ramp/block_stacking", num_objects=2)
+    tilted = 0
+    for _ in range(12):
+        state = env.reset()
+        expert = env.scene.task.expert
+        command = env.actions.decode(state["expert_action"].numpy())
+        body = min(
+            env.scene.task.objects,
+            key=lambda body: math.dist(body.position[:2], (command.x_m, command.y_m)),
+        )
+        approach = -np.array(tool_rotation(*command.angles_rad))[:, 2]
+        normal = np.array(quaternion_matrix(body.pose.orientation))[:, 2]
+        if body.tilt_rad > 0.1 and expert.grasps.quality(body, expert.grasps.best(body))[0] == 0:
+            tilted += 1
+            assert math.acos(min(approach @ normal, 1.0)) <= body.tilt_rad + 0.02
+            if approach @ normal > 0.999:
+                tilted += 10
+    assert tilted > 30  # most grasps are exactly along the normal
+
+
+def test_a_gap_narrower_than_the_pieces_is_refused(world):
+    ramps = Ramps(world, WORKSPACE, least_gap_m=0.1)
+    world.seal()
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        ramps.initialize_episode(rng)
+        assert 0.1 <= sum(ramps.layout.distances_m) <= GAP_M[1]
+    with pytest.raises(ValueError, match="wider"):
+        Ramps(World(), WORKSPACE, least_gap_m=0.25)
+
+
+def test_footprints_are_rotated_outlines(make_env):
+    env = make_env("ramp/house_building_2")
+    env.reset()
+    roof = max(env.scene.task.objects, key=lambda body: np.ptp(body.shape.vertices[:, 1]))
+    outline = footprint(roof, (0.4, 0.1), math.pi / 2)
+    assert np.ptp(outline[:, 0]) == pytest.approx(np.ptp(roof.shape.vertices[:, 1]))
+    assert outline.mean(axis=0) == pytest.approx((0.4, 0.1), abs=1e-6)
