@@ -25,7 +25,7 @@ from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics, World
-from ba_torchrl.tasks.base import TASKS, Task
+from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.structures.undo import UndoRecorder
 from ba_torchrl.tasks.workspace import ActionLimits
 
@@ -58,8 +58,7 @@ class OpenLoopEnv(ManipulationEnv):
     physics = Physics(time_step_s=1 / 240, solver_iterations=30)
 
     def __init__(self, task_id: str, config: EnvConfig) -> None:
-        mode = config.in_hand_mode or TASKS[task_id].default_in_hand_mode
-        self._in_hand_kind = IN_HAND_MODES[mode]()
+        self._in_hand_kind = IN_HAND_MODES[config.in_hand_mode]()
         self._display = ArmDisplay(partial(self._build_scene, render=False))
         super().__init__(task_id, config)
 

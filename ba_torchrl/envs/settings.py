@@ -13,7 +13,8 @@ def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = No
     """Validate the parameters of an environment, those of its task included.
 
     A parameter of other tasks is dropped if it has its default value, so that a complete
-    configuration of one task is valid for another.
+    configuration of one task is valid for another. In open loop, the task's default of
+    `in_hand_mode` is filled in.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
@@ -34,7 +35,11 @@ def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = No
             )
         if defaults:
             del values[name]
-    return parse(model, values, what or f"configuration of {task_id}")
+    config = parse(model, values, what or f"configuration of {task_id}")
+    task_class = TASKS[task_id]
+    if config.in_hand_mode is None and task_class.control == "open_loop":
+        config = config.model_copy(update={"in_hand_mode": task_class.default_in_hand_mode})
+    return config
 
 
 def task_parameters(task_class: type[Task], config: EnvConfig) -> TaskParameters:

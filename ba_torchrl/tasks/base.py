@@ -79,7 +79,7 @@ class Task(ABC):
     default_action_sequence: ClassVar[str | None] = None
     """Default `action_sequence`; None for the default of the control."""
     default_in_hand_mode: ClassVar[str] = "raw"
-    """Default `in_hand_mode`."""
+    """Default `in_hand_mode` in open loop."""
     terminates_at_limit: ClassVar[bool] = False
     """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False
