@@ -206,6 +206,23 @@ def hand_clearance_m(
     return gap
 
 
+def tool_clearance_m(
+    robot: Robot, tool: Pose, body: Body, others: Sequence[Body], opening: float = 1.0
+) -> float:
+    """Return the clearance between the hand with open fingers at a pose, and other bodies.
+
+    Args:
+        robot: the robot.
+        tool: pose of the tool, which may be tilted.
+        body: the body to grasp.
+        others: the other bodies.
+        opening: opening of the gripper, 0 to 1.
+    """
+    view, (x, y, z) = tool_view(tool), tool.position
+    fingers = grasp_clearance_m(robot.gripper, body, 0.0, others, opening, tool.position, view)
+    return min(fingers, hand_clearance_m(robot, PlanarFrame(x, y, 0.0), z, others, view))
+
+
 def outline_clearance_m(
     gripper: Gripper, tool: PlanarFrame, half_opening_m: float, others: Iterable[Rectangle]
 ) -> float:

@@ -20,6 +20,7 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.clearance import tool_clearance_m
 from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
 from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
@@ -186,7 +187,7 @@ class BoxPalletizing(PackingTask):
     # ----------------------------------------------------------------------------------------
 
     def _along_normal(self, grasp: TopDownGrasp) -> Pose:
-        """Return the tool of a grasp, tilted like the box if the gripper can tilt that far."""
+        """Return the tool of a grasp, tilted like the box if arm and neighbours allow it."""
         body = grasp.body
         if not self.action_limits.can_tilt or CUBOID.tilt_rad(body) < LEVEL_RAD:
             return grasp.tool
@@ -197,7 +198,12 @@ class BoxPalletizing(PackingTask):
         x, y = PlanarFrame(*body.position[:2], grasp.yaw_rad).to_local(*grasp.position[:2])
         offset = Pose((x, y, top_m - GRASP_DEPTH_M * self.unit), downward_quaternion(0.0))
         tool = Pose(body.position, surface).compose(offset)
-        return tool if is_reachable(self.robot, tool) else grasp.tool
+        others = [other for other in self.pool.active if other is not body]
+        clearance_m = tool_clearance_m(
+            self.robot, tool, body, [*others, self.container], self.finger_opening
+        )
+        is_clear = clearance_m >= min(grasp.clearance_m, SUFFICIENT_CLEARANCE_M)
+        return tool if is_clear and is_reachable(self.robot, tool) else grasp.tool
 
     def _activate_next_box(self) -> None:
         """Place the next box where it arrives."""

@@ -16,3 +16,4 @@ class BumpBoxPalletizing(OnBumps, BoxPalletizing):
     """
 
     platform_m = (0.24, 0.2)
+    scale_limits = (0.75, 0.9)  # boxes and gripper have no room beside a larger platform

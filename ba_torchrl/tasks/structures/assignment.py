@@ -27,7 +27,7 @@ class PieceState(NamedTuple):
     on_ground: bool
     """Whether it touches the ground."""
     on_base: bool
-    """Whether it touches ground on which a structure may stand."""
+    """Whether ground on which a structure may stand supports it."""
     supports: frozenset[Body]
     """The pieces that it rests on."""
 
@@ -56,23 +56,22 @@ def read_piece_states(
     heights = {body: body.position[2] for body in pieces}
     states = {}
     for body, piece in pieces.items():
-        touched, supports = set(), set()
+        touched, below, supports = set(), set(), set()
         for point in contacts(world.client, body.id):
             if point.distance_m >= CONTACT_DISTANCE_M:
                 continue
             touched.add(point.other_id)
+            if point.normal[2] <= SUPPORT_COSINE:
+                continue
+            below.add(point.other_id)
             other = by_id.get(point.other_id)
-            if (
-                other is not None
-                and point.normal[2] > SUPPORT_COSINE
-                and heights[body] - heights[other] >= block_m / 2
-            ):
+            if other is not None and heights[body] - heights[other] >= block_m / 2:
                 supports.add(other)
         states[body] = PieceState(
             body.position,
             piece.tilt_rad(body),
             not ground.isdisjoint(touched),
-            not base.isdisjoint(touched),
+            not base.isdisjoint(below),
             frozenset(supports),
         )
     return states

@@ -21,7 +21,7 @@ from ba_torchrl.tasks.clearance import (
     grasp_clearance_m,
     hand_clearance_m,
     path_clearance_m,
-    tool_view,
+    tool_clearance_m,
 )
 from ba_torchrl.tasks.pick_place_commands import LEVEL_RAD
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps
@@ -194,11 +194,8 @@ class GraspSelector:
         ]
         gripper, yaw = self.robot.gripper, candidate.yaw_rad
         if candidate.tool is not None:
-            view, tool = tool_view(Pose(grasp, candidate.tool)), PlanarFrame(x, y, 0.0)
-            fingers = grasp_clearance_m(
-                gripper, body, 0.0, others, self.finger_opening, grasp, view
-            )
-            return min(fingers, hand_clearance_m(self.robot, tool, z, others, view))
+            tool = Pose(grasp, candidate.tool)
+            return tool_clearance_m(self.robot, tool, body, others, self.finger_opening)
         if candidate.shift_m:
             far = (candidate.far_finger_range_m,)
             fingers = path_clearance_m(gripper, body, yaw, far, others, at)
