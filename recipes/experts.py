@@ -30,8 +30,10 @@ def main(settings: DictConfig) -> None:
     load_plugins(settings.plugins)
     variants = OmegaConf.to_container(settings.variants, resolve=True)
     tables = []
-    for control, columns in variants.items():
-        tasks = [task for task in settings.tasks or list_tasks() if TASKS[task].control == control]
+    for table, columns in variants.items():
+        tasks = [
+            task for task in settings.tasks or list_tasks() if _table_of(task, variants) == table
+        ]
         if not tasks:
             continue
         lines = [
@@ -48,6 +50,17 @@ def main(settings: DictConfig) -> None:
     print(f"\n{text}\n\n{settings.episodes} episodes each, seed {settings.seed}")
     if settings.path is not None:
         Path(settings.path).write_text(text + "\n")
+
+
+def _table_of(task: str, variants: dict[str, Any]) -> str:
+    """Return the key of a task's table: its group, the part of its id before the slash, or control.
+
+    Args:
+        task: id of the task.
+        variants: columns of each table.
+    """
+    group = task.split("/")[0]
+    return group if group in variants else TASKS[task].control
 
 
 def _cell(task: str, settings: DictConfig, env: dict[str, Any]) -> str:
