@@ -105,6 +105,14 @@ def test_the_open_loop_quick_start_composes():
     assert config.env_config.num_objects == 3
 
 
+@pytest.mark.parametrize("network", ["asr", "equi_deictic_asr"])
+def test_the_quick_start_in_six_degrees_of_freedom_composes(network):
+    config = experiment("quickstart_six_dof", f"network={network}")
+    assert config.task == "ramp/block_stacking"
+    assert config.env_config.in_hand_mode == "proj"
+    assert (config.network_config.voxel_scale, config.network_config.num_rotations) == (10, 8)
+
+
 @pytest.mark.parametrize("network", [name for name in NETWORKS if suits("sacfd", name)])
 def test_the_quick_start_takes_any_network(network):
     config = experiment("quickstart", f"network={network}", "env.max_steps=20")
