@@ -20,12 +20,14 @@ from ba_torchrl.sim.geometry import (
     downward,
     downward_quaternion,
     euler_matrix,
+    matrix_quaternion,
     perpendicular,
     quaternion_matrix,
     quaternion_product,
     quaternion_tilt,
     quaternion_yaw,
     rotation_array,
+    surface_quaternion,
     tool_angles,
     tool_rotation,
     yaw_quaternion,
@@ -167,3 +169,36 @@ def test_only_geometry_py_computes_rotations():
     files = sorted(Path(ba_torchrl.__file__).parent.rglob("*.py"))
     found = {path.name for path in files if re.search(TRANSFORMS, path.read_text("utf-8"))}
     assert found == {"geometry.py"}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_matrices_and_quaternions_are_inverse(seed):
+    x = np.random.default_rng(seed).normal(size=4)
+    x[seed % 4] *= 10.0  # each component is the largest one in some case
+    quaternion = x / np.linalg.norm(x)
+    found = np.array(matrix_quaternion(quaternion_matrix(tuple(quaternion.tolist()))))
+    assert abs(found @ quaternion) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("turn", [(math.pi, 0, 0), (0, math.pi, 0), (0, 0, math.pi), (0, 0, 0)])
+def test_half_turns_have_a_quaternion(turn):
+    matrix = euler_matrix(*turn)
+    found = quaternion_matrix(matrix_quaternion(matrix))
+    assert np.array(found) == pytest.approx(np.array(matrix), abs=1e-12)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5, math.pi / 2, math.pi])
+@pytest.mark.parametrize("slope", [0.0, 0.1, math.pi / 6, 1.2])
+@pytest.mark.parametrize("bearing", [0.0, 0.7, math.pi / 2, -2.0])
+def test_a_frame_on_a_surface_has_its_normal_and_heading(yaw, slope, bearing):
+    normal = (
+        math.sin(slope) * math.cos(bearing),
+        math.sin(slope) * math.sin(bearing),
+        math.cos(slope),
+    )
+    matrix = np.array(quaternion_matrix(surface_quaternion(normal, yaw)))
+    assert matrix[:, 2] == pytest.approx(normal, abs=1e-12)
+    assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+    heading = math.atan2(matrix[1, 0], matrix[0, 0])
+    assert math.cos(heading - yaw) == pytest.approx(1.0)
