@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import Mesh
@@ -15,7 +16,7 @@ from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.footprints import Rectangle
-from ba_torchrl.tasks.sloped_terrain import SlopedTerrain
+from ba_torchrl.tasks.sloped_terrain import ON_SIDE_RAD, SlopedTerrain
 from ba_torchrl.tasks.workspace import Area, OrientedArea, Spacing, Workspace
 
 SLOPE_RAD = (0.0, math.pi / 12)
@@ -118,16 +119,24 @@ class Bumps(SlopedTerrain):
         return self.layout.platform
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Draw the pyramids, their heading, and the pose of the platform inside the workspace."""
+        """Draw the pyramids, their heading, and the pose of the platform inside the workspace.
+
+        Raises:
+            PlacementError: the workspace is too small for the platform.
+        """
         pyramids = rng.choice(VARIANTS, size=PYRAMIDS_PER_ROW**2, replace=False)
         heading = float(rng.uniform(0.0, math.pi))
         yaw = float(rng.uniform(0.0, 2 * math.pi)) if self.random_orientation else math.pi / 2
         half_x, half_y = (size / 2 for size in self.platform_m)
         extents = Rectangle(0.0, 0.0, yaw, half_x, half_y).extents_m(0.0)
-        center = (
-            float(rng.uniform(low + extent, high - extent))
-            for (low, high), extent in zip(self.spawn_area, extents, strict=True)
-        )
+        center = []
+        for (low, high), extent in zip(self.spawn_area, extents, strict=True):
+            if low + extent > high - extent:
+                raise PlacementError(
+                    f"the platform of {2 * half_x:.3g} m by {2 * half_y:.3g} m does not fit: "
+                    "enlarge `workspace` or lower `object_scale_range`"
+                )
+            center.append(float(rng.uniform(low + extent, high - extent)))
         self._set_layout(BumpLayout(tuple(pyramids.tolist()), heading, PlanarFrame(*center, yaw)))
 
     def get_state(self) -> BumpLayout:
@@ -217,6 +226,7 @@ class OnBumps:
     default_action_sequence: ClassVar[str | None] = "pxyzrrr"
     default_in_hand_mode: ClassVar[str] = "proj"
     required_action_components: ClassVar[frozenset[str]] = frozenset(("z", "rz", "ry", "rx"))
+    tipped_rad: ClassVar[float] = ON_SIDE_RAD
     platform_m: ClassVar[tuple[float, float]]
     """Extents of the platform at the default scale of the objects."""
 

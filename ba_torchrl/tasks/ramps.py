@@ -13,7 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, quaternion_product, yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.sloped_terrain import SlopedTerrain, footprint
+from ba_torchrl.tasks.sloped_terrain import ON_SIDE_RAD, SlopedTerrain, footprint
 from ba_torchrl.tasks.structures.blueprint import Piece
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Area, OrientedArea, Workspace
 
@@ -26,8 +26,8 @@ EDGE_M = (0.0, 0.01)
 OFFSET_SHARE = 0.25
 """Largest offset of the centre of the gap from that of the workspace, as a multiple of the
 difference between the widest and the present gap."""
-RAMP_M = (0.7, 0.45, 0.24)
-"""Extents of a ramp along its edge, up the slope and perpendicular to it."""
+BORDER_M = 0.03
+"""Distance by which the ramps extend beyond the corners of the workspace."""
 FRICTION = 1.0
 """Objects slide at slopes above 45 degrees."""
 COLORS: tuple[Color, Color] = ((0.62, 0.7, 0.78, 1.0), (0.55, 0.63, 0.72, 1.0))
@@ -72,13 +72,15 @@ class Ramps(SlopedTerrain):
                 f"pieces of {least_gap_m:.3f} m are wider than the widest gap, {GAP_M[1]} m"
             )
         super().__init__(world, workspace)
+        radius_m = math.hypot(*(high - low for low, high in self.spawn_area)) / 2 + BORDER_M
+        length_m = radius_m / math.cos(SLOPE_RAD[1])
+        self.size_m = (2 * radius_m, length_m, length_m * math.tan(SLOPE_RAD[1]) + BORDER_M)
+        """Extents of a ramp along its edge, up the slope and perpendicular to it."""
         self.gap_range_m = (max(GAP_M[0], least_gap_m), GAP_M[1])
-        self.ramps = [
-            world.add(
-                Box(size_m=RAMP_M, mass_kg=0.0, friction=FRICTION, color=color), f"ramp {i + 1}"
-            )
-            for i, color in enumerate(COLORS)
+        shapes = [
+            Box(size_m=self.size_m, mass_kg=0.0, friction=FRICTION, color=color) for color in COLORS
         ]
+        self.ramps = [world.add(shape, f"ramp {i + 1}") for i, shape in enumerate(shapes)]
         half = GAP_M[1] / 2
         self._set_layout(RampLayout(0.0, (half, half), (0.0, 0.0), (0.0, 0.0)))
 
@@ -99,7 +101,7 @@ class Ramps(SlopedTerrain):
         offset, half = (first - second) / 2, (first + second) / 2
         center = self._frame.to_world(0.0, offset)
         frame = PlanarFrame(*center, self.layout.heading_rad)
-        return OrientedArea(frame, RAMP_M[0] / 2, half, self.spawn_area)
+        return OrientedArea(frame, self.size_m[0] / 2, half, self.spawn_area)
 
     @property
     def aside_area(self) -> Area:
@@ -184,7 +186,7 @@ class Ramps(SlopedTerrain):
     def _set_layout(self, layout: RampLayout) -> None:
         """Move the ramps to a layout."""
         self.layout = layout
-        _, length, thickness = RAMP_M
+        _, length, thickness = self.size_m
         from_edge = Pose((0.0, length / 2, -thickness / 2))
         for i, (ramp, turn) in enumerate(zip(self.ramps, (0.0, math.pi), strict=True)):
             side = 1 if i == 0 else -1
@@ -205,7 +207,7 @@ class OnRamps:
     default_action_sequence: ClassVar[str | None] = "pxyzrrr"
     default_in_hand_mode: ClassVar[str] = "proj"
     required_action_components: ClassVar[frozenset[str]] = frozenset(("z", "rz", "ry", "rx"))
-    tipping_ends: ClassVar[bool] = False
+    tipped_rad: ClassVar[float] = ON_SIDE_RAD
 
     def make_terrain(self) -> Ramps:
         """Load the ramps."""

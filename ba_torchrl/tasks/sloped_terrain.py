@@ -21,6 +21,8 @@ from ba_torchrl.sim.robots.gripper import FLOOR_CLEARANCE_M, Gripper
 from ba_torchrl.tasks.terrain import Terrain
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Spacing
 
+ON_SIDE_RAD = math.pi / 3
+"""Tilt of a piece that has tipped over on a slope. No grasp turns it upright."""
 PROBE_M = 1e-4
 """Distance at which the slope at a point is measured."""
 FLAT_M = 2e-4

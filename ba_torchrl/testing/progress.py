@@ -88,6 +88,8 @@ class Disturbed(NamedTuple):
     """The actions, as shares of the range of each component."""
     is_solved: bool
     is_truncated: bool
+    most_refused: int
+    """Largest number of successive actions that were out of reach."""
 
     def repetitions(self, step: int) -> list[int]:
         """Return the earlier steps with the action and the scene of a step."""
@@ -105,12 +107,12 @@ Disturb = Callable[[ManipulationEnv, TensorDictBase, np.random.Generator], Tenso
 def check_progress(
     task: str, *, episodes: int, max_unsolved_rate: float = 0.0, **config: Any
 ) -> None:
-    """Check that the expert ends episodes from disturbed scenes and repeats no action in vain.
+    """Check that the expert ends episodes from disturbed scenes and repeats no futile action.
 
-    It may not send an action twice in succession into an unchanged scene, nor return to a scene
-    and action `MAX_REPETITIONS` times. The scenes are disturbed by random actions, by fingers that
-    close around an object (close loop), and by an object that is dropped, often flush with another
-    body (open loop). Tasks of one step are exempt.
+    It may not send an action twice in succession into an unchanged scene, return to a scene and
+    action `MAX_REPETITIONS` times, or send that many actions out of reach in succession. The scenes
+    are disturbed by random actions, by fingers that close around an object (close loop), and by an
+    object that is dropped, often flush with another body (open loop). Tasks of one step are exempt.
 
     Args:
         task: id of the task.
@@ -152,16 +154,23 @@ def play_disturbed(env: ManipulationEnv, seed: int, disturb: Disturb) -> Disturb
         return None
     low, high = env.action_spec.space.low, env.action_spec.space.high
     views, actions = [], []
+    refused = most_refused = 0
     while not state[keys.DONE]:
         views.append(SceneView.of(env.scene))
         state = expert_policy(state)
         actions.append(((state[keys.ACTION] - low) / (high - low)).numpy())
         state = env.step(state)[keys.NEXT]
-    return Disturbed(views, actions, bool(state[keys.SUCCESS]), bool(state[keys.TRUNCATED]))
+        refused = refused + 1 if env.is_out_of_reach else 0
+        most_refused = max(most_refused, refused)
+    is_solved, is_truncated = bool(state[keys.SUCCESS]), bool(state[keys.TRUNCATED])
+    return Disturbed(views, actions, is_solved, is_truncated, most_refused)
 
 
 def _check_repetitions(played: Disturbed, where: str) -> None:
-    """Check that no action is repeated in vain."""
+    """Check that no futile action is repeated."""
+    assert played.most_refused < MAX_REPETITIONS, (
+        f"{where} the expert sends {played.most_refused} actions out of reach in succession"
+    )
     for step in range(1, len(played.actions)):
         earlier = played.repetitions(step)
         assert step - 1 not in earlier, (
@@ -217,7 +226,7 @@ def drop_object(
         quaternion = rng.normal(size=4)
         orientation = tuple((quaternion / np.linalg.norm(quaternion)).tolist())
     body.set_pose((*xy, 0.0), orientation)
-    z = scene.task.terrain.height_m(xy) - vertical_extent(body)[0]
+    z = -scene.task.terrain.gap_below_m(body)
     body.set_pose((*xy, z + float(rng.uniform(0.1, 1)) * DROP_M), orientation)
     scene.world.settle(max_steps=SETTLE_STEPS)
     shares = np.full(7, 0.5)

@@ -66,7 +66,6 @@ OTHERS_NOT_WITHOUT_YAW = {
 """Tasks that robots other than kuka cannot solve without yaw actions, and why."""
 
 UNSOLVED = {
-    "bump/house_building_4": (0.1, "a roof that is dropped on its side stays there"),
     "open_loop/bin_packing": (0.1, "a dropped object may lie on the rim of the bin"),
     "open_loop/covid_test": (0.25, "fingers do not fit between a wall and a swab that touches it"),
 }

@@ -6,12 +6,15 @@ import numpy as np
 import pybullet
 import pytest
 
+import ba_torchrl
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import world_vertices
 from ba_torchrl.sim.geometry import quaternion_matrix, tool_rotation
 from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.bumps import Bumps
+from ba_torchrl.tasks.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.ramps import GAP_M, RampLayout, Ramps
 from ba_torchrl.tasks.sloped_terrain import footprint
 from ba_torchrl.tasks.terrain import Flat
@@ -141,8 +144,7 @@ def test_the_pyramids_have_slopes_up_to_15_degrees_and_the_platform_their_height
 
 
 def test_on_level_ground_the_least_height_of_the_tool_is_that_of_a_flat_floor(world):
-    ramps = make_ramps(world)
-    gripper = Kuka(world).gripper if world._pristine is None else _gripper()
+    ramps, gripper = make_ramps(world), _gripper()
     ramps._set_layout(RampLayout(0.0, (0.1, 0.1), (0.0, 0.0), (0.0, 0.0)))
     flat = Flat(world, WORKSPACE)
     for rotation in (None, tool_rotation(0.4, 0.3, -0.2)):
@@ -150,7 +152,7 @@ def test_on_level_ground_the_least_height_of_the_tool_is_that_of_a_flat_floor(wo
         lowest = ramps.lowest_tool_m(gripper, (0.45, 0.1), rotation)
         # the outer sides of tilted fingers are lower than the inner sides that Flat considers
         extra = 0.0 if rotation is None else gripper.finger_depth_m
-        assert expected - 1e-12 <= lowest <= expected + extra
+        assert expected - 1e-12 <= lowest <= expected + extra + 1e-12
 
 
 def _gripper():
@@ -214,11 +216,38 @@ def test_objects_start_beside_the_platform(make_env):
     env = make_env("bump/house_building_4")
     for _ in range(8):
         env.reset()
-        terrain = env.scene.task.terrain
+        frame = env.scene.task.terrain.layout.platform
+        platform = Rectangle(*frame, 0.065, 0.065)
         for body in env.scene.task.objects:
-            area = terrain.build_area
-            along, across = area.frame.to_local(*world_vertices(body)[:, :2].T)
-            assert not ((abs(along) < area.half_x) & (abs(across) < area.half_y)).any()
+            assert gap_m(platform, outline(body)) > 0.01
+
+
+@pytest.mark.parametrize("task", SIX_DOF)
+def test_the_arm_does_not_penetrate_the_terrain_at_home(make_env, task):
+    env = make_env(task)
+    for _ in range(10):
+        env.reset()
+        robot, terrain = env.scene.robot, env.scene.task.terrain
+        assert not robot.penetrates(terrain.support_ids, robot.home_joints)
+
+
+def test_a_workspace_smaller_than_the_platform_is_refused():
+    with pytest.raises(ConfigError, match="the platform of"):
+        ba_torchrl.make("bump/box_palletizing", workspace=((0.35, 0.6), (-0.125, 0.125), (0, 0.3)))
+
+
+@pytest.mark.parametrize("width", [0.4, 0.7])
+def test_the_ramps_cover_the_corners_of_any_workspace(world, width):
+    workspace = Workspace((0.3, 0.3 + width), (-width / 2, width / 2), (0.0, 0.4))
+    ramps = Ramps(world, workspace)
+    world.seal()
+    rng = np.random.default_rng(0)
+    corners = np.array([(x, y) for x in workspace.x for y in workspace.y])
+    for _ in range(40):
+        ramps.initialize_episode(rng)
+        plane = corners[ramps._planes(corners, 5e-3)[2] < 1e-9]
+        assert len(plane) >= 2
+        assert ramps.heights_m(plane) == pytest.approx(cast_down(world, plane)[0], abs=2e-3)
 
 
 @pytest.mark.parametrize("task", STRUCTURES)

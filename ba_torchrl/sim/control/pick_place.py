@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import contacts, is_any_within
+from ba_torchrl.sim.control.approach import approach_point, plan_approach
 from ba_torchrl.sim.control.close_loop import OPENING_TOLERANCE, move_fingers
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.control.support_surface import Floor, SupportSurface
@@ -28,9 +29,6 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
-
-MAX_UNCHECKED_TILT_COSINE = 0.86
-"""Within 30 degrees of the vertical, neither hand nor arm can reach below the fingertips."""
 
 
 class HeldState(NamedTuple):
@@ -215,8 +213,7 @@ class PickPlace:
 
     def _approach_point(self, position: Vector, rotation: Matrix, distance_m: float) -> Vector:
         """Return the point at a distance before ``position`` on the approach line."""
-        away = (0.0, 0.0, 1.0) if self.top_down else tuple(-row[2] for row in rotation)
-        return tuple(p + distance_m * a for p, a in zip(position, away, strict=True))
+        return approach_point(position, rotation, distance_m, top_down=self.top_down)
 
     def _clear_of_surface(self, position: Vector, rotation: Matrix) -> Vector:
         """Return the point, raised if necessary so that the fingers close clear of the surface."""
@@ -226,30 +223,6 @@ class PickPlace:
 
     def _solve_joints(self, position: Vector, rotation: Matrix) -> list[float] | None:
         return self.robot.inverse_kinematics(position, rotation, self.robot.joints)
-
-    def _plan_approach(self, end: Vector, rotation: Matrix) -> list[list[float]] | None:
-        """Return the arm joints at samples of an approach, the first one at its start.
-
-        Args:
-            end: position of the tool point at the end of the approach, metres.
-            rotation: of the tool.
-
-        Returns:
-            Joint angles in radians; None if the approach is out of reach: a sample has no inverse
-            kinematics, or hand or arm penetrate the support surface at the start or at the end.
-        """
-        distances = (self.limits.approach_distance_m, *self.limits.approach_samples_m, 0.0)
-        path = [
-            self._solve_joints(self._approach_point(end, rotation, distance), rotation)
-            for distance in distances
-        ]
-        if any(joints is None for joints in path):
-            return None
-        is_steep = -rotation[2][2] > MAX_UNCHECKED_TILT_COSINE
-        supports = self.surface.support_ids
-        if not is_steep and any(self.robot.penetrates(supports, path[i]) for i in (0, -1)):
-            return None
-        return path
 
     def _approach(self, position: Vector, rotation: Matrix, clearance_m: float) -> bool:
         """Move the tool along the approach line to a target, or to a clearance before it.
@@ -263,7 +236,14 @@ class PickPlace:
             Whether the approach is within reach; if not, the arm does not move.
         """
         end = self._approach_point(position, rotation, clearance_m)
-        path = self._plan_approach(end, rotation)
+        path = plan_approach(
+            self.robot,
+            self.surface.support_ids,
+            self.limits,
+            end,
+            rotation,
+            top_down=self.top_down,
+        )
         self.is_out_of_reach = path is None
         if path is None:
             return False

@@ -228,9 +228,10 @@ class Robot(ABC):
         return tool.position, tool.yaw_rad
 
     def penetrates(self, body_ids: Iterable[int], joints: Sequence[float]) -> bool:
-        """Whether a link other than base and fingers would penetrate bodies at a configuration.
+        """Whether hand or arm would penetrate bodies at a configuration.
 
-        The state of the arm is unchanged.
+        The fingers, the base and the first link do not count: bodies may surround the mount. The
+        state of the arm is unchanged.
 
         Args:
             body_ids: PyBullet's ids of the bodies.
@@ -242,7 +243,7 @@ class Robot(ABC):
             point
             for body_id in body_ids
             for point in nearest_points(self.client, self.id, body_id, 0.0)
-            if point.link >= 0 and point.link not in self._finger_of_link
+            if point.link > self.arm_joints[0] and point.link not in self._finger_of_link
         ]
         self._set_arm([state[:2] for state in states])
         return is_any_within(points, 0.0)

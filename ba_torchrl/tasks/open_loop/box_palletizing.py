@@ -203,7 +203,9 @@ class BoxPalletizing(PackingTask):
             self.robot, tool, body, [*others, self.container], self.finger_opening
         )
         is_clear = clearance_m >= min(grasp.clearance_m, SUFFICIENT_CLEARANCE_M)
-        return tool if is_clear and is_reachable(self.robot, tool) else grasp.tool
+        if is_clear and is_reachable(self.robot, self.terrain.support_ids, tool):
+            return tool
+        return grasp.tool
 
     def _activate_next_box(self) -> None:
         """Place the next box where it arrives."""

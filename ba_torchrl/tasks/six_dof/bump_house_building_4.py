@@ -12,8 +12,7 @@ class BumpHouseBuilding4(OnBumps, HouseBuilding4):
     """House Building 4 on a platform of 13 x 13 cm; the pieces start on a bumpy surface around it.
 
     The surface consists of nine pyramids with slopes of 0 to 15 degrees. The episode ends early
-    when a piece leaves the workspace. Appendix C.
+    when the roof lies on its side or a piece leaves the workspace. Appendix C.
     """
 
     platform_m = (0.13, 0.13)
-    tipping_ends = False

@@ -118,11 +118,21 @@ class GraspSelector:
         return candidates
 
     def is_free(self, body: Body) -> bool:
-        """Whether a grasp of a body has clearance."""
-        return self.quality(body, self.best(body))[2] > 0
+        """Whether a grasp of a body has clearance and, with tilts, is within reach."""
+        best = self.best(body)
+        if self.quality(body, best)[2] <= 0:
+            return False
+        if not self.limits.can_tilt:
+            return True
+        tool = self.tool_pose(body, best)
+        is_grasp = best in self.candidates(body)
+        return is_grasp and is_reachable(self.robot, self.terrain.support_ids, tool)
 
     def best(self, body: Body) -> GraspCandidate:
-        """Return the best grasp of a body; with tilts, the best of those that the arm reaches."""
+        """Return the best grasp of a body; with tilts, the best of those that the arm reaches.
+
+        If it reaches none of them, it pushes a tilted body with fingers that point straight down.
+        """
         ranked = sorted(
             self.candidates(body),
             key=lambda candidate: self.quality(body, candidate),
@@ -130,8 +140,16 @@ class GraspSelector:
         )
         if not self.limits.can_tilt:
             return ranked[0]
-        reachable = (c for c in ranked if is_reachable(self.robot, self.tool_pose(body, c)))
-        return next(reachable, ranked[0])
+        supports = self.terrain.support_ids
+        vertical = (GraspCandidate(yaw) for yaw in self.yaws(body))
+        return next(
+            (
+                candidate
+                for candidate in (*ranked, *vertical)
+                if is_reachable(self.robot, supports, self.tool_pose(body, candidate))
+            ),
+            ranked[0],
+        )
 
     def _is_on_ground(self, body: Body) -> bool:
         return self.terrain.gap_below_m(body) < self.structure.block_m / 4

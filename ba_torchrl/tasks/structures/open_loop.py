@@ -12,7 +12,7 @@ from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
-from ba_torchrl.tasks.structures.blueprint import Blueprint
+from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 from ba_torchrl.tasks.structures.goal import StructureGoal
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
@@ -26,8 +26,8 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
     """Pieces at random poses on the ground; success when they form the blueprint's structure."""
 
     can_be_deconstructed = True
-    tipping_ends: ClassVar[bool] = True
-    """Whether the episode ends when a piece that must stay upright, such as a roof, tips over."""
+    tipped_rad: ClassVar[float] = UPRIGHT_RAD
+    """Tilt at which a piece that must stay upright, such as a roof, ends the episode."""
     clears_blocked_pieces: ClassVar[bool] = False
     """Whether the expert removes pieces that block the grasp of another piece. Off for structures
     with long pieces, for which the removals would not end."""
@@ -76,7 +76,7 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
         """Whether all pieces are inside the workspace, and upright where required."""
         if not super().is_valid():
             return False
-        return not (self.tipping_ends and self.planner.has_tipped(self.robot.held_body()))
+        return not self.planner.has_tipped(self.robot.held_body(), self.tipped_rad)
 
     def expert_command(self) -> PickPlaceCommand:
         """Return the pick or place of the planner's next move."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
     Pose,
@@ -93,7 +94,9 @@ class PickPlaceExpert(GraspQueries):
             return self._place(move)
         body = self._unblocking(move.body)
         if self.limits.turn_rad and not self.grasps.is_free(body):
-            grasp = self.grasps.tool_pose(body, self.grasps.best(body))
+            # straight down, so that the arm reaches it with any deviation
+            upright = self.grasps.best(body)._replace(tool=None)
+            grasp = self.grasps.tool_pose(body, upright)
             return perturbed_pick(self.structure.planner.world, body, grasp, can_turn=True)
         return self.pick(body)
 
@@ -248,8 +251,11 @@ class PickPlaceExpert(GraspQueries):
             key=lambda pose: self._release_clearance_m(move, pose),
             reverse=True,
         )
+        supports, clearance_m = self.terrain.support_ids, PickPlaceLimits().pre_place_height_m
         reachable = (
-            pose for pose in ranked if is_reachable(self.robot, carrying_pose(tool, held, pose))
+            pose
+            for pose in ranked
+            if is_reachable(self.robot, supports, carrying_pose(tool, held, pose), clearance_m)
         )
         return next(reachable, ranked[0])
 

@@ -95,14 +95,15 @@ class StructurePlanner:
         """
         return all(self.evaluate(held).values())
 
-    def has_tipped(self, held: Body | None = None) -> bool:
+    def has_tipped(self, held: Body | None = None, tipped_rad: float = UPRIGHT_RAD) -> bool:
         """Whether a piece that must stay upright has tipped over and is not held.
 
         Args:
             held: the body in the gripper.
+            tipped_rad: tilt of a piece that has tipped over.
         """
         return any(
-            piece.stays_upright and body is not held and piece.tilt_rad(body) >= UPRIGHT_RAD
+            piece.stays_upright and body is not held and piece.tilt_rad(body) >= tipped_rad
             for body, piece in self.pieces.items()
         )
 
@@ -358,7 +359,8 @@ class StructurePlanner:
         site = tuple(sites[best].tolist())
         origin = area.origin_pose(site, queries.rise_m(body), footprint_radius_m(body))
         target_yaw = None if yaw is None else float(yaw + bearings[best])
-        move = Move(body, piece, origin.position, target_yaw, piece.yaw_period_rad, ())
+        period = piece.yaw_period_rad
+        move = Move(body, piece, origin.position, target_yaw, period, (), origin.orientation)
         return move, float(deficits[best])
 
     def _to_ground(

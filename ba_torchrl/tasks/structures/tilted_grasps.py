@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
+from ba_torchrl.actions import MAX_TILT_RAD
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.control.approach import approach_point, plan_approach
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.geometry import (
     Pose,
@@ -15,6 +17,7 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
     quaternion_product,
     surface_quaternion,
+    tool_angles,
 )
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.structures.blueprint import Piece
@@ -65,18 +68,25 @@ def release_pose(piece: Piece, body: Body, origin: Pose, yaw_rad: float) -> Pose
     return Pose(origin.position, quaternion_product(frame, in_resting_frame(piece, body)))
 
 
-def is_reachable(robot: Robot, tool: Pose) -> bool:
-    """Whether the arm reaches a pose of the tool and the start of the approach to it.
+def is_reachable(
+    robot: Robot, support_ids: frozenset[int], tool: Pose, clearance_m: float = 0.0
+) -> bool:
+    """Whether the arm reaches a pose of the tool and the approach to it.
 
-    Both poses are also reached after half a turn of the tool, which the action space may add.
+    Both are also reached after half a turn of the tool, which the action space may add.
+
+    Args:
+        robot: the robot.
+        support_ids: PyBullet ids of the bodies that form the ground.
+        tool: pose of the tool.
+        clearance_m: distance before the pose at which the approach ends.
     """
+    if any(abs(tilt) > MAX_TILT_RAD for tilt in tool_angles(tool.orientation)[1:]):
+        return False
     rotation = quaternion_matrix(tool.orientation)
+    end = approach_point(tool.position, rotation, clearance_m)
     half_turn = tuple((-x, -y, z) for x, y, z in rotation)
     return all(
-        robot.inverse_kinematics(
-            tuple(p - d * row[2] for p, row in zip(tool.position, rotation, strict=True)), turned
-        )
-        is not None
+        plan_approach(robot, support_ids, PickPlaceLimits(), end, turned) is not None
         for turned in (rotation, half_turn)
-        for d in (0.0, PickPlaceLimits().approach_distance_m)
     )

@@ -99,8 +99,10 @@ def test_reach_counts_both_ways_of_holding_the_tool():
     with World() as world:
         robot = Kuka(world)
         near = Pose((0.45, 0.0, 0.1), _orientation(0.3, 0.2, 0.1))
-        assert is_reachable(robot, near)
-        assert not is_reachable(robot, near._replace(position=(1.2, 0.0, 0.1)))
+        floor = frozenset((world.floor,))
+        assert is_reachable(robot, floor, near)
+        assert not is_reachable(robot, floor, near._replace(orientation=_orientation(0, 0, 1.6)))
+        assert not is_reachable(robot, floor, near._replace(position=(1.2, 0.0, 0.1)))
         # in some poses only one of both ways is within reach: the hand is not symmetric
         single = 0
         for x in np.linspace(0.6, 0.8, 200).tolist():
@@ -111,7 +113,7 @@ def test_reach_counts_both_ways_of_holding_the_tool():
                 for s in (1, -1)
             ]
             single += (both[0] is None) != (both[1] is None)
-            assert not (is_reachable(robot, tool) and None in both)
+            assert not (is_reachable(robot, floor, tool) and None in both)
         assert single > 0
 
 
