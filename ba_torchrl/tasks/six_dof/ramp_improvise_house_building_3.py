@@ -12,6 +12,6 @@ class RampImproviseHouseBuilding3(OnRamps, ImproviseHouseBuilding3):
     """Improvise House Building 3 with two ramps: the structure stands between them.
 
     The distance between the ramps is 4 to 20 cm, their slopes are 0 to 30 degrees, the heights of
-    their lower edges 0 to 1 cm. The episode ends early when a shape or the roof lies on its side, or
-    a piece leaves the workspace. Appendix C.
+    their lower edges 0 to 1 cm. The episode ends early when a shape or the roof lies on its side
+    or a piece leaves the workspace. Appendix C.
     """
