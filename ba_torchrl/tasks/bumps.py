@@ -166,7 +166,7 @@ class Bumps(SlopedTerrain):
         gap = np.maximum(along - area.half_x, across - area.half_y)
         return np.maximum(radius_m + CLEARANCE_M - gap, 0.0)
 
-    def is_flush(self, outline: np.ndarray) -> bool:
+    def can_start_at(self, outline: np.ndarray) -> bool:
         """Whether an outline [V, 2] is clear of the platform."""
         area = self.build_area
         along, across = np.stack(area.frame.to_local(*outline.T))

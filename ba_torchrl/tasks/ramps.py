@@ -29,7 +29,7 @@ difference between the widest and the present gap."""
 BORDER_M = 0.03
 """Distance by which the ramps extend beyond the corners of the workspace."""
 FRICTION = 1.0
-"""Objects slide at slopes above 45 degrees."""
+"""Objects of friction 1 slide at slopes above 45 degrees."""
 COLORS: tuple[Color, Color] = ((0.62, 0.7, 0.78, 1.0), (0.55, 0.63, 0.72, 1.0))
 EDGE_MARGIN_M = 2e-3
 """Least distance of an object from the edges of the ramps at the start."""
@@ -145,7 +145,7 @@ class Ramps(SlopedTerrain):
         is_between = self.build_area.outside_m(points) == 0
         return super().uneven_m(points, radius_m) + INSIDE_DEFICIT_M * is_between
 
-    def is_flush(self, outline: np.ndarray) -> bool:
+    def can_start_at(self, outline: np.ndarray) -> bool:
         """Whether an outline [V, 2] lies on one side of each edge, with a margin."""
         _, across = self._frame.to_local(*outline.T)
         first, second = self.layout.distances_m

@@ -71,7 +71,7 @@ class SlopedTerrain(Terrain):
         return UNEVEN_WEIGHT * self.build_area.shrunk(radius_m).outside_m(points)
 
     @abstractmethod
-    def is_flush(self, outline: np.ndarray) -> bool:
+    def can_start_at(self, outline: np.ndarray) -> bool:
         """Whether a body with an outline may start there.
 
         Args:
@@ -168,7 +168,7 @@ class SlopedTerrain(Terrain):
             if any(math.dist(xy, other) < spacing.distance_m for other in others):
                 continue
             yaw = draw_yaw(body)
-            if self.is_flush(footprint(body, xy, yaw)):
+            if self.can_start_at(footprint(body, xy, yaw)):
                 return xy, yaw
         return None
 

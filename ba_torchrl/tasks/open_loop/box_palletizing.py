@@ -56,6 +56,8 @@ TIP_OVER_M = 0.008
 """Distance beyond the pallet's edge at which an upended box is released, so that it tips over."""
 TIP_SITES = 2
 """Sites on each side of the centre of the edge that are compared for this."""
+TILT_SHARES = (1.0, 0.75, 0.5, 0.25)
+"""Tilts of the tool that are compared, as a share of that of the box."""
 FREE_HALF_M = (0.056, 0.016)
 """Half the extents of the free area around a box at the start."""
 SETTLE_STEPS = 100
@@ -187,24 +189,26 @@ class BoxPalletizing(PackingTask):
     # ----------------------------------------------------------------------------------------
 
     def _along_normal(self, grasp: TopDownGrasp) -> Pose:
-        """Return the tool of a grasp, tilted like the box if arm and neighbours allow it."""
+        """Return the tool of a grasp, tilted like the box as far as arm and neighbours allow."""
         body = grasp.body
         if not self.action_limits.can_tilt or CUBOID.tilt_rad(body) < LEVEL_RAD:
             return grasp.tool
-        normal = tuple(row[2] for row in quaternion_matrix(CUBOID.resting_frame(body)))
-        surface = surface_quaternion(normal, grasp.yaw_rad)
+        normal = [row[2] for row in quaternion_matrix(CUBOID.resting_frame(body))]
         rows = quaternion_matrix(in_resting_frame(CUBOID, body))
         top_m = float((body.shape.vertices @ rows[2]).max())
         x, y = PlanarFrame(*body.position[:2], grasp.yaw_rad).to_local(*grasp.position[:2])
         offset = Pose((x, y, top_m - GRASP_DEPTH_M * self.unit), downward_quaternion(0.0))
-        tool = Pose(body.position, surface).compose(offset)
-        others = [other for other in self.pool.active if other is not body]
-        clearance_m = tool_clearance_m(
-            self.robot, tool, body, [*others, self.container], self.finger_opening
-        )
-        is_clear = clearance_m >= min(grasp.clearance_m, SUFFICIENT_CLEARANCE_M)
-        if is_clear and is_reachable(self.robot, self.terrain.support_ids, tool):
-            return tool
+        others = [other for other in (*self.pool.active, self.container) if other is not body]
+        for share in TILT_SHARES:
+            axis = np.array([0.0, 0.0, 1.0 - share]) + share * np.array(normal)
+            axis = tuple((axis / np.linalg.norm(axis)).tolist())
+            surface = Pose(body.position, surface_quaternion(axis, grasp.yaw_rad))
+            tool = surface.compose(offset)
+            clearance_m = tool_clearance_m(self.robot, tool, body, others, self.finger_opening)
+            if clearance_m >= min(grasp.clearance_m, SUFFICIENT_CLEARANCE_M) and is_reachable(
+                self.robot, self.terrain.support_ids, tool
+            ):
+                return tool
         return grasp.tool
 
     def _activate_next_box(self) -> None:

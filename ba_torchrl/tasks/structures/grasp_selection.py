@@ -103,8 +103,8 @@ class GraspSelector:
                 for share in LENGTH_SHARES
                 for candidate in centered
             ]
-        # edge grasps not if the gripper turns straight down only: it finds a free yaw; and only on
-        # the ground: on others a body drags its support along
+        # Edge grasps are for a gripper that cannot turn, and for slopes beside a body. On another
+        # body, the grasped one would drag its support along.
         if (self.limits.can_tilt or not self.limits.turn_rad) and self._is_on_ground(body):
             gripper, opening = self.robot.gripper, self.finger_opening
             for candidate in centered:
