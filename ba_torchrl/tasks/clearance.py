@@ -15,7 +15,7 @@ from ba_torchrl.sim.bodies import Body, world_vertices
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, Vector, downward, rotation_array
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
-from ba_torchrl.tasks.footprints import Rectangle, gap_m
+from ba_torchrl.tasks.footprints import Rectangle, extents_m, gap_m, separation_m
 
 Range = tuple[float, float]
 """Ends of an interval along the direction in which the fingers close."""
@@ -33,8 +33,6 @@ PASSING_HEIGHT_M = 0.03
 """Height of the tool above bodies that it passes over; more for grippers with longer fingers."""
 PASSING_GAP_M = 0.012
 """Least gap between the fingertips and bodies that they pass over."""
-
-
 # -- parts of a gripper ------------------------------------------------------------------------
 
 
@@ -129,7 +127,6 @@ def path_clearance_m(
     ranges_m: Sequence[Range],
     others: Sequence[Body],
     at: Vector | None = None,
-    vertices: VerticesOf = world_vertices,
 ) -> float:
     """Return the clearance between the fingertips on their path to a body, and other bodies.
 
@@ -140,13 +137,12 @@ def path_clearance_m(
         ranges_m: ranges that the fingers occupy, relative to the origin of the body.
         others: the other bodies.
         at: assumed position of the body; its present one if None.
-        vertices: by default those in the world frame; for a tilted tool, see `tool_view`.
     """
     bx, by, bz = body.position if at is None else at
     frame = PlanarFrame(bx, by, yaw_rad)
     gap = math.inf
     for other in others:
-        corners = vertices(other)
+        corners = world_vertices(other)
         if corners[:, 2].max() < bz + gripper.lowest_tip_m:
             continue
         along, across = frame.to_local(corners[:, 0], corners[:, 1])
@@ -163,7 +159,6 @@ def grasp_clearance_m(
     others: Sequence[Body],
     opening: float = 1.0,
     at: Vector | None = None,
-    vertices: VerticesOf = world_vertices,
 ) -> float:
     """Return the clearance between the fingers, opened around a body's origin, and other bodies.
 
@@ -174,10 +169,9 @@ def grasp_clearance_m(
         others: the other bodies.
         opening: opening of the gripper, 0 to 1.
         at: assumed position of the body; its present one if None.
-        vertices: by default those in the world frame; for a tilted tool, see `tool_view`.
     """
     ranges = finger_ranges_m(gripper, opening)
-    return path_clearance_m(gripper, body, yaw_rad, ranges, others, at, vertices)
+    return path_clearance_m(gripper, body, yaw_rad, ranges, others, at)
 
 
 def hand_clearance_m(
@@ -185,7 +179,6 @@ def hand_clearance_m(
     tool: PlanarFrame,
     tool_z_m: float,
     others: Sequence[Body],
-    vertices: VerticesOf = world_vertices,
 ) -> float:
     """Return the clearance between the hand above the palm and other bodies.
 
@@ -194,11 +187,10 @@ def hand_clearance_m(
         tool: frame of the tool.
         tool_z_m: height of the tool.
         others: the other bodies; only those higher than the palm count.
-        vertices: by default those in the world frame; for a tilted tool, see `tool_view`.
     """
     gap = math.inf
     for other in others:
-        corners = vertices(other)
+        corners = world_vertices(other)
         if corners[:, 2].max() > tool_z_m + robot.gripper.palm_height_m:
             local = np.stack(tool.to_local(corners[:, 0], corners[:, 1]), axis=1)
             gaps = np.maximum(local.min(axis=0), -local.max(axis=0)) - robot.hand_half_extents_m
@@ -207,20 +199,32 @@ def hand_clearance_m(
 
 
 def tool_clearance_m(
-    robot: Robot, tool: Pose, body: Body, others: Sequence[Body], opening: float = 1.0
+    robot: Robot, tool: Pose, others: Sequence[Body], opening: float = 1.0
 ) -> float:
     """Return the clearance between the hand with open fingers at a pose, and other bodies.
+
+    It is a lower bound, the largest gap between parallel lines that separate the two.
 
     Args:
         robot: the robot.
         tool: pose of the tool, which may be tilted.
-        body: the body to grasp.
         others: the other bodies.
         opening: opening of the gripper, 0 to 1.
     """
     view, (x, y, z) = tool_view(tool), tool.position
-    fingers = grasp_clearance_m(robot.gripper, body, 0.0, others, opening, tool.position, view)
-    return min(fingers, hand_clearance_m(robot, PlanarFrame(x, y, 0.0), z, others, view))
+    frame, gripper = PlanarFrame(x, y, 0.0), robot.gripper
+    fingers = finger_rectangles(gripper, frame, half_gap_m(gripper, opening))
+    parts = [(finger, gripper.lowest_tip_m) for finger in fingers]
+    parts.append((hand_rectangle(robot, frame), gripper.palm_height_m))
+    extents = [(extents_m(part.corners), height) for part, height in parts]
+    gap = math.inf
+    for other in others:
+        corners = view(other)
+        around = extents_m(corners[:, :2])
+        for part, height in extents:
+            if corners[:, 2].max() > z + height:
+                gap = min(gap, separation_m(part, around))
+    return gap
 
 
 def outline_clearance_m(

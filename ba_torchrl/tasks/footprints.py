@@ -15,6 +15,12 @@ WIDTH_YAWS = 12
 """Directions per half turn in which the width of a body is compared."""
 WIDTH_TOLERANCE_M = 5e-4
 """Half widths within this of the least one count as equal."""
+BEARINGS = 16
+"""Directions per half turn along which the gap between two outlines is measured."""
+
+_DIRECTIONS = np.array(
+    [[math.cos(a), math.sin(a)] for a in np.arange(BEARINGS) * math.pi / BEARINGS]
+).T
 
 
 class Rectangle(NamedTuple):
@@ -32,6 +38,12 @@ class Rectangle(NamedTuple):
     def frame(self) -> PlanarFrame:
         """Frame of its centre, its axes along the sides."""
         return PlanarFrame(self.x, self.y, self.yaw_rad)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Its corners, [4, 2]."""
+        local = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (self.half_x, self.half_y)
+        return np.stack(self.frame.to_world(*local.T), axis=1)
 
     def resized(self, half_x: float, half_y: float) -> Rectangle:
         """Return a rectangle of another size with the same centre and yaw."""
@@ -112,3 +124,14 @@ def _bounding_rectangle(corners: np.ndarray, yaw_rad: float) -> Rectangle:
     (x0, x1), (y0, y1) = ((float(values.min()), float(values.max())) for values in (along, across))
     center = frame.to_world((x0 + x1) / 2, (y0 + y1) / 2)
     return Rectangle(*center, yaw_rad, (x1 - x0) / 2, (y1 - y0) / 2)
+
+
+def extents_m(points: np.ndarray) -> np.ndarray:
+    """Return the extremes [2, BEARINGS] of points [V, 2] along each bearing."""
+    along = points @ _DIRECTIONS
+    return np.stack([along.min(axis=0), along.max(axis=0)])
+
+
+def separation_m(one: np.ndarray, other: np.ndarray) -> float:
+    """Return a lower bound of the distance between two outlines from their extents."""
+    return float(np.maximum(one[0] - other[1], other[0] - one[1]).max())

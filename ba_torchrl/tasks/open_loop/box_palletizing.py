@@ -204,7 +204,7 @@ class BoxPalletizing(PackingTask):
             axis = tuple((axis / np.linalg.norm(axis)).tolist())
             surface = Pose(body.position, surface_quaternion(axis, grasp.yaw_rad))
             tool = surface.compose(offset)
-            clearance_m = tool_clearance_m(self.robot, tool, body, others, self.finger_opening)
+            clearance_m = tool_clearance_m(self.robot, tool, others, self.finger_opening)
             if clearance_m >= min(grasp.clearance_m, SUFFICIENT_CLEARANCE_M) and is_reachable(
                 self.robot, self.terrain.support_ids, tool
             ):

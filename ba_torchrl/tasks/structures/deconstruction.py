@@ -18,6 +18,7 @@ from ba_torchrl.sim.geometry import PlanarFrame, Pose, YawPose, downward_pose, q
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TaskSettings
+from ba_torchrl.tasks.footprints import extents_m, separation_m
 from ba_torchrl.tasks.open_loop_task import OpenLoopTask
 from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.assignment import mean_position
@@ -41,12 +42,6 @@ SPAN_SHARE = 0.5
 expert to 1 for the largest allowed."""
 SITES = 300
 """Largest number of random sites that are compared for a piece."""
-BEARINGS = 16
-"""Directions per half turn along which the gap between two outlines is measured."""
-
-_DIRECTIONS = np.array(
-    [[math.cos(a), math.sin(a)] for a in np.arange(BEARINGS) * math.pi / BEARINGS]
-).T
 
 
 class Deconstructible(Protocol):
@@ -271,12 +266,12 @@ class Deconstruction(OpenLoopTask):
     def _pieces_to_move(self) -> list[Body]:
         """Return the pieces that are not on the ground, or too close to another."""
         bodies = list(self.objects)
-        extents = {body: _extents_m(world_vertices(body)[:, :2]) for body in bodies}
+        extents = {body: extents_m(world_vertices(body)[:, :2]) for body in bodies}
 
         def is_close(body: Body, other: Body) -> bool:
             return (
                 math.dist(body.position[:2], other.position[:2]) < APART_BLOCKS * self.block_m
-                or _gap_m(extents[body], extents[other]) < GAP_M
+                or separation_m(extents[body], extents[other]) < GAP_M
             )
 
         return [
@@ -290,7 +285,7 @@ class Deconstruction(OpenLoopTask):
         """Return the place at the first random site with enough free space, or at the best one."""
         tool, pose = self.robot.tool_frame(), held.pose
         others = [other for other in self.objects if other is not held]
-        extents = [_extents_m(world_vertices(other)[:, :2]) for other in others]
+        extents = [extents_m(world_vertices(other)[:, :2]) for other in others]
         outline = world_vertices(held)[:, :2] - held.position[:2]
         border = footprint_radius_m(held) + self.block_m / 4
         area = self.terrain.aside_area.shrunk(border)
@@ -311,8 +306,8 @@ class Deconstruction(OpenLoopTask):
             if margin <= best:
                 continue
             frame = PlanarFrame(x, y, yaw - tool.yaw_rad)
-            own = _extents_m(np.stack(frame.to_world(*outline.T), axis=1))
-            gap = min(_gap_m(own, other) for other in extents)
+            own = extents_m(np.stack(frame.to_world(*outline.T), axis=1))
+            gap = min(separation_m(own, other) for other in extents)
             clearance = self.task.expert.grasps.clearance_m(held, yaw, origin.position)
             margin = min(margin, gap - GAP_M - SITE_GAP_M, clearance - RELEASE_CLEARANCE_M)
             if margin > best:
@@ -342,14 +337,3 @@ class Deconstruction(OpenLoopTask):
         """Return a random generator seeded with the positions of the pieces."""
         poses = np.array([body.position for body in self.objects])
         return np.random.default_rng(np.frombuffer(poses.tobytes(), np.uint32).tolist())
-
-
-def _extents_m(points: np.ndarray) -> np.ndarray:
-    """Return the extremes [2, BEARINGS] of points [V, 2] along each bearing."""
-    along = points @ _DIRECTIONS
-    return np.stack([along.min(axis=0), along.max(axis=0)])
-
-
-def _gap_m(one: np.ndarray, other: np.ndarray) -> float:
-    """Return a lower bound of the distance between two outlines from their extents."""
-    return float(np.maximum(one[0] - other[1], other[0] - one[1]).max())

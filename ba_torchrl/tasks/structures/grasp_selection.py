@@ -213,7 +213,7 @@ class GraspSelector:
         gripper, yaw = self.robot.gripper, candidate.yaw_rad
         if candidate.tool is not None:
             tool = Pose(grasp, candidate.tool)
-            return tool_clearance_m(self.robot, tool, body, others, self.finger_opening)
+            return tool_clearance_m(self.robot, tool, others, self.finger_opening)
         if candidate.shift_m:
             far = (candidate.far_finger_range_m,)
             fingers = path_clearance_m(gripper, body, yaw, far, others, at)
