@@ -16,7 +16,7 @@ from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.footprints import Rectangle
-from ba_torchrl.tasks.sloped_terrain import ON_SIDE_RAD, SlopedTerrain
+from ba_torchrl.tasks.sloped_terrain import OnSlopes, SlopedTerrain
 from ba_torchrl.tasks.workspace import Area, OrientedArea, Spacing, Workspace
 
 SLOPE_RAD = (0.0, math.pi / 12)
@@ -217,16 +217,12 @@ class Bumps(SlopedTerrain):
         self.platform.place((x, y, (self.top_m - UNDERGROUND_M) / 2), yaw)
 
 
-class OnBumps:
+class OnBumps(OnSlopes):
     """Mixin of an open-loop task: the goal is on a platform on a bumpy surface (appendix C).
 
     All objects start beside the platform.
     """
 
-    default_action_sequence: ClassVar[str | None] = "pxyzrrr"
-    default_in_hand_mode: ClassVar[str] = "proj"
-    required_action_components: ClassVar[frozenset[str]] = frozenset(("z", "rz", "ry", "rx"))
-    tipped_rad: ClassVar[float] = ON_SIDE_RAD
     platform_m: ClassVar[tuple[float, float]]
     """Extents of the platform at the default scale of the objects."""
 

@@ -7,7 +7,7 @@ direction in which the fingers close. Only bodies higher than the fingertips cou
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from ba_torchrl.tasks.footprints import Rectangle, extents_m, gap_m, separation_
 Range = tuple[float, float]
 """Ends of an interval along the direction in which the fingers close."""
 
-VerticesOf = Callable[[Body], np.ndarray]
-"""Function that returns the vertices [V, 3] of a body in the frame where clearances are taken."""
-
 INNER_MARGIN_M = 3e-3
 """Margin on the inner side of each finger."""
 OUTER_MARGIN_M = 7.5e-3
@@ -33,6 +30,8 @@ PASSING_HEIGHT_M = 0.03
 """Height of the tool above bodies that it passes over; more for grippers with longer fingers."""
 PASSING_GAP_M = 0.012
 """Least gap between the fingertips and bodies that they pass over."""
+
+
 # -- parts of a gripper ------------------------------------------------------------------------
 
 
@@ -99,22 +98,6 @@ def tips_below_tool_m(robot: Robot) -> float:
 def passing_height_m(gripper: Gripper) -> float:
     """Return the height of the tool above a body that the gripper passes over."""
     return max(PASSING_HEIGHT_M, PASSING_GAP_M - gripper.lowest_tip_m)
-
-
-def tool_view(tool: Pose) -> VerticesOf:
-    """Return a function for the vertices of bodies in a frame in which a tool points straight down.
-
-    The frame has the tool's position; the tool's yaw in it is zero.
-
-    Args:
-        tool: pose of the tool in the world.
-    """
-    to_view = np.array(downward(0.0)) @ rotation_array(tool.orientation).T
-
-    def vertices(body: Body) -> np.ndarray:
-        return (world_vertices(body) - tool.position) @ to_view.T + tool.position
-
-    return vertices
 
 
 # -- clearances --------------------------------------------------------------------------------
@@ -211,7 +194,9 @@ def tool_clearance_m(
         others: the other bodies.
         opening: opening of the gripper, 0 to 1.
     """
-    view, (x, y, z) = tool_view(tool), tool.position
+    # in a frame with the tool's position in which the tool points straight down at yaw zero
+    to_view = rotation_array(tool.orientation) @ np.array(downward(0.0)).T
+    x, y, z = tool.position
     frame, gripper = PlanarFrame(x, y, 0.0), robot.gripper
     fingers = finger_rectangles(gripper, frame, half_gap_m(gripper, opening))
     parts = [(finger, gripper.lowest_tip_m) for finger in fingers]
@@ -219,7 +204,7 @@ def tool_clearance_m(
     extents = [(extents_m(part.corners), height) for part, height in parts]
     gap = math.inf
     for other in others:
-        corners = view(other)
+        corners = (world_vertices(other) - tool.position) @ to_view + tool.position
         around = extents_m(corners[:, :2])
         for part, height in extents:
             if corners[:, 2].max() > z + height:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, quaternion_product, yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.sloped_terrain import ON_SIDE_RAD, SlopedTerrain, footprint
+from ba_torchrl.tasks.sloped_terrain import OnSlopes, SlopedTerrain, footprint
 from ba_torchrl.tasks.structures.blueprint import Piece
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Area, OrientedArea, Workspace
 
@@ -197,17 +197,12 @@ class Ramps(SlopedTerrain):
             ramp.set_pose(*Pose((x, y, layout.edges_m[i]), orientation).compose(from_edge))
 
 
-class OnRamps:
+class OnRamps(OnSlopes):
     """Mixin of an open-loop structure task: the structure stands between two ramps (appendix C).
 
     The pieces start on the ramps or between them, where one piece of the lowest layer always is.
     The gap is at least as wide as the pieces of that layer need.
     """
-
-    default_action_sequence: ClassVar[str | None] = "pxyzrrr"
-    default_in_hand_mode: ClassVar[str] = "proj"
-    required_action_components: ClassVar[frozenset[str]] = frozenset(("z", "rz", "ry", "rx"))
-    tipped_rad: ClassVar[float] = ON_SIDE_RAD
 
     def make_terrain(self) -> Ramps:
         """Load the ramps."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -235,6 +236,15 @@ class SlopedTerrain(Terrain):
             self.heights_m(points) - heights,
         )
         return heights, slopes, above
+
+
+class OnSlopes:
+    """Mixin of an open-loop task on a terrain with slopes, in six degrees of freedom."""
+
+    default_action_sequence: ClassVar[str | None] = "pxyzrrr"
+    default_in_hand_mode: ClassVar[str] = "proj"
+    required_action_components: ClassVar[frozenset[str]] = frozenset(("z", "rz", "ry", "rx"))
+    tipped_rad: ClassVar[float] = ON_SIDE_RAD
 
 
 def footprint(body: Body, xy: tuple[float, float], yaw_rad: float) -> np.ndarray:
