@@ -71,10 +71,6 @@ class Terrain(ABC):
         """The area where experts place other objects on the ground."""
         return self.build_area
 
-    def can_hold(self, xy: tuple[float, float], radius_m: float) -> bool:
-        """Whether an object with this radius is in full contact with the surface at a point."""
-        return True
-
     @property
     def goal_frame(self) -> PlanarFrame | None:
         """Centre and heading of the place where a container stands; None if it stands anywhere."""
@@ -119,9 +115,7 @@ class Terrain(ABC):
         return self.random_points(rng, [Spacing(padding_m, 0.0)])[0]
 
     def random_points(
-        self,
-        rng: np.random.Generator,
-        spacings: Sequence[Spacing],
+        self, rng: np.random.Generator, spacings: Sequence[Spacing]
     ) -> list[tuple[float, float]]:
         """Return random points of the spawn area that keep their distances.
 
@@ -132,11 +126,7 @@ class Terrain(ABC):
         Raises:
             PlacementError: no layout was found.
         """
-        return self.spawn_area.random_points(
-            rng,
-            spacings,
-            lambda point, spacing: self.can_hold(point, spacing.padding_m / 2),
-        )
+        return self.spawn_area.random_points(rng, spacings)
 
     def random_base_points(
         self, rng: np.random.Generator, spacings: Sequence[Spacing]

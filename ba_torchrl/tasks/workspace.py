@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
 
@@ -138,17 +138,13 @@ class Area(NamedTuple):
         return tuple(point)
 
     def random_points(
-        self,
-        rng: np.random.Generator,
-        spacings: Sequence[Spacing],
-        is_allowed: Callable[[tuple[float, float], Spacing], bool] = lambda point, spacing: True,
+        self, rng: np.random.Generator, spacings: Sequence[Spacing]
     ) -> list[tuple[float, float]]:
         """Return uniformly random points, one for each object, that keep their distances.
 
         Args:
             rng: random generator.
             spacings: space that each object needs.
-            is_allowed: whether an object with a spacing may be centred at a point.
 
         Raises:
             PlacementError: no layout was found.
@@ -157,9 +153,7 @@ class Area(NamedTuple):
             points: list[tuple[float, float]] = []
             for spacing in spacings:
                 point = self.random_point(rng, spacing.padding_m)
-                if not is_allowed(point, spacing) or any(
-                    math.dist(point, other) < spacing.distance_m for other in points
-                ):
+                if any(math.dist(point, other) < spacing.distance_m for other in points):
                     break
                 points.append(point)
             else:
