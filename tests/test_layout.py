@@ -11,6 +11,7 @@ import pytest
 import ba_torchrl
 from ba_torchrl.config import StrictModel
 from ba_torchrl.tasks.base import TASKS, Task
+from ba_torchrl.tasks.sloped_terrain import OnSlopes
 
 ROOT = Path(__file__).parents[1]
 TASKS_FOLDER = ROOT / "ba_torchrl" / "tasks"
@@ -65,29 +66,22 @@ def test_every_task_file_is_one_task_of_its_name():
         assert tasks == {ours[task].__name__}
 
 
-def is_variant(cls):
-    """Return whether a class is a task on another terrain: a mixin, and no methods of its own."""
-    return (
-        cls.__module__.startswith("ba_torchrl.tasks.six_dof.")
-        and not any(callable(value) for value in vars(cls).values())
-        and len(cls.__bases__) == 2
-        and not issubclass(cls.__bases__[0], Task)
-    )
-
-
 @pytest.mark.parametrize("task", list(TASKS))
 def test_no_task_is_more_than_two_levels_below_the_base(task):
-    assert below(Task, TASKS[task]) <= 2 + is_variant(TASKS[task])
+    assert below(Task, TASKS[task]) <= 2
 
 
-def test_every_task_in_six_degrees_of_freedom_is_a_variant_on_a_terrain():
-    for task in TASKS:
-        assert is_variant(TASKS[task]) == (task.split("/")[0] in TERRAINS)
+@pytest.mark.parametrize("task", [task for task in TASKS if task.split("/")[0] in TERRAINS])
+def test_a_task_in_six_degrees_of_freedom_is_a_terrain_and_a_flat_task_without_methods(task):
+    cls, flat = TASKS[task], TASKS[f"open_loop/{task.split('/')[1]}"]
+    terrain, *others = cls.__bases__
+    assert issubclass(terrain, OnSlopes)
+    assert tuple(others) == flat.__bases__
+    assert not any(callable(value) for value in vars(cls).values())
 
 
 def test_no_class_is_more_than_two_levels_below_its_base():
     classes = own_classes() - {StrictModel}  # the root of all settings, as pydantic's BaseModel is
-    classes = {cls for cls in classes if not is_variant(cls)}
     assert len(classes) > 200
 
     def depth(cls):

@@ -80,15 +80,8 @@ def slots(layer: int) -> list[tuple[float, float, float]]:
     return [(-y, x, 0.0) for x, y in places]
 
 
-@TASKS.register("open_loop/box_palletizing")
-class BoxPalletizing(PackingTask):
-    """Objects: 6, 12 or 18 boxes of 7.2 x 4.5 x 4.5 cm, 18 by default, and a pallet.
-
-    Goal: each slot of each layer on the pallet of 23.2 x 19.2 x 3 cm has its box, released. A box
-    is stacked if it lies in a slot and all layers below it are full. The boxes arrive one at a
-    time, when all earlier ones are stacked and none is held. The episode ends early when a box
-    leaves the workspace. Appendix A.1.
-    """
+class Palletizing:
+    """Mixin of a `PackingTask`: Box Palletizing on any terrain."""
 
     scale_limits = (0.75, 1.0)
     max_steps = 40
@@ -325,3 +318,14 @@ class BoxPalletizing(PackingTask):
         site = Rectangle(*arrival[0], arrival[1], width, length)
         others = [outline(body) for body in self.pool.active if body is not held]
         return min((gap_m(site, other) for other in others), default=math.inf)
+
+
+@TASKS.register("open_loop/box_palletizing")
+class BoxPalletizing(Palletizing, PackingTask):
+    """Objects: 6, 12 or 18 boxes of 7.2 x 4.5 x 4.5 cm, 18 by default, and a pallet.
+
+    Goal: each slot of each layer on the pallet of 23.2 x 19.2 x 3 cm has its box, released. A box
+    is stacked if it lies in a slot and all layers below it are full. The boxes arrive one at a
+    time, when all earlier ones are stacked and none is held. The episode ends early when a box
+    leaves the workspace. Appendix A.1.
+    """

@@ -8,13 +8,8 @@ from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, triangle
 
 
-@TASKS.register("open_loop/house_building_1")
-class HouseBuilding1(StructureTask):
-    """Objects: one to five cubes of 3 cm, three by default, and a triangle of 3 cm.
-
-    Goal: the cubes form a stack with the triangle on top, released. The episode ends early when the
-    triangle tips over or a piece leaves the workspace. Appendix A.1.
-    """
+class House1:
+    """Mixin of a `StructureTask`: House Building 1 on any terrain."""
 
     max_steps = 10
     num_objects = 4
@@ -24,3 +19,12 @@ class HouseBuilding1(StructureTask):
         """Return the stack with the triangle."""
         cubes = [cube(self.block_m)] * (self.settings.num_objects - 1)
         return tower(*cubes, triangle(self.block_m))
+
+
+@TASKS.register("open_loop/house_building_1")
+class HouseBuilding1(House1, StructureTask):
+    """Objects: one to five cubes of 3 cm, three by default, and a triangle of 3 cm.
+
+    Goal: the cubes form a stack with the triangle on top, released. The episode ends early when the
+    triangle tips over or a piece leaves the workspace. Appendix A.1.
+    """

@@ -8,14 +8,8 @@ from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof
 
 
-@TASKS.register("open_loop/house_building_3")
-class HouseBuilding3(StructureTask):
-    """Objects: two cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
-
-    Goal: the cuboid lies on both cubes and the roof on the cuboid, both centred over the cubes,
-    released. The episode ends early when the roof tips over or a piece leaves the workspace.
-    Appendix A.1.
-    """
+class House3:
+    """Mixin of a `StructureTask`: House Building 3 on any terrain."""
 
     scale_limits = (0.55, 0.9)
     max_steps = 10
@@ -33,3 +27,13 @@ class HouseBuilding3(StructureTask):
                 Slot(roof(self.block_m), on=(2,), centered_over=(0, 1)),
             )
         )
+
+
+@TASKS.register("open_loop/house_building_3")
+class HouseBuilding3(House3, StructureTask):
+    """Objects: two cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
+
+    Goal: the cuboid lies on both cubes and the roof on the cuboid, both centred over the cubes,
+    released. The episode ends early when the roof tips over or a piece leaves the workspace.
+    Appendix A.1.
+    """

@@ -8,14 +8,8 @@ from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof
 
 
-@TASKS.register("open_loop/house_building_4")
-class HouseBuilding4(StructureTask):
-    """Objects: four cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
-
-    Goal: two cubes support the cuboid, which supports the other two cubes, which support the roof,
-    released. The episode ends early when the roof tips over or a piece leaves the workspace.
-    Appendix A.1.
-    """
+class House4:
+    """Mixin of a `StructureTask`: House Building 4 on any terrain."""
 
     scale_limits = (0.55, 0.66)
     max_steps = 20
@@ -35,3 +29,13 @@ class HouseBuilding4(StructureTask):
                 Slot(roof(self.block_m), on=(3, 4), span=span),
             )
         )
+
+
+@TASKS.register("open_loop/house_building_4")
+class HouseBuilding4(House4, StructureTask):
+    """Objects: four cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
+
+    Goal: two cubes support the cuboid, which supports the other two cubes, which support the roof,
+    released. The episode ends early when the roof tips over or a piece leaves the workspace.
+    Appendix A.1.
+    """

@@ -15,14 +15,8 @@ from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import roof
 
 
-@TASKS.register("open_loop/improvise_house_building_3")
-class ImproviseHouseBuilding3(StructureTask):
-    """Objects: two random shapes, 2.5 to 3 cm high, a random cuboid and a roof of 3 x 12 x 3 cm.
-
-    Goal: the cuboid lies on both shapes and the roof on the cuboid, both centred over the shapes,
-    released. The episode ends early when a shape or the roof tips over, or a piece leaves the
-    workspace. Appendix A.1.
-    """
+class ImprovisedHouse3:
+    """Mixin of a `StructureTask`: Improvise House Building 3 on any terrain."""
 
     scale_limits = (0.55, 0.9)
     max_steps = 10
@@ -42,3 +36,13 @@ class ImproviseHouseBuilding3(StructureTask):
                 Slot(with_circular_spacing(roof(self.block_m)), on=(2,), centered_over=(0, 1)),
             )
         )
+
+
+@TASKS.register("open_loop/improvise_house_building_3")
+class ImproviseHouseBuilding3(ImprovisedHouse3, StructureTask):
+    """Objects: two random shapes, 2.5 to 3 cm high, a random cuboid and a roof of 3 x 12 x 3 cm.
+
+    Goal: the cuboid lies on both shapes and the roof on the cuboid, both centred over the shapes,
+    released. The episode ends early when a shape or the roof tips over, or a piece leaves the
+    workspace. Appendix A.1.
+    """

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.bumps import OnBumps
-from ba_torchrl.tasks.open_loop.house_building_4 import HouseBuilding4
+from ba_torchrl.tasks.open_loop.house_building_4 import House4
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 
 
 @TASKS.register("bump/house_building_4")
-class BumpHouseBuilding4(OnBumps, HouseBuilding4):
+class BumpHouseBuilding4(OnBumps, House4, StructureTask):
     """House Building 4 on a platform of 13 x 13 cm; the pieces start on a bumpy surface around it.
 
     The surface consists of nine pyramids with slopes of 0 to 15 degrees. The episode ends early

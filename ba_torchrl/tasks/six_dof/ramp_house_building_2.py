@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.house_building_2 import HouseBuilding2
+from ba_torchrl.tasks.open_loop.house_building_2 import House2
 from ba_torchrl.tasks.ramps import OnRamps
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 
 
 @TASKS.register("ramp/house_building_2")
-class RampHouseBuilding2(OnRamps, HouseBuilding2):
+class RampHouseBuilding2(OnRamps, House2, StructureTask):
     """House Building 2 with two ramps: the structure stands between them.
 
     The distance between the ramps is 4 to 20 cm, their slopes are 0 to 30 degrees, the heights of

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.house_building_3 import HouseBuilding3
+from ba_torchrl.tasks.open_loop.house_building_3 import House3
 from ba_torchrl.tasks.ramps import OnRamps
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 
 
 @TASKS.register("ramp/house_building_3")
-class RampHouseBuilding3(OnRamps, HouseBuilding3):
+class RampHouseBuilding3(OnRamps, House3, StructureTask):
     """House Building 3 with two ramps: the structure stands between them.
 
     The distance between the ramps is 4 to 20 cm, their slopes are 0 to 30 degrees, the heights of

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.house_building_4 import HouseBuilding4
+from ba_torchrl.tasks.open_loop.house_building_4 import House4
 from ba_torchrl.tasks.ramps import OnRamps
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 
 
 @TASKS.register("ramp/house_building_4")
-class RampHouseBuilding4(OnRamps, HouseBuilding4):
+class RampHouseBuilding4(OnRamps, House4, StructureTask):
     """House Building 4 with two ramps: the structure stands between them.
 
     The distance between the ramps is 4 to 20 cm, their slopes are 0 to 30 degrees, the heights of

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.open_loop.improvise_house_building_3 import ImproviseHouseBuilding3
+from ba_torchrl.tasks.open_loop.improvise_house_building_3 import ImprovisedHouse3
 from ba_torchrl.tasks.ramps import OnRamps
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 
 
 @TASKS.register("ramp/improvise_house_building_3")
-class RampImproviseHouseBuilding3(OnRamps, ImproviseHouseBuilding3):
+class RampImproviseHouseBuilding3(OnRamps, ImprovisedHouse3, StructureTask):
     """Improvise House Building 3 with two ramps: the structure stands between them.
 
     The distance between the ramps is 4 to 20 cm, their slopes are 0 to 30 degrees, the heights of
