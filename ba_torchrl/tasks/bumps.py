@@ -31,8 +31,8 @@ UNDERGROUND_M = 0.02
 FRICTION = 1.0
 COLORS: tuple[Color, Color] = ((0.8, 0.75, 0.64, 1.0), (0.72, 0.67, 0.56, 1.0))
 PLATFORM_COLOR: Color = (0.6, 0.66, 0.72, 1.0)
-ROCKING_STEPS = 100
-"""Physics steps in which objects that lie on several faces stop rocking."""
+ROCKING_STEPS = 20
+"""Physics steps in which objects that lie on several faces come to rest."""
 CLEARANCE_M = 0.03
 """Least distance of an object from the platform at the start, with space for a finger."""
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, world_vertices
@@ -16,6 +17,7 @@ from ba_torchrl.sim.geometry import (
     PlanarFrame,
     Pose,
     Vector,
+    quaternion_matrix,
     surface_quaternion,
 )
 from ba_torchrl.sim.robots.gripper import FLOOR_CLEARANCE_M, Gripper
@@ -32,8 +34,12 @@ UNEVEN_WEIGHT = 10.0
 """Deficit of a site per metre of unevenness or overhang."""
 POSE_ATTEMPTS = 50
 """Random poses of a body before a new layout is begun."""
-FOOTPRINT_POINTS = 9
-"""Points along each side of the grid that represents the footprint of a body."""
+FOOTPRINT_POINTS = 17
+"""Points along each side of the grid that represents the lower face of a body."""
+RESTING_ITERATIONS = 3
+"""Linearisations in the computation of a body's pose at rest."""
+DEPTH_M = 1.0
+"""Distance below the surface of the point that closes its convex hull."""
 
 _BEARINGS = 2 * math.pi * np.arange(16) / 16
 _RING = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS)], axis=1)
@@ -174,25 +180,30 @@ class SlopedTerrain(Terrain):
         return None
 
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
-        """Place a body on the plane that approximates the surface below it, from above."""
+        """Place a body in static equilibrium on the surface below it.
+
+        Its lower face lies on the lowest plane above the surface, as seen from its centre of mass.
+        """
         low, high = body.shape.bounds_m
-        local = np.stack(
-            np.meshgrid(
-                *(
-                    np.linspace(a, b, FOOTPRINT_POINTS)
-                    for a, b in zip(low[:2], high[:2], strict=True)
-                )
-            ),
-            axis=-1,
-        ).reshape(-1, 2)
-        points = np.stack(PlanarFrame(*xy, yaw_rad).to_world(*local.T), axis=1)
-        heights = self.heights_m(points)
-        offsets = np.column_stack([points - xy, np.ones(len(points))])
-        slope_x, slope_y, height = np.linalg.lstsq(offsets, heights, rcond=None)[0]
-        height += float((heights - offsets @ (slope_x, slope_y, height)).max())
-        surface = Pose(
-            (*xy, float(height)), surface_quaternion(_normal((slope_x, slope_y)), yaw_rad)
-        )
+        axes = [
+            np.linspace(*ends, FOOTPRINT_POINTS) for ends in zip(low[:2], high[:2], strict=True)
+        ]
+        local = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        center = np.array(body.shape.center_of_mass_m) - (0.0, 0.0, low[2])
+        slopes, height = np.zeros(2), 0.0
+        for _ in range(RESTING_ITERATIONS):
+            rotation = np.array(quaternion_matrix(surface_quaternion(_normal(slopes), yaw_rad)))
+            points = local @ rotation[:, :2].T + (*xy, height)
+            rises = self.heights_m(points[:, :2]) - points[:, 2]
+            # the point of the lower face below the centre of mass
+            below = center[:2] - center[2] * rotation[2, :2] / rotation[2, 2]
+            gradient, offset = lowest_plane(local, rises, below)
+            slopes = slopes + np.linalg.solve(rotation[:2, :2].T, gradient)
+            height += offset
+        rotation = np.array(quaternion_matrix(surface_quaternion(_normal(slopes), yaw_rad)))
+        points = local @ rotation[:, :2].T + (*xy, height)
+        height += float((self.heights_m(points[:, :2]) - points[:, 2]).max())
+        surface = Pose((*xy, height), surface_quaternion(_normal(slopes), yaw_rad))
         body.set_pose(*surface.compose(Pose((0.0, 0.0, -low[2]))))
 
     def gap_below_m(self, body: Body) -> float:
@@ -250,6 +261,30 @@ class OnSlopes:
 def footprint(body: Body, xy: tuple[float, float], yaw_rad: float) -> np.ndarray:
     """Return the vertices [V, 2] of an upright body at a position and yaw, seen from above."""
     return np.stack(PlanarFrame(*xy, yaw_rad).to_world(*body.shape.vertices[:, :2].T), axis=1)
+
+
+def lowest_plane(
+    points: np.ndarray, heights: np.ndarray, center: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the plane above all heights that is lowest at a point among them.
+
+    A rigid body whose lower face lies in this plane, and whose centre of mass is above the point,
+    has the least potential energy. It touches the surface at three points or more.
+
+    Args:
+        points: [N, 2] points of the lower face, metres.
+        heights: [N] heights of the surface at these points, metres.
+        center: [2] the point below the centre of mass, inside the convex hull of ``points``.
+
+    Returns:
+        Slopes [2] of the plane along both axes, and its height at the origin.
+    """
+    deep = (*points.mean(axis=0), heights.min() - DEPTH_M)
+    planes = ConvexHull(np.vstack([np.column_stack([points, heights]), deep])).equations
+    upper = planes[planes[:, 2] > 1e-9]  # the other faces contain the deep point
+    slopes, offsets = -upper[:, :2] / upper[:, 2:3], -upper[:, 3] / upper[:, 2]
+    lowest = int((slopes @ center + offsets).argmin())
+    return slopes[lowest], float(offsets[lowest])
 
 
 def _normal(slopes: np.ndarray) -> Vector:

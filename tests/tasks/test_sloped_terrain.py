@@ -5,20 +5,22 @@ import math
 import numpy as np
 import pybullet
 import pytest
+from scipy.optimize import linprog
 
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import world_vertices
 from ba_torchrl.sim.geometry import quaternion_matrix, tool_rotation
 from ba_torchrl.sim.robots.kuka import Kuka
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.bumps import Bumps
 from ba_torchrl.tasks.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.ramps import GAP_M, RampLayout, Ramps
-from ba_torchrl.tasks.sloped_terrain import footprint
+from ba_torchrl.tasks.sloped_terrain import footprint, lowest_plane
 from ba_torchrl.tasks.terrain import Flat
-from ba_torchrl.tasks.workspace import Workspace
+from ba_torchrl.tasks.workspace import Spacing, Workspace
 
 WORKSPACE = Workspace((0.25, 0.65), (-0.1, 0.3), (0.0, 0.4))  # its centre is off the x axis
 SIX_DOF = [task for task in TASKS if task.startswith(("ramp/", "bump/"))]
@@ -210,6 +212,37 @@ def test_objects_lie_flush_on_one_side_of_each_edge(make_env, task):
         assert task_.structure.blueprint.slots[0].piece.kind in on_base
         between += len(on_base)
     assert between < 8 * len(task_.structure.pieces)  # the others start on the ramps, too
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_lowest_plane_is_the_solution_of_the_linear_program(seed):
+    rng = np.random.default_rng(seed)
+    points, heights = rng.uniform(-1, 1, (60, 2)), rng.uniform(0, 0.3, 60)
+    center = points[:3].mean(axis=0)
+    slopes, height = lowest_plane(points, heights, center)
+    # minimise the height at the centre, subject to: the plane is above every point
+    rows = np.column_stack([points, np.ones(60)])
+    solution = linprog([*center, 1.0], A_ub=-rows, b_ub=-heights, bounds=(None, None))
+    assert slopes @ center + height == pytest.approx(solution.fun, abs=1e-9)
+    assert (rows @ (*slopes, height) - heights).min() == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_boxes_stand_on_bumps_where_physics_leaves_them(world, seed):
+    bumps = Bumps(world, WORKSPACE, (0.13, 0.1), random_orientation=True)
+    boxes = [world.add(Box(size_m=(0.03, 0.06, 0.03)), f"box {i}") for i in range(8)]
+    world.seal()
+    rng = np.random.default_rng(seed)
+    bumps.initialize_episode(rng)
+    spacings = [Spacing(0.06, 0.07)] * len(boxes)
+    bumps.scatter(rng, boxes, spacings, lambda body: float(rng.uniform(0, math.pi)), base=boxes[0])
+    for body in boxes:  # the poses before the physics steps of `scatter`
+        bumps.stand(body, body.position[:2], body.yaw_rad)
+    before = [world_vertices(body) for body in boxes]
+    world.step(60)
+    moved = [np.abs(world_vertices(b) - v).max() for b, v in zip(boxes, before, strict=True)]
+    assert np.median(moved) < 1e-3
+    assert max(moved) < 3e-3
 
 
 def test_objects_start_beside_the_platform(make_env):

@@ -131,6 +131,7 @@ class PickPlace:
             reached, limits = self.robot.tool_frame().position, self.limits
             down = self._approach_point(reached, rotation, -limits.pre_place_height_m)
             self.motion.move_straight(reached, down, rotation, self.held, limits.lowering_steps)
+            self.world.step(limits.release_rest_steps)
             self.on_contact()
             self._detach()
             self._open_fingers()

@@ -6,6 +6,7 @@ import numpy as np
 import pybullet
 import pytest
 
+from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.control.pick_place import PickPlace
 from ba_torchrl.sim.control.tool_motion import PEAK_ACCELERATION, quintic_time_scaling
@@ -22,8 +23,10 @@ PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-
 class Table:
     """A robot, blocks and static obstacles."""
 
-    def __init__(self, count, *, static=(), teleport=True, robot="kuka", top_down=False):
-        self.world = World(PHYSICS)
+    def __init__(
+        self, count, *, static=(), teleport=True, robot="kuka", top_down=False, physics=PHYSICS
+    ):
+        self.world = World(physics)
         self.robot = ROBOTS[robot](self.world)
         self.blocks = [self.world.add(Box(size_m=(B, B, B)), f"cube {i}") for i in range(count)]
         self.obstacles = [
@@ -304,3 +307,16 @@ def test_tool_rotation_is_a_product_of_rotations():
     np.testing.assert_allclose(
         tool_rotation(rz, ry, rx), turns[0] @ turns[1] @ turns[2] @ down, atol=1e-6
     )
+
+
+@pytest.mark.parametrize("rise_m", [0.0, 1e-4, 3e-4])
+def test_a_body_released_just_above_a_box_does_not_hit_it(table, rise_m):
+    top_m = 0.02
+    table = table(1, static=[((0.1, 0.1, top_m), (0.5, 0.15, top_m / 2))], physics=Physics())
+    cube = table.blocks[0]
+    x, y, z = cube.position
+    table.pick(x, y, z)
+    x, y, z = table.robot.tool_frame().position
+    low_m = vertical_extent(cube)[0]
+    table.hand.place((0.5, 0.15, z - low_m + top_m + rise_m), tool_rotation(0.0, 0.0, 0.0))
+    assert vertical_extent(cube)[0] > top_m - 1e-3
