@@ -21,7 +21,7 @@ from tests.tasks.open_loop.covid_test.scenes import (
 )
 
 
-@pytest.mark.parametrize("seed", [307, 312, 317])
+@pytest.mark.parametrize("seed", [307, 312])
 def test_the_expert_picks_objects_at_a_wall_last(make, seed):
     env = make(max_steps=60)
     state, rng = env.reset(seed=seed), np.random.default_rng(seed - 300)
