@@ -148,6 +148,13 @@ class AlgorithmConfig(StrictModel, ABC):
 
     controls: ClassVar[frozenset[Control]]
     """Controls of the tasks that the algorithm supports."""
+    collects: ClassVar[bool] = True
+    """Whether the policy collects transitions; if not, all updates are on the demonstrations."""
+
+    @property
+    def needs_pretraining(self) -> bool:
+        """Whether the run must take updates before the first collection."""
+        return False
 
     def check(self, network: NetworkConfig, control: Control) -> None:
         """Check that the algorithm supports the task's control, and that the network does.

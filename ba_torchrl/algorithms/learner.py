@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torchrl.data import ReplayBuffer
@@ -25,6 +25,10 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.objectives.imitation import BehaviourCloningLoss
+
+Init = Literal["random", "bc"]
+"""How the policy is initialised."""
 
 
 class LearnerConfig(AlgorithmConfig):
@@ -50,6 +54,14 @@ class LearnerConfig(AlgorithmConfig):
     """Initial exponent beta of the importance weights, which increases to 1 over the run."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
+    init: Init = "random"
+    """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
+    updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
+
+    @property
+    def needs_pretraining(self) -> bool:
+        """Whether the run must take updates before the first collection."""
+        return self.init == "bc"
 
 
 class Learner(Algorithm):
@@ -86,6 +98,7 @@ class Learner(Algorithm):
         policy = ActingPolicy(self.make_policy(networks), self.codecs)
         self.loss = self.make_loss(networks).to(problem.device)
         self.policy = policy.to(problem.device)
+        self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
         self.augmentation = self.make_augmentation()
@@ -105,6 +118,19 @@ class Learner(Algorithm):
     @abstractmethod
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
+
+    def make_init_loss(self) -> LossModule:
+        """Return the loss of the pretraining updates with ``init="bc"``.
+
+        Raises:
+            ConfigError: the policy is not a distribution of actions.
+        """
+        policy = self.policy.policy
+        if not isinstance(policy, ProbabilisticTensorDictSequential):
+            raise ConfigError(
+                f"init: {type(self).__name__} has no actor that behaviour cloning could initialise"
+            )
+        return BehaviourCloningLoss(policy)
 
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""
@@ -189,18 +215,43 @@ class Learner(Algorithm):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.loss(batch)
-        total = sum(value for name, value in scalars.items() if name.startswith("loss_"))
-        if not torch.isfinite(total):
-            values = {key: value.item() for key, value in scalars.items()}
-            raise FloatingPointError(f"a loss is not finite at update {self.updates}: {values}")
-        self.step(total)
+        scalars = self.minimize(self.loss, batch)
         if self.target_updater is not None:
             self.target_updater.step()
         if self._prioritized_sampler() is not None:
             # the trees of the sampler are on the CPU
             self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
         self.updates += 1
+        return scalars
+
+    def pretrain_update(self) -> TensorDict:
+        """Take one update before the first collection, of behaviour cloning with ``init="bc"``.
+
+        Raises:
+            FloatingPointError: a loss is not finite.
+        """
+        if self.init_loss is None:
+            return self.update()
+        scalars = self.minimize(self.init_loss, self.sample())
+        self.updates += 1
+        return scalars
+
+    def minimize(self, loss: LossModule, batch: TensorDictBase) -> TensorDict:
+        """Take one step on the sum of a loss module's ``loss_...`` entries, and return its scalars.
+
+        Args:
+            loss: of parameters of the optimiser.
+            batch: transitions [B].
+
+        Raises:
+            FloatingPointError: a loss is not finite.
+        """
+        scalars = loss(batch)
+        total = sum(value for name, value in scalars.items() if name.startswith("loss_"))
+        if not torch.isfinite(total):
+            values = {key: value.item() for key, value in scalars.items()}
+            raise FloatingPointError(f"a loss is not finite at update {self.updates}: {values}")
+        self.step(total)
         return scalars.detach()
 
     def step(self, loss: Tensor) -> None:

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
@@ -17,6 +17,7 @@ from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
+from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.sacfd import SACfDLoss
 
 
@@ -68,16 +69,7 @@ class SAC(Learner):
 
     def make_policy(self, networks: ActorCritic) -> ProbabilisticActor:
         """Return the squashed Gaussian of the actor."""
-        module = TensorDictModule(
-            networks.actor, in_keys=self.observation_keys, out_keys=["loc", "scale"]
-        )
-        return ProbabilisticActor(
-            module,
-            in_keys=["loc", "scale"],
-            out_keys=[keys.ACTION],
-            distribution_class=TanhNormal,
-            distribution_kwargs={"low": -1.0, "high": 1.0},
-        )
+        return squashed_gaussian_policy(networks.actor, self.observation_keys)
 
     def make_loss(self, networks: ActorCritic) -> SACfDLoss:
         """Return the loss of actor, critics and temperature."""

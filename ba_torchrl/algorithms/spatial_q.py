@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import HardUpdate
 
-from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
-from ba_torchrl.data.augmentation.rigid import (
-    RigidAugmentation,
-    RigidTransforms,
-    reverse_gripper_axes,
-)
+from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
+from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
 from ba_torchrl.data.replay.make import ReplayKind
-from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import NetworkConfig
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_policy import (
-    SpatialActions,
-    SpatialPolicy,
-    SpatialValues,
-    spatial_policy,
-)
+from ba_torchrl.modules.spatial_policy import SpatialPolicy, SpatialValues, spatial_policy
 from ba_torchrl.objectives.dqn import Demonstrations, LevelDQNLoss
 
 
@@ -106,18 +93,9 @@ class SpatialQ(Learner):
 
     def make_networks(self, network: NetworkConfig) -> SpatialValues:
         """Return the network, wrapped as values of the environment's actions."""
-        actions = self.problem.actions
-        assert isinstance(actions, OpenLoopActions), "spatial Q-learning is for open_loop tasks"
-        spec = SpatialSpec(
-            self.images,
-            components=tuple(name for name in actions.components if name != "p"),
-            half_rotation=actions.half_rotation,
-            side_m=actions.bounds_m[0][1] - actions.bounds_m[0][0],
-        )
-        net = network.build(spec)
-        self.actions = SpatialActions(actions, net.levels, net.limits)
-        values = SpatialValues(net, self.actions, list(self.images))
-        return values.to(self.problem.device)
+        values = make_spatial_values(network, self.problem, self.images)
+        self.actions = values.actions
+        return values
 
     def make_policy(self, networks: SpatialValues) -> TensorDictModule:
         """Return the epsilon-greedy policy."""
@@ -164,32 +142,8 @@ class SpatialQ(Learner):
         Args:
             episodes: TensorDicts [T].
         """
-        super().on_demonstrations([self._on_grid(episode) for episode in episodes])
-
-    def _on_grid(self, episode: TensorDictBase) -> TensorDictBase:
-        """Return an episode [T] with the nearest actions on the grid.
-
-        If the nearest yaw of a pick close to half a turn is zero, the fingers are swapped, and the
-        images with the gripper's axes are reversed while the picked object is held.
-        """
-        action = episode[keys.ACTION]
-        nearest = self.nearest_action(action)
-        out = episode.copy().set(keys.ACTION, nearest)
-        components = self.problem.actions.components
-        if "rz" not in components or not self.problem.actions.half_rotation:
-            return out
-        rz = components.index("rz")
-        is_swapped = (nearest[:, rz] - action[:, rz]).abs() > math.pi / 2
-        is_over = torch.zeros(len(episode) + 1, dtype=torch.bool)
-        for t, is_holding in enumerate(episode[keys.HOLDING].flatten().tolist()):
-            is_over[t + 1] = is_over[t] if is_holding else is_swapped[t]
-        for key, image in self.images.items():
-            if image.frame == "gripper":
-                for nested, over in ((key, is_over[:-1]), ((keys.NEXT, key), is_over[1:])):
-                    reversed_images = reverse_gripper_axes(episode[nested], image.axes, "xy")
-                    over = over.reshape(-1, 1, 1, 1)
-                    out.set(nested, torch.where(over, reversed_images, episode[nested]))
-        return out
+        on_grid = [demonstration_on_grid(each, self.actions, self.images) for each in episodes]
+        super().on_demonstrations(on_grid)
 
     def update(self) -> TensorDict:
         """Take one step as `Learner.update`, and update epsilon.

@@ -168,6 +168,13 @@ class ExperimentConfig(StrictModel):
             raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
         if config.pretrain_updates and not config.demonstrations:
             raise ConfigError("pretrain_updates needs demonstrations")
+        if not config.algorithm_config.collects and not config.demonstrations:
+            raise ConfigError(
+                f"algorithm {config.algorithm['name']!r} learns from demonstrations only; set "
+                "demonstrations"
+            )
+        if config.algorithm_config.needs_pretraining and not config.pretrain_updates:
+            raise ConfigError("algorithm.init: 'bc' takes effect in pretrain_updates; set them")
         config._check_demonstrations()
         if not is_available(config.logger):
             raise ConfigError(

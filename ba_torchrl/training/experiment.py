@@ -198,7 +198,9 @@ class Experiment:
     def _learn(self) -> None:
         """Pretrain, then alternate collection and updates until the last update."""
         config, algorithm = self.config, self.algorithm
-        while algorithm.updates < config.pretrain_updates:
+        collects = config.algorithm_config.collects
+        pretrain_updates = config.pretrain_updates if collects else config.total_updates
+        while algorithm.updates < pretrain_updates:
             self._update(algorithm.pretrain_update)
         if algorithm.updates == config.total_updates:
             return

@@ -1,0 +1,77 @@
+"""Spatial Q networks and demonstrations on their grid of actions, for a problem."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+
+from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.algorithms.base import Problem
+from ba_torchrl.data.augmentation.rigid import reverse_gripper_axes
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.modules.base import NetworkConfig
+from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.spatial_policy import SpatialActions, SpatialValues
+
+
+def make_spatial_values(
+    network: NetworkConfig, problem: Problem, images: Mapping[str, ImageSpec]
+) -> SpatialValues:
+    """Return a freshly initialised network, wrapped as values of the environment's actions.
+
+    Args:
+        network: builds it.
+        problem: actions and device.
+        images: declarations of the network's input images.
+
+    Raises:
+        ValueError: the network does not support the images or the actions.
+    """
+    actions = problem.actions
+    assert isinstance(actions, OpenLoopActions), "spatial networks are for open_loop tasks"
+    spec = SpatialSpec(
+        images,
+        components=tuple(name for name in actions.components if name != "p"),
+        half_rotation=actions.half_rotation,
+        side_m=actions.bounds_m[0][1] - actions.bounds_m[0][0],
+    )
+    net = network.build(spec)
+    values = SpatialValues(net, SpatialActions(actions, net.levels, net.limits), list(images))
+    return values.to(problem.device)
+
+
+def demonstration_on_grid(
+    episode: TensorDictBase, grid: SpatialActions, images: Mapping[str, ImageSpec]
+) -> TensorDictBase:
+    """Return an episode [T] with the nearest actions on the grid.
+
+    If the nearest yaw of a pick close to half a turn is zero, the fingers are swapped, and the
+    images with the gripper's axes are reversed while the picked object is held.
+
+    Args:
+        episode: a demonstration.
+        grid: of the network's actions.
+        images: declarations of the network's input images.
+    """
+    action = episode[keys.ACTION]
+    nearest = grid.nearest(action)
+    out = episode.copy().set(keys.ACTION, nearest)
+    components = grid.actions.components
+    if "rz" not in components or not grid.actions.half_rotation:
+        return out
+    rz = components.index("rz")
+    is_swapped = (nearest[:, rz] - action[:, rz]).abs() > math.pi / 2
+    is_over = torch.zeros(len(episode) + 1, dtype=torch.bool)
+    for t, is_holding in enumerate(episode[keys.HOLDING].flatten().tolist()):
+        is_over[t + 1] = is_over[t] if is_holding else is_swapped[t]
+    for key, image in images.items():
+        if image.frame == "gripper":
+            for nested, over in ((key, is_over[:-1]), ((keys.NEXT, key), is_over[1:])):
+                reversed_images = reverse_gripper_axes(episode[nested], image.axes, "xy")
+                over = over.reshape(-1, 1, 1, 1)
+                out.set(nested, torch.where(over, reversed_images, episode[nested]))
+    return out

@@ -1,0 +1,85 @@
+"""Imitation of an expert's actions: behaviour cloning of Gaussian policies and of Q networks."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import nn
+from torchrl.objectives import LossModule
+
+from ba_torchrl.envs import keys
+from ba_torchrl.objectives.dqn import LevelValues
+
+
+class BehaviourCloningLoss(LossModule):
+    """Behaviour cloning of a stochastic policy: the mean squared error of an action drawn from it.
+
+    The mean over batch and components of (a - a_e)^2, with the expert's action a_e and a ~ pi drawn
+    with gradient. Its expectation is the squared error of the mean plus the variance, so it trains
+    the standard deviation as well. This is the behaviour term of SACfD (appendix G.2). TorchRL's
+    ``BCLoss`` has the likelihood instead, which a squashed Gaussian does not bound at the ends of
+    the action's range, where the experts' gripper commands are, or the error of the mode.
+
+    Args:
+        actor_network: policy; from the observation to a distribution with ``rsample``.
+    """
+
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+
+    out_keys = ("loss_bc",)
+
+    def __init__(self, actor_network: ProbabilisticTensorDictSequential) -> None:
+        super().__init__()
+        self.convert_to_functional(actor_network, "actor_network")
+        self.in_keys = [*actor_network.in_keys, keys.ACTION]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``loss_bc``.
+
+        Args:
+            tensordict: observations and expert actions [B].
+        """
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            observation = tensordict.select(*self.actor_network.in_keys)
+            sample = self.actor_network.get_dist(observation).rsample()
+        return TensorDict({"loss_bc": F.mse_loss(sample, tensordict[keys.ACTION])})
+
+
+class LevelCrossEntropyLoss(LossModule):
+    """Behaviour cloning of a policy that chooses an action level by level.
+
+    The cross-entropy of the softmax of each level's values with the expert's choice, conditioned on
+    the expert's choices at the levels before, averaged over the batch and summed over the levels.
+
+    Args:
+        value_network: computes the values of the levels.
+    """
+
+    value_network: nn.Module
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    out_keys = ("loss_bc", "accuracy")
+
+    def __init__(self, value_network: LevelValues) -> None:
+        super().__init__()
+        self.convert_to_functional(value_network, "value_network")
+        self.in_keys = [*value_network.in_keys, keys.ACTION]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``loss_bc``, and the fraction of choices that are the expert's as ``accuracy``.
+
+        Args:
+            tensordict: observations and expert actions [B].
+        """
+        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
+            levels = self.value_network(*(tensordict[key] for key in self.in_keys))
+        losses = [F.cross_entropy(values, chosen) for values, chosen in levels]
+        hits = [(values.argmax(dim=1) == chosen).float().mean() for values, chosen in levels]
+        return TensorDict(
+            {"loss_bc": torch.stack(losses).sum(), "accuracy": torch.stack(hits).mean().detach()}
+        )

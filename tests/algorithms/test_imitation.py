@@ -1,0 +1,128 @@
+"""Behaviour cloning: of close-loop and open-loop policies, and as the initialisation of SAC."""
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.experiment import Experiment
+
+SIZES = {
+    "cnn": {"width": 0.25},
+    "equi": {"group_order": 4, "n_hidden": 8},
+    "asr": {"num_rotations": 4, "width": 0.125},
+}
+CLOSE = {
+    "task": "close_loop/block_reaching",
+    "env": {"obs_size": 64, "max_steps": 6},
+    "num_envs": 2,
+    "parallel": False,
+    "demonstrations": 4,
+    "total_updates": 2,
+    "min_replay": 1,
+    "eval_every": 2,
+    "eval_episodes": 2,
+    "final_eval_episodes": 2,
+    "log_every": 1,
+    "video_episodes": 0,
+}
+OPEN = {**CLOSE, "task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects": 2}}
+
+
+def experiment(folder, run, network, algorithm, **changes):
+    units = {} if network == "asr" else {"depth_center_m": 0.2, "depth_scale_m": 0.1}
+    values = {
+        **run,
+        "algorithm": {"batch_size": 16, "learning_rate": 3e-3, **algorithm},
+        "network": {"name": network, **SIZES[network], **units},
+        "run_dir": str(folder / "run"),
+        **changes,
+    }
+    return Experiment(ExperimentConfig.parse(values), progress=False)
+
+
+def losses(folder, name):
+    return read_scalars(folder / "run")[f"train/{name}"].values
+
+
+@pytest.mark.parametrize(
+    ("run", "network"),
+    [(CLOSE, "cnn"), (CLOSE, "equi"), (OPEN, "asr")],
+    ids=["close_loop cnn", "close_loop equi", "open_loop asr"],
+)
+def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, run, network):
+    made = experiment(tmp_path, run, network, {"name": "bc"}, total_updates=40, eval_every=40)
+    assert made.run().updates == 40
+    found = losses(tmp_path, "loss_bc")
+    assert found[-5:].mean() < 0.9 * found[:5].mean()
+    assert losses(tmp_path, "env_steps")[-1] == 0
+    assert made.algorithm.replay.storage.column(keys.IS_EXPERT).all()
+
+
+def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
+    learner = experiment(tmp_path, OPEN, "asr", {"name": "bc"}).algorithm
+    action = torch.tensor([0.0, 0.4512, 0.0123, 0.3])
+    nearest = learner.nearest_action(action)
+    assert not torch.equal(nearest, action)
+    assert torch.equal(learner.nearest_action(nearest), nearest)
+
+
+def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
+    algorithm = {"name": "sac", "init": "bc", "replay": "prioritized", "augmentation": "none"}
+    made = experiment(
+        tmp_path, CLOSE, "cnn", algorithm, total_updates=32, pretrain_updates=30, eval_every=32
+    )
+    learner = made.algorithm
+    critic = learner.loss.qvalue_network_params.clone()
+    state, taken = {}, []
+    minimize = learner.minimize
+
+    def record(loss, batch):
+        if learner.updates == 30:
+            state["critic"] = learner.loss.qvalue_network_params.clone()
+            state["error"] = demonstration_error(learner)
+        scalars = minimize(loss, batch)
+        taken.append("loss_bc" in scalars)
+        return scalars
+
+    learner.minimize = record
+    before = []
+    on_demonstrations = learner.on_demonstrations
+
+    def measure(episodes):
+        on_demonstrations(episodes)
+        before.append(demonstration_error(learner))
+
+    learner.on_demonstrations = measure
+    made.run()
+    assert taken == [True] * 30 + [False] * 2
+    assert state["error"] < 0.7 * before[0]
+    assert (state["critic"] == critic).all()
+    assert not (learner.loss.qvalue_network_params == critic).all()
+
+
+def demonstration_error(learner):
+    """Return the greedy policy's mean squared error on the demonstrations."""
+    data = learner.replay.storage[:]
+    data = data[data[keys.IS_EXPERT][:, 0]]
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        seen = data.select(*learner.observation_keys)
+        return float((learner.policy(seen)[keys.ACTION] - data[keys.ACTION]).square().mean())
+
+
+@pytest.mark.parametrize(
+    ("run", "network", "algorithm", "changes", "message"),
+    [
+        (CLOSE, "cnn", {"name": "bc"}, {"demonstrations": 0}, "learns from demonstrations only"),
+        (CLOSE, "cnn", {"name": "sac", "init": "bc"}, {}, "pretrain_updates"),
+        (OPEN, "asr", {"name": "spatial_q", "init": "bc"}, {"pretrain_updates": 1}, "no actor"),
+        (CLOSE, "cnn", {"name": "bc", "replay": "prioritized"}, {}, "replay"),
+        (CLOSE, "asr", {"name": "bc"}, {}, "network for open_loop"),
+    ],
+)
+def test_what_cannot_run_is_refused(tmp_path, run, network, algorithm, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        experiment(tmp_path, run, network, algorithm, **changes)

@@ -1,0 +1,90 @@
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from ba_torchrl.envs import keys
+from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
+from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
+from tests.linear_sac import batch
+
+
+class Constant(nn.Module):
+    """A Gaussian that does not depend on the observation."""
+
+    def __init__(self, loc, scale):
+        super().__init__()
+        self.loc = nn.Parameter(torch.tensor(loc, dtype=torch.float64))
+        self.log_scale = nn.Parameter(torch.tensor(scale, dtype=torch.float64).log())
+
+    def forward(self, pixels, holding):
+        return tuple(p.expand(len(pixels), -1) for p in (self.loc, self.log_scale.exp()))
+
+
+OBSERVATION = [keys.PIXELS, keys.HOLDING]
+
+
+def test_the_error_is_that_of_the_drawn_action():
+    actor = Constant([0.3, -0.4], [0.5, 0.2])
+    loss = BehaviourCloningLoss(squashed_gaussian_policy(actor, OBSERVATION))
+    data = batch()
+    torch.manual_seed(5)
+    found = loss(data)["loss_bc"]
+    torch.manual_seed(5)
+    noise = torch.randn(4, 2, dtype=torch.float64)
+    drawn = torch.tanh(actor.loc + actor.log_scale.exp() * noise)
+    torch.testing.assert_close(found, (drawn - data[keys.ACTION]).square().mean())
+    found.backward()
+    assert (actor.loc.grad != 0).all()
+    assert (actor.log_scale.grad != 0).all()
+
+
+def test_the_expected_error_is_the_squared_bias_plus_the_variance():
+    actor = Constant([0.1], [0.01])  # narrow: tanh is linear there
+    loss = BehaviourCloningLoss(squashed_gaussian_policy(actor, OBSERVATION))
+    data = TensorDict(
+        {
+            keys.PIXELS: torch.zeros(100_000, 1),
+            keys.HOLDING: torch.zeros(100_000, 1).bool(),
+            keys.ACTION: torch.full((100_000, 1), 0.12, dtype=torch.float64),
+        },
+        [100_000],
+    )
+    slope = 1 - math.tanh(0.1) ** 2
+    expected = (math.tanh(0.1) - 0.12) ** 2 + (slope * 0.01) ** 2
+    assert loss(data)["loss_bc"].item() == pytest.approx(expected, rel=0.02)
+
+
+class TwoLevels(nn.Module):
+    """Values [B, 3] and [B, 2]; the action holds the choices."""
+
+    in_keys = ("pixels",)
+
+    def __init__(self):
+        super().__init__()
+        self.first = nn.Parameter(torch.tensor([0.0, math.log(2), math.log(5)]))
+        self.second = nn.Parameter(torch.tensor([0.0, math.log(3)]))
+
+    def forward(self, pixels, action):
+        chosen = action.long()
+        count = len(pixels)
+        return [
+            (self.first.expand(count, 3), chosen[:, 0]),
+            (self.second.expand(count, 2), chosen[:, 1]),
+        ]
+
+
+def test_cross_entropies_are_averaged_over_the_batch_and_summed_over_levels():
+    loss = LevelCrossEntropyLoss(TwoLevels())
+    data = TensorDict(
+        {"pixels": torch.zeros(2, 1), keys.ACTION: torch.tensor([[2.0, 0.0], [1.0, 1.0]])}, [2]
+    )
+    found = loss(data)
+    # softmax: (1, 2, 5) / 8 and (1, 3) / 4
+    first = -(math.log(5 / 8) + math.log(2 / 8)) / 2
+    second = -(math.log(1 / 4) + math.log(3 / 4)) / 2
+    assert found["loss_bc"].item() == pytest.approx(first + second, rel=1e-6)
+    assert float(found["accuracy"]) == 0.5  # right at one level of two in either sample
+    assert not found["accuracy"].requires_grad
