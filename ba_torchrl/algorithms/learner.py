@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +27,9 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
+
+Loss = Callable[[TensorDictBase], TensorDictBase]
+"""From a batch of transitions to losses ``loss_...`` and other scalars; a loss module is one."""
 
 Init = Literal["random", "bc"]
 """How the policy is initialised."""
@@ -236,8 +240,8 @@ class Learner(Algorithm):
         self.updates += 1
         return scalars
 
-    def minimize(self, loss: LossModule, batch: TensorDictBase) -> TensorDict:
-        """Take one step on the sum of a loss module's ``loss_...`` entries, and return its scalars.
+    def minimize(self, loss: Loss, batch: TensorDictBase) -> TensorDict:
+        """Take one step on the sum of the ``loss_...`` entries of a loss, and return its scalars.
 
         Args:
             loss: of parameters of the optimiser.

@@ -24,6 +24,8 @@ class SeedUse(IntEnum):
     REPLAY = 5
     AUGMENTATION = 6
     EXPLORATION = 7
+    ENSEMBLE = 8
+    """Subsets of an ensemble of critics."""
 
 
 def derive_seed(seed: int, use: SeedUse, part: int = 0) -> int:

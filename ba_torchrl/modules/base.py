@@ -28,6 +28,8 @@ class ActorCriticSpec:
     Args:
         images: declarations of the network's input images, by key, in the order of its arguments.
         action_sequence: one letter per action component, in the order of the action ("pxyzr").
+        critics: number of critics of an ensemble with layer normalisation, see
+            `ba_torchrl.modules.ensembles`; None for twin critics without it.
 
     Raises:
         ValueError: the sequence is empty, repeats a letter or holds one outside "pxyzr".
@@ -35,6 +37,7 @@ class ActorCriticSpec:
 
     images: Mapping[str, ImageSpec]
     action_sequence: str
+    critics: int | None = None
 
     def __post_init__(self) -> None:
         letters = self.action_sequence
@@ -67,7 +70,8 @@ class ActorCritic(NamedTuple):
         actor: (images [..., C, H, W] each, holding [..., 1]) -> (loc [..., A], scale [..., A]) of
             the Gaussian before it is squashed.
         encoder: (images, holding) -> features [..., F], shared by the two critics.
-        critic: (features [..., F], action [..., A]) -> twin values [..., 2].
+        critic: (features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the
+            specification asks for K critics.
     """
 
     actor: nn.Module

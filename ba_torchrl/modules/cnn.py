@@ -8,6 +8,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.ensembles import EnsembleCritic
 from ba_torchrl.modules.trunk import (
     ImageNetworkConfig,
     ImageTrunk,
@@ -108,11 +109,18 @@ class CNNConfig(ImageNetworkConfig):
         networks = ActorCritic(
             actor=CNNActor(self._trunk(spec), features, spec.action_size),
             encoder=self._trunk(spec),
-            critic=CNNTwinCritic(features, spec.action_size, scaled_width(_HIDDEN, self.width)),
+            critic=self._critic(spec, features),
         )
         for network in networks:
             network.apply(initialise_plain)
         return networks
+
+    def _critic(self, spec: ActorCriticSpec, features: int) -> nn.Module:
+        hidden = scaled_width(_HIDDEN, self.width)
+        if spec.critics is None:
+            return CNNTwinCritic(features, spec.action_size, hidden)
+        first = nn.Linear(features + spec.action_size, spec.critics * hidden)
+        return EnsembleCritic(first, spec.critics, hidden)
 
     def _trunk(self, spec: ActorCriticSpec) -> ImageTrunk:
         stages = trunk_stages(spec.image_size, [scaled_width(w, self.width) for w in _WIDTHS])

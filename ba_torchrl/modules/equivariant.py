@@ -15,6 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.ensembles import EnsembleCritic
 from ba_torchrl.modules.steerable import (
     FieldTypes,
     SteerableConv2d,
@@ -162,8 +163,17 @@ class EquivariantConfig(ImageNetworkConfig):
         return ActorCritic(
             actor=EquivariantActor(gspace, self._trunk(gspace, spec), features, action),
             encoder=self._trunk(gspace, spec),
-            critic=EquivariantTwinCritic(gspace, features, action),
+            critic=self._critic(gspace, features, action, spec.critics),
         )
+
+    def _critic(
+        self, gspace: GSpace2D, features: FieldTypes, action: ActionFields, critics: int | None
+    ) -> nn.Module:
+        if critics is None:
+            return EquivariantTwinCritic(gspace, features, action)
+        inputs = [*features, *action.types(gspace)]
+        first = SteerableLinear(gspace, inputs, [(gspace.regular_repr, critics * self.n_hidden)])
+        return EnsembleCritic(first, critics, self.n_hidden, self.group_order, action.group)
 
     def _trunk(self, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:
         n = self.n_hidden

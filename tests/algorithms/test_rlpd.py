@@ -1,0 +1,119 @@
+"""RLPD: every hyper-parameter has an effect, and it runs on both networks."""
+
+import pytest
+import torch
+
+from ba_torchrl.algorithms.base import ALGORITHMS
+from ba_torchrl.config import parse
+from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.errors import ConfigError
+from tests.algorithms.tiny import build, run, transitions
+
+UNUSUAL = {
+    "learning_rate": 0.003,
+    "weight_decay": 0.02,
+    "gradient_clamp": 1e-4,
+    "gamma": 0.7,
+    "tau": 0.3,
+    "alpha_init": 0.25,
+    "target_entropy": -2.5,
+    "critics": 5,
+    "subset": 3,
+    "critic_updates": 3,
+    "entropy_backup": True,
+    "batch_size": 6,
+    "buffer_size": 55,
+    "augmentation": "so2",
+    "augmentation_probability": 0.35,
+}
+
+
+def made(**changes):
+    learner = build("rlpd", **{**UNUSUAL, **changes})
+    learner.extend(transitions(learner))
+    return learner
+
+
+def flat(params):
+    return torch.cat([value.detach().flatten() for value in params.values(True, True)])
+
+
+def test_the_terms_have_their_values():
+    loss = made().loss
+    assert float(loss.value_estimator.gamma) == pytest.approx(0.7)
+    assert float(loss.alpha) == pytest.approx(0.25)
+    assert (loss.target_entropy, loss.subset, loss.entropy_backup) == (-2.5, 3, True)
+    assert loss.qvalue_network.module.heads == 5
+
+
+def test_an_update_is_several_critic_updates_and_one_of_the_policy():
+    learner = made()
+    target = flat(learner.loss.target_qvalue_network_params)
+    taken = []
+    step, sample = learner.step, learner.sample
+    drawn = []
+
+    def record(loss):
+        before = flat(learner.loss.actor_network_params), flat(learner.loss.qvalue_network_params)
+        step(loss)
+        after = flat(learner.loss.actor_network_params), flat(learner.loss.qvalue_network_params)
+        taken.append(tuple(not torch.equal(*pair) for pair in zip(before, after, strict=True)))
+        nonlocal target
+        target = 0.7 * target + 0.3 * after[1]
+
+    learner.step = record
+    learner.sample = lambda: drawn.append(sample()) or drawn[-1]
+    learner.update()
+    assert taken == [(False, True), (False, True), (True, True)]
+    assert learner.updates == 1
+    torch.testing.assert_close(flat(learner.loss.target_qvalue_network_params), target)
+    assert not torch.equal(drawn[0]["action"], drawn[1]["action"])
+
+
+def test_optimiser_and_augmentation_have_their_values():
+    learner = made()
+    assert isinstance(learner.replay, SymmetricReplay)
+    assert (learner.replay.expert.storage.max_size, learner.replay.batch_size) == (55, 6)
+    assert isinstance(learner.augmentation, SO2Augmentation)
+    assert learner.augmentation.probability == 0.35
+    assert isinstance(made(augmentation="none").augmentation, torch.nn.Identity)
+    learner.update()
+    decay = {
+        id(p): group["weight_decay"]
+        for group in learner.optimizer.param_groups
+        for p in group["params"]
+    }
+    for name, parameter in learner.loss.named_parameters():
+        is_network = name != "log_alpha"
+        assert decay[id(parameter)] == (0.02 if is_network else 0.0)
+        assert float(parameter.grad.abs().max()) <= 1.0001e-4 or not is_network
+
+
+def test_the_learning_rate_decreases_over_all_critic_updates():
+    learner = made(learning_rate_end_factor=0.1)
+    for _ in range(10):  # the run's updates
+        learner.update()
+    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.0003)
+
+
+def test_a_restored_learner_draws_the_same_subsets():
+    first, second = made(), made()
+    first.update()
+    second.load_state_dict(first.state_dict())
+    states = [learner.loss.get_generator_state() for learner in (first, second)]
+    assert torch.equal(*states)
+
+
+def test_what_cannot_be_built_is_refused():
+    with pytest.raises(ConfigError, match="subset"):
+        build("rlpd", critics=3, subset=4)
+    with pytest.raises(ConfigError, match="replay"):
+        parse(ALGORITHMS["rlpd"], {"replay": "uniform"}, "rlpd")
+
+
+@pytest.mark.parametrize("network", ["cnn", "equi"])
+def test_two_iterations_of_a_run(tmp_path, network):
+    learner = run(tmp_path, network, {"name": "rlpd", "critics": 3, "critic_updates": 2})
+    assert len(learner.replay.expert) > 0
+    assert len(learner.replay.online) > 0

@@ -1,0 +1,80 @@
+"""Small learners, transitions and runs of close-loop algorithms."""
+
+import torch
+from tensordict import TensorDict
+
+from ba_torchrl.actions import CloseLoopActions
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
+from ba_torchrl.config import parse
+from ba_torchrl.envs import keys
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.experiment import Experiment
+from tests.specs import close_loop_images
+
+SIZES = {"cnn": {"width": 0.25}, "equi": {"group_order": 4, "n_hidden": 8}}
+
+
+def build(algorithm, network="cnn", **settings):
+    """A learner for a run of ten updates."""
+    torch.manual_seed(0)
+    problem = Problem(
+        control="close_loop",
+        images=close_loop_images(64),
+        actions=CloseLoopActions("pxyzr"),
+        total_updates=10,
+        seed=0,
+        device=torch.device("cpu"),
+    )
+    config = parse(ALGORITHMS[algorithm], settings, algorithm)
+    return config.build(parse(NETWORKS[network], SIZES[network], network), problem)
+
+
+def transitions(learner, count=24):
+    """Random transitions, every second one a demonstration."""
+    generator = torch.Generator().manual_seed(1)
+
+    def rand(*shape):
+        return torch.rand(count, *shape, generator=generator)
+
+    def state():
+        images = {key: rand(*image.shape) * image.high for key, image in learner.images.items()}
+        return {**images, keys.HOLDING: rand(1) < 0.5}
+
+    ended = torch.zeros(count, 1, dtype=torch.bool)
+    following = {
+        **state(),
+        keys.REWARD: rand(1),
+        **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
+    }
+    data = {
+        **state(),
+        keys.ACTION: 1.8 * rand(learner.problem.actions.size) - 0.9,
+        keys.IS_EXPERT: torch.arange(count)[:, None] % 2 == 0,
+        keys.NEXT: following,
+    }
+    return TensorDict(data, [count])
+
+
+def run(folder, network, algorithm, **changes):
+    """The learner after a run of two updates, each after two steps of the environments."""
+    values = {
+        "task": "close_loop/block_reaching",
+        "env": {"obs_size": 64, "max_steps": 6},
+        "algorithm": {"batch_size": 8, "learning_rate": 3e-3, **algorithm},
+        "network": {"name": network, **SIZES[network]},
+        "num_envs": 2,
+        "parallel": False,
+        "demonstrations": 2,
+        "total_updates": 2,
+        "min_replay": 1,
+        "eval_every": 2,
+        "eval_episodes": 2,
+        "final_eval_episodes": 2,
+        "log_every": 1,
+        "video_episodes": 0,
+        "run_dir": str(folder / "run"),
+        **changes,
+    }
+    experiment = Experiment(ExperimentConfig.parse(values), progress=False)
+    assert experiment.run().updates == values["total_updates"]
+    return experiment.algorithm
