@@ -26,6 +26,8 @@ class SeedUse(IntEnum):
     EXPLORATION = 7
     ENSEMBLE = 8
     """Subsets of an ensemble of critics."""
+    MIXTURE = 9
+    """Choice between the actions of policy and expert."""
 
 
 def derive_seed(seed: int, use: SeedUse, part: int = 0) -> int:

@@ -7,41 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.experiment import Experiment
-
-SIZES = {
-    "cnn": {"width": 0.25},
-    "equi": {"group_order": 4, "n_hidden": 8},
-    "asr": {"num_rotations": 4, "width": 0.125},
-}
-CLOSE = {
-    "task": "close_loop/block_reaching",
-    "env": {"obs_size": 64, "max_steps": 6},
-    "num_envs": 2,
-    "parallel": False,
-    "demonstrations": 4,
-    "total_updates": 2,
-    "min_replay": 1,
-    "eval_every": 2,
-    "eval_episodes": 2,
-    "final_eval_episodes": 2,
-    "log_every": 1,
-    "video_episodes": 0,
-}
-OPEN = {**CLOSE, "task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects": 2}}
-
-
-def experiment(folder, run, network, algorithm, **changes):
-    units = {} if network == "asr" else {"depth_center_m": 0.2, "depth_scale_m": 0.1}
-    values = {
-        **run,
-        "algorithm": {"batch_size": 16, "learning_rate": 3e-3, **algorithm},
-        "network": {"name": network, **SIZES[network], **units},
-        "run_dir": str(folder / "run"),
-        **changes,
-    }
-    return Experiment(ExperimentConfig.parse(values), progress=False)
+from tests.algorithms.tiny import OPEN, make_experiment
 
 
 def losses(folder, name):
@@ -49,12 +15,19 @@ def losses(folder, name):
 
 
 @pytest.mark.parametrize(
-    ("run", "network"),
-    [(CLOSE, "cnn"), (CLOSE, "equi"), (OPEN, "asr")],
+    ("network", "changes"),
+    [("cnn", {}), ("equi", {}), ("asr", OPEN)],
     ids=["close_loop cnn", "close_loop equi", "open_loop asr"],
 )
-def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, run, network):
-    made = experiment(tmp_path, run, network, {"name": "bc"}, total_updates=40, eval_every=40)
+def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, network, changes):
+    made = make_experiment(
+        tmp_path,
+        network,
+        {"name": "bc", "batch_size": 16},
+        **changes,
+        total_updates=40,
+        eval_every=40,
+    )
     assert made.run().updates == 40
     found = losses(tmp_path, "loss_bc")
     assert found[-5:].mean() < 0.9 * found[:5].mean()
@@ -63,7 +36,7 @@ def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, ru
 
 
 def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
-    learner = experiment(tmp_path, OPEN, "asr", {"name": "bc"}).algorithm
+    learner = make_experiment(tmp_path, "asr", {"name": "bc"}, **OPEN).algorithm
     action = torch.tensor([0.0, 0.4512, 0.0123, 0.3])
     nearest = learner.nearest_action(action)
     assert not torch.equal(nearest, action)
@@ -72,8 +45,8 @@ def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
 
 def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
     algorithm = {"name": "sac", "init": "bc", "replay": "prioritized", "augmentation": "none"}
-    made = experiment(
-        tmp_path, CLOSE, "cnn", algorithm, total_updates=32, pretrain_updates=30, eval_every=32
+    made = make_experiment(
+        tmp_path, "cnn", algorithm, total_updates=32, pretrain_updates=30, eval_every=32
     )
     learner = made.algorithm
     critic = learner.loss.qvalue_network_params.clone()
@@ -114,15 +87,15 @@ def demonstration_error(learner):
 
 
 @pytest.mark.parametrize(
-    ("run", "network", "algorithm", "changes", "message"),
+    ("network", "algorithm", "changes", "message"),
     [
-        (CLOSE, "cnn", {"name": "bc"}, {"demonstrations": 0}, "learns from demonstrations only"),
-        (CLOSE, "cnn", {"name": "sac", "init": "bc"}, {}, "pretrain_updates"),
-        (OPEN, "asr", {"name": "spatial_q", "init": "bc"}, {"pretrain_updates": 1}, "no actor"),
-        (CLOSE, "cnn", {"name": "bc", "replay": "prioritized"}, {}, "replay"),
-        (CLOSE, "asr", {"name": "bc"}, {}, "network for open_loop"),
+        ("cnn", {"name": "bc"}, {"demonstrations": 0}, "learns from demonstrations only"),
+        ("cnn", {"name": "sac", "init": "bc"}, {}, "pretrain_updates"),
+        ("asr", {"name": "spatial_q", "init": "bc"}, {**OPEN, "pretrain_updates": 1}, "no actor"),
+        ("cnn", {"name": "bc", "replay": "prioritized"}, {}, "replay"),
+        ("asr", {"name": "bc"}, {}, "network for open_loop"),
     ],
 )
-def test_what_cannot_run_is_refused(tmp_path, run, network, algorithm, changes, message):
+def test_what_cannot_run_is_refused(tmp_path, network, algorithm, changes, message):
     with pytest.raises(ConfigError, match=message):
-        experiment(tmp_path, run, network, algorithm, **changes)
+        make_experiment(tmp_path, network, algorithm, **changes)

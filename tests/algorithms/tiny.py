@@ -1,4 +1,4 @@
-"""Small learners, transitions and runs of close-loop algorithms."""
+"""Small learners, transitions and runs of algorithms."""
 
 import torch
 from tensordict import TensorDict
@@ -11,7 +11,13 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from tests.specs import close_loop_images
 
-SIZES = {"cnn": {"width": 0.25}, "equi": {"group_order": 4, "n_hidden": 8}}
+SIZES = {
+    "cnn": {"width": 0.25},
+    "equi": {"group_order": 4, "n_hidden": 8},
+    "asr": {"num_rotations": 4, "width": 0.125},
+}
+OPEN = {"task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects": 2}}
+"""Changes of `run` for an open-loop task."""
 
 
 def build(algorithm, network="cnn", **settings):
@@ -55,16 +61,17 @@ def transitions(learner, count=24):
     return TensorDict(data, [count])
 
 
-def run(folder, network, algorithm, **changes):
-    """The learner after a run of two updates, each after two steps of the environments."""
+def make_experiment(folder, network, algorithm, **changes):
+    """A run of two updates, each after a step of two environments."""
+    units = {} if network == "asr" else {"depth_center_m": 0.2, "depth_scale_m": 0.1}
     values = {
         "task": "close_loop/block_reaching",
         "env": {"obs_size": 64, "max_steps": 6},
         "algorithm": {"batch_size": 8, "learning_rate": 3e-3, **algorithm},
-        "network": {"name": network, **SIZES[network]},
+        "network": {"name": network, **SIZES[network], **units},
         "num_envs": 2,
         "parallel": False,
-        "demonstrations": 2,
+        "demonstrations": 4,
         "total_updates": 2,
         "min_replay": 1,
         "eval_every": 2,
@@ -75,6 +82,11 @@ def run(folder, network, algorithm, **changes):
         "run_dir": str(folder / "run"),
         **changes,
     }
-    experiment = Experiment(ExperimentConfig.parse(values), progress=False)
-    assert experiment.run().updates == values["total_updates"]
+    return Experiment(ExperimentConfig.parse(values), progress=False)
+
+
+def run(folder, network, algorithm, **changes):
+    """The learner after `make_experiment`'s run."""
+    experiment = make_experiment(folder, network, algorithm, **changes)
+    assert experiment.run().updates == experiment.config.total_updates
     return experiment.algorithm

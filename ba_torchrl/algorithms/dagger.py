@@ -1,0 +1,172 @@
+"""DAgger: imitation in the states that the policy visits (Ross et al., 2011).
+
+The experts are functions of the scene, so the environment returns the expert's action in every
+visited state. After the demonstrations, the executed action is the expert's with a probability beta
+and the policy's otherwise; the stored label is always the expert's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import torch
+from pydantic import Field
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.objectives import LossModule
+
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
+from ba_torchrl.algorithms.imitators import Imitator, make_imitator
+from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.envs import keys
+from ba_torchrl.modules.base import NetworkConfig
+
+
+@ALGORITHMS.register("dagger")
+class DAggerConfig(LearnerConfig):
+    """Hyper-parameters of DAgger; the loss is that of `ba_torchrl.algorithms.bc`.
+
+    By default beta is zero after the demonstrations: the parameter-free schedule of Ross et al.
+    (2011), section 3.
+    """
+
+    controls: ClassVar[frozenset[Control]] = frozenset({"close_loop", "open_loop"})
+
+    beta_init: float = Field(default=0.0, ge=0, le=1)
+    """Probability of executing the expert's action at the first update."""
+    beta_updates: int = Field(default=1000, ge=1)
+    """Updates over which that probability decreases linearly to zero."""
+    replay: Literal["uniform"] = "uniform"
+    init: Literal["random"] = "random"
+
+    def build(self, network: NetworkConfig, problem: Problem) -> DAgger:
+        """Return a freshly initialised learner.
+
+        Raises:
+            ValueError: the network does not support the task's images or actions.
+        """
+        return DAgger(self, network, problem)
+
+
+class MixedPolicy(TensorDictModuleBase):
+    """A policy that executes the expert's action in a random part of the steps.
+
+    It does so under TorchRL's exploration type RANDOM only.
+
+    Args:
+        policy: from the observation to ``action``.
+        imitator: maps the expert's action to one that the policy can choose.
+        seed: of the choice between the two.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, imitator: Imitator, seed: int) -> None:
+        super().__init__()
+        self.policy = policy
+        self.beta = 0.0
+        self.in_keys = list(policy.in_keys)
+        self.out_keys = [keys.ACTION]
+        self._imitator = imitator
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action of a root TensorDict of any batch shape.
+
+        Args:
+            tensordict: observation; with ``expert_action`` if beta is positive.
+        """
+        out = self.policy(tensordict)
+        if exploration_type() != ExplorationType.RANDOM or self.beta == 0:
+            return out
+        draws = torch.rand(*out.batch_size, 1, generator=self._generator)
+        expert = self._imitator.nearest_action(out[keys.EXPERT_ACTION])
+        is_expert = (draws < self.beta).to(expert.device)
+        return out.set(keys.ACTION, torch.where(is_expert, expert, out[keys.ACTION]))
+
+    def get_generator_state(self) -> Tensor:
+        """Return the state of the generator."""
+        return self._generator.get_state()
+
+    def set_generator_state(self, state: Tensor) -> None:
+        """Restore the state of the generator, from any device."""
+        self._generator.set_state(state.cpu())
+
+
+class DAgger(Learner):
+    """A policy trained on the expert's actions in the states of both.
+
+    Args:
+        config: hyper-parameters.
+        network: builds the network of the policy.
+        problem: images, actions, device, seed and length of the run.
+    """
+
+    config: DAggerConfig
+    policy: MixedPolicy
+    stores_expert_action: ClassVar[bool] = True
+
+    def __init__(self, config: DAggerConfig, network: NetworkConfig, problem: Problem) -> None:
+        super().__init__(config, network, problem)
+        seed = problem.derived_seed(SeedUse.MIXTURE)
+        self.policy = MixedPolicy(self.policy, self.imitator, seed)
+        self._set_beta()
+
+    def make_networks(self, network: NetworkConfig) -> Imitator:
+        """Return the policy with its loss."""
+        self.imitator = make_imitator(network, self.problem, self.images)
+        return self.imitator
+
+    def make_policy(self, networks: Imitator) -> TensorDictModuleBase:
+        """Return the policy."""
+        return networks.policy
+
+    def make_loss(self, networks: Imitator) -> LossModule:
+        """Return the loss between the policy and the expert's actions."""
+        return networks.make_loss()
+
+    def nearest_action(self, action: Tensor) -> Tensor:
+        """Return the nearest action that the policy can choose."""
+        return self.imitator.nearest_action(action)
+
+    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
+        """Store demonstrations with actions that the policy can choose.
+
+        Args:
+            episodes: TensorDicts [T].
+        """
+        super().on_demonstrations([self.imitator.as_demonstration(each) for each in episodes])
+
+    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+        """Return the transitions [N], with the expert's action in place of the executed one.
+
+        The loss reads states and labels only, not what followed.
+        """
+        transitions = super().to_transitions(data, is_expert=is_expert)
+        return transitions.set(keys.ACTION, transitions.pop(keys.EXPERT_ACTION))
+
+    def update(self) -> TensorDict:
+        """Take one step as `Learner.update`, and update beta.
+
+        Raises:
+            FloatingPointError: a loss is not finite.
+        """
+        scalars = super().update()
+        self._set_beta()
+        return scalars
+
+    def _set_beta(self) -> None:
+        config = self.config
+        self.policy.beta = config.beta_init * max(1 - self.updates / config.beta_updates, 0.0)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return networks, optimiser, schedule, generators and number of updates."""
+        return {**super().state_dict(), "mixture": self.policy.get_generator_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the learner from a `state_dict` of any device."""
+        super().load_state_dict(state)
+        self.policy.set_generator_state(state["mixture"])
+        self._set_beta()

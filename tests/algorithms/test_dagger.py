@@ -1,0 +1,82 @@
+"""DAgger: labels are the expert's, actions are the policy's or the expert's."""
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ba_torchrl.envs import keys
+from tests.algorithms.tiny import OPEN, build, run, transitions
+
+
+def visited(learner):
+    """Transitions of the policy, with the expert's actions."""
+    data = transitions(learner)
+    data[keys.NEXT, keys.FAULT] = torch.zeros(len(data), 1, dtype=torch.bool)
+    return data.set(keys.EXPERT_ACTION, -data[keys.ACTION] / 2)
+
+
+def test_the_label_is_the_action_of_the_expert():
+    learner = build("dagger")
+    data = visited(learner)
+    stored = learner.to_transitions(data, is_expert=False)
+    assert torch.equal(stored[keys.ACTION], data[keys.EXPERT_ACTION])
+    assert keys.EXPERT_ACTION not in stored
+    del data[keys.EXPERT_ACTION]  # demonstrations have only the executed action
+    stored = learner.to_transitions(data, is_expert=True)
+    assert torch.equal(stored[keys.ACTION], data[keys.ACTION])
+
+
+def test_the_expert_acts_with_probability_beta():
+    learner = build("dagger", beta_init=0.3)
+    data = torch.cat([visited(learner)] * 20)
+    with set_exploration_type(ExplorationType.RANDOM):
+        acted = learner.policy(data.clone())[keys.ACTION]
+    is_expert = (acted == data[keys.EXPERT_ACTION]).all(dim=1)
+    assert 0.2 < float(is_expert.float().mean()) < 0.4
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        greedy = learner.policy(data.exclude(keys.EXPERT_ACTION))[keys.ACTION]
+    assert not (greedy == data[keys.EXPERT_ACTION]).all(dim=1).any()
+
+
+def test_beta_decreases_linearly_to_zero():
+    learner = build("dagger", beta_init=0.6, beta_updates=3, batch_size=4)
+    learner.extend(learner.to_transitions(visited(learner), is_expert=True))
+    betas = []
+    for _ in range(5):
+        betas.append(learner.policy.beta)
+        learner.update()
+    assert betas == pytest.approx([0.6, 0.4, 0.2, 0.0, 0.0])
+    other = build("dagger", beta_init=0.6, beta_updates=6, batch_size=4)
+    other.load_state_dict(learner.state_dict())
+    assert other.policy.beta == pytest.approx(0.1)
+    states = [each.policy.get_generator_state() for each in (learner, other)]
+    assert torch.equal(*states)
+
+
+@pytest.mark.parametrize("network", ["cnn", "equi"])
+def test_two_iterations_of_a_run(tmp_path, network):
+    learner = run(tmp_path, network, {"name": "dagger", "beta_init": 0.5})
+    is_expert = learner.replay.storage.column(keys.IS_EXPERT)
+    assert (~is_expert).sum() == 4
+    assert is_expert.any()
+
+
+def test_two_iterations_of_a_run_in_the_open_loop(tmp_path):
+    settings = {"name": "dagger", "beta_init": 0.5}
+    learner = run(tmp_path, "asr", settings, **OPEN)
+    assert (~learner.replay.storage.column(keys.IS_EXPERT)).sum() == 4
+    labels = learner.replay.storage.column(keys.ACTION)
+    is_expert = learner.replay.storage.column(keys.IS_EXPERT)[:, 0]
+    nearest = learner.nearest_action(labels)
+    torch.testing.assert_close(nearest[is_expert], labels[is_expert])
+    assert not torch.allclose(nearest[~is_expert], labels[~is_expert], atol=1e-5)
+
+
+def test_the_executed_action_of_an_expert_is_on_the_grid(tmp_path):
+    learner = run(tmp_path, "asr", {"name": "dagger", "beta_init": 1.0}, **OPEN)
+    learner.policy.beta = 1.0
+    state = learner.replay.storage[:].select(*learner.observation_keys, keys.ACTION)
+    state.rename_key_(keys.ACTION, keys.EXPERT_ACTION)
+    with set_exploration_type(ExplorationType.RANDOM):
+        acted = learner.policy(state)[keys.ACTION]
+    assert torch.equal(acted, learner.nearest_action(state[keys.EXPERT_ACTION]))
