@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tensordict.nn import TensorDictModule
-from torch import nn
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torch import Tensor, nn
+from torchrl.modules import ProbabilisticActor, TanhNormal, TruncatedNormal
 
 from ba_torchrl.envs import keys
 
@@ -24,4 +24,58 @@ def squashed_gaussian_policy(actor: nn.Module, in_keys: Sequence[str]) -> Probab
         out_keys=[keys.ACTION],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": -1.0, "high": 1.0},
+    )
+
+
+class ModeGreedyTruncatedNormal(TruncatedNormal):
+    """TorchRL's truncated normal distribution, whose deterministic sample is the mode."""
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The mode [..., A]; TorchRL's is the mean, which is further from the ends of the range."""
+        return self.mode
+
+
+class BoundedScale(nn.Module):
+    """An actor with a lower and an upper bound of its standard deviations.
+
+    Args:
+        actor: from the observation to (loc, scale), each [..., A].
+        low: least standard deviation.
+        high: greatest standard deviation.
+    """
+
+    def __init__(self, actor: nn.Module, low: float, high: float) -> None:
+        super().__init__()
+        self.actor = actor
+        self.low = low
+        self.high = high
+
+    def forward(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A]."""
+        loc, scale = self.actor(*observation)
+        return loc, scale.clamp(self.low, self.high)
+
+
+def truncated_gaussian_policy(
+    actor: nn.Module, in_keys: Sequence[str], *, std_min: float, std_max: float = 1.0
+) -> ProbabilisticActor:
+    """Return the policy whose action is a Gaussian variable truncated to [-1, 1].
+
+    Its mode is tanh(loc). In contrast to the squashed Gaussian, the
+    likelihood of actions at the ends of the range is bounded.
+
+    Args:
+        actor: from the observation to (loc, scale), each [..., A].
+        in_keys: keys of the observation, in the order of the actor's arguments.
+        std_min: least standard deviation.
+        std_max: greatest standard deviation.
+    """
+    bounded = BoundedScale(actor, std_min, std_max)
+    return ProbabilisticActor(
+        TensorDictModule(bounded, in_keys=list(in_keys), out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=[keys.ACTION],
+        distribution_class=ModeGreedyTruncatedNormal,
+        distribution_kwargs={"low": -1.0, "high": 1.0, "upscale": 1.0, "tanh_loc": True},
     )

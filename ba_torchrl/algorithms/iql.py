@@ -1,0 +1,108 @@
+"""Implicit Q-learning from offline data (Kostrikov et al., 2021), also online after it.
+
+The value of a state is an upper expectile of the values of the actions in the data, so no action
+outside the data is evaluated. The policy is regressed on the data's actions, weighted by their
+exponentiated advantage. A run with ``pretrain_updates`` equal to ``total_updates`` learns from
+the demonstrations alone; with fewer, the remaining updates are online.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, NamedTuple
+
+from pydantic import Field
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import IQLLoss, SoftUpdate
+
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
+from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.envs import keys
+from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
+from ba_torchrl.modules.gaussian_policy import truncated_gaussian_policy
+from ba_torchrl.modules.values import ActionValue, StateValue
+
+
+@ALGORITHMS.register("iql")
+class IQLConfig(LearnerConfig):
+    """Hyper-parameters of implicit Q-learning.
+
+    Expectile and temperature are those of Kostrikov et al. (2021) for sparse rewards (AntMaze), tau
+    is theirs as well.
+    """
+
+    controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
+
+    replay: Literal["uniform", "symmetric"] = "uniform"
+    expectile: float = Field(default=0.9, gt=0, lt=1)
+    """Expectile of the actions' values that is the value of a state."""
+    temperature: float = Field(default=10.0, ge=0)
+    """Inverse temperature: factor of the advantage in the exponent of a sample's weight."""
+    std_min: float = Field(default=0.1, gt=0, le=1)
+    """Least standard deviation of the policy, which bounds the likelihood of the data."""
+    gamma: float = Field(default=0.99, gt=0, le=1)
+    """Discount factor."""
+    tau: float = Field(default=0.005, gt=0, le=1)
+    """Weight of the critics in the update of their targets."""
+
+    def build(self, network: NetworkConfig, problem: Problem) -> IQL:
+        """Return a freshly initialised learner."""
+        return IQL(self, network, problem)
+
+
+class IQLNetworks(NamedTuple):
+    """The plain modules of implicit Q-learning, each with an encoder of its own."""
+
+    actor: nn.Module
+    qvalues: list[ActionValue]
+    value: StateValue
+
+
+class IQL(Learner):
+    """A truncated Gaussian policy, two critics and a state value.
+
+    Args:
+        config: hyper-parameters.
+        network: builds actor, encoders and critics.
+        problem: images, actions, device, seed and length of the run.
+    """
+
+    config: IQLConfig
+    loss: IQLLoss
+
+    def make_networks(self, network: NetworkConfig) -> IQLNetworks:
+        """Return actor, critics and state value."""
+        actions = self.problem.actions
+        spec = ActorCriticSpec(self.images, actions.sequence, critics=1)
+        first, second, third = (network.build(spec) for _ in range(3))
+        return IQLNetworks(
+            first.actor,
+            [ActionValue(each.encoder, each.critic) for each in (first, second)],
+            StateValue(third.encoder, third.critic, actions.size),
+        )
+
+    def make_policy(self, networks: IQLNetworks) -> ProbabilisticActor:
+        """Return the truncated Gaussian of the actor."""
+        return truncated_gaussian_policy(
+            networks.actor, self.observation_keys, std_min=self.config.std_min
+        )
+
+    def make_loss(self, networks: IQLNetworks) -> IQLLoss:
+        """Return TorchRL's loss, without ``vmap``, which steerable convolutions do not support."""
+        inputs = [*self.observation_keys, keys.ACTION]
+        loss = IQLLoss(
+            self.make_policy(networks),
+            [TensorDictModule(q, inputs, ["state_action_value"]) for q in networks.qvalues],
+            TensorDictModule(networks.value, self.observation_keys, ["state_value"]),
+            loss_function="l2",
+            temperature=self.config.temperature,
+            expectile=self.config.expectile,
+            deactivate_vmap=True,
+        )
+        loss.make_value_estimator(gamma=self.config.gamma)
+        return loss
+
+    def make_target_updater(self) -> SoftUpdate:
+        """Return the soft update of the critics' targets."""
+        return SoftUpdate(self.loss, tau=self.config.tau)
