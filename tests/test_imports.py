@@ -32,6 +32,10 @@ APART = {
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
     "_malloc": set(),
+    # whole algorithms as scripts: no learner and no experiment
+    "recipes.torchrl": BASE
+    | {"envs", "data", "modules", "objectives", "__init__"}
+    | {"algorithms.acting", "algorithms.spatial_actions"},
 }
 LEARNING = {"torch", "tensordict", "torchrl"}
 FORBIDDEN_PACKAGES = dict.fromkeys(("sim", "tasks", *BASE), LEARNING)
@@ -52,7 +56,7 @@ def part_of(module):
     """Return the part a dotted module name belongs to: 'ba_torchrl.sim.world' -> 'sim'."""
     names = module.split(".")
     if names[0] != PACKAGE:
-        return names[0]
+        return ".".join(names[:-1]) if len(names) > 2 else names[0]
     return names[1] if len(names) > 1 else "__init__"
 
 
@@ -202,6 +206,8 @@ def test_a_circle_between_files_is_found():
         ("ba_torchrl.envs.base", "from ba_torchrl import make", "__init__"),
         ("ba_torchrl._malloc", "from ba_torchrl.config import EnvConfig", "config"),
         ("recipes.train", "from ba_torchrl.modules.cnn import CNN", "modules"),
+        ("recipes.torchrl.sac", "from ba_torchrl.algorithms.sac import SAC", "algorithms"),
+        ("recipes.torchrl.sac", "from ba_torchrl.training import experiment", "training"),
     ],
 )
 def test_a_wrong_import_is_found(module, source, culprit):
