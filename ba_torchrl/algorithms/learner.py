@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +10,7 @@ import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule
@@ -27,9 +26,6 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
-
-Loss = Callable[[TensorDictBase], TensorDictBase]
-"""From a batch of transitions to losses ``loss_...`` and other scalars; a loss module is one."""
 
 Init = Literal["random", "bc"]
 """How the policy is initialised."""
@@ -219,13 +215,10 @@ class Learner(Algorithm):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.minimize(self.loss, batch)
-        if self.target_updater is not None:
-            self.target_updater.step()
+        scalars = self.minimize(self.loss(batch))
         if self._prioritized_sampler() is not None:
             # the trees of the sampler are on the CPU
             self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
-        self.updates += 1
         return scalars
 
     def pretrain_update(self) -> TensorDict:
@@ -236,36 +229,45 @@ class Learner(Algorithm):
         """
         if self.init_loss is None:
             return self.update()
-        scalars = self.minimize(self.init_loss, self.sample())
-        self.updates += 1
-        return scalars
+        return self.minimize(self.init_loss(self.sample()))
 
-    def minimize(self, loss: Loss, batch: TensorDictBase) -> TensorDict:
-        """Take one step on the sum of the ``loss_...`` entries of a loss, and return its scalars.
+    def minimize(self, scalars: TensorDictBase) -> TensorDict:
+        """Take one gradient step on a sum of losses, update the target network and count it.
 
         Args:
-            loss: of parameters of the optimiser.
-            batch: transitions [B].
+            scalars: losses, whose names begin with "loss_", and diagnostics.
+
+        Returns:
+            The scalars without gradient.
 
         Raises:
             FloatingPointError: a loss is not finite.
         """
-        scalars = loss(batch)
-        total = sum(value for name, value in scalars.items() if name.startswith("loss_"))
-        if not torch.isfinite(total):
-            values = {key: value.item() for key, value in scalars.items()}
-            raise FloatingPointError(f"a loss is not finite at update {self.updates}: {values}")
-        self.step(total)
+        self.step(scalars)
+        self.updates += 1
         return scalars.detach()
 
-    def step(self, loss: Tensor) -> None:
-        """Take one step of the optimiser and of the schedule of the learning rate."""
+    def step(self, scalars: TensorDictBase) -> None:
+        """Take one step of optimiser, schedule and target network.
+
+        Args:
+            scalars: losses, whose names begin with "loss_", and diagnostics.
+
+        Raises:
+            FloatingPointError: a loss is not finite.
+        """
+        loss = sum(value for name, value in scalars.items() if name.startswith("loss_"))
+        if not torch.isfinite(loss):
+            values = {key: value.item() for key, value in scalars.items()}
+            raise FloatingPointError(f"a loss is not finite at update {self.updates}: {values}")
         self.optimizer.zero_grad()
         loss.backward()
         if self.config.gradient_clamp is not None:
             nn.utils.clip_grad_value_(self.network_parameters(), self.config.gradient_clamp)
         self.optimizer.step()
         self.scheduler.step()
+        if self.target_updater is not None:
+            self.target_updater.step()
 
     def _prioritized_sampler(self) -> ExpertPrioritizedSampler | None:
         sampler = self.replay.sampler

@@ -151,8 +151,7 @@ class RLPD(Learner):
             FloatingPointError: a loss is not finite.
         """
         for _ in range(self.config.critic_updates - 1):
-            self.minimize(self.loss.critic_loss, self.sample())
-            self.target_updater.step()
+            self.step(self.loss.critic_loss(self.sample()))
         return super().update()
 
     def state_dict(self) -> dict[str, Any]:

@@ -53,11 +53,11 @@ def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
     state, taken = {}, []
     minimize = learner.minimize
 
-    def record(loss, batch):
+    def record(losses):
         if learner.updates == 30:
             state["critic"] = learner.loss.qvalue_network_params.clone()
             state["error"] = demonstration_error(learner)
-        scalars = minimize(loss, batch)
+        scalars = minimize(losses)
         taken.append("loss_bc" in scalars)
         return scalars
 
