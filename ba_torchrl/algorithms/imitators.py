@@ -45,7 +45,7 @@ class GaussianImitator:
 
     Args:
         network: builds the actor.
-        problem: actions of the task.
+        problem: actions and device.
         images: declarations of the network's input images.
     """
 
@@ -53,6 +53,7 @@ class GaussianImitator:
         self, network: NetworkConfig, problem: Problem, images: Mapping[str, ImageSpec]
     ) -> None:
         actor = network.build(ActorCriticSpec(images, problem.actions.sequence)).actor
+        actor.to(problem.device)
         self.policy = squashed_gaussian_policy(actor, [*images, keys.HOLDING])
 
     def make_loss(self) -> LossModule:

@@ -76,10 +76,11 @@ class IQL(Learner):
         actions = self.problem.actions
         spec = ActorCriticSpec(self.images, actions.sequence, critics=1)
         first, second, third = (network.build(spec) for _ in range(3))
+        device = self.problem.device
         return IQLNetworks(
-            first.actor,
-            [ActionValue(each.encoder, each.critic) for each in (first, second)],
-            StateValue(third.encoder, third.critic, actions.size),
+            first.actor.to(device),
+            [ActionValue(each.encoder, each.critic).to(device) for each in (first, second)],
+            StateValue(third.encoder, third.critic, actions.size).to(device),
         )
 
     def make_policy(self, networks: IQLNetworks) -> ProbabilisticActor:

@@ -93,7 +93,7 @@ class RLPD(Learner):
         networks = network.build(ActorCriticSpec(self.images, sequence, self.config.critics))
         if not isinstance(networks.critic, EnsembleCritic):
             raise ConfigError(f"{type(network).__name__} builds no ensemble of critics")
-        return networks
+        return ActorCritic(*(module.to(self.problem.device) for module in networks))
 
     def make_policy(self, networks: ActorCritic) -> ProbabilisticActor:
         """Return the squashed Gaussian of the actor."""

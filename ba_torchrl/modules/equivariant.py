@@ -171,9 +171,10 @@ class EquivariantConfig(ImageNetworkConfig):
     ) -> nn.Module:
         if critics is None:
             return EquivariantTwinCritic(gspace, features, action)
+        regular, fields = gspace.regular_repr, self.n_hidden
         inputs = [*features, *action.types(gspace)]
-        first = SteerableLinear(gspace, inputs, [(gspace.regular_repr, critics * self.n_hidden)])
-        return EnsembleCritic(first, critics, self.n_hidden, self.group_order, action.group)
+        first = SteerableLinear(gspace, inputs, [(regular, critics * fields)])
+        return EnsembleCritic(first, critics, fields, regular.size, action.group)
 
     def _trunk(self, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:
         n = self.n_hidden

@@ -41,12 +41,16 @@ class BehaviourCloningLoss(LossModule):
         """Return ``loss_bc``.
 
         Args:
-            tensordict: observations and expert actions [B].
+            tensordict: observations and expert actions [B]. The observation's entries may have a
+                dimension of views after the batch.
         """
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             observation = tensordict.select(*self.actor_network.in_keys)
             sample = self.actor_network.get_dist(observation).rsample()
-        return TensorDict({"loss_bc": F.mse_loss(sample, tensordict[keys.ACTION])})
+        action = tensordict[keys.ACTION]
+        if sample.ndim > action.ndim:
+            action = action.unsqueeze(-2).expand_as(sample)
+        return TensorDict({"loss_bc": F.mse_loss(sample, action)})
 
 
 class LevelCrossEntropyLoss(LossModule):

@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from tests.algorithms.tiny import OPEN, make_experiment
+from tests.algorithms.tiny import OPEN, build, make_experiment, transitions
 
 
 def losses(folder, name):
@@ -41,6 +41,28 @@ def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
     nearest = learner.nearest_action(action)
     assert not torch.equal(nearest, action)
     assert torch.equal(learner.nearest_action(nearest), nearest)
+
+
+@pytest.mark.parametrize("name", ["bc", "dagger"])
+def test_the_values_of_the_optimiser_and_the_replay_have_effect(name):
+    values = {
+        "learning_rate": 0.002,
+        "learning_rate_end_factor": 0.5,
+        "weight_decay": 0.03,
+        "gradient_clamp": 1e-4,
+        "batch_size": 6,
+        "buffer_size": 55,
+    }
+    learner = build(name, **values)
+    learner.extend(transitions(learner))
+    assert (learner.replay.storage.max_size, learner.replay.batch_size) == (55, 6)
+    (group,) = learner.optimizer.param_groups
+    assert (group["lr"], group["weight_decay"]) == (0.002, 0.03)
+    learner.update()
+    assert all(float(p.grad.abs().max()) <= 1.0001e-4 for p in learner.loss.parameters())
+    for _ in range(9):
+        learner.update()
+    assert group["lr"] == pytest.approx(0.001)
 
 
 def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):

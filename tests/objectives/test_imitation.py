@@ -57,6 +57,22 @@ def test_the_expected_error_is_the_squared_bias_plus_the_variance():
     assert loss(data)["loss_bc"].item() == pytest.approx(expected, rel=0.02)
 
 
+class Shifted(nn.Module):
+    """An almost deterministic policy: the first two components of the image."""
+
+    def forward(self, pixels, holding):
+        return pixels[..., :2].atanh(), torch.full_like(pixels[..., :2], 1e-9)
+
+
+def test_every_view_of_an_observation_is_compared_with_the_action():
+    loss = BehaviourCloningLoss(squashed_gaussian_policy(Shifted(), OBSERVATION))
+    action = torch.tensor([[0.1, 0.2], [-0.3, 0.4]])
+    views = action[:, None] + torch.tensor([0.0, 0.1, -0.2])[:, None]
+    data = {keys.PIXELS: views, keys.HOLDING: torch.zeros(2, 3, 1).bool(), keys.ACTION: action}
+    found = loss(TensorDict(data, [2]))["loss_bc"]
+    assert found.item() == pytest.approx((0.1**2 + 0.2**2) / 3, rel=1e-4)
+
+
 class TwoLevels(nn.Module):
     """Values [B, 3] and [B, 2]; the action holds the choices."""
 
