@@ -24,9 +24,9 @@ class SeedUse(IntEnum):
     REPLAY = 5
     AUGMENTATION = 6
     EXPLORATION = 7
-    ENSEMBLE = 8
+    ENSEMBLE = 10
     """Subsets of an ensemble of critics."""
-    MIXTURE = 9
+    MIXTURE = 11
     """Choice between the actions of policy and expert."""
 
 
