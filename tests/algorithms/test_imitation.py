@@ -99,6 +99,22 @@ def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
     assert not (learner.loss.qvalue_network_params == critic).all()
 
 
+@pytest.mark.parametrize("name", ["sac", "rlpd", "iql"])
+def test_any_actor_is_initialised_and_nothing_else(name):
+    learner = build(name, init="bc", batch_size=6)
+    learner.extend(transitions(learner))
+    before = {key: p.detach().clone() for key, p in learner.loss.named_parameters()}
+    scalars = learner.pretrain_update()
+    assert set(scalars.keys()) == {"loss_bc"}
+    assert learner.updates == 1
+    after = learner.loss.named_parameters()
+    changed = {key for key, p in after if not torch.equal(p, before[key])}
+    assert changed
+    assert all(key.startswith("actor_network") for key in changed)
+    learner.update()
+    assert learner.updates == 2
+
+
 def demonstration_error(learner):
     """Return the greedy policy's mean squared error on the demonstrations."""
     data = learner.replay.storage[:]

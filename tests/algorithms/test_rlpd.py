@@ -1,5 +1,7 @@
 """RLPD: every hyper-parameter has an effect, and it runs on both networks."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -8,7 +10,8 @@ from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.symmetric import SymmetricReplay
 from ba_torchrl.errors import ConfigError
-from tests.algorithms.tiny import build, run, transitions
+from ba_torchrl.modules.cnn import CNNConfig
+from tests.algorithms.tiny import build, problem, run, transitions
 
 UNUSUAL = {
     "learning_rate": 0.003,
@@ -110,6 +113,18 @@ def test_what_cannot_be_built_is_refused():
         build("rlpd", critics=3, subset=4)
     with pytest.raises(ConfigError, match="replay"):
         parse(ALGORITHMS["rlpd"], {"replay": "uniform"}, "rlpd")
+
+
+def test_a_network_without_an_ensemble_is_refused():
+    class Twins(CNNConfig):
+        def build(self, spec):
+            return super().build(dataclasses.replace(spec, critics=None))
+
+    with pytest.raises(ConfigError, match="Twins builds no ensemble"):
+        ALGORITHMS["rlpd"]().build(Twins(width=0.25), problem())
+    learner = ALGORITHMS["iql"]().build(Twins(width=0.25), problem())  # takes one of the twins
+    learner.extend(transitions(learner))
+    learner.update()
 
 
 @pytest.mark.parametrize("network", ["cnn", "equi"])

@@ -20,10 +20,9 @@ OPEN = {"task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects
 """Changes of `run` for an open-loop task."""
 
 
-def build(algorithm, network="cnn", **settings):
-    """A learner for a run of ten updates."""
-    torch.manual_seed(0)
-    problem = Problem(
+def problem():
+    """A close-loop problem of ten updates."""
+    return Problem(
         control="close_loop",
         images=close_loop_images(64),
         actions=CloseLoopActions("pxyzr"),
@@ -31,8 +30,13 @@ def build(algorithm, network="cnn", **settings):
         seed=0,
         device=torch.device("cpu"),
     )
+
+
+def build(algorithm, network="cnn", **settings):
+    """A learner for `problem`."""
+    torch.manual_seed(0)
     config = parse(ALGORITHMS[algorithm], settings, algorithm)
-    return config.build(parse(NETWORKS[network], SIZES[network], network), problem)
+    return config.build(parse(NETWORKS[network], SIZES[network], network), problem())
 
 
 def transitions(learner, count=24):
