@@ -33,8 +33,9 @@ from ba_torchrl.objectives.rlpd import RLPDLoss
 class RLPDConfig(LearnerConfig):
     """Hyper-parameters of RLPD.
 
-    Ensemble and subset have the values of Ball et al. (2023); they take 20 critic updates per step
-    of an environment with vector observations. Values shared with SAC are those of appendix G.2.
+    Ball et al. (2023) have ten critics, choose a subset of one or two and the entropy backup for
+    each environment, and take 20 critic updates per step in environments with vector observations.
+    The values that SAC has too are SAC's.
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
@@ -47,7 +48,7 @@ class RLPDConfig(LearnerConfig):
     critic_updates: int = Field(default=4, ge=1)
     """Critic updates per update of the policy, each on another batch."""
     entropy_backup: bool = False
-    """Whether targets have the entropy term; the authors leave it out for sparse rewards."""
+    """Whether targets have the entropy term."""
     gamma: float = Field(default=0.99, gt=0, le=1)
     """Discount factor."""
     tau: float = Field(default=0.01, gt=0, le=1)
