@@ -30,13 +30,14 @@ from ba_torchrl.modules.base import NetworkConfig
 class DAggerConfig(LearnerConfig):
     """Hyper-parameters of DAgger; the loss is that of `ba_torchrl.algorithms.bc`.
 
-    By default beta is zero after the demonstrations: the parameter-free schedule of Ross et al.
-    (2011), section 3.
+    Beta starts at one, as in Ross et al. (2011), section 3, and decreases with every update.
+    A policy trained by few updates stops where the expert's action changes abruptly; with a beta of
+    zero, such states then fill the replay. Several updates per step help (``updates_per_step``).
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop", "open_loop"})
 
-    beta_init: float = Field(default=0.0, ge=0, le=1)
+    beta_init: float = Field(default=1.0, ge=0, le=1)
     """Probability of executing the expert's action at the first update."""
     beta_updates: int = Field(default=1000, ge=1)
     """Updates over which that probability decreases linearly to zero."""
