@@ -25,6 +25,7 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 
 
 class LearnerConfig(AlgorithmConfig):
@@ -47,7 +48,13 @@ class LearnerConfig(AlgorithmConfig):
     priority_exponent: float = Field(default=0.6, ge=0)
     """Exponent alpha of the priorities of a prioritised replay."""
     importance_exponent: float = Field(default=0.4, ge=0, le=1)
-    """Initial exponent beta of the importance weights, which increases to 1 over the run."""
+    """Initial exponent beta of the importance weights, which increases to 1 over the run; with 0,
+    the weights are 1 throughout."""
+    importance_weighted: WeightedTerms = "critic_and_policy"
+    """Terms of the loss that the importance weights multiply: "none", "critic",
+    "critic_and_policy", or "all", which adds those on demonstrations and the temperature."""
+    importance_norm: WeightNorm = "max"
+    """Statistic of a batch by which its importance weights are divided: "max" or "mean"."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
 

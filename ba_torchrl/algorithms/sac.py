@@ -95,6 +95,8 @@ class SAC(Learner):
             alpha_init=config.alpha_init,
             target_entropy=config.target_entropy,
             demonstration_weight=config.demonstration_weight,
+            weighted_terms=config.importance_weighted,
+            weight_norm=config.importance_norm,
         )
         return loss.make_value_estimator(gamma=config.gamma)
 

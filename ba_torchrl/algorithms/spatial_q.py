@@ -134,6 +134,8 @@ class SpatialQ(Learner):
             margin=config.margin,
             first_beta=config.first_beta,
             later_beta=config.later_beta,
+            weighted_terms=config.importance_weighted,
+            weight_norm=config.importance_norm,
         )
         return loss.make_value_estimator(gamma=config.gamma)
 

@@ -13,20 +13,32 @@ from torch import Tensor, nn
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
-from ba_torchrl.objectives.base import Reduction, TransitionLoss, reduce_loss, reduce_over
+from ba_torchrl.objectives.base import (
+    Reduction,
+    TransitionLoss,
+    WeightedTerms,
+    WeightNorm,
+    reduce_loss,
+    reduce_over,
+    weighted,
+)
 
 
 class SACfDLoss(TransitionLoss):
     """Soft Actor-Critic with a behaviour term on the demonstrations in the batch (appendix G.2).
 
-    With weights w_i (ones without prioritised replay), twin values q_1 and q_2 of the stored
-    action, and an action a ~ pi drawn from the policy::
+    With twin values q_1 and q_2 of the stored action, an action a ~ pi drawn from the policy, and
+    importance weights u_i, v_i, w_i::
 
         y_i         = r_i + gamma (1 - terminated_i) (min_k q'_k(s'_i, a') - alpha log pi(a'|s'_i))
-        loss_qvalue = sum_k mean_i w_i (q_k(s_i, a_i) - y_i)^2
-        loss_actor  = mean_i w_i (alpha log pi(a | s_i) - min_k q_k(s_i, a))
-                      + demonstration_weight * mean over experts of mean over components (a - a_i)^2
-        loss_alpha  = mean_i -log_alpha (log pi(a | s_i) + target_entropy)
+        loss_qvalue = sum_k mean_i u_i (q_k(s_i, a_i) - y_i)^2
+        loss_actor  = mean_i v_i (alpha log pi(a | s_i) - min_k q_k(s_i, a)) + demonstration_weight
+                      * mean over experts of w_i mean over components (a - a_i)^2
+        loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
+
+    u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
+    "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are
+    ones.
 
     All three are computed with the current parameters and have gradients with respect to disjoint
     parameters, so one backward pass on their sum suffices. The encoder is trained by loss_qvalue
@@ -44,6 +56,8 @@ class SACfDLoss(TransitionLoss):
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
             flag in the batch.
         reduction: of the samples' losses; the formulas above are "mean".
+        weighted_terms: terms that the importance weights multiply.
+        weight_norm: statistic by which a batch's weights are divided.
 
     Raises:
         ValueError: ``alpha_init`` is not positive, or the encoder has several outputs.
@@ -97,6 +111,8 @@ class SACfDLoss(TransitionLoss):
         target_entropy: float = -5.0,
         demonstration_weight: float = 1.0,
         reduction: Reduction | None = None,
+        weighted_terms: WeightedTerms = "critic_and_policy",
+        weight_norm: WeightNorm = "max",
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
@@ -104,7 +120,7 @@ class SACfDLoss(TransitionLoss):
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
-        super().__init__(reduction)
+        super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
         self.convert_to_functional(actor_network, "actor_network")
         self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
         self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
@@ -154,7 +170,7 @@ class SACfDLoss(TransitionLoss):
         action = tensordict[self.tensor_keys.action]
         q = self._twin_values(features, action, self.qvalue_network_params)
         error = q - target
-        loss_qvalue = self._reduced(error.square().sum(dim=-1), weights)
+        loss_qvalue = self._reduced(error.square().sum(dim=-1), weights.of("critic"))
         priority = error.detach().abs().mean(dim=-1, keepdim=True)
         tensordict.set(self.tensor_keys.priority, priority)
 
@@ -165,10 +181,12 @@ class SACfDLoss(TransitionLoss):
         policy_term = self.alpha * log_prob - q_pi.amin(dim=-1)
         is_expert = self._expert_flag(tensordict)
         error = (sample - action).square().mean(dim=-1)
-        demonstration = reduce_over(error, is_expert, self.reduction)
-        loss_actor = self._reduced(policy_term, weights) + self.demonstration_weight * demonstration
+        demonstration = reduce_over(weighted(error, weights.of("all")), is_expert, self.reduction)
+        policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
+        loss_actor = policy_term + self.demonstration_weight * demonstration
         log_prob = log_prob.detach()
-        loss_alpha = -reduce_loss(self.log_alpha * (log_prob + self.target_entropy), self.reduction)
+        temperature_term = self.log_alpha * (log_prob + self.target_entropy)
+        loss_alpha = -self._reduced(temperature_term, weights.of("all"))
         return TensorDict(
             {
                 "loss_actor": loss_actor,
@@ -229,4 +247,4 @@ class SACfDLoss(TransitionLoss):
         return torch.zeros(tensordict.batch_size, dtype=torch.bool, device=action.device)
 
     def _reduced(self, losses: Tensor, weights: Tensor | None) -> Tensor:
-        return reduce_loss(losses if weights is None else weights * losses, self.reduction)
+        return reduce_loss(weighted(losses, weights), self.reduction)
