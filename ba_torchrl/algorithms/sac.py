@@ -14,7 +14,6 @@ from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.objectives.sacfd import SACfDLoss
@@ -24,7 +23,8 @@ from ba_torchrl.objectives.sacfd import SACfDLoss
 class SACConfig(LearnerConfig):
     """Hyper-parameters of SAC and its variants, which are presets in ``configs/algorithm``.
 
-    The defaults are the paper's (appendix G.2).
+    The defaults are those of SACfD in appendix G.2. Where the appendix gives no value, the default
+    is that of the reference implementation, and the field says so.
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
@@ -32,16 +32,15 @@ class SACConfig(LearnerConfig):
     gamma: float = Field(default=0.99, gt=0, le=1)
     """Discount factor."""
     tau: float = Field(default=0.01, gt=0, le=1)
-    """Weight of the critic in the update of its target."""
+    """Weight of the critic in the update of its target; reference implementation."""
     alpha_init: float = Field(default=0.01, gt=0)
     """Initial entropy temperature."""
     target_entropy: float = -5.0
     """Entropy that the temperature is tuned for, nats."""
     demonstration_weight: float = Field(default=1.0, ge=0)
-    """Weight of the behaviour term; 0 for plain SAC."""
-    replay: ReplayKind = "prioritized"
-    augmentation: Literal["so2", "none"] = "so2"
-    """Rotation of sampled transitions about the z axis."""
+    """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
+    augmentation: Literal["none", "so2"] = "none"
+    """Rotation of transitions about the z axis; none in the appendix."""
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
     """Probability of rotating a sampled transition."""
 

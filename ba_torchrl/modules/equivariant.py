@@ -136,8 +136,10 @@ class EquivariantConfig(ImageNetworkConfig):
     """Hyper-parameters of the rotation-equivariant actor-critic.
 
     Args:
-        group_order: number of rotations n of the cyclic group C_n, at least 2.
-        n_hidden: number of regular fields of the last layers. The first layer has an eighth of it
+        group_order: number of rotations n of the cyclic group C_n, at least 2; the default is that
+            of the reference implementation.
+        n_hidden: number of regular fields of the last layers; the default is that of the reference
+            implementation. The first layer has an eighth of it
             at 128 px, and a quarter at 64 px, where the first stage is left out.
     """
 
