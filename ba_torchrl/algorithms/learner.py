@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
+
+_STATEFUL_PARTS = ("loss", "optimizer", "scheduler", "stored_augmentation", "augmentation")
 
 
 class LearnerConfig(AlgorithmConfig):
@@ -90,11 +93,12 @@ class Learner(Algorithm):
         self.observation_keys = [*self.images, keys.HOLDING]
         self.codecs = make_codecs(self.images)
         networks = self.make_networks(network)
-        policy = ActingPolicy(self.make_policy(networks), self.codecs)
+        policy = ActingPolicy(self.make_policy(networks), self.make_acting_transforms())
         self.loss = self.make_loss(networks).to(problem.device)
         self.policy = policy.to(problem.device)
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
+        self.stored_augmentation = self.make_stored_augmentation()
         self.augmentation = self.make_augmentation()
         self.optimizer = self.make_optimizer()
         self.scheduler = self.make_scheduler()
@@ -113,6 +117,10 @@ class Learner(Algorithm):
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
 
+    def make_acting_transforms(self) -> Mapping[str, nn.Module]:
+        """Return the transform of each image that the acting policy sees; by default its codec."""
+        return self.codecs
+
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""
         return None
@@ -130,6 +138,11 @@ class Learner(Algorithm):
             weight_exponent=config.importance_exponent,
             expert_bonus=config.expert_bonus,
         )
+
+    def make_stored_augmentation(self) -> nn.Module:
+        """Return the map from new transitions [N] to those that are stored; by default the
+        identity."""
+        return nn.Identity()
 
     def make_augmentation(self) -> nn.Module:
         """Return the augmentation of sampled batches; by default the identity."""
@@ -172,8 +185,9 @@ class Learner(Algorithm):
         )
 
     def extend(self, transitions: TensorDictBase) -> None:
-        """Add transitions [N] to the replay, except those with a fault."""
-        self.replay.extend(transitions)
+        """Add transitions [N], and augmented copies if configured, to the replay, except those with
+        a fault."""
+        self.replay.extend(self.stored_augmentation(transitions))
 
     @property
     def replay_size(self) -> int:
@@ -196,7 +210,24 @@ class Learner(Algorithm):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.loss(batch)
+        scalars = self.minimize(self.loss(batch))
+        if self._prioritized_sampler() is not None:
+            # the trees of the sampler are on the CPU
+            self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
+        return scalars
+
+    def minimize(self, scalars: TensorDict) -> TensorDict:
+        """Take one gradient step on a sum of losses, update the target network and count it.
+
+        Args:
+            scalars: losses, whose names begin with "loss_", and diagnostics.
+
+        Returns:
+            The scalars without gradient.
+
+        Raises:
+            FloatingPointError: a loss is not finite.
+        """
         total = sum(value for name, value in scalars.items() if name.startswith("loss_"))
         if not torch.isfinite(total):
             values = {key: value.item() for key, value in scalars.items()}
@@ -204,9 +235,6 @@ class Learner(Algorithm):
         self.step(total)
         if self.target_updater is not None:
             self.target_updater.step()
-        if self._prioritized_sampler() is not None:
-            # the trees of the sampler are on the CPU
-            self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
         self.updates += 1
         return scalars.detach()
 
@@ -226,18 +254,13 @@ class Learner(Algorithm):
     # -- state -------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, target, optimiser, schedule, augmentation and number of updates."""
-        return {
-            "loss": self.loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "scheduler": self.scheduler.state_dict(),
-            "augmentation": self.augmentation.state_dict(),
-            "updates": self.updates,
-        }
+        """Return networks, target, optimiser, schedule, augmentations and number of updates."""
+        parts = {name: getattr(self, name).state_dict() for name in _STATEFUL_PARTS}
+        return {**parts, "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
-        for name in ("loss", "optimizer", "scheduler", "augmentation"):
+        for name in _STATEFUL_PARTS:
             getattr(self, name).load_state_dict(state[name])
         self.updates = state["updates"]
 
