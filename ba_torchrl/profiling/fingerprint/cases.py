@@ -90,6 +90,8 @@ SMALL_NETWORK: dict[str, dict[str, Any]] = {
     "cnn": {"network.width": 0.25},
     "equi": {"network.n_hidden": 8},
     "equi_small": {"network.n_hidden": 8},
+    "equi_d4": {"network.n_hidden": 8},
+    "ferm": {"network.width": 0.25},
     **{
         name: {"network.width": 0.25, "network.num_rotations": 4}
         for name in ("asr", "equi_asr", "equi_fcn", "fcn", "rot_fcn")
@@ -312,6 +314,8 @@ def _training_case(
     name: str, task: str, algorithm: str, network: str, file: str = "train", **changes: Any
 ) -> Case:
     small = SMALL_CLOSE_LOOP if TASKS[task].control == "close_loop" else SMALL_OPEN_LOOP
+    if algorithm.startswith("ferm"):
+        small = {**small, "env.obs_size": 71, "algorithm.crop_size": 64}
     config = {
         "file": file,
         "task": task,
