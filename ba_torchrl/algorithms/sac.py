@@ -229,6 +229,6 @@ class SAC(Learner):
 
     def pretrain_update(self) -> TensorDict:
         """Take one update on the demonstrations, of all losses or of the contrastive one alone."""
-        if self.config.pretraining == "all":
-            return self.update()
-        return self.minimize(self.loss.contrastive_loss(self.sample()))
+        if self.config.pretraining == "contrastive":
+            return self.minimize(self.loss.contrastive_loss(self.sample()))
+        return super().pretrain_update()
