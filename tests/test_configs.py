@@ -71,8 +71,8 @@ def test_presets_compose_or_are_refused(algorithm, network):
     assert config.run_dir.endswith(f"{name}-{algorithm}_{network}-seed3")
 
 
-def test_the_paper_sets_the_defaults():
-    config = experiment("train")
+def test_the_appendix_sets_the_defaults():
+    config = experiment("train", "algorithm=sacfd_per")
     algorithm, network = config.algorithm_config, config.network_config
     assert (algorithm.learning_rate, algorithm.gamma, algorithm.batch_size) == (1e-3, 0.99, 64)
     assert (algorithm.alpha_init, algorithm.target_entropy, algorithm.tau) == (0.01, -5.0, 0.01)
@@ -83,10 +83,27 @@ def test_the_paper_sets_the_defaults():
     assert (config.num_envs, config.eval_every, config.env_config.obs_size) == (5, 500, 128)
 
 
-def test_sac_is_sacfd_without_demonstrations_in_its_loss():
-    sac = experiment("train", "algorithm=sac").algorithm_config
-    assert sac.demonstration_weight == 0
-    assert sac.replay == "uniform"
+def options(algorithm):
+    config = experiment("train", f"algorithm={algorithm}").algorithm_config
+    return config.model_dump(exclude_defaults=True)
+
+
+def test_the_variants_of_sac_differ_from_sacfd_by_their_options():
+    rotation = {"augmentation": "so2"}
+    assert options("sacfd") == {}
+    assert options("sacfd_so2") == rotation
+    assert options("sacfd_per") == {"replay": "prioritized"}
+    assert options("sacfd_per_so2") == {"replay": "prioritized", **rotation}
+    assert options("sac") == {"demonstration_weight": 0}
+    assert options("sac_so2") == {"demonstration_weight": 0, **rotation}
+
+
+def test_training_and_quick_start_have_priorities_and_rotation_by_default():
+    for name in ("train", "quickstart"):
+        config = experiment(name).algorithm_config
+        assert (config.replay, config.augmentation) == ("prioritized", "so2")
+        assert (config.expert_bonus, config.augmentation_probability) == (1.0, 0.8)
+        assert config.importance_weighted == "critic_and_policy"
 
 
 def test_the_paper_sets_the_defaults_of_the_open_loop():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,10 +26,13 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
 
 Init = Literal["random", "bc"]
 """How the policy is initialised."""
+
+_STATEFUL_PARTS = ("loss", "optimizer", "scheduler", "stored_augmentation", "augmentation")
 
 
 class LearnerConfig(AlgorithmConfig):
@@ -51,7 +55,13 @@ class LearnerConfig(AlgorithmConfig):
     priority_exponent: float = Field(default=0.6, ge=0)
     """Exponent alpha of the priorities of a prioritised replay."""
     importance_exponent: float = Field(default=0.4, ge=0, le=1)
-    """Initial exponent beta of the importance weights, which increases to 1 over the run."""
+    """Initial exponent beta of the importance weights, which increases to 1 over the run; with 0,
+    the weights are 1 throughout."""
+    importance_weighted: WeightedTerms = "critic_and_policy"
+    """Terms of the loss that the importance weights multiply: "none", "critic",
+    "critic_and_policy", or "all", which adds those on demonstrations and the temperature."""
+    importance_norm: WeightNorm = "max"
+    """Statistic of a batch by which its importance weights are divided: "max" or "mean"."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
     init: Init = "random"
@@ -95,12 +105,13 @@ class Learner(Algorithm):
         self.observation_keys = [*self.images, keys.HOLDING]
         self.codecs = make_codecs(self.images)
         networks = self.make_networks(network)
-        policy = ActingPolicy(self.make_policy(networks), self.codecs)
+        policy = ActingPolicy(self.make_policy(networks), self.make_acting_transforms())
         self.loss = self.make_loss(networks).to(problem.device)
         self.policy = policy.to(problem.device)
         self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
+        self.stored_augmentation = self.make_stored_augmentation()
         self.augmentation = self.make_augmentation()
         self.optimizer = self.make_optimizer()
         self.scheduler = self.make_scheduler()
@@ -132,6 +143,10 @@ class Learner(Algorithm):
             )
         return BehaviourCloningLoss(policy)
 
+    def make_acting_transforms(self) -> Mapping[str, nn.Module]:
+        """Return the transform of each image that the acting policy sees; by default its codec."""
+        return self.codecs
+
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""
         return None
@@ -149,6 +164,11 @@ class Learner(Algorithm):
             weight_exponent=config.importance_exponent,
             expert_bonus=config.expert_bonus,
         )
+
+    def make_stored_augmentation(self) -> nn.Module:
+        """Return the map from new transitions [N] to those that are stored; by default the
+        identity."""
+        return nn.Identity()
 
     def make_augmentation(self) -> nn.Module:
         """Return the augmentation of sampled batches; by default the identity."""
@@ -191,8 +211,9 @@ class Learner(Algorithm):
         )
 
     def extend(self, transitions: TensorDictBase) -> None:
-        """Add transitions [N] to the replay, except those with a fault."""
-        self.replay.extend(transitions)
+        """Add transitions [N], and augmented copies if configured, to the replay, except those with
+        a fault."""
+        self.replay.extend(self.stored_augmentation(transitions))
 
     @property
     def replay_size(self) -> int:
@@ -276,18 +297,13 @@ class Learner(Algorithm):
     # -- state -------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, target, optimiser, schedule, augmentation and number of updates."""
-        return {
-            "loss": self.loss.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "scheduler": self.scheduler.state_dict(),
-            "augmentation": self.augmentation.state_dict(),
-            "updates": self.updates,
-        }
+        """Return networks, target, optimiser, schedule, augmentations and number of updates."""
+        parts = {name: getattr(self, name).state_dict() for name in _STATEFUL_PARTS}
+        return {**parts, "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
-        for name in ("loss", "optimizer", "scheduler", "augmentation"):
+        for name in _STATEFUL_PARTS:
             getattr(self, name).load_state_dict(state[name])
         self.updates = state["updates"]
 

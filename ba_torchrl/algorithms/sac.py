@@ -1,10 +1,13 @@
-"""Soft Actor-Critic, with or without demonstrations (SAC and SACfD; appendix D.3, G.2)."""
+"""Soft Actor-Critic and its variants: SACfD, RAD, DrQ, FERM (appendix D.3, F, G.2)."""
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal, Self
 
-from pydantic import Field
+import torch
+from pydantic import Field, model_validator
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor
@@ -14,18 +17,28 @@ from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.data.replay.make import ReplayKind
+from ba_torchrl.data.augmentation.stored import StoredCopies
+from ba_torchrl.data.augmentation.views import (
+    CenterCrop,
+    RandomViews,
+    ViewTransform,
+    cropped_images,
+)
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
+from ba_torchrl.objectives.contrastive import BilinearInfoNCE
 from ba_torchrl.objectives.sacfd import SACfDLoss
+from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
 
 
 @ALGORITHMS.register("sac")
 class SACConfig(LearnerConfig):
     """Hyper-parameters of SAC and its variants, which are presets in ``configs/algorithm``.
 
-    The defaults are the paper's (appendix G.2).
+    The defaults are those of SACfD in appendix G.2. Where the appendix gives no value, the default
+    is that of the reference implementation, and the field says so.
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
@@ -33,18 +46,50 @@ class SACConfig(LearnerConfig):
     gamma: float = Field(default=0.99, gt=0, le=1)
     """Discount factor."""
     tau: float = Field(default=0.01, gt=0, le=1)
-    """Weight of the critic in the update of its target."""
+    """Weight of the critic in the update of its target; reference implementation."""
+    encoder_tau: float | None = Field(default=None, gt=0, le=1)
+    """The same for the encoder; None for `tau`."""
     alpha_init: float = Field(default=0.01, gt=0)
     """Initial entropy temperature."""
     target_entropy: float = -5.0
     """Entropy that the temperature is tuned for, nats."""
     demonstration_weight: float = Field(default=1.0, ge=0)
-    """Weight of the behaviour term; 0 for plain SAC."""
-    replay: ReplayKind = "prioritized"
-    augmentation: Literal["so2", "none"] = "so2"
-    """Rotation of sampled transitions about the z axis."""
+    """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
+    augmentation: Literal["none", "so2"] = "none"
+    """Rotation of transitions about the z axis; none in the appendix."""
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
     """Probability of rotating a sampled transition."""
+    stored_copies: int = Field(default=0, ge=0)
+    """Number of rotated copies that are stored with each transition, which is then not rotated when
+    it is sampled; 0 to rotate sampled transitions."""
+    view_transform: ViewTransform = "none"
+    """Random views of sampled images: a "crop", or a "shift" by some pixels. Acting takes the
+    centre of the image."""
+    crop_size: int = Field(default=128, ge=1)
+    """Rows and columns of a crop, pixels."""
+    shift_pixels: int = Field(default=4, ge=1)
+    """Largest shift, pixels."""
+    views: int = Field(default=1, ge=1)
+    """Views of each observation, over which the losses are averaged."""
+    target_views: int = Field(default=1, ge=1)
+    """Views of each next observation, over which the target is averaged."""
+    contrastive_weight: float = Field(default=0.0, ge=0)
+    """Weight of the encoder's contrastive loss on pairs of views; 0 for none."""
+    pretraining: Literal["all", "contrastive"] = "all"
+    """Losses that updates before the first collection minimise."""
+
+    @model_validator(mode="after")
+    def _check_options(self) -> Self:
+        needs_views = self.views > 1 or self.target_views > 1 or self.contrastive_weight > 0
+        if needs_views and self.view_transform == "none":
+            raise ValueError("several views or a contrastive loss need view_transform")
+        if self.pretraining == "contrastive" and not self.contrastive_weight:
+            raise ValueError("pretraining 'contrastive' needs contrastive_weight")
+        if self.pretraining == "contrastive" and self.init == "bc":
+            raise ValueError("pretraining 'contrastive' and init 'bc' exclude each other")
+        if self.stored_copies and self.augmentation == "none":
+            raise ValueError("stored_copies needs augmentation")
+        return self
 
     def build(self, network: NetworkConfig, problem: Problem) -> SAC:
         """Return a freshly initialised learner."""
@@ -58,21 +103,42 @@ class SAC(Learner):
         config: hyper-parameters.
         network: builds actor, encoder and critic.
         problem: images, actions, device, seed and length of the run.
+
+    Raises:
+        ConfigError: an image is smaller than its crop.
     """
 
     config: SACConfig
     loss: SACfDLoss
 
+    @property
+    def seen_images(self) -> Mapping[str, ImageSpec]:
+        """Declarations of the images that the networks see, which are crops if configured."""
+        if self.config.view_transform != "crop":
+            return self.images
+        return cropped_images(self.images, self.config.crop_size)
+
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and critic."""
-        return network.build(ActorCriticSpec(self.images, self.problem.actions.sequence))
+        spec = ActorCriticSpec(self.seen_images, self.problem.actions.sequence)
+        networks = network.build(spec)
+        for module in networks:  # before the loss, since networks may share parameters
+            module.to(self.problem.device)
+        return networks
 
     def make_policy(self, networks: ActorCritic) -> ProbabilisticActor:
         """Return the squashed Gaussian of the actor."""
         return squashed_gaussian_policy(networks.actor, self.observation_keys)
 
+    def make_acting_transforms(self) -> Mapping[str, nn.Module]:
+        """Return the codec of each image, and its central part where the networks see crops."""
+        if self.config.view_transform != "crop":
+            return self.codecs
+        crop = CenterCrop(self.config.crop_size)
+        return {key: nn.Sequential(codec, crop) for key, codec in self.codecs.items()}
+
     def make_loss(self, networks: ActorCritic) -> SACfDLoss:
-        """Return the loss of actor, critics and temperature."""
+        """Return the loss of actor, critics, temperature and, if configured, encoder."""
         config = self.config
         loss = SACfDLoss(
             self.make_policy(networks),
@@ -87,24 +153,76 @@ class SAC(Learner):
             alpha_init=config.alpha_init,
             target_entropy=config.target_entropy,
             demonstration_weight=config.demonstration_weight,
+            weighted_terms=config.importance_weighted,
+            weight_norm=config.importance_norm,
+            views=config.views,
+            target_views=config.target_views,
+            contrastive=self._make_contrastive(networks.encoder),
+            contrastive_weight=config.contrastive_weight,
         )
         return loss.make_value_estimator(gamma=config.gamma)
 
+    def _make_contrastive(self, encoder: nn.Module) -> BilinearInfoNCE | None:
+        if not self.config.contrastive_weight:
+            return None
+        device = self.problem.device
+        images = (torch.zeros(image.shape, device=device) for image in self.seen_images.values())
+        with torch.no_grad():
+            features = encoder(*images, torch.zeros(1, device=device))
+        return BilinearInfoNCE(features.shape[-1])
+
     def make_target_updater(self) -> SoftUpdate:
-        """Return the soft update of the critic's target."""
-        return SoftUpdate(self.loss, tau=self.config.tau)
+        """Return the soft update of the targets of critic and encoder."""
+        config = self.config
+        if config.encoder_tau is None:
+            return SoftUpdate(self.loss, tau=config.tau)
+        taus = {"encoder_network": config.encoder_tau}
+        return SoftUpdateByNetwork(self.loss, tau=config.tau, taus=taus)
+
+    def make_stored_augmentation(self) -> nn.Module:
+        """Return the rotated copies that are stored with each transition, if configured."""
+        if not self.config.stored_copies:
+            return nn.Identity()
+        rotation = self._make_rotation(1.0, SeedUse.STORED_AUGMENTATION)
+        return StoredCopies(rotation, self.config.stored_copies)
 
     def make_augmentation(self) -> nn.Module:
-        """Return the rotation of sampled transitions, if it is configured."""
-        if self.config.augmentation == "none":
-            return nn.Identity()
+        """Return the rotation of sampled transitions and the views of images, if configured."""
+        config, parts = self.config, []
+        if config.augmentation == "so2" and not config.stored_copies:
+            probability = config.augmentation_probability
+            parts.append(self._make_rotation(probability, SeedUse.AUGMENTATION))
+        if config.view_transform != "none":
+            is_crop = config.view_transform == "crop"
+            parts.append(
+                RandomViews(
+                    self.images,
+                    size=config.crop_size if is_crop else None,
+                    padding=0 if is_crop else config.shift_pixels,
+                    views=config.views,
+                    target_views=config.target_views,
+                    has_positive=config.contrastive_weight > 0,
+                    seed=self.problem.derived_seed(SeedUse.VIEWS),
+                )
+            )
+        if len(parts) > 1:
+            return nn.Sequential(*parts)
+        return parts[0] if parts else nn.Identity()
+
+    def _make_rotation(self, probability: float, use: SeedUse) -> SO2Augmentation:
         return SO2Augmentation(
             self.images,
             self.problem.actions.sequence,
-            probability=self.config.augmentation_probability,
-            seed=self.problem.derived_seed(SeedUse.AUGMENTATION),
+            probability=probability,
+            seed=self.problem.derived_seed(use),
         )
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return all parameters but the entropy temperature."""
         return [p for p in self.loss.parameters() if p is not self.loss.log_alpha]
+
+    def pretrain_update(self) -> TensorDict:
+        """Take one update on the demonstrations, of all losses or of the contrastive one alone."""
+        if self.config.pretraining == "contrastive":
+            return self.minimize(self.loss.contrastive_loss(self.sample()))
+        return super().pretrain_update()

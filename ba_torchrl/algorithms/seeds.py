@@ -24,6 +24,10 @@ class SeedUse(IntEnum):
     REPLAY = 5
     AUGMENTATION = 6
     EXPLORATION = 7
+    VIEWS = 8
+    """Random views of sampled images."""
+    STORED_AUGMENTATION = 9
+    """Augmented copies that are stored with each transition."""
     ENSEMBLE = 10
     """Subsets of an ensemble of critics."""
     MIXTURE = 11

@@ -26,7 +26,8 @@ from ba_torchrl.objectives.dqn import Demonstrations, LevelDQNLoss
 class SpatialQConfig(LearnerConfig):
     """Hyper-parameters of spatial Q-learning; its variants are presets in ``configs/algorithm``.
 
-    The defaults are those of SDQfD in the paper (appendix G.1).
+    The defaults are those of SDQfD in appendix G.1. Where the appendix gives no value, the default
+    is that of the reference implementation, and the field says so.
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"open_loop"})
@@ -38,17 +39,18 @@ class SpatialQConfig(LearnerConfig):
     margin: float = Field(default=0.1, ge=0)
     """Margin of "dqfd" and "sdqfd" between demonstrated actions and others."""
     first_beta: float = Field(default=100.0, gt=0)
-    """Inverse temperature of "adet" at the first level."""
+    """Inverse temperature of "adet" at the first level; reference implementation."""
     later_beta: float = Field(default=1.0, gt=0)
-    """Inverse temperature of "adet" at later levels."""
+    """Inverse temperature of "adet" at later levels; reference implementation."""
     learning_rate: float = Field(default=1e-4, gt=0)
     weight_decay: float = Field(default=1e-5, ge=0)
     gradient_clamp: float | None = Field(default=1.0, gt=0)
+    """Bound of each element of the gradient; reference implementation."""
     gamma: float = Field(default=0.95, gt=0, le=1)
     """Discount factor."""
     batch_size: int = Field(default=16, ge=1)
     target_interval: int = Field(default=100, ge=1)
-    """Updates between two copies of the network to its target."""
+    """Updates between two copies of the network to its target; reference implementation."""
     replay: ReplayKind = "symmetric"
     augmentation: RigidTransforms = "none"
     """Rigid transforms of sampled transitions: "translation", "cn", "d4" or "se2"."""
@@ -57,7 +59,7 @@ class SpatialQConfig(LearnerConfig):
     augmentation_order: int = Field(default=16, ge=1)
     """Number of rotations n of "cn"."""
     epsilon_init: float = Field(default=0.0, ge=0, le=1)
-    """Initial probability of a random action; 0 in the paper."""
+    """Initial probability of a random action; in the appendix, the behaviour policy is greedy."""
     epsilon_end: float = Field(default=0.0, ge=0, le=1)
     """Final probability of a random action."""
     epsilon_updates: int = Field(default=1000, ge=1)
@@ -112,6 +114,8 @@ class SpatialQ(Learner):
             margin=config.margin,
             first_beta=config.first_beta,
             later_beta=config.later_beta,
+            weighted_terms=config.importance_weighted,
+            weight_norm=config.importance_norm,
         )
         return loss.make_value_estimator(gamma=config.gamma)
 

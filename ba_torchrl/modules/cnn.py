@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from pydantic import Field
@@ -85,6 +87,25 @@ def initialise_plain(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
+def plain_trunk(
+    config: ImageNetworkConfig, spec: ActorCriticSpec, widths: Sequence[int]
+) -> ImageTrunk:
+    """Return a trunk of plain convolutions.
+
+    Args:
+        config: precision and the input's units.
+        spec: the images.
+        widths: of the stages of 128 px images.
+    """
+    stages = trunk_stages(spec.image_size, widths)
+    inputs = [spec.image_channels + 1, *(width for width, _, _ in stages)]
+    convs = [
+        CastConv2d(channels, width, 3, padding=padding)
+        for channels, (width, padding, _) in zip(inputs, stages, strict=False)
+    ]
+    return config.image_trunk(convs, [pools for _, _, pools in stages])
+
+
 @NETWORKS.register("cnn")
 class CNNConfig(ImageNetworkConfig):
     """Hyper-parameters of the plain convolutional actor-critic.
@@ -123,10 +144,4 @@ class CNNConfig(ImageNetworkConfig):
         return EnsembleCritic(first, spec.critics, hidden)
 
     def _trunk(self, spec: ActorCriticSpec) -> ImageTrunk:
-        stages = trunk_stages(spec.image_size, [scaled_width(w, self.width) for w in _WIDTHS])
-        inputs = [spec.image_channels + 1, *(width for width, _, _ in stages)]
-        convs = [
-            CastConv2d(channels, width, 3, padding=padding)
-            for channels, (width, padding, _) in zip(inputs, stages, strict=False)
-        ]
-        return self.image_trunk(convs, [pools for _, _, pools in stages])
+        return plain_trunk(self, spec, [scaled_width(width, self.width) for width in _WIDTHS])

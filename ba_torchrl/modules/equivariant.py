@@ -1,8 +1,8 @@
-"""The rotation-equivariant actor-critic (appendix G.2; "Equi SACfD").
+"""The equivariant actor-critic (appendix G.2; "Equi SACfD").
 
 Turning the scene by +90 degrees about z turns the image by ``torch.rot90(k=1)`` and (dx, dy) into
 (-dy, dx); escnn's rotations have the same sense, so (dx, dy) is a vector field without a change of
-sign.
+sign. Reflecting the scene's y axis reverses the columns of the image, dy and the yaw.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ba_torchrl.modules.steerable import (
     SteerableConv2d,
     SteerableLinear,
     planar_rotations,
+    planar_rotations_and_flips,
 )
 from ba_torchrl.modules.trunk import (
     ImageNetworkConfig,
@@ -34,41 +35,57 @@ if TYPE_CHECKING:
 
 
 class ActionFields:
-    """How the components of an action transform: (x, y) is a vector, the others are invariant.
+    """How the components of an action transform under rotations and reflections.
+
+    (x, y) is a vector and the other components are invariant, except for the yaw r, which a
+    reflection reverses.
 
     Args:
         action_sequence: one letter per component.
+        has_reflections: whether the group contains reflections.
 
     Raises:
         ValueError: x or y is missing.
     """
 
-    def __init__(self, action_sequence: str) -> None:
+    def __init__(self, action_sequence: str, *, has_reflections: bool = False) -> None:
         if not {"x", "y"} <= set(action_sequence):
             raise ValueError(
                 f"an equivariant network needs x and y in the action, got {action_sequence!r}"
             )
         self.size = len(action_sequence)
-        self.invariants = [i for i, letter in enumerate(action_sequence) if letter not in "xy"]
-        # Index in the action of each component of [vector, invariants], and the inverse
+        self.has_reflections = has_reflections
+        self.signed = [
+            i for i, letter in enumerate(action_sequence) if letter == "r" and has_reflections
+        ]
+        """Indices of the components that a reflection reverses."""
+        self.invariants = [
+            i
+            for i, letter in enumerate(action_sequence)
+            if letter not in "xy" and i not in self.signed
+        ]
+        # Index in the action of each component of [vector, signed, invariants], and the inverse
         # permutation.
-        self._grouped = [action_sequence.index("x"), action_sequence.index("y"), *self.invariants]
+        vector = [action_sequence.index("x"), action_sequence.index("y")]
+        self._grouped = [*vector, *self.signed, *self.invariants]
         self._restore = [self._grouped.index(i) for i in range(self.size)]
 
     def types(self, gspace: GSpace2D, extra_invariants: int = 0) -> FieldTypes:
-        """Return the fields [vector, invariants], with extra invariants at the end."""
-        rotation = gspace.irrep(1)
+        """Return the fields [vector, signed, invariants], with extra invariants at the end."""
+        rotation = gspace.irrep(1, 1) if self.has_reflections else gspace.irrep(1)
         # A half turn acts on x and y separately, so C_2 needs its one-dimensional irrep twice.
-        vector = (rotation, 2 // rotation.size)
+        fields = [(rotation, 2 // rotation.size)]
+        if self.signed:
+            fields.append((gspace.irrep(1, 0), len(self.signed)))
         count = len(self.invariants) + extra_invariants
-        return [vector, (gspace.trivial_repr, count)] if count else [vector]
+        return [*fields, (gspace.trivial_repr, count)] if count else fields
 
     def group(self, action: Tensor) -> Tensor:
-        """Return the action's components [..., A] as [vector, invariants]."""
+        """Return the action's components [..., A] as [vector, signed, invariants]."""
         return torch.stack([action[..., i] for i in self._grouped], dim=-1)
 
     def ungroup(self, fields: Tensor) -> Tensor:
-        """Return the components [..., A] of [vector, invariants] in the order of the action."""
+        """Return the components [..., A] of [vector, signed, invariants] in the action's order."""
         return torch.stack([fields[..., i] for i in self._restore], dim=-1)
 
 
@@ -134,15 +151,19 @@ class EquivariantTwinCritic(nn.Module):
 
 @NETWORKS.register("equi")
 class EquivariantConfig(ImageNetworkConfig):
-    """Hyper-parameters of the rotation-equivariant actor-critic.
+    """Hyper-parameters of the equivariant actor-critic.
 
     Args:
-        group_order: number of rotations n of the cyclic group C_n, at least 2.
-        n_hidden: number of regular fields of the last layers. The first layer has an eighth of it
+        group_order: number of rotations n of the group, at least 2; the default is that of the
+            reference implementation.
+        reflections: the group is the dihedral group D_n instead of the cyclic group C_n.
+        n_hidden: number of regular fields of the last layers; the default is that of the reference
+            implementation. The first layer has an eighth of it
             at 128 px, and a quarter at 64 px, where the first stage is left out.
     """
 
     group_order: int = Field(default=8, ge=2)
+    reflections: bool = False
     n_hidden: int = Field(default=64, ge=4)
 
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
@@ -154,11 +175,15 @@ class EquivariantConfig(ImageNetworkConfig):
         Raises:
             ImportError: escnn is missing; the message names the fix.
             ValueError: the image size is not 64 or 128, the image is not depth or height,
-                ``n_hidden`` does not divide into whole fields, or the action lacks x or y.
+                ``n_hidden`` does not divide into whole fields, the action lacks x or y, or the
+                group is D_2.
         """
         self.check_images(spec)
-        gspace = planar_rotations(self.group_order)
-        action = ActionFields(spec.action_sequence)
+        if self.reflections and self.group_order < 3:
+            raise ValueError("reflections need a group_order of at least 3")
+        group = planar_rotations_and_flips if self.reflections else planar_rotations
+        gspace = group(self.group_order)
+        action = ActionFields(spec.action_sequence, has_reflections=self.reflections)
         features = [(gspace.regular_repr, self.n_hidden)]
         return ActorCritic(
             actor=EquivariantActor(gspace, self._trunk(gspace, spec), features, action),

@@ -46,7 +46,8 @@ class FCNConfig(SpatialImageConfig):
     """Hyper-parameters of the plain FCN: a UNet with one output map per primitive and yaw.
 
     Args:
-        num_rotations: yaws, evenly spaced; without a yaw in the action it has no meaning.
+        num_rotations: yaws, evenly spaced; without a yaw in the action it has no meaning. The
+            default is that of the reference implementation.
     """
 
     num_rotations: int = Field(default=16, ge=2)
@@ -74,7 +75,8 @@ class EquiFCNConfig(SpatialImageConfig):
     as there are yaws.
 
     Args:
-        num_rotations: yaws, evenly spaced; without a yaw in the action it has no meaning.
+        num_rotations: yaws, evenly spaced; without a yaw in the action it has no meaning. The
+            default is that of the reference implementation.
         group_order: number of rotations of the dihedral group, 4 if None; only for actions without
             a yaw.
     """

@@ -34,7 +34,8 @@ def is_six_dof(spec: SpatialSpec) -> bool:
 
 
 class PoseGridConfig(StrictModel):
-    """Hyper-parameters of the levels of z and the tilts; the defaults are the paper's.
+    """Hyper-parameters of the levels of z and the tilts; the defaults are those of the
+    reference implementation; the appendix gives none.
 
     Args:
         num_z: heights of the tool, evenly spaced.

@@ -56,7 +56,7 @@ class RotFCNConfig(SpatialImageConfig):
     """Hyper-parameters of the Rot FCN.
 
     Args:
-        num_rotations: yaws, evenly spaced.
+        num_rotations: yaws, evenly spaced; the default is that of the reference implementation.
     """
 
     num_rotations: int = Field(default=16, ge=2)

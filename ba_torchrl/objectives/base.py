@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Literal, Self
+from dataclasses import dataclass
+from typing import Literal, Self, get_args
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -16,6 +17,11 @@ from ba_torchrl.envs import keys
 
 Reduction = Literal["none", "mean", "sum"]
 """How the losses of a batch's samples are combined, as in TorchRL."""
+WeightedTerms = Literal["none", "critic", "critic_and_policy", "all"]
+"""Terms of a loss that importance weights multiply: the error of the values; also the policy's
+objective; also the terms on demonstrations and the entropy temperature."""
+WeightNorm = Literal["max", "mean"]
+"""Statistic of a batch's importance weights by which they are divided."""
 
 
 class TransitionLoss(LossModule):
@@ -23,12 +29,29 @@ class TransitionLoss(LossModule):
 
     Args:
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
+        weighted_terms: terms that the importance weights multiply.
+        weight_norm: statistic by which a batch's weights are divided. With "max", no weight
+            exceeds one and their mean falls as the priorities spread; with "mean", their mean is
+            one.
     """
 
     default_value_estimator = ValueEstimators.TD0
 
-    def __init__(self, reduction: Reduction | None = None) -> None:
+    def __init__(
+        self,
+        reduction: Reduction | None = None,
+        *,
+        weighted_terms: WeightedTerms = "critic_and_policy",
+        weight_norm: WeightNorm = "max",
+    ) -> None:
         super().__init__()
+        if weighted_terms not in get_args(WeightedTerms) or weight_norm not in get_args(WeightNorm):
+            raise ValueError(
+                f"weighted_terms is one of {get_args(WeightedTerms)} and weight_norm one of "
+                f"{get_args(WeightNorm)}, got {weighted_terms!r} and {weight_norm!r}"
+            )
+        self.weighted_terms: WeightedTerms = weighted_terms
+        self.weight_norm: WeightNorm = weight_norm
         self.reduction: Reduction = "mean" if reduction is None else reduction
         if self.reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be none, mean or sum, got {reduction!r}")
@@ -92,13 +115,40 @@ class TransitionLoss(LossModule):
         names = [self.tensor_keys.action, *observation, *map(_next, (*observation, *ends))]
         return list(dict.fromkeys(names))
 
-    def _importance_weights(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Return the batch's importance weights [...] divided by their largest, None if absent."""
+    def _importance_weights(self, tensordict: TensorDictBase) -> ImportanceWeights:
+        """Return the batch's importance weights, divided by their largest or their mean."""
         weights = tensordict.get(self.tensor_keys.priority_weight, None)
-        if weights is None:
-            return None
-        weights = weights.reshape(tensordict.batch_size)
-        return weights / weights.amax()
+        if weights is not None:
+            weights = weights.reshape(tensordict.batch_size)
+            weights = weights / (weights.amax() if self.weight_norm == "max" else weights.mean())
+        return ImportanceWeights(weights, self.weighted_terms)
+
+
+@dataclass(frozen=True)
+class ImportanceWeights:
+    """Normalised importance weights of a batch, and the terms that they multiply.
+
+    Args:
+        values: [...], None without prioritised replay.
+        terms: the weighted terms.
+    """
+
+    values: Tensor | None
+    terms: WeightedTerms
+
+    def of(self, term: WeightedTerms) -> Tensor | None:
+        """Return the weights [...] of a term's samples, None if the term is not weighted.
+
+        Args:
+            term: the narrowest choice of terms that includes the term.
+        """
+        choices = get_args(WeightedTerms)
+        return self.values if choices.index(self.terms) >= choices.index(term) else None
+
+
+def weighted(losses: Tensor, weights: Tensor | None) -> Tensor:
+    """Return the losses of samples [...] times their weights [...], if there are any."""
+    return losses if weights is None else weights * losses
 
 
 def reduce_loss(losses: Tensor, reduction: Reduction) -> Tensor:

@@ -14,7 +14,15 @@ from torch import Tensor, nn
 from torchrl.modules import QValueActor
 
 from ba_torchrl.envs import keys
-from ba_torchrl.objectives.base import Reduction, TransitionLoss, reduce_loss, reduce_over
+from ba_torchrl.objectives.base import (
+    Reduction,
+    TransitionLoss,
+    WeightedTerms,
+    WeightNorm,
+    reduce_loss,
+    reduce_over,
+    weighted,
+)
 from ba_torchrl.objectives.single_level import SingleLevelValues
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
@@ -45,6 +53,7 @@ def large_margin(
     is_expert: Tensor,
     margin: float,
     reduction: Reduction = "mean",
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Return the margin loss of DQfD (appendix E).
 
@@ -56,11 +65,12 @@ def large_margin(
         is_expert: bool [B].
         margin: least difference of Q(a_e) to the other values.
         reduction: of the samples' losses; zero for samples that are not demonstrations.
+        weights: [B] of the samples' losses.
     """
     of_chosen = q.gather(1, chosen[:, None])
     is_other = torch.ones_like(q).scatter_(1, chosen[:, None], 0.0)
     excess = (q + margin * is_other).amax(dim=1) - of_chosen[:, 0]
-    return reduce_over(excess, is_expert, reduction)
+    return reduce_over(weighted(excess, weights), is_expert, reduction)
 
 
 def strict_large_margin(
@@ -69,6 +79,7 @@ def strict_large_margin(
     is_expert: Tensor,
     margin: float,
     reduction: Reduction = "mean",
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Return the margin loss of SDQfD, which applies to every violating action (appendix E).
 
@@ -82,12 +93,14 @@ def strict_large_margin(
         is_expert: bool [B].
         margin: least difference of Q(a_e) to the other values.
         reduction: of the samples' losses.
+        weights: [B] of the samples' losses.
     """
     gap = q - q.gather(1, chosen[:, None]) + margin
     violates = (gap > 0).scatter(1, chosen[:, None], False)
     violates &= is_expert[:, None]
     count = violates.sum(dim=1).clamp_min(1)
-    return reduce_loss(torch.where(violates, gap, 0.0).sum(dim=1) / count, reduction)
+    losses = torch.where(violates, gap, 0.0).sum(dim=1) / count
+    return reduce_loss(weighted(losses, weights), reduction)
 
 
 def cross_entropy(
@@ -96,6 +109,7 @@ def cross_entropy(
     is_expert: Tensor,
     beta: float,
     reduction: Reduction = "mean",
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Return the loss of ADET: the cross-entropy of softmax(beta Q) with the expert's action.
 
@@ -107,9 +121,10 @@ def cross_entropy(
         is_expert: bool [B].
         beta: inverse temperature.
         reduction: of the samples' losses; zero for samples that are not demonstrations.
+        weights: [B] of the samples' losses.
     """
     losses = F.cross_entropy(beta * q, chosen, reduction="none")
-    return reduce_over(losses, is_expert, reduction)
+    return reduce_over(weighted(losses, weights), is_expert, reduction)
 
 
 class LevelDQNLoss(TransitionLoss):
@@ -136,6 +151,9 @@ class LevelDQNLoss(TransitionLoss):
         first_beta: inverse temperature of "adet" at the first level.
         later_beta: inverse temperature of "adet" at later levels.
         reduction: of the samples' losses; the formulas above are "mean".
+        weighted_terms: terms that the importance weights multiply; "all" includes
+            loss_demonstration.
+        weight_norm: statistic by which a batch's weights are divided.
     """
 
     @dataclass
@@ -177,8 +195,10 @@ class LevelDQNLoss(TransitionLoss):
         first_beta: float = 100.0,
         later_beta: float = 1.0,
         reduction: Reduction | None = None,
+        weighted_terms: WeightedTerms = "critic_and_policy",
+        weight_norm: WeightNorm = "max",
     ) -> None:
-        super().__init__(reduction)
+        super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
         if isinstance(value_network, QValueActor):
             value_network = SingleLevelValues(value_network)
         self.demonstrations = demonstrations
@@ -220,10 +240,13 @@ class LevelDQNLoss(TransitionLoss):
         q = torch.stack([values.gather(1, chosen[:, None]) for values, chosen in levels], dim=-1)
         errors = F.huber_loss(q, target[..., None].expand_as(q), reduction="none")
         weights = self._importance_weights(tensordict)
-        errors = errors if weights is None else weights[:, None, None] * errors
+        td_weights = weights.of("critic")
+        errors = weighted(errors, None if td_weights is None else td_weights[:, None, None])
         difference = (q.detach() - target[..., None]).abs().mean(dim=-1)
         tensordict.set(self.tensor_keys.priority, difference)
-        demonstration = self._demonstration_error(tensordict, levels, self.reduction)
+        demonstration = self._demonstration_error(
+            tensordict, levels, self.reduction, weights.of("all")
+        )
         return TensorDict(
             {
                 "loss_qvalue": self._sum_over_levels(errors[:, 0]),
@@ -258,6 +281,7 @@ class LevelDQNLoss(TransitionLoss):
         tensordict: TensorDictBase,
         levels: list[tuple[Tensor, Tensor]],
         reduction: Reduction,
+        weights: Tensor | None = None,
     ) -> Tensor:
         """Return the sum of the levels' terms, zero without demonstrations in the batch."""
         if self.demonstrations == "none":
@@ -267,9 +291,11 @@ class LevelDQNLoss(TransitionLoss):
         for number, (q, chosen) in enumerate(levels):
             if self.demonstrations == "adet":
                 beta = self.later_beta if number else self.first_beta
-                terms.append(cross_entropy(q, chosen, is_expert, beta, reduction))
+                terms.append(cross_entropy(q, chosen, is_expert, beta, reduction, weights))
             elif self.demonstrations == "dqfd":
-                terms.append(large_margin(q, chosen, is_expert, self.margin, reduction))
+                terms.append(large_margin(q, chosen, is_expert, self.margin, reduction, weights))
             else:
-                terms.append(strict_large_margin(q, chosen, is_expert, self.margin, reduction))
+                terms.append(
+                    strict_large_margin(q, chosen, is_expert, self.margin, reduction, weights)
+                )
         return torch.stack(terms).sum(dim=0)

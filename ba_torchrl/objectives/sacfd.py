@@ -13,25 +13,43 @@ from torch import Tensor, nn
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
-from ba_torchrl.objectives.base import Reduction, TransitionLoss, reduce_loss, reduce_over
+from ba_torchrl.objectives.base import (
+    Reduction,
+    TransitionLoss,
+    WeightedTerms,
+    WeightNorm,
+    reduce_loss,
+    reduce_over,
+    weighted,
+)
 
 
 class SACfDLoss(TransitionLoss):
     """Soft Actor-Critic with a behaviour term on the demonstrations in the batch (appendix G.2).
 
-    With weights w_i (ones without prioritised replay), twin values q_1 and q_2 of the stored
-    action, and an action a ~ pi drawn from the policy::
+    With twin values q_1 and q_2 of the stored action, an action a ~ pi drawn from the policy, and
+    importance weights u_i, v_i, w_i::
 
         y_i         = r_i + gamma (1 - terminated_i) (min_k q'_k(s'_i, a') - alpha log pi(a'|s'_i))
-        loss_qvalue = sum_k mean_i w_i (q_k(s_i, a_i) - y_i)^2
-        loss_actor  = mean_i w_i (alpha log pi(a | s_i) - min_k q_k(s_i, a))
-                      + demonstration_weight * mean over experts of mean over components (a - a_i)^2
-        loss_alpha  = mean_i -log_alpha (log pi(a | s_i) + target_entropy)
+        loss_qvalue = sum_k mean_i u_i (q_k(s_i, a_i) - y_i)^2
+        loss_actor  = mean_i v_i (alpha log pi(a | s_i) - min_k q_k(s_i, a)) + demonstration_weight
+                      * mean over experts of w_i mean over components (a - a_i)^2
+        loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
-    All three are computed with the current parameters and have gradients with respect to disjoint
-    parameters, so one backward pass on their sum suffices. The encoder is trained by loss_qvalue
-    only; loss_actor uses its detached features. The target bootstraps on truncated steps and not on
-    terminated ones.
+    u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
+    "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are
+    ones.
+
+    With several views of an observation, every term of a sample is the mean over its views, and y
+    over the views of the next observation (DrQ: Kostrikov et al., 2021, equation 3). With a
+    contrastive term, loss_contrastive is contrastive_weight times the mean of its losses, with the
+    encoder's features as anchors and those of the target encoder, of another view, as positives
+    (CURL: Srinivas et al., 2020; FERM: Zhan et al., 2020).
+
+    The first three are computed with the current parameters and have gradients with respect to
+    disjoint parameters, so one backward pass on the sum of all losses suffices. The encoder is
+    trained by loss_qvalue and loss_contrastive only; loss_actor uses its detached features. The
+    target bootstraps on truncated steps and not on terminated ones.
 
     ``forward`` also writes the priority, mean_k |q_k - y| of shape [..., 1], into its input.
 
@@ -44,6 +62,14 @@ class SACfDLoss(TransitionLoss):
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
             flag in the batch.
         reduction: of the samples' losses; the formulas above are "mean".
+        weighted_terms: terms that the importance weights multiply.
+        weight_norm: statistic by which a batch's weights are divided.
+        views: number of views of the observation. If there are several, the entries of the
+            observation have a dimension of views after the batch.
+        target_views: number of views of the next observation, likewise.
+        contrastive: from anchors and positives [B, F] to losses [B]; None for no contrastive term,
+            else the batch has another view of the observation under "positive".
+        contrastive_weight: weight of the contrastive term.
 
     Raises:
         ValueError: ``alpha_init`` is not positive, or the encoder has several outputs.
@@ -97,6 +123,12 @@ class SACfDLoss(TransitionLoss):
         target_entropy: float = -5.0,
         demonstration_weight: float = 1.0,
         reduction: Reduction | None = None,
+        weighted_terms: WeightedTerms = "critic_and_policy",
+        weight_norm: WeightNorm = "max",
+        views: int = 1,
+        target_views: int = 1,
+        contrastive: nn.Module | None = None,
+        contrastive_weight: float = 1.0,
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
@@ -104,7 +136,7 @@ class SACfDLoss(TransitionLoss):
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
-        super().__init__(reduction)
+        super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
         self.convert_to_functional(actor_network, "actor_network")
         self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
         self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
@@ -115,6 +147,12 @@ class SACfDLoss(TransitionLoss):
         )
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
         self._needs_expert_flag = demonstration_weight != 0
+        self.views = views
+        self.target_views = target_views
+        self.contrastive = None if contrastive is None else contrastive.to(device)
+        self.contrastive_weight = contrastive_weight
+        if contrastive is not None:
+            self.out_keys = (*self.out_keys, "loss_contrastive")
         # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=device)
 
@@ -128,6 +166,8 @@ class SACfDLoss(TransitionLoss):
         names = self._transition_keys(observation)
         if self._needs_expert_flag:
             names.append(self.tensor_keys.is_expert)
+        if self.contrastive is not None:
+            names += [(keys.POSITIVE, *_as_path(key)) for key in self.encoder_network.in_keys]
         return names
 
     @dispatch
@@ -135,10 +175,12 @@ class SACfDLoss(TransitionLoss):
         """Return the losses and detached diagnostics of a batch of transitions.
 
         Args:
-            tensordict: transitions [..., B]; gets the priority written into it.
+            tensordict: transitions [..., B], or [B] with a contrastive term; gets the priority
+                written into it.
 
         Returns:
-            ``loss_actor``, ``loss_qvalue``, ``loss_alpha``, scalars or, with the reduction
+            ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, with a contrastive term,
+            ``loss_contrastive``, scalars or, with the reduction
             "none", of shape [..., B]; and without gradient the scalars ``alpha``, ``entropy``,
             ``demonstration_error`` (the unweighted behaviour term) and ``q_value`` (mean of the
             twin values of the stored actions).
@@ -150,26 +192,30 @@ class SACfDLoss(TransitionLoss):
         weights = self._importance_weights(tensordict)
         target = self._target(tensordict)
 
-        features = self._features(tensordict, self.encoder_network_params)
-        action = tensordict[self.tensor_keys.action]
+        state = self._observation(tensordict, self.views)
+        features = self._features(state, self.encoder_network_params)
+        action = self._for_views(tensordict[self.tensor_keys.action])
         q = self._twin_values(features, action, self.qvalue_network_params)
-        error = q - target
-        loss_qvalue = self._reduced(error.square().sum(dim=-1), weights)
-        priority = error.detach().abs().mean(dim=-1, keepdim=True)
-        tensordict.set(self.tensor_keys.priority, priority)
+        error = q - self._for_views(target)
+        squared = self._over_views(error.square().sum(dim=-1))
+        loss_qvalue = self._reduced(squared, weights.of("critic"))
+        priority = self._over_views(error.detach().abs().mean(dim=-1))
+        tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
 
-        sample, log_prob = self._sample_action(tensordict)
+        sample, log_prob = self._sample_action(state)
         # Detached features and heads: the gradient reaches the actor's parameters only, through the
         # action.
         q_pi = self._twin_values(features.detach(), sample, self.qvalue_network_params.data)
-        policy_term = self.alpha * log_prob - q_pi.amin(dim=-1)
+        policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
         is_expert = self._expert_flag(tensordict)
-        error = (sample - action).square().mean(dim=-1)
-        demonstration = reduce_over(error, is_expert, self.reduction)
-        loss_actor = self._reduced(policy_term, weights) + self.demonstration_weight * demonstration
-        log_prob = log_prob.detach()
-        loss_alpha = -reduce_loss(self.log_alpha * (log_prob + self.target_entropy), self.reduction)
-        return TensorDict(
+        error = self._over_views((sample - action).square().mean(dim=-1))
+        demonstration = reduce_over(weighted(error, weights.of("all")), is_expert, self.reduction)
+        policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
+        loss_actor = policy_term + self.demonstration_weight * demonstration
+        log_prob = self._over_views(log_prob.detach())
+        temperature_term = self.log_alpha * (log_prob + self.target_entropy)
+        loss_alpha = -self._reduced(temperature_term, weights.of("all"))
+        out = TensorDict(
             {
                 "loss_actor": loss_actor,
                 "loss_qvalue": loss_qvalue,
@@ -180,16 +226,60 @@ class SACfDLoss(TransitionLoss):
                 "q_value": q.detach().mean(),
             }
         )
+        if self.contrastive is not None:
+            anchors = features[:, 0] if self.views > 1 else features
+            out.set("loss_contrastive", self._contrastive_loss(anchors, tensordict))
+        return out
+
+    def contrastive_loss(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return ``loss_contrastive`` alone, for training the encoder before the policy.
+
+        Args:
+            tensordict: observations [B], of which only the first of several views is used, and
+                other views of them under "positive".
+        """
+        state = self._observation(tensordict, self.views)
+        anchors = self._features(
+            state[:, 0] if self.views > 1 else state, self.encoder_network_params
+        )
+        return TensorDict({"loss_contrastive": self._contrastive_loss(anchors, tensordict)})
+
+    def _contrastive_loss(self, anchors: Tensor, tensordict: TensorDictBase) -> Tensor:
+        with torch.no_grad():
+            other = tensordict.get(keys.POSITIVE)
+            positives = self._features(other, self.target_encoder_network_params)
+        losses = self.contrastive(anchors, positives)
+        return self.contrastive_weight * reduce_loss(losses, self.reduction)
 
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Return the critics' target y, [..., 1]."""
-        following = tensordict.get(keys.NEXT)
+        following = self._observation(tensordict.get(keys.NEXT), self.target_views)
         action, log_prob = self._sample_action(following)
         features = self._features(following, self.target_encoder_network_params)
         q = self._twin_values(features, action, self.target_qvalue_network_params)
-        value = q.amin(dim=-1, keepdim=True) - self.alpha * log_prob.unsqueeze(-1)
-        return self.value_estimator.value_estimate(tensordict, next_value=value)
+        value = q.amin(dim=-1) - self.alpha * log_prob
+        if self.target_views > 1:
+            value = value.mean(dim=-1)
+        return self.value_estimator.value_estimate(tensordict, next_value=value.unsqueeze(-1))
+
+    def _observation(self, tensordict: TensorDictBase, views: int) -> TensorDictBase:
+        """Return the observation [..., B], or [..., B, views] if it has several views."""
+        names = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
+        seen = tensordict.select(*dict.fromkeys(names))
+        if views > 1:
+            seen.batch_size = torch.Size([*tensordict.batch_size, views])
+        return seen
+
+    def _for_views(self, values: Tensor) -> Tensor:
+        """Return values [..., B, D] of samples as those of their views [..., B, views, D]."""
+        if self.views == 1:
+            return values
+        return values.unsqueeze(-2).expand(*values.shape[:-1], self.views, values.shape[-1])
+
+    def _over_views(self, losses: Tensor) -> Tensor:
+        """Return the losses of samples [..., B], means over those of their views."""
+        return losses.mean(dim=-1) if self.views > 1 else losses
 
     def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return an action [..., A] drawn with gradient and its log-probability [...]."""
@@ -229,4 +319,8 @@ class SACfDLoss(TransitionLoss):
         return torch.zeros(tensordict.batch_size, dtype=torch.bool, device=action.device)
 
     def _reduced(self, losses: Tensor, weights: Tensor | None) -> Tensor:
-        return reduce_loss(losses if weights is None else weights * losses, self.reduction)
+        return reduce_loss(weighted(losses, weights), self.reduction)
+
+
+def _as_path(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key

@@ -38,7 +38,13 @@ class LearningUnit:
 
 CLOSE_LOOP = {
     "task": "close_loop/block_picking",
-    "algorithm": {"name": "sac", "demonstration_weight": 1.0, "batch_size": 64},
+    "algorithm": {
+        "name": "sac",
+        "demonstration_weight": 1.0,
+        "batch_size": 64,
+        "replay": "prioritized",
+        "augmentation": "so2",
+    },
 }
 OPEN_LOOP = {
     "task": "open_loop/block_stacking",

@@ -27,9 +27,10 @@ SET_BY_THE_EXPERIMENT = ("seed", "expert")
 
 
 class ExperimentConfig(StrictModel):
-    """One training run. Fields that the paper fixes have its values (appendix G.2).
+    """One training run. The defaults are those of the close-loop benchmarks (appendix G.2).
 
-    `parse` checks all fields, nested ones included, before anything starts.
+    Where the appendix gives no value, the default is that of the reference implementation, and the
+    field says so. `parse` checks all fields, nested ones included, before anything starts.
     """
 
     plugins: list[str] = Field(default_factory=list)
@@ -56,7 +57,7 @@ class ExperimentConfig(StrictModel):
     start_method: Literal["spawn", "fork"] = "spawn"
     """How these processes start."""
     demonstrations: int = Field(default=100, ge=0)
-    """Expert episodes in the replay before the first update."""
+    """Expert episodes in the replay before the first update; reference implementation."""
     demonstrations_source: Source = "expert"
     """Their source: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
@@ -66,16 +67,16 @@ class ExperimentConfig(StrictModel):
     pretrain_updates: int = Field(default=0, ge=0)
     """Updates on the demonstrations before the first environment step."""
     total_updates: int = Field(default=10_000, ge=1)
-    """Gradient updates of the run, pretraining included."""
+    """Gradient updates of the run, pretraining included; reference implementation."""
     updates_per_step: int = Field(default=1, ge=1)
     """Updates for each step of all environments together."""
     min_replay: int = Field(default=100, ge=1)
-    """Transitions in the replay before the first update."""
+    """Transitions in the replay before the first update; reference implementation."""
     eval_every: int = Field(default=500, ge=1)
     """Updates between evaluations of the greedy policy; a checkpoint follows each, and the best and
     the latest ones are kept."""
     eval_episodes: int = Field(default=100, ge=1)
-    """Episodes of each of these evaluations."""
+    """Episodes of each of these evaluations; reference implementation."""
     final_eval_episodes: int = Field(default=100, ge=1)
     """Episodes of the last evaluation, which is reported."""
     report: Literal["last", "best"] = "last"

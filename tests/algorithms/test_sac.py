@@ -27,7 +27,8 @@ def build(network="cnn", **config):
         seed=0,
         device=torch.device("cpu"),
     )
-    settings = parse(SACConfig, {"batch_size": 16, "buffer_size": 500, **config}, "sac")
+    options = {"batch_size": 16, "buffer_size": 500, "replay": "prioritized", "augmentation": "so2"}
+    settings = parse(SACConfig, {**options, **config}, "sac")
     return settings.build(parse(NETWORKS[network], sizes, network), problem)
 
 

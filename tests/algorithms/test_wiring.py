@@ -36,6 +36,8 @@ SAC = {
     "replay": "prioritized",
     "priority_exponent": 0.9,
     "importance_exponent": 0.2,
+    "importance_weighted": "all",
+    "importance_norm": "mean",
     "expert_bonus": 2.5,
     "augmentation": "so2",
     "augmentation_probability": 0.35,
@@ -54,6 +56,8 @@ SPATIAL_Q = {
     "batch_size": 6,
     "buffer_size": 55,
     "replay": "symmetric",
+    "importance_weighted": "critic",
+    "importance_norm": "mean",
     "augmentation": "cn",
     "augmentation_probability": 0.45,
     "augmentation_order": 6,
@@ -154,6 +158,13 @@ def test_the_terms_of_spatial_q_have_their_values():
     assert loss.demonstrations == "adet"
     values = (loss.demonstration_weight, loss.margin, loss.first_beta, loss.later_beta)
     assert values == (0.7, 0.4, 7.0, 3.0)
+
+
+@pytest.mark.parametrize("name", ["sac", "spatial_q"])
+def test_the_loss_has_the_configured_importance_weights(name):
+    loss, config = build(name).loss, KINDS[name]
+    assert loss.weighted_terms == config["importance_weighted"]
+    assert loss.weight_norm == config["importance_norm"]
 
 
 def flat(params):

@@ -13,9 +13,9 @@ from tests.specs import actor_critic_spec
 SEQUENCES = ["pxyzr", "pxyz"]
 
 
-def build(size, sequence="pxyzr", n_hidden=8, group_order=8, seed=0):
+def build(size, sequence="pxyzr", n_hidden=8, seed=0, **group):
     torch.manual_seed(seed)
-    config = NETWORKS["equi"](n_hidden=n_hidden, group_order=group_order, precision="float32")
+    config = NETWORKS["equi"](n_hidden=n_hidden, precision="float32", **group)
     return config.build(actor_critic_spec(size, sequence))
 
 

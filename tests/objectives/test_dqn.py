@@ -78,7 +78,9 @@ def huber(error):
     return 0.5 * error**2 if abs(error) < 1 else abs(error) - 0.5
 
 
-def by_hand(loss, data, kind, weight=0.1, margin=0.1, betas=(100.0, 1.0), importance=None):
+def by_hand(
+    loss, data, kind, weight=0.1, margin=0.1, betas=(100.0, 1.0), td_weights=None, term_weights=None
+):
     """The losses, computed by a loop over samples, levels and actions."""
     online = {k: loss.value_network_params[k].detach().double() for k in ("first", "second")}
     target = {k: loss.target_value_network_params[k].double() for k in ("first", "second")}
@@ -94,7 +96,7 @@ def by_hand(loss, data, kind, weight=0.1, margin=0.1, betas=(100.0, 1.0), import
             (x @ online["first"]).tolist(),
             (x @ online["second"][choices[0]]).tolist(),
         ]
-        share = 1.0 if importance is None else importance[i] / max(importance)
+        share = 1.0 if td_weights is None else td_weights[i]
         errors = [values[choice] - y for values, choice in zip(q, choices, strict=True)]
         td += share * sum(map(huber, errors)) / len(data)
         priorities.append(sum(map(abs, errors)) / 2)
@@ -117,7 +119,7 @@ def by_hand(loss, data, kind, weight=0.1, margin=0.1, betas=(100.0, 1.0), import
                 top = max(scaled)
                 log_sum = top + math.log(sum(math.exp(s - top) for s in scaled))
                 sample += log_sum - scaled[choice]
-        terms.append(sample)
+        terms.append(sample if term_weights is None else term_weights[i] * sample)
     experts = int(data["is_expert"].sum())
     count = len(data) if kind == "sdqfd" else max(experts, 1)
     return td, weight * sum(terms) / count, priorities
@@ -137,12 +139,23 @@ def test_the_losses_equal_a_loop_written_from_the_formulas(kind, experts):
     assert not out["demonstration_error"].requires_grad
 
 
-def test_importance_weights_are_applied_divided_by_their_largest():
+@pytest.mark.parametrize("kind", ["dqfd", "sdqfd", "adet"])
+@pytest.mark.parametrize("norm", ["max", "mean"])
+@pytest.mark.parametrize("terms", ["none", "critic", "critic_and_policy", "all"])
+def test_importance_weights_multiply_the_chosen_terms(terms, norm, kind):
     data = batch()
-    weights = [0.1 + 0.05 * i for i in range(len(data))]
-    data["priority_weight"] = torch.tensor(weights)
-    loss = make_loss()
-    td, demonstration, _ = by_hand(loss, data, "sdqfd", importance=weights)
+    drawn = [0.1 + 0.05 * i for i in range(len(data))]
+    data["priority_weight"] = torch.tensor(drawn)
+    divisor = max(drawn) if norm == "max" else sum(drawn) / len(drawn)
+    weights = [weight / divisor for weight in drawn]
+    loss = make_loss(demonstrations=kind, weighted_terms=terms, weight_norm=norm)
+    td, demonstration, _ = by_hand(
+        loss,
+        data,
+        kind,
+        td_weights=None if terms == "none" else weights,
+        term_weights=weights if terms == "all" else None,
+    )
     out = loss(data)
     assert float(out["loss_qvalue"].detach()) == pytest.approx(td, rel=1e-5)
     assert float(out["loss_demonstration"].detach()) == pytest.approx(demonstration, rel=1e-5)

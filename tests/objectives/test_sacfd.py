@@ -26,7 +26,26 @@ def affine(row_weights, bias, x):
     ]
 
 
-def by_hand(loss, data, gamma, alpha, target_entropy, demonstration_weight):
+def importance(data, terms, norm):
+    """Weights of the critic's, the policy's and the other terms of each sample."""
+    ones = [1.0] * len(data)
+    weights = data["priority_weight"].tolist() if "priority_weight" in data else ones
+    divisor = max(weights) if norm == "max" else sum(weights) / len(weights)
+    weights = [w / divisor for w in weights]
+    number = ["none", "critic", "critic_and_policy", "all"].index(terms)
+    return [weights if number >= least else ones for least in (1, 2, 3)]
+
+
+def by_hand(
+    loss,
+    data,
+    gamma,
+    alpha,
+    target_entropy,
+    demonstration_weight,
+    terms="critic_and_policy",
+    norm="max",
+):
     """The terms of the loss, computed with Python floats and loops."""
 
     def parameters(name):
@@ -50,9 +69,8 @@ def by_hand(loss, data, gamma, alpha, target_entropy, demonstration_weight):
         return [*tree[keys.PIXELS][i].tolist(), float(tree[keys.HOLDING][i])]
 
     n = len(data)
-    weights = data["priority_weight"].tolist() if "priority_weight" in data else [1.0] * n
-    weights = [w / max(weights) for w in weights]
-    qvalue = actor_term = alpha_term = entropy = value = behaviour = 0.0
+    critic, policy_weights, others = importance(data, terms, norm)
+    qvalue = actor_term = alpha_term = entropy = value = behaviour = weighted_behaviour = 0.0
     experts, priorities = 0, []
     for i in range(n):
         x, following = observation(data, i), observation(data[keys.NEXT], i)
@@ -63,20 +81,23 @@ def by_hand(loss, data, gamma, alpha, target_entropy, demonstration_weight):
         if not data[keys.NEXT, keys.TERMINATED][i]:
             y += gamma * bootstrap
         errors = [v - y for v in q(x, stored, "")]
-        qvalue += weights[i] * sum(e * e for e in errors) / n
+        qvalue += critic[i] * sum(e * e for e in errors) / n
         value += sum(q(x, stored, "")) / 2 / n
         priorities.append([sum(abs(e) for e in errors) / 2])
         action, log_prob = policy(x)
-        actor_term += weights[i] * (alpha * log_prob - min(q(x, action, ""))) / n
-        alpha_term -= math.log(alpha) * (log_prob + target_entropy) / n
+        actor_term += policy_weights[i] * (alpha * log_prob - min(q(x, action, ""))) / n
+        alpha_term -= others[i] * math.log(alpha) * (log_prob + target_entropy) / n
         entropy -= log_prob / n
         if keys.IS_EXPERT in data and data[keys.IS_EXPERT][i]:
             experts += 1
-            behaviour += sum((a - e) ** 2 for a, e in zip(action, stored, strict=True)) / 2
+            error = sum((a - e) ** 2 for a, e in zip(action, stored, strict=True)) / 2
+            behaviour += error
+            weighted_behaviour += others[i] * error
     behaviour /= max(experts, 1)
+    weighted_behaviour /= max(experts, 1)
     return {
         "loss_qvalue": qvalue,
-        "loss_actor": actor_term + demonstration_weight * behaviour,
+        "loss_actor": actor_term + demonstration_weight * weighted_behaviour,
         "loss_alpha": alpha_term,
         "alpha": alpha,
         "entropy": entropy,
@@ -101,6 +122,24 @@ def test_losses_equal_a_calculation_in_python(experts, weights, demonstration_we
     assert data[keys.TD_ERROR].shape == (4, 1)
     expected_priorities = torch.tensor(priorities, dtype=torch.float64)
     torch.testing.assert_close(data[keys.TD_ERROR], expected_priorities, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("norm", ["max", "mean"])
+@pytest.mark.parametrize("terms", ["none", "critic", "critic_and_policy", "all"])
+def test_importance_weights_multiply_the_chosen_terms(terms, norm):
+    loss = make(alpha_init=0.2, target_entropy=-1.5, weighted_terms=terms, weight_norm=norm)
+    data = batch()
+    expected, _ = by_hand(loss, data, 0.99, 0.2, -1.5, 1.0, terms, norm)
+    out = loss(data)
+    for name, value in expected.items():
+        assert out[name].item() == pytest.approx(value, rel=1e-6), name
+
+
+def test_unknown_importance_weights_are_refused():
+    with pytest.raises(ValueError, match=r"weighted_terms .* 'actor'"):
+        make(weighted_terms="actor")
+    with pytest.raises(ValueError, match=r"weight_norm .* 'median'"):
+        make(weight_norm="median")
 
 
 def test_defaults_are_those_of_the_paper():

@@ -27,7 +27,12 @@ ROOT = Path(__file__).parents[2]
 TINY = {
     "task": "close_loop/block_reaching",
     "env": {"obs_size": 64, "max_steps": 8},
-    "algorithm": {"name": "sac", "batch_size": 8},
+    "algorithm": {
+        "name": "sac",
+        "batch_size": 8,
+        "replay": "prioritized",
+        "augmentation": "so2",
+    },
     "network": {"name": "cnn", "width": 0.25},
     "num_envs": 2,
     "parallel": False,

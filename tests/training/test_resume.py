@@ -18,7 +18,12 @@ from ba_torchrl.training.resume import check_same_run, resumable_updates
 TINY = {
     "task": "close_loop/block_reaching",
     "env": {"obs_size": 64, "max_steps": 8},
-    "algorithm": {"name": "sac", "batch_size": 8},
+    "algorithm": {
+        "name": "sac",
+        "batch_size": 8,
+        "replay": "prioritized",
+        "augmentation": "so2",
+    },
     "network": {"name": "cnn", "width": 0.25},
     "num_envs": 2,
     "parallel": False,

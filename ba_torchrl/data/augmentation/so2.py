@@ -1,4 +1,4 @@
-"""Rotation of sampled transitions about the z axis (appendix G.2)."""
+"""Rotation of transitions about the z axis; the appendix has no augmentation of this kind."""
 
 from __future__ import annotations
 
@@ -115,10 +115,10 @@ def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
 class SO2Augmentation(nn.Module):
     """Rotates images, next images and (dx, dy) of each transition by a random angle.
 
-    It replaces the rotated copies that the reference stores with each transition (appendix G.2,
-    "augmentation buffer"): four copies and the original correspond to a probability of 0.8. The
-    gripper, z and yaw components and images with the gripper's axes are unchanged. Each call on the
-    same batch draws new angles.
+    The reference implementation stores four rotated copies with each transition; on sampled
+    transitions, a probability of 0.8 has nearly the same effect without the memory. The gripper, z
+    and yaw components and images with the gripper's axes are unchanged. Each call on the same batch
+    draws new angles.
 
     Args:
         images: declarations of the images by key.

@@ -25,13 +25,13 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
     A transition is drawn in proportion to (|td| + eps + bonus * is_expert) ^ alpha. New transitions
     get the largest |td| so far. That maximum excludes the bonus, since it would otherwise grow by
     one bonus per insertion. Each draw has the importance weight ``priority_weight`` = (p / p_min) ^
-    -beta, in (0, 1]; the loss divides it by the batch's largest.
+    -beta, in (0, 1]; the loss normalises it over the batch.
 
     Args:
         max_capacity: number of transitions of the storage, over all its dimensions.
         generator: source of every draw.
         alpha: exponent of the priorities.
-        beta: initial exponent of the weights; ``anneal`` raises it to one.
+        beta: initial exponent of the weights; ``anneal`` raises it to one, except from zero.
         eps: added to every priority.
         expert_bonus: added to the priority of demonstrations.
         expert_key: entry with the flag of demonstrations.
@@ -64,11 +64,13 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         self._initial_beta = beta
 
     def anneal(self, fraction: float) -> None:
-        """Interpolate beta between its initial value and one.
+        """Interpolate beta between its initial value and one; an initial value of zero is kept.
 
         Args:
             fraction: elapsed fraction of the run; clipped to [0, 1].
         """
+        if not self._initial_beta:
+            return
         fraction = min(max(fraction, 0.0), 1.0)
         self.beta = self._initial_beta + (1.0 - self._initial_beta) * fraction
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,6 @@ VIEW_TASKS = ("close_loop/block_picking", "close_loop/drawer_opening")
 STEPPED_TOGETHER = {"close_loop/block_stacking", "open_loop/house_building_1"}
 
 CLOSE_LOOP_TASK, OPEN_LOOP_TASK = "close_loop/block_picking", "open_loop/block_stacking"
-CLOSE_LOOP_ALGORITHMS = ("sac", "sacfd")
 SMALL_RUN: dict[str, Any] = {
     "device": "cpu",
     "threads": 1,
@@ -90,6 +90,8 @@ SMALL_NETWORK: dict[str, dict[str, Any]] = {
     "cnn": {"network.width": 0.25},
     "equi": {"network.n_hidden": 8},
     "equi_small": {"network.n_hidden": 8},
+    "equi_d4": {"network.n_hidden": 8},
+    "ferm": {"network.width": 0.25},
     **{
         name: {"network.width": 0.25, "network.num_rotations": 4}
         for name in ("asr", "equi_asr", "equi_fcn", "fcn", "rot_fcn")
@@ -110,17 +112,17 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
         "cnn",
         {"algorithm__replay": "uniform", "algorithm__augmentation": "none"},
     ),
-    "prioritized sac": (CLOSE_LOOP_TASK, "sac", "cnn", {"algorithm__replay": "prioritized"}),
+    "prioritized sac": (CLOSE_LOOP_TASK, "sac_so2", "cnn", {"algorithm__replay": "prioritized"}),
     "without yaw": (
         CLOSE_LOOP_TASK,
-        "sacfd",
+        "sacfd_per_so2",
         "equi_small",
         {"env__action_sequence": "pxyz", "env__random_orientation": False},
     ),
-    "128 pixels": (CLOSE_LOOP_TASK, "sacfd", "cnn", {"env__obs_size": 128}),
+    "128 pixels": (CLOSE_LOOP_TASK, "sacfd_per_so2", "cnn", {"env__obs_size": 128}),
     "schedules": (
         CLOSE_LOOP_TASK,
-        "sacfd",
+        "sacfd_per_so2",
         "cnn",
         {
             "algorithm__learning_rate_end_factor": 0.1,
@@ -130,7 +132,7 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
             "report": "best",
         },
     ),
-    "quickstart": (CLOSE_LOOP_TASK, "sacfd", "equi_small", {"file": "quickstart"}),
+    "quickstart": (CLOSE_LOOP_TASK, "sacfd_per_so2", "equi_small", {"file": "quickstart"}),
     "quickstart_open_loop": (
         OPEN_LOOP_TASK,
         "sdqfd",
@@ -187,7 +189,7 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
         "fcn",
         {"demonstrations_source": "deconstruction", "only_successful_demonstrations": True},
     ),
-    "processes": (CLOSE_LOOP_TASK, "sacfd", "cnn", {"parallel": True}),
+    "processes": (CLOSE_LOOP_TASK, "sacfd_per_so2", "cnn", {"parallel": True}),
 }
 """Variants of training: task, algorithm, network and overrides, "__" for a dot."""
 
@@ -283,22 +285,37 @@ def _env_cases() -> Iterator[Case]:
 
 def _training_cases() -> Iterator[Case]:
     """Yield every pair of an algorithm and a network preset, and some options."""
-    algorithms, networks = (
-        sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
-        for group in ("algorithm", "network")
-    )
-    pairs = [(algorithm, network) for algorithm in algorithms for network in networks]
-    for algorithm, network in pairs:
-        task = CLOSE_LOOP_TASK if algorithm in CLOSE_LOOP_ALGORITHMS else OPEN_LOOP_TASK
+    networks = sorted(path.stem for path in (config_folder() / "network").glob("*.yaml"))
+    for (algorithm, task), network in product(_tasks_of_algorithms().items(), networks):
         yield _training_case(f"{algorithm} {network}", task, algorithm, network)
     for name, (task, algorithm, network, changes) in TRAINING_OPTIONS.items():
         yield _training_case(f"option {name}", task, algorithm, network, **changes)
+
+
+def _tasks_of_algorithms() -> dict[str, str]:
+    """Return the task of the cases of each algorithm preset."""
+    from hydra import initialize_config_dir
+
+    from ba_torchrl.algorithms.base import ALGORITHMS
+    from ba_torchrl.training import hydra_schema
+
+    folder = config_folder()
+    hydra_schema.register()
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        presets = sorted(path.stem for path in (folder / "algorithm").glob("*.yaml"))
+        names = {preset: hydra_schema.preset("algorithm", preset)["name"] for preset in presets}
+    return {
+        preset: CLOSE_LOOP_TASK if "close_loop" in ALGORITHMS[name].controls else OPEN_LOOP_TASK
+        for preset, name in names.items()
+    }
 
 
 def _training_case(
     name: str, task: str, algorithm: str, network: str, file: str = "train", **changes: Any
 ) -> Case:
     small = SMALL_CLOSE_LOOP if TASKS[task].control == "close_loop" else SMALL_OPEN_LOOP
+    if algorithm.startswith("ferm"):
+        small = {**small, "env.obs_size": 71, "algorithm.crop_size": 64}
     config = {
         "file": file,
         "task": task,

@@ -49,6 +49,10 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
     """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
     first."""
 
+    def default_max_failures(self) -> int:
+        """Return the number of attempts of the reference implementation, 1.5 per object."""
+        return math.ceil(1.5 * self.settings.num_objects)
+
     def evaluate(self) -> dict[str, bool]:
         """Return whether an object is held and whether the tool is higher than 15 cm."""
         return {"is_grasped": self.robot.held_body() is not None, "is_lifted": self._is_lifted()}

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
+from pydantic import Field
 
 from ba_torchrl.config import TaskParameters
 from ba_torchrl.sim.assets.base import load_object_set
@@ -20,25 +21,14 @@ from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clutter.grasp_planner import GraspPlanner
 from ba_torchrl.tasks.clutter.tray import Tray
 
-MAX_FAILURES = 3
-"""Consecutive episodes without a grasped object after which new objects are dropped."""
-
 DROP_Z_M = 0.2
-"""Height from which objects with random orientations are dropped."""
+"""Height from which objects are dropped."""
 DROP_INTERVAL_S = 0.15
 """Time between two drops, in which an object falls 11 cm and clears the next one's start."""
 DROP_MARGIN_M = 0.03
 """Least distance between the start of a drop and the edge of the tray's floor."""
 SETTLE_S = 4.0
 """Time limit for the objects to come to rest."""
-LOW_DROP_M = 5e-3
-"""Height above the floor from which upright objects are dropped."""
-GAP_M = 5e-3
-"""Least gap between upright objects."""
-LAYOUTS = 20
-"""Random layouts of upright objects that are compared."""
-TRIES = 50
-"""Random points that are compared for each upright object."""
 DROP_ATTEMPTS = 3
 """Heaps that are dropped until one comes to rest within the time limit."""
 
@@ -49,19 +39,29 @@ RETREAT_Z_M = (0.55, 0.5, 0.45, 0.4, 0.35)
 class Clutter:
     """All objects of an object set, and the heap that some of them form in a tray.
 
-    A heap persists until it is empty or `MAX_FAILURES` consecutive episodes grasped nothing.
+    A heap persists until it is empty or `max_failures` consecutive episodes grasped nothing.
 
     Args:
         world: not sealed yet.
         robot: the robot; its arm retreats during a drop.
         tray: the tray.
         settings: settings of the task; `parameters` names the object set.
+        max_failures: number of consecutive failures after which new objects are dropped.
     """
 
-    def __init__(self, world: World, robot: Robot, tray: Tray, settings: TaskSettings) -> None:
+    def __init__(
+        self,
+        world: World,
+        robot: Robot,
+        tray: Tray,
+        settings: TaskSettings,
+        *,
+        max_failures: int,
+    ) -> None:
         self.world = world
         self.robot = robot
         self.settings = settings
+        self.max_failures = max_failures
         self.failures = 0
         """Consecutive episodes without a grasped object."""
         self.tray = tray
@@ -83,7 +83,7 @@ class Clutter:
         """
         if grasped_object is not None:
             return len(self.pool.active) > 1
-        return bool(self.pool.active) and self.failures + 1 < MAX_FAILURES
+        return bool(self.pool.active) and self.failures + 1 < self.max_failures
 
     def advance(self, grasped_object: Body | None) -> None:
         """Remove the grasped object from the scene, or count a failure.
@@ -100,9 +100,8 @@ class Clutter:
     def drop(self, rng: np.random.Generator) -> None:
         """Drop new objects one by one until they are at rest.
 
-        Orientations are random. With fixed orientations, objects are upright at yaw 0 and dropped
-        from a low height, apart from each other; those that do not fit are dropped last, from the
-        full height.
+        They start with random orientations, or with the identity if orientations are fixed, and
+        tumble as they hit the tray and each other.
 
         Args:
             rng: random generator.
@@ -119,18 +118,12 @@ class Clutter:
             pool.clear()
             chosen = rng.choice(len(pool.bodies), size=count, replace=False)
             bodies = [pool.bodies[i] for i in chosen]
-            points = {} if settings.random_orientation else _layout(rng, bodies, half_m)
-            for i, (x, y) in points.items():
-                xy = (x + center[0], y + center[1])
-                z = self.tray.height_m(xy) + LOW_DROP_M - bodies[i].shape.bounds_m[0][2]
-                pool.activate(bodies[i])
-                bodies[i].place((*xy, z))
-            for i in sorted(set(range(count)) - set(points)):
+            for body in bodies:
                 x, y = center + rng.uniform(DROP_MARGIN_M - half_m, half_m - DROP_MARGIN_M, 2)
                 is_random = settings.random_orientation
                 orientation = _random_orientation(rng) if is_random else (0.0, 0.0, 0.0, 1.0)
-                pool.activate(bodies[i])
-                bodies[i].set_pose((x, y, DROP_Z_M), orientation)
+                pool.activate(body)
+                body.set_pose((x, y, DROP_Z_M), orientation)
                 world.step(pause)
             if world.settle(round(SETTLE_S / world.physics.time_step_s)):
                 break
@@ -148,8 +141,9 @@ class ClutterTask(Task):
     """A task of grasping an object from a heap, in which the next episode continues with the rest.
 
     New objects are dropped when the tray is empty, when an object has left the workspace, and after
-    three consecutive episodes without a grasped object; an episode that is reset early counts as
-    one of these.
+    ``max_failures`` consecutive episodes without a grasped object; an episode that is reset early
+    counts as one of these. In the appendix, a heap with remaining objects is never replaced; the
+    reference implementation has a limit, whose value is the default.
     """
 
     needs_fresh_world = True
@@ -162,6 +156,13 @@ class ClutterTask(Task):
         """Name of the object set; see `ba_torchrl.sim.assets`."""
         asset_root: str | None = None
         """Folder of an object set that is not part of the package."""
+        max_failures: int | None = Field(default=None, ge=1)
+        """Consecutive episodes without a grasped object after which new objects are dropped; by
+        default 30 in open loop, and 1.5 per object, rounded up, in close loop."""
+
+    @abstractmethod
+    def default_max_failures(self) -> int:
+        """Return the number of consecutive failures after which new objects are dropped."""
 
     @abstractmethod
     def grasped_object(self) -> Body | None:
@@ -169,7 +170,14 @@ class ClutterTask(Task):
 
     def load_scene(self) -> None:
         """Load all objects of the object set."""
-        self.clutter = Clutter(self.world, self.robot, self.terrain, self.settings)
+        limit = self.settings.parameters.max_failures
+        self.clutter = Clutter(
+            self.world,
+            self.robot,
+            self.terrain,
+            self.settings,
+            max_failures=self.default_max_failures() if limit is None else limit,
+        )
 
     def make_terrain(self) -> Tray:
         """Load the tray and return it."""
@@ -216,40 +224,6 @@ class ClutterTask(Task):
         """Restore the active objects and the number of consecutive failures."""
         active, self.clutter.failures = state
         self.clutter.pool.set_state(active)
-
-
-def _layout(
-    rng: np.random.Generator, bodies: Sequence[Body], half_m: float
-) -> dict[int, tuple[float, float]]:
-    """Return random points at which upright bodies keep a gap to each other, by their index.
-
-    Bodies that do not fit have no point. Larger bodies are placed first.
-
-    Args:
-        rng: random generator.
-        bodies: the bodies.
-        half_m: half the width of the square around the origin in which they are placed.
-    """
-    bounds = np.array([np.array(body.shape.bounds_m)[:, :2] for body in bodies])
-    order = np.argsort(-np.prod(bounds[:, 1] - bounds[:, 0], axis=1))
-    best: dict[int, tuple[float, float]] = {}
-    for _ in range(LAYOUTS):
-        points: dict[int, tuple[float, float]] = {}
-        placed = np.empty((0, 2, 2))
-        for i in order.tolist():
-            low, high = bounds[i]
-            tries = rng.uniform(-half_m - low, half_m - high, (TRIES, 1, 2))
-            gaps = np.maximum(low + tries - placed[:, 1], placed[:, 0] - high - tries)
-            free = np.flatnonzero((gaps.max(axis=2) > GAP_M).all(axis=1))
-            if len(free):
-                point = tries[free[0], 0]
-                points[i] = tuple(point.tolist())
-                placed = np.concatenate([placed, [bounds[i] + point]])
-        if len(points) > len(best):
-            best = points
-        if len(best) == len(bodies):
-            break
-    return best
 
 
 def _random_orientation(rng: np.random.Generator) -> Quaternion:

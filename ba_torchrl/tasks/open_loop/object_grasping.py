@@ -46,6 +46,10 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
     num_objects_range = (1, 20)
     scale_range = (1.0, 1.0)
 
+    def default_max_failures(self) -> int:
+        """Return the number of attempts of the reference implementation, 30."""
+        return 30
+
     def evaluate(self) -> dict[str, bool]:
         """Return whether an object is held."""
         return {"is_grasped": self.robot.held_body() is not None}

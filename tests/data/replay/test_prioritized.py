@@ -131,6 +131,19 @@ def test_draws_and_weights_follow_the_formula(bonus):
     assert weights == pytest.approx(textbook / textbook.max(), rel=1e-9)
 
 
+@pytest.mark.parametrize(("beta", "expected"), [(0.0, [0, 0, 0]), (0.4, [0.4, 0.7, 1.0])])
+def test_the_exponent_of_the_weights_increases_to_one_except_from_zero(beta, expected):
+    buffer, sampler = make(FLAGS, beta=beta)
+    buffer.update_priority(torch.arange(8), torch.tensor(ERRORS))
+    found = []
+    for fraction in (0.0, 0.5, 1.0):
+        sampler.anneal(fraction)
+        found.append(sampler.beta)
+        is_one = bool((buffer.sample()["priority_weight"] == 1).all())
+        assert is_one == (beta == 0)
+    assert found == pytest.approx(expected)
+
+
 def leaves(sampler, n):
     return np.asarray(sampler._sum_tree[torch.arange(n)])
 

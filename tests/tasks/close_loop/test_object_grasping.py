@@ -79,14 +79,13 @@ def test_objects_and_poses_are_random(make):
     assert max(tilts) > 1.2
 
 
-def test_fixed_orientations_keep_most_objects_upright(make):
+def test_objects_with_fixed_orientations_fall_into_a_heap(make):
     env = make(random_orientation=False)
-    upright = []
+    tilts = []
     for seed in range(6):
         env.reset(seed=seed)
-        for body in env.scene.task.objects:
-            upright.append(body.tilt_rad < 0.2 and abs(body.yaw_rad) < 0.2)
-    assert np.mean(upright) > 0.85
+        tilts += [body.tilt_rad for body in env.scene.task.objects]
+    assert np.mean(np.array(tilts) > 0.2) > 0.1  # they tumble
 
 
 def test_only_active_objects_are_visible(make):
@@ -164,8 +163,8 @@ def test_new_objects_are_dropped_into_an_empty_tray(make):
     assert counts == [2, 1, 2, 1]
 
 
-def test_the_heap_is_replaced_after_three_failures(make):
-    env = make(max_steps=2)
+def test_the_heap_is_replaced_after_the_configured_number_of_failures(make):
+    env = make(max_steps=2, max_failures=3)
     state, heaps = env.reset(), []
     for _ in range(7):
         heaps.append(tuple(names(env)))
@@ -173,6 +172,18 @@ def test_the_heap_is_replaced_after_three_failures(make):
         state = env.reset()
     assert heaps[0] == heaps[1] == heaps[2] != heaps[3]
     assert heaps[3] == heaps[4] == heaps[5] != heaps[6]
+
+
+@pytest.mark.parametrize(("count", "limit"), [(1, 2), (4, 6), (5, 8)])
+def test_the_default_number_of_failures_is_one_and_a_half_per_object(make, count, limit):
+    env = make(max_steps=1, num_objects=count)
+    state, heaps = env.reset(), []
+    for _ in range(limit + 1):
+        heaps.append(tuple(names(env)))
+        finish(env, state, NO_OP)
+        state = env.reset()
+    assert len(set(heaps[:limit])) == 1
+    assert heaps[limit] != heaps[0]
 
 
 def test_a_success_resets_the_count_of_failures(make):
@@ -327,7 +338,7 @@ def test_the_expert_succeeds_with_every_robot(make, robot):
     ("config", "least"),
     [
         ({}, 0.95),
-        ({"random_orientation": False, "action_sequence": "pxyz"}, 0.95),
+        ({"random_orientation": False, "action_sequence": "pxyz"}, 0.9),
         ({"random_orientation": False}, 0.95),
         ({"num_objects": 15}, 0.95),
         ({"object_set": "household"}, 0.95),

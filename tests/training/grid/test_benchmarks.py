@@ -18,6 +18,18 @@ from tests.training.grid.grids import PICK, PLACE, REACH
 ROOT = Path(__file__).parents[3]
 
 
+CLOSE_LOOP_METHODS = {
+    *(
+        f"{algorithm} {net}"
+        for algorithm in ("sac", "sacfd", "sacfd_per")
+        for net in ("cnn", "equi")
+    ),
+    *(f"{kind}_{base} cnn" for kind in ("rad", "drq") for base in ("sac", "sacfd", "sacfd_per")),
+    *(f"ferm_{base} ferm" for base in ("sac", "sacfd", "sacfd_per")),
+}
+"""Labels of the methods of figures 20 and 22."""
+
+
 def tasks_of(control):
     """Return the built-in tasks of a control."""
     built_in = (task for task in TASKS if TASKS.plugin_module(task) is None)
@@ -46,25 +58,25 @@ def shipped(name, *overrides):
 def test_close_loop_benchmarks_have_the_values_of_the_paper(name, actions, turned):
     config, _, runs = shipped(name)
     assert sorted(config.tasks) == tasks_of("close_loop")
-    assert len(runs) == 10 * 2 * 2 * 4
+    methods = {run.label for run in runs}
+    assert methods == CLOSE_LOOP_METHODS
+    assert len(runs) == 10 * len(methods) * 4
     assert {run.benchmark for run in runs} == {name}
     assert {run.run_dir.split("/")[1] for run in runs} == {name}
     for run in runs:
         env, algorithm = run.env_config, run.algorithm_config
         assert (env.action_sequence, env.random_orientation) == (actions, turned)
-        assert (env.robot, env.obs_size, run.num_envs) == ("kuka", 128, 5)
-        assert (run.demonstrations, run.total_updates) == (100, 10_000)
+        pretraining, size = (1600, 142) if "ferm" in run.label else (0, 128)
+        assert (env.robot, env.obs_size, run.num_envs) == ("kuka", size, 5)
+        assert (run.demonstrations, run.pretrain_updates) == (100, pretraining)
+        assert run.total_updates == 10_000 + pretraining
         assert (run.eval_every, run.eval_episodes) == (500, 100)
         assert (algorithm.learning_rate, algorithm.gamma) == (1e-3, 0.99)
         assert (algorithm.batch_size, algorithm.buffer_size) == (64, 100_000)
         assert (algorithm.alpha_init, algorithm.target_entropy) == (0.01, -5.0)
-        assert (algorithm.replay == "prioritized") is run.label.startswith("sacfd")
-    first = next(run for run in runs if run.label == "sacfd equi").algorithm_config
-    assert (first.priority_exponent, first.importance_exponent, first.expert_bonus) == (
-        0.6,
-        0.4,
-        1.0,
-    )
+        assert algorithm.replay == ("prioritized" if "_per" in run.label else "uniform")
+        assert algorithm.augmentation == "none"
+        assert (algorithm.demonstration_weight > 0) is ("sacfd" in run.label)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,168 @@
+"""Random views of images: crops and shifts (RAD, DrQ, CURL)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.errors import ConfigError
+
+ViewTransform = Literal["none", "crop", "shift"]
+"""Random views of an image: parts of it, or the image moved by some pixels."""
+
+
+def take_views(images: Tensor, offsets: Tensor, size: int, padding: int = 0) -> Tensor:
+    """Return square parts of images, whose border is repeated outside of them.
+
+    Args:
+        images: [B, C, H, W].
+        offsets: int64 [B, V, 2], row and column of each view's first pixel in the padded image.
+        size: rows and columns of a view, pixels.
+        padding: rows and columns added on each side of the images, pixels.
+
+    Returns:
+        [B, V, C, size, size].
+    """
+    height, width = images.shape[-2:]
+    steps = torch.arange(size, device=images.device) - padding
+    rows = (offsets[..., 0, None] + steps).clamp(0, height - 1)[..., :, None]
+    columns = (offsets[..., 1, None] + steps).clamp(0, width - 1)[..., None, :]
+    batch = torch.arange(len(images), device=images.device).reshape(-1, 1, 1, 1)
+    return images.movedim(1, -1)[batch, rows, columns].movedim(-1, 2)
+
+
+class CenterCrop(nn.Module):
+    """The central part of images, which the acting policy sees.
+
+    Args:
+        size: rows and columns, pixels.
+    """
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.size = size
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return [..., size, size] of images [..., H, W]."""
+        row, column = ((length - self.size) // 2 for length in images.shape[-2:])
+        return images[..., row : row + self.size, column : column + self.size]
+
+
+def cropped_images(images: Mapping[str, ImageSpec], size: int) -> dict[str, ImageSpec]:
+    """Return the declarations of the views of images.
+
+    Args:
+        images: declarations by key.
+        size: rows and columns of the views, pixels.
+
+    Raises:
+        ConfigError: an image is smaller than its views.
+    """
+    for key, image in images.items():
+        if image.size < size:
+            raise ConfigError(
+                f"crop_size={size}: image {key!r} has only {image.size} px; raise env.obs_size "
+                "or lower algorithm.crop_size"
+            )
+    return {key: replace(image, size=size) for key, image in images.items()}
+
+
+class RandomViews(nn.Module):
+    """Replaces the images of transitions by random views of them.
+
+    With one view of the image and one of the next image, both have the same offset (RAD: Laskin et
+    al., "Reinforcement Learning with Augmented Data", 2020). With several, every view has its own
+    offset, and observation or next observation get a dimension of views after the batch (DrQ:
+    Kostrikov et al., "Image Augmentation Is All You Need", 2021). No other entry changes: the
+    holding flag of a view is that of the transition.
+
+    Args:
+        images: declarations of the images by key.
+        size: rows and columns of a view, pixels; None for those of the image.
+        padding: pixels added on each side of an image, which repeat its border.
+        views: number of views of the image.
+        target_views: number of views of the next image.
+        has_positive: add one more view of the image, under "positive", for a contrastive loss
+            (CURL: Srinivas et al., 2020).
+        seed: of the module's own draws.
+
+    Raises:
+        ValueError: a number of views is not positive.
+    """
+
+    def __init__(
+        self,
+        images: Mapping[str, ImageSpec],
+        *,
+        seed: int,
+        size: int | None = None,
+        padding: int = 0,
+        views: int = 1,
+        target_views: int = 1,
+        has_positive: bool = False,
+    ) -> None:
+        super().__init__()
+        if min(views, target_views) < 1:
+            raise ValueError(f"views must be positive, got {views} and {target_views}")
+        self.sizes = {key: image.size if size is None else size for key, image in images.items()}
+        self.padding = padding
+        self.views = views
+        self.target_views = target_views
+        self.has_positive = has_positive
+        # On the CPU for any device of the batch, so that the offsets of a seed are the same on all
+        # devices.
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return a copy of a batch of transitions [B] with views of the images.
+
+        Args:
+            tensordict: holds the images, the holding flag and their successors.
+        """
+        out = tensordict.copy()
+        is_paired = self.views == self.target_views == 1
+        for key in self.sizes:
+            image, following = tensordict[key], tensordict[keys.NEXT, key]
+            offsets = self._draw(key, image, self.views)
+            out.set(key, self._take(key, image, offsets))
+            if not is_paired:
+                offsets = self._draw(key, image, self.target_views)
+            out.set((keys.NEXT, key), self._take(key, following, offsets))
+            if self.has_positive:
+                positive = self._take(key, image, self._draw(key, image, 1))
+                out.set((keys.POSITIVE, key), positive)
+        holding, following = tensordict[keys.HOLDING], tensordict[keys.NEXT, keys.HOLDING]
+        if self.has_positive:
+            out.set((keys.POSITIVE, keys.HOLDING), holding)
+        if self.views > 1:
+            out.set(keys.HOLDING, holding[:, None].expand(-1, self.views, -1))
+        if self.target_views > 1:
+            expanded = following[:, None].expand(-1, self.target_views, -1)
+            out.set((keys.NEXT, keys.HOLDING), expanded)
+        return out
+
+    def _draw(self, key: str, image: Tensor, views: int) -> Tensor:
+        """Return uniform offsets [B, views, 2]."""
+        choices = image.shape[-1] + 2 * self.padding - self.sizes[key] + 1
+        offsets = torch.randint(choices, (len(image), views, 2), generator=self._generator)
+        return offsets.to(image.device)
+
+    def _take(self, key: str, image: Tensor, offsets: Tensor) -> Tensor:
+        """Return [B, C, size, size] of a single view, and [B, V, C, size, size] of several."""
+        views = take_views(image, offsets, self.sizes[key], self.padding)
+        return views.squeeze(1) if offsets.shape[1] == 1 else views
+
+    def get_extra_state(self) -> Tensor:
+        """Return the generator's state, so that a checkpoint continues the same draws."""
+        return self._generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restore the generator's state, from any device."""
+        self._generator.set_state(state.cpu())

@@ -1,0 +1,250 @@
+"""Every preset of an algorithm with every network of its control: two updates on small networks."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import initialize_config_dir
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
+from ba_torchrl.algorithms.sac import SAC
+from ba_torchrl.config import parse
+from ba_torchrl.data.augmentation.views import RandomViews
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
+from ba_torchrl.training import hydra_schema
+from tests.specs import close_loop_images, open_loop_images
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+FAMILIES = {"sac": "close_loop", "spatial_q": "open_loop"}
+"""Registered algorithms and their control."""
+BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
+SMALL = {
+    "cnn": {"width": 0.1},
+    "equi": {"n_hidden": 4, "group_order": 4},
+    "ferm": {"width": 0.1, "features": 8},
+    **{
+        name: {"width": 0.05, "num_rotations": 4}
+        for name in ("asr", "equi_asr", "fcn", "equi_fcn", "rot_fcn")
+    },
+}
+IMAGE, CROP = 71, 64
+
+
+@cache
+def presets():
+    """The values of every preset of the families, by name."""
+    hydra_schema.register()
+    names = sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        values = {name: hydra_schema.preset("algorithm", name) for name in names}
+    return {name: found for name, found in values.items() if found["name"] in FAMILIES}
+
+
+PAIRS = [
+    (preset, network)
+    for preset, values in presets().items()
+    for network in SMALL
+    if NETWORKS[network].control == FAMILIES[values["name"]]
+]
+
+
+def build(preset, network, **changes):
+    values = {"batch_size": 4, "buffer_size": 60, **presets()[preset], **changes}
+    values |= {"batch_size": 4, "buffer_size": 60}
+    name = values.pop("name")
+    is_close = FAMILIES[name] == "close_loop"
+    if values.get("view_transform") == "crop":
+        values["crop_size"] = CROP
+    images = close_loop_images(IMAGE if values.get("crop_size") == CROP else CROP)
+    torch.manual_seed(0)
+    problem = Problem(
+        control=FAMILIES[name],
+        images=images if is_close else open_loop_images(32),
+        actions=CloseLoopActions("pxyzr") if is_close else OpenLoopActions("pxyr", BOUNDS),
+        total_updates=10,
+        seed=0,
+        device=torch.device("cpu"),
+    )
+    return parse(ALGORITHMS[name], values, preset).build(
+        parse(NETWORKS[network], SMALL[network], network), problem
+    )
+
+
+def transitions(algorithm, count=8):
+    """Random transitions, every second one a demonstration."""
+    generator = torch.Generator().manual_seed(1)
+
+    def rand(*shape):
+        return torch.rand(count, *shape, generator=generator)
+
+    def state():
+        images = {key: rand(*image.shape) * image.high for key, image in algorithm.images.items()}
+        return {**images, keys.HOLDING: rand(1) < 0.5}
+
+    size = algorithm.problem.actions.size
+    action = rand(size) - 0.5
+    if "in_hand" in algorithm.images:
+        action = torch.tensor([0.5, 0.45, 0.0, 0.1]) + 0.1 * action
+    ended = torch.zeros(count, 1, dtype=torch.bool)
+    following = {
+        **state(),
+        keys.REWARD: rand(1),
+        **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
+    }
+    is_expert = torch.arange(count)[:, None] % 2 == 0
+    return TensorDict(
+        {**state(), keys.ACTION: action, keys.IS_EXPERT: is_expert, keys.NEXT: following}, [count]
+    )
+
+
+def parameters(algorithm):
+    return {name: p.detach().clone() for name, p in algorithm.loss.named_parameters()}
+
+
+@pytest.mark.parametrize(("preset", "network"), PAIRS)
+def test_two_updates_change_every_network(preset, network):
+    algorithm = build(preset, network)
+    algorithm.extend(transitions(algorithm))
+    before = parameters(algorithm)
+    for _ in range(2):
+        scalars = algorithm.update()
+    assert algorithm.updates == 2
+    assert all(torch.isfinite(value).all() for value in scalars.values())
+    after = parameters(algorithm)
+    changed = {name for name in after if not torch.equal(after[name], before[name])}
+    parts = [{name.split("_params")[0] for name in names} for names in (changed, after)]
+    assert parts[0] == parts[1]
+    state = transitions(algorithm).select(*algorithm.observation_keys)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert algorithm.policy(state)[keys.ACTION].isfinite().all()
+
+
+@pytest.mark.parametrize("preset", ["rad_sacfd", "drq_sacfd", "ferm_sacfd"])
+def test_a_restored_learner_continues_the_same_views(preset):
+    first, second = build(preset, "cnn"), build(preset, "cnn")
+    for algorithm in (first, second):
+        algorithm.extend(transitions(algorithm))
+    first.update()
+    second.load_state_dict(first.state_dict())
+    second.replay.set_rng(torch.Generator().manual_seed(3))
+    first.replay.set_rng(torch.Generator().manual_seed(3))
+    assert torch.equal(first.sample()[keys.PIXELS], second.sample()[keys.PIXELS])
+
+
+def test_the_options_reach_augmentation_loss_and_target_update():
+    drq = build("drq_sacfd", "cnn", shift_pixels=3, views=3)
+    assert isinstance(drq.augmentation, RandomViews)
+    augmentation = drq.augmentation
+    assert (augmentation.padding, augmentation.views, augmentation.target_views) == (3, 3, 2)
+    assert (drq.loss.views, drq.loss.target_views) == (3, 2)
+    assert drq.loss.contrastive is None
+    ferm = build("ferm_sacfd", "ferm", contrastive_weight=0.3, encoder_tau=0.2, tau=0.1)
+    assert ferm.augmentation.has_positive
+    assert ferm.augmentation.padding == 0
+    assert ferm.loss.contrastive.weight.shape == (8, 8)
+    assert ferm.loss.contrastive_weight == 0.3
+    assert isinstance(ferm.target_updater, SoftUpdateByNetwork)
+    assert ferm.target_updater.tau == 0.1
+    assert ferm.target_updater.taus == {"encoder_network_params": 0.2}
+    both = build("rad_sacfd", "cnn", augmentation="so2")
+    assert [type(part).__name__ for part in both.augmentation] == ["SO2Augmentation", "RandomViews"]
+
+
+def test_contrastive_pretraining_trains_the_encoder_only():
+    ferm = build("ferm_sacfd", "ferm")
+    ferm.extend(transitions(ferm))
+    before = parameters(ferm)
+    scalars = ferm.pretrain_update()
+    assert list(scalars.keys()) == ["loss_contrastive"]
+    assert ferm.updates == 1
+    after = parameters(ferm)
+    changed = {name for name in after if not torch.equal(after[name], before[name])}
+    encoder = {name for name in after if name.startswith("encoder_network")}
+    # the policy shares the encoder's convolutions, which have one name each
+    shared = {name for name in after if name.startswith("actor_network") and ".trunk." in name}
+    assert encoder
+    assert shared
+    assert changed == encoder | shared | {"contrastive.weight"}
+    losses = [float(ferm.pretrain_update()["loss_contrastive"]) for _ in range(60)]
+    assert sum(losses[-10:]) < sum(losses[:10])
+
+
+def test_pretraining_of_other_variants_takes_all_losses():
+    sac = build("sacfd", "cnn")
+    sac.extend(transitions(sac))
+    assert "loss_actor" in sac.pretrain_update()
+
+
+def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_training_them():
+    ferm = build("ferm_sacfd", "ferm")
+    ferm.extend(transitions(ferm))
+    for _ in range(2):
+        ferm.update()
+    loss = ferm.loss
+    actor = loss.actor_network_params["module", "0", "module", "trunk"]
+    encoder = loss.encoder_network_params["module", "trunk"]
+    for key, value in encoder.items(True, True):
+        assert value.data_ptr() == actor[key].data_ptr()
+    acting = ferm.policy.policy.get_submodule("module.0.module").trunk
+    assert {p.data_ptr() for p in acting.parameters()} == {
+        p.data_ptr() for p in encoder.values(True, True)
+    }
+    assert len({id(p) for p in loss.parameters()}) == len(list(loss.parameters()))
+    loss.zero_grad()
+    batch = ferm.sample()
+    loss(batch)["loss_actor"].backward()
+    assert all(value.grad is None for value in encoder.values(True, True))
+
+
+def test_the_acting_policy_sees_the_centre_of_larger_images():
+    ferm = build("ferm_sacfd", "ferm")
+    state = transitions(ferm).select(*ferm.observation_keys)
+    other = state.clone()
+    border = torch.ones(IMAGE, IMAGE, dtype=torch.bool)
+    border[3 : 3 + CROP, 3 : 3 + CROP] = False
+    other[keys.PIXELS][..., border] = 0.1
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        first, second = ferm.policy(state)[keys.ACTION], ferm.policy(other)[keys.ACTION]
+        other[keys.PIXELS][..., ~border] = 0.1
+        assert torch.equal(first, second)
+        assert not torch.equal(first, ferm.policy(other)[keys.ACTION])
+
+
+def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
+    stored = build("sacfd_so2", "cnn", stored_copies=4)
+    assert isinstance(stored, SAC)
+    data = transitions(stored)
+    stored.extend(data)
+    assert stored.replay_size == 5 * len(data)
+    assert isinstance(stored.augmentation, torch.nn.Identity)
+    sampled = build("sacfd_so2", "cnn")
+    sampled.extend(data)
+    assert sampled.replay_size == len(data)
+    assert not isinstance(sampled.augmentation, torch.nn.Identity)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"views": 2}, "need view_transform"),
+        ({"contrastive_weight": 1.0}, "need view_transform"),
+        ({"pretraining": "contrastive"}, "needs contrastive_weight"),
+        ({"stored_copies": 4}, "stored_copies needs augmentation"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        build("sacfd", "cnn", **changes)
+
+
+def test_a_crop_larger_than_the_image_is_refused():
+    problem = build("sac", "cnn").problem
+    settings = parse(ALGORITHMS["sac"], {"view_transform": "crop", "crop_size": 128}, "sac")
+    with pytest.raises(ConfigError, match=r"crop_size=128: .* only 64 px"):
+        settings.build(parse(NETWORKS["cnn"], {}, "cnn"), problem)
