@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, SerialEnv
 
 from ba_torchrl.envs.checks import check_actions
+from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.parallel import VectorEnv
 
@@ -76,6 +77,15 @@ def make_vector_env(
 
 class SerialVectorEnv(SeededVector, SerialEnv):
     """Environments that step sequentially in this process."""
+
+    def get_positions(self) -> list[Position]:
+        """Return the position of each environment; see `SeededVector.get_positions`."""
+        return [env.get_position() for env in self._envs]
+
+    def continue_from(self, positions: Sequence[Position]) -> None:
+        """Continue episodes; see `SeededVector.continue_from`."""
+        for env, position in zip(self._envs, positions, strict=True):
+            env.continue_from(position)
 
     def _seed_env(self, index: int, seed: int) -> None:
         self._envs[index].set_seed(seed, static_seed=True)

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
 from torchrl.envs.batched_envs import _run_worker_pipe_direct, _run_worker_pipe_shared_mem
 
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.worker import Worker, wait_until
 from ba_torchrl.errors import WorkerError
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 MakeEnv = Callable[[], EnvBase]
 
 _HEALTH_CHECK_S = 5e-3
+_STEP_S = 1.0
+"""Upper bound of the duration of a step that is repeated."""
 _LOST_STEP = {
     keys.REWARD: 0,
     keys.TERMINATED: False,
@@ -85,6 +88,15 @@ class VectorEnv(SeededVector, ParallelEnv):
         """Process ids of the workers, by environment."""
         return [worker.process.pid for worker in self.parent_channels]
 
+    def get_positions(self) -> list[Position]:
+        """Return the position of each environment; see `SeededVector.get_positions`."""
+        return self._ask_all("get_position", [()] * self.num_workers)
+
+    def continue_from(self, positions: Sequence[Position]) -> None:
+        """Continue episodes; see `SeededVector.continue_from`."""
+        steps = max(sum(map(len, position["actions"])) for position in positions)
+        self._ask_all("continue_from", [(position,) for position in positions], steps * _STEP_S)
+
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
@@ -119,6 +131,28 @@ class VectorEnv(SeededVector, ParallelEnv):
         if self._use_buffers and mask is not None and not mask.any():  # TorchRL would fail
             return self.shared_tensordict_parent.select(*self._selected_reset_keys_filt).clone()
         return super()._reset(tensordict, **kwargs)
+
+    def _ask_all(
+        self, method: str, arguments: Sequence[tuple[Any, ...]], extra_s: float = 0.0
+    ) -> list[Any]:
+        """Call a method of every environment and return the results.
+
+        Raises:
+            WorkerError: a worker failed; `step` then replaces it.
+        """
+        for worker, args in zip(self.parent_channels, arguments, strict=True):
+            worker.check()
+            worker.send((method, (args, {})))
+        results, failure = [], None
+        for worker in self.parent_channels:
+            try:
+                results.append(worker.read(self.timeout_s + extra_s)[1])
+            except WorkerError as error:
+                worker.abort()  # a late answer would be taken for that to the next command
+                failure = error
+        if failure is not None:
+            raise failure
+        return results
 
     def _seed_env(self, index: int, seed: int) -> None:
         self._replacements[index] = 0
