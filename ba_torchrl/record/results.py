@@ -38,6 +38,7 @@ NON_LEARNING_FIELDS = frozenset(
         "threads",
         "parallel",
         "start_method",
+        "save_minutes",
         "logger",
         "log_every",
         "video_episodes",

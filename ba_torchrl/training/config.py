@@ -82,6 +82,8 @@ class ExperimentConfig(StrictModel):
     report: Literal["last", "best"] = "last"
     """The reported policy: the last one, or that of the checkpoint with the best evaluation. The
     episodes of its evaluation differ from those that selected the checkpoint."""
+    save_minutes: float = Field(default=10.0, gt=0)
+    """Minutes after which the state for ``resume`` is saved, besides at every evaluation."""
     log_every: int = Field(default=50, ge=1)
     """Updates between rows of the losses."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"

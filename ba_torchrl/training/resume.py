@@ -1,9 +1,10 @@
-"""Resuming: the state of a run at its last evaluation, from which an interrupted run continues.
+"""Resuming: the saved state of a run, from which an interrupted run continues.
 
 Saved: the algorithm (networks, optimiser, schedules, generators), its replay with priorities, the
-process's random number generators, the learning curve and all counters. Not saved: the episodes in
-progress, which start again with other seeds, and the updates since the last evaluation, which are
-repeated. A resumed run is therefore another sample of the same run, not the same bits.
+process's random number generators, the learning curve, all counters, and the position of every
+environment in its episode. On a CPU, a resumed run therefore continues bit for bit, and repeats
+what came after the last save. If a worker process had failed when the state was saved, the episodes
+in progress are replaced by episodes of other seeds.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import torch
 from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 
 from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
 from ba_torchrl.training.checkpoint import read_config, write_config
@@ -52,6 +54,10 @@ class Progress:
     """Wall time until the state was saved."""
     resumed_at: list[int] = field(default_factory=list)
     """Updates after which the run was resumed."""
+    pending_updates: int = 0
+    """Updates still to be taken for the last step of collection."""
+    positions: list[Position] | None = None
+    """Position of each environment in its episodes; None before the collection starts."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything as plain values."""
@@ -67,7 +73,7 @@ class Progress:
 
 
 class ResumeState:
-    """The state that a run saves at every evaluation and deletes when it finishes; it is large.
+    """The state that a run saves regularly and deletes when it finishes; it is large.
 
     Each state gets its final name when it is complete on the disk, with checksums of its files. The
     last two are kept: if the newest is damaged, the run continues from the one before.
@@ -154,7 +160,7 @@ def open_run_folder(config: ExperimentConfig) -> None:
                 raise ConfigError(
                     f"{folder} has checkpoints, but nothing to resume from; choose another run_dir"
                 )
-            logger.warning("the run in %s has no evaluation yet: starting it again", folder)
+            logger.warning("the run in %s has no saved state yet: starting it again", folder)
     write_config(config)
 
 
