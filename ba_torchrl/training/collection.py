@@ -31,6 +31,9 @@ def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
         parallel=config.parallel,
         start_method=config.start_method,
         register_modules=config.plugins,
+        timeout_s=config.timeout_s,
+        max_restarts=config.max_restarts,
+        start_timeout_s=config.start_timeout_s,
         **{**config.env, "seed": seed, **changes},
     )
 

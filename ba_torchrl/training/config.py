@@ -56,6 +56,13 @@ class ExperimentConfig(StrictModel):
     """One process per environment, or all in the learner's process."""
     start_method: Literal["spawn", "fork"] = "spawn"
     """How these processes start."""
+    timeout_s: float = Field(default=60.0, gt=0)
+    """Seconds after which a process that does not answer is replaced."""
+    max_restarts: int = Field(default=5, ge=0)
+    """Largest number of failures in a row of a process: of attempts to start it, or of resets and
+    steps without a completed step."""
+    start_timeout_s: float = Field(default=120.0, gt=0)
+    """Seconds after which a process that does not start is replaced."""
     demonstrations: int = Field(default=100, ge=0)
     """Expert episodes in the replay before the first update; reference implementation."""
     demonstrations_source: Source = "expert"

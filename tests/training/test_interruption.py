@@ -43,7 +43,7 @@ SDQFD = {
     **SAC,
     "task": "open_loop/block_stacking",
     "env": {"obs_size": 32, "num_objects": 2},
-    "algorithm": {"name": "sdqfd", "batch_size": 4},
+    "algorithm": {"name": "spatial_q", "batch_size": 4},
     "network": {"name": "asr", "width": 0.125},
 }
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torchrl.checkpoint import GlobalRNGState
 
+from ba_torchrl.data.state_files import seal
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
@@ -268,6 +269,8 @@ def pretend_cuda(folder):
     assert any('"device":"cpu"' in content for content in text)
     for schema, content in zip(schemas, text, strict=True):
         schema.write_text(content.replace('"device":"cpu"', '"device":"cuda:0"'))
+    for state in (folder / "resume").iterdir():
+        seal(state)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a machine without a GPU")

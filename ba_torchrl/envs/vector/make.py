@@ -29,6 +29,7 @@ def make_vector_env(
     use_buffers: bool | None = None,
     timeout_s: float = 60.0,
     max_restarts: int = 5,
+    start_timeout_s: float = 120.0,
 ) -> SerialVectorEnv | VectorEnv:
     """Return ``num_envs`` environments as one, with batch size [num_envs], ready to be reset.
 
@@ -45,8 +46,8 @@ def make_vector_env(
         use_buffers: whether data pass through shared memory (the default, faster for steps of a
             few milliseconds) or through pipes.
         timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: largest number of consecutive replacements of a worker without a completed
-            step.
+        max_restarts: largest number of failures in a row of a worker; see `VectorEnv`.
+        start_timeout_s: seconds after which a worker that does not start is replaced.
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.
@@ -63,6 +64,7 @@ def make_vector_env(
             make_env,
             timeout_s=timeout_s,
             max_restarts=max_restarts,
+            start_timeout_s=start_timeout_s,
             mp_start_method=start_method,
             num_threads=num_threads,
             use_buffers=True if use_buffers is None else use_buffers,
