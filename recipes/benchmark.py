@@ -41,7 +41,12 @@ def main(settings: DictConfig) -> None:
     # the runs end with this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     failures = run_all(runs, jobs=config.jobs, max_hours=config.max_hours)
-    print(f"{len(runs) - len(failures)} of {len(runs)} runs done in {config.folder}")
+    states = {run.run_dir: status(run) for run in runs}
+    done = sum(state.state == "done" for state in states.values())
+    print(f"{done} of {len(runs)} runs done in {config.folder}")
+    for folder, state in states.items():
+        if state.state == "running":
+            print(f"  running {folder}: {state.detail}")
     for folder, reason in failures.items():
         print(f"  failed  {folder}: {reason}")
     if failures:

@@ -125,7 +125,8 @@ def read_result(folder: str | Path) -> RunResult:
     try:
         return RunResult.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        raise ValueError(f"{path} is not the result of a run: {error}") from None
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{path} is not the result of a run: {reason}") from None
 
 
 def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
@@ -143,18 +144,21 @@ def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
 
 
 def read_failure(folder: str | Path) -> str | None:
-    """Return why a benchmark's last run in a folder failed, None if it did not fail.
-
-    Raises:
-        ValueError: the file is not the record of a failure.
-    """
+    """Return why a benchmark's last run in a folder failed, None if it did not fail."""
     path = Path(folder) / FAILURE_FILE
     try:
         return str(json.loads(path.read_text(encoding="utf-8"))["reason"])
     except FileNotFoundError:
         return None
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not the record of a failure: {error}") from None
+    except (ValueError, KeyError, TypeError):
+        return f"{FAILURE_FILE} is damaged"
+
+
+def why_unfinished(folder: str | Path) -> str:
+    """Return why a run folder holds no result that can be read."""
+    if (Path(folder) / RESULT_FILE).exists():
+        return f"{RESULT_FILE} is damaged"
+    return read_failure(folder) or "interrupted"
 
 
 def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

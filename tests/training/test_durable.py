@@ -15,7 +15,7 @@ from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.state_files import CHECKSUMS_FILE, _fingerprint
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.record.results import read_failure, read_result
+from ba_torchrl.record.results import read_result
 from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
@@ -209,7 +209,6 @@ def test_an_object_declared_in_a_data_set_is_not_unpickled(demonstrations, tmp_p
     [
         ("config.json", read_config),
         ("result.json", read_result),
-        ("failure.json", read_failure),
         ("scalars.csv", read_scalars),
     ],
 )
