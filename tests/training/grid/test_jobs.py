@@ -134,7 +134,7 @@ def test_jobs_run_at_the_same_time(tmp_path, fake):
 
 def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
     runs = planned(tmp_path)
-    processes = []
+    processes, interrupted = [], []
     start = subprocess.Popen
 
     def remember(*args, **kwargs):
@@ -142,7 +142,8 @@ def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
         return processes[-1]
 
     def interrupt(seconds):
-        if calls(runs[0]):
+        if calls(runs[0]) and not interrupted:
+            interrupted.append(True)
             raise KeyboardInterrupt
 
     monkeypatch.setattr(jobs.subprocess, "Popen", remember)
