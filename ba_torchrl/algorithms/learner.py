@@ -61,6 +61,11 @@ class LearnerConfig(AlgorithmConfig):
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
 
+    @property
+    def capacity(self) -> int:
+        """Largest number of transitions in the replay."""
+        return self.buffer_size * (2 if self.replay == "symmetric" else 1)
+
 
 class Learner(Algorithm):
     """Networks, a loss, an optimiser and a replay.

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from ba_torchrl import __version__
 from ba_torchrl.data.demos import Source, source_config
-from ba_torchrl.data.state_files import check, publish, seal, write_text
+from ba_torchrl.data.state_files import check, check_space, publish, seal, write_text
 from ba_torchrl.envs.factory import resolve
 from ba_torchrl.errors import ConfigError
 
@@ -58,7 +58,9 @@ def save_demonstrations(
     ]
     scratch = path.with_name(f".{path.name}.scratch")
     shutil.rmtree(scratch, ignore_errors=True)
-    torch.cat(numbered).memmap(scratch, copy_existing=True)
+    data = torch.cat(numbered)
+    check_space(path, list(data.values(True, True)))
+    data.memmap(scratch, copy_existing=True)
     metadata = {
         "task": task,
         "env": _env_values(task, env),

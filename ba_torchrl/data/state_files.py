@@ -7,14 +7,17 @@ which unpickle some of them, find none.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 from torchrl.checkpoint import StateDictCheckpointAdapter
 
 from ba_torchrl.errors import ConfigError, DamagedFilesError
@@ -22,6 +25,8 @@ from ba_torchrl.errors import ConfigError, DamagedFilesError
 CHECKSUMS_FILE = "checksums.json"
 _DATA_SUFFIXES = frozenset({".json", ".memmap"})
 _CHUNK = 1 << 20
+_RESERVE = 10_000_000
+"""Bytes for all files besides the tensors, and for tensors that take whole blocks."""
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -107,7 +112,11 @@ def write_state(folder: str | Path, state: dict[str, Any]) -> None:
     Args:
         folder: created if needed.
         state: as ``state_dict`` returns.
+
+    Raises:
+        OSError: there is not enough space.
     """
+    check_space(folder, state)
     _ADAPTER.save(_State(state), Path(folder), args=(), kwargs={})
 
 
@@ -123,6 +132,36 @@ def read_state(folder: str | Path) -> dict[str, Any]:
     holder = _State({})
     _ADAPTER.load(holder, folder, map_location="cpu", tensor_load_kwargs={}, args=(), kwargs={})
     return holder.state
+
+
+def check_space(folder: str | Path, state: Any) -> None:
+    """Check that the tensors of a state fit on the disk.
+
+    Writing a memory map to a full disk would end the process (SIGBUS).
+
+    Args:
+        folder: which need not exist.
+        state: nested dictionaries and sequences with tensors.
+
+    Raises:
+        OSError: there is not enough space.
+    """
+    existing = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
+    needed, free = _bytes(state) + _RESERVE, shutil.disk_usage(existing).free
+    if needed > free:
+        raise OSError(
+            errno.ENOSPC,
+            f"{needed / 1e6:.0f} MB are needed, {free / 1e6:.0f} MB are free",
+            str(existing),
+        )
+
+
+def _bytes(state: Any) -> int:
+    if isinstance(state, torch.Tensor | np.ndarray):
+        return state.nbytes
+    if isinstance(state, Mapping):
+        return sum(map(_bytes, state.values()))
+    return sum(map(_bytes, state)) if isinstance(state, list | tuple) else 0
 
 
 class _State:

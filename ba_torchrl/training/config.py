@@ -50,7 +50,7 @@ class ExperimentConfig(StrictModel):
     """Where the learner runs; "auto" takes a GPU if there is one."""
     threads: int | None = Field(default=None, ge=1)
     """torch threads of the learner; None leaves torch's choice."""
-    num_envs: int = Field(default=5, ge=1)
+    num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool = True
     """One process per environment, or all in the learner's process."""
@@ -99,7 +99,7 @@ class ExperimentConfig(StrictModel):
     """Greedy episodes in the video at the end."""
     label: str = "run"
     """Name of the curve in plots, such as "sacfd equi"."""
-    run_dir: str = "runs/run"
+    run_dir: str = Field(default="runs/run", min_length=1)
     """Folder of the run's files."""
     resume: bool = False
     """Continue the run in that folder if it was interrupted."""
@@ -178,6 +178,12 @@ class ExperimentConfig(StrictModel):
             raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
         if config.pretrain_updates and not config.demonstrations:
             raise ConfigError("pretrain_updates needs demonstrations")
+        capacity = getattr(config.algorithm_config, "capacity", None)
+        if capacity is not None and config.min_replay > capacity:
+            raise ConfigError(
+                f"min_replay: {config.min_replay} transitions are more than the replay holds "
+                f"({capacity}); the run would never start to learn"
+            )
         config._check_demonstrations()
         if not is_available(config.logger):
             raise ConfigError(
@@ -185,8 +191,8 @@ class ExperimentConfig(StrictModel):
                 f"pip install 'ba-torchrl[{config.logger}]'"
             )
         try:
-            torch.empty(0, device=config.torch_device)
-        except (RuntimeError, AssertionError) as error:
+            torch.zeros(1, device=config.torch_device).item()
+        except (RuntimeError, AssertionError, NotImplementedError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
         return config.model_copy(update={"plugins": config._all_plugins()})

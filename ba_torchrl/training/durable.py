@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointLoadResult
 
-from ba_torchrl.data.state_files import check, publish, seal
+from ba_torchrl.data.state_files import check, check_space, publish, seal
 from ba_torchrl.errors import ConfigError, DamagedFilesError
 
 logger = logging.getLogger(__name__)
@@ -24,8 +24,15 @@ class DurableCheckpoint(Checkpoint):
     """
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """Write a checkpoint; see TorchRL."""
+        """Write a checkpoint; see TorchRL.
+
+        Raises:
+            OSError: there is not enough space.
+        """
         path = Path(path)
+        for component in self.components.values():
+            if hasattr(component, "state_dict"):
+                check_space(path, component.state_dict())
         scratch = path.with_name(f".{path.name}.scratch")
         shutil.rmtree(scratch, ignore_errors=True)
         try:

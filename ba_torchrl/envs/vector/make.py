@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Literal
 
 from tensordict import TensorDictBase
@@ -12,10 +15,14 @@ from ba_torchrl.envs.checks import check_actions
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.parallel import VectorEnv
+from ba_torchrl.errors import ConfigError
 
 __all__ = ["SerialVectorEnv", "VectorEnv", "check_actions", "make_vector_env"]
 
 MakeEnv = Callable[[], EnvBase]
+
+MAX_ENVS = 1024
+_SHARED_MEMORY = Path("/dev/shm")
 
 
 def make_vector_env(
@@ -51,12 +58,16 @@ def make_vector_env(
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.
+        ConfigError: there are not enough file handles, processes or shared memory for
+            ``num_envs``.
         RuntimeError: a worker could not be started.
     """
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, got {num_envs}")
     if not callable(make_env) and len(make_env) != num_envs:
         raise ValueError(f"{len(make_env)} functions were given for {num_envs} environments")
+    if num_envs > MAX_ENVS:
+        raise ConfigError(f"num_envs: at most {MAX_ENVS}, the number of worlds of PyBullet")
     env: SerialVectorEnv | VectorEnv
     if parallel:
         env = VectorEnv(
@@ -71,10 +82,37 @@ def make_vector_env(
         )
     else:
         env = SerialVectorEnv(num_envs, make_env)
-    env.start()
+    try:
+        if parallel and env._use_buffers:
+            _check_shared_memory(env)
+        env.start()
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM):
+            raise
+        raise ConfigError(
+            f"{num_envs} processes cannot be started ({error.strerror}): lower num_envs, or raise "
+            "the limits that `ulimit -n` and `ulimit -u` show"
+        ) from error
     if seed is not None:
         env.set_seed(seed)
     return env
+
+
+def _check_shared_memory(env: VectorEnv) -> None:
+    """Check the space for the observations of all workers; too little would end this process.
+
+    Raises:
+        ConfigError: there is not enough.
+    """
+    if not _SHARED_MEMORY.is_dir():
+        return
+    needed = sum(value.nbytes for value in env.fake_tensordict().values(True, True))
+    free = shutil.disk_usage(_SHARED_MEMORY).free
+    if needed > free:
+        raise ConfigError(
+            f"{_SHARED_MEMORY} has {free / 1e6:.1f} MB free, {env.num_workers} environments need "
+            f"{needed / 1e6:.1f} MB: lower num_envs, or enlarge it (docker run --shm-size)"
+        )
 
 
 class SerialVectorEnv(SeededVector, SerialEnv):
