@@ -112,7 +112,7 @@ def test_imports_go_one_way(module):
 
 
 SIM = (
-    {"geometry"},
+    {"geometry", "display"},
     {"contacts", "meshes"},
     {"shapes"},
     {"assets", "bodies"},
