@@ -51,6 +51,9 @@ def make_vector_env(
     parallel: bool = True,
     start_method: str = "spawn",
     register_modules: Sequence[str | ModuleType] = (),
+    timeout_s: float = 60.0,
+    max_restarts: int = 5,
+    start_timeout_s: float = 120.0,
     **config: Any,
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.
@@ -65,6 +68,10 @@ def make_vector_env(
         register_modules: modules outside the package that each process imports before it makes its
             environment, such as ``["my_tasks"]``. Those that register the task and the robot are
             found without being named.
+        timeout_s: seconds after which a process that does not answer is replaced.
+        max_restarts: largest number of failures in a row of a process, of attempts to start it or
+            without a completed step.
+        start_timeout_s: seconds after which a process that does not start is replaced.
         config: as for `make`.
 
     Raises:
@@ -78,5 +85,8 @@ def make_vector_env(
         parallel=parallel,
         start_method=start_method,
         register_modules=register_modules,
+        timeout_s=timeout_s,
+        max_restarts=max_restarts,
+        start_timeout_s=start_timeout_s,
         **config,
     )

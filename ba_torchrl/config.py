@@ -53,9 +53,9 @@ def parse(model: type[Model], values: dict[str, Any], what: str) -> Model:
 
 
 class StrictModel(BaseModel):
-    """Immutable settings that refuse unknown names and wrong types."""
+    """Immutable settings that refuse unknown names, wrong types and infinite numbers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 Rgb = tuple[float, float, float]
@@ -132,13 +132,11 @@ class EnvConfig(StrictModel):
     """Close loop: the objects lie in a tray as in Object Grasping."""
     view_type: str = Field(default="camera_center_xyz", json_schema_extra=_CLOSE_LOOP)
     """Close loop: view of the depth image; see `ba_torchrl.sim.vision.views`."""
-    view_scale: float = Field(default=1.5, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
+    view_scale: float = Field(default=1.5, gt=0, le=100, json_schema_extra=_CLOSE_LOOP)
     """Close loop: width of the image as a multiple of the workspace's width."""
-    dpos: float = Field(default=0.05, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP)
+    dpos: float = Field(default=0.05, gt=0, le=1, json_schema_extra=_CLOSE_LOOP)
     """Close loop: displacement along an axis at action 1."""
-    drot: float = Field(
-        default=math.pi / 4, gt=0, allow_inf_nan=False, json_schema_extra=_CLOSE_LOOP
-    )
+    drot: float = Field(default=math.pi / 4, gt=0, le=2 * math.pi, json_schema_extra=_CLOSE_LOOP)
     """Close loop: change of yaw at action 1."""
     obs_type: Literal["pixel", "vec"] = "pixel"
     """Observe an image, or the poses of gripper and objects as a vector."""
@@ -163,7 +161,7 @@ class EnvConfig(StrictModel):
     """Custom physics: length of a physics step."""
     solver_iterations: int | None = Field(default=None, ge=1)
     """Custom physics: iterations of the contact solver in each step."""
-    solver_residual: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+    solver_residual: float | None = Field(default=None, ge=0)
     """Custom physics: residual at which the solver stops early; 0, the default, keeps episodes and
     restored states exact to the last bit."""
     expert: bool = False

@@ -14,6 +14,10 @@ class UnknownNameError(ConfigError, KeyError):
         return str(self.args[0])
 
 
+class DamagedFilesError(ConfigError):
+    """Files that are incomplete or altered; the message names the first one."""
+
+
 class InvalidActionError(ValueError):
     """An action of the wrong shape, or one that is not finite."""
 

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from ba_torchrl.config import parse
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.command_line import plain_errors
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 
@@ -23,6 +24,7 @@ hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="benchmark", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
     limit_library_logs()
@@ -41,7 +43,12 @@ def main(settings: DictConfig) -> None:
     # the runs end with this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     failures = run_all(runs, jobs=config.jobs, max_hours=config.max_hours)
-    print(f"{len(runs) - len(failures)} of {len(runs)} runs done in {config.folder}")
+    states = {run.run_dir: status(run) for run in runs}
+    done = sum(state.state == "done" for state in states.values())
+    print(f"{done} of {len(runs)} runs done in {config.folder}")
+    for folder, state in states.items():
+        if state.state == "running":
+            print(f"  running {folder}: {state.detail}")
     for folder, reason in failures.items():
         print(f"  failed  {folder}: {reason}")
     if failures:

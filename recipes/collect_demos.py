@@ -20,15 +20,20 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs, progress_bar
 from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors
 
 hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="collect_demos", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Play the expert's episodes and write them as a memory-mapped TensorDict."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_counts(settings, "episodes", "num_envs")
+    check_counts(settings, "replays", "seed", least=0)
+    check_writable(settings.path)
     if Path(settings.path).exists():
         raise ConfigError(f"{settings.path} exists already; choose another path")
     env_settings = OmegaConf.to_container(settings.env, resolve=True)

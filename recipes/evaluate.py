@@ -15,16 +15,24 @@ from ba_torchrl import make_vector_env  # noqa: E402
 from ba_torchrl.algorithms.seeds import SeedUse  # noqa: E402
 from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
-from ba_torchrl.record.video import write_video  # noqa: E402
+from ba_torchrl.record.video import check_video, write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
+from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors  # noqa: E402
 from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes  # noqa: E402
+
+FPS = 5
 
 
 @hydra.main(config_path="../configs", config_name="evaluate", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Play greedy episodes with the policy of a checkpoint."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_counts(settings, "episodes", "num_envs", "video_episodes")
+    if settings.video is not None:
+        check_video(settings.video, FPS)
+        check_writable(settings.video)
     checkpoint = find_checkpoint(settings.checkpoint, settings.which)
     config, algorithm = load(checkpoint, device=settings.device)
     policy = acting_on(algorithm.policy, config.torch_device)
@@ -53,7 +61,7 @@ def main(settings: DictConfig) -> None:
     print(f"  episodes  seed {seed}{chosen}")
     if settings.video is not None:
         frames = record_episodes(config.task, config.env, policy, settings.video_episodes, seed)
-        print(f"  video     {write_video(settings.video, frames, fps=5)}")
+        print(f"  video     {write_video(settings.video, frames, fps=FPS)}")
 
 
 if __name__ == "__main__":

@@ -17,17 +17,26 @@ from ba_torchrl.data.demos import expert_scores
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
+from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors
 
 hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="experts", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Play the experts' episodes and print their success and length."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_counts(settings, "episodes", "num_envs")
+    check_counts(settings, "seed", least=0)
+    if settings.path is not None:
+        check_writable(settings.path)
+    for robot in settings.robots:
+        _ = ROBOTS[robot]  # raises with the known names
     variants = OmegaConf.to_container(settings.variants, resolve=True)
     tables = []
     for table, columns in variants.items():

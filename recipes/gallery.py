@@ -13,9 +13,11 @@ from tqdm import tqdm
 from ba_torchrl import list_tasks
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
+from ba_torchrl.training.command_line import plain_errors
 
 
 @hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Play one episode per task and write its pictures."""
     load_plugins(settings.plugins)

@@ -15,8 +15,9 @@ from ba_torchrl.data.demos import expert_policy
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
-from ba_torchrl.record.video import write_video
+from ba_torchrl.record.video import check_video, write_video
 from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors
 from ba_torchrl.training.evaluation import record_episodes
 
 POLICIES = {"expert": expert_policy, "random": None}
@@ -25,12 +26,18 @@ hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="play", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Play episodes and write a video of them."""
     limit_library_logs()
     load_plugins(settings.plugins)
     if settings.policy not in POLICIES:
         raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
+    check_counts(settings, "episodes")
+    check_counts(settings, "seed", least=0)
+    if settings.video is not None:
+        check_video(settings.video, settings.fps)
+        check_writable(settings.video)
     torch.manual_seed(settings.seed)
     env = OmegaConf.to_container(settings.env, resolve=True)
     frames = record_episodes(

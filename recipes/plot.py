@@ -9,9 +9,11 @@ from omegaconf import DictConfig
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.training.checkpoint import read_config
+from ba_torchrl.training.command_line import plain_errors
 
 
 @hydra.main(config_path="../configs", config_name="plot", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Plot the success rate of the greedy policies against the updates."""
     curves = {}

@@ -11,9 +11,11 @@ import hydra
 from omegaconf import DictConfig
 
 from ba_torchrl.record.report import write_report
+from ba_torchrl.training.command_line import plain_errors
 
 
 @hydra.main(config_path="../configs", config_name="report", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Write the report and print its tables."""
     roots = [settings.runs] if isinstance(settings.runs, str) else list(settings.runs)

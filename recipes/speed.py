@@ -15,9 +15,11 @@ from omegaconf import DictConfig  # noqa: E402
 from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.profiling.table import as_markdown, machine, measure  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
+from ba_torchrl.training.command_line import plain_errors  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="speed", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Measure, and print a table with the budgets."""
     limit_library_logs()

@@ -10,9 +10,11 @@ from omegaconf import DictConfig
 
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.task_page import task_page
+from ba_torchrl.training.command_line import plain_errors
 
 
 @hydra.main(config_path="../configs", config_name="tasks", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Write the page."""
     load_plugins(settings.plugins)

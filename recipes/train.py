@@ -17,18 +17,25 @@ from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
 from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
 from ba_torchrl.training import hydra_schema  # noqa: E402
+from ba_torchrl.training.command_line import plain_errors  # noqa: E402
 from ba_torchrl.training.config import ExperimentConfig  # noqa: E402
 from ba_torchrl.training.experiment import Experiment  # noqa: E402
+from ba_torchrl.training.interruption import RunStopped  # noqa: E402
 
 hydra_schema.register(sys.argv[1:])
 
 
 @hydra.main(config_path="../configs", config_name="train", version_base="1.3")
+@plain_errors
 def main(settings: DictConfig) -> None:
     """Run or resume the experiment of the configuration."""
     limit_library_logs()
     config = ExperimentConfig.parse(OmegaConf.to_container(settings, resolve=True))
-    result = Experiment(config).run()
+    try:
+        result = Experiment(config).run()
+    except RunStopped as stopped:
+        print(stopped, file=sys.stderr)
+        raise
     evaluation = result.evaluation
     print(f"success_rate {evaluation.success_rate:.2f} over {evaluation.episodes} episodes")
     print(

@@ -116,7 +116,7 @@ def test_imports_go_one_way(module):
 
 
 SIM = (
-    {"geometry"},
+    {"geometry", "display"},
     {"contacts", "meshes"},
     {"shapes"},
     {"assets", "bodies"},

@@ -73,6 +73,11 @@ class LearnerConfig(AlgorithmConfig):
         """Whether the run must take updates before the first collection."""
         return self.init == "bc"
 
+    @property
+    def capacity(self) -> int:
+        """Largest number of transitions in the replay."""
+        return self.buffer_size * (2 if self.replay == "symmetric" else 1)
+
 
 class Learner(Algorithm):
     """Networks, a loss, an optimiser and a replay.

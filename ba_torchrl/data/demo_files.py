@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from tensordict import TensorDict
 
 from ba_torchrl import __version__
 from ba_torchrl.data.demos import Source, source_config
+from ba_torchrl.data.state_files import check, check_space, publish, seal, write_text
 from ba_torchrl.envs.factory import resolve
 from ba_torchrl.errors import ConfigError
 
@@ -31,8 +33,10 @@ def save_demonstrations(
 ) -> None:
     """Write episodes as one memory-mapped TensorDict, with their task and parameters.
 
+    The folder appears when it is complete on the disk, with checksums of its files.
+
     Args:
-        path: a new folder.
+        path: a new or empty folder.
         episodes: TensorDicts [T].
         task: id of the task.
         env: fields of `EnvConfig` that were set.
@@ -46,13 +50,17 @@ def save_demonstrations(
     if not episodes:
         raise ValueError("there are no episodes to save")
     path = Path(path)
-    if (path / _METADATA_FILE).exists():
-        raise FileExistsError(f"{path} holds demonstrations; choose another folder")
+    if path.exists() and any(path.iterdir()):
+        raise FileExistsError(f"{path} is not empty; choose another folder")
     numbered = [
         episode.copy().set(_EPISODE, torch.full((len(episode), 1), number))
         for number, episode in enumerate(episodes)
     ]
-    torch.cat(numbered).memmap(path, copy_existing=True)
+    scratch = path.with_name(f".{path.name}.scratch")
+    shutil.rmtree(scratch, ignore_errors=True)
+    data = torch.cat(numbered)
+    check_space(path, list(data.values(True, True)))
+    data.memmap(scratch, copy_existing=True)
     metadata = {
         "task": task,
         "env": _env_values(task, env),
@@ -65,7 +73,9 @@ def save_demonstrations(
             "torchrl": torchrl.__version__,
         },
     }
-    (path / _METADATA_FILE).write_text(json.dumps(metadata, indent=2) + "\n")
+    write_text(scratch / _METADATA_FILE, json.dumps(metadata, indent=2) + "\n")
+    seal(scratch)
+    publish(scratch, path)
 
 
 def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> list[TensorDict]:
@@ -77,13 +87,16 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
         env: fields of `EnvConfig` of the environments.
 
     Raises:
-        ConfigError: there are none at ``path``, or task or parameters differ; the message names
-            every difference.
+        ConfigError: there are none at ``path``, their files are damaged, or task or parameters
+            differ; the message names every difference.
     """
     path = Path(path)
     check_demonstrations(path, task=task, env=env)
-    data = TensorDict.load_memmap(path)
-    numbers = data[_EPISODE].squeeze(-1)
+    try:
+        data = TensorDict.load_memmap(path, allow_pickle=False)
+        numbers = data[_EPISODE].squeeze(-1)
+    except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path} does not hold episodes: {error}") from error
     return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
 
 
@@ -96,15 +109,19 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
         env: fields of `EnvConfig` of the environments.
 
     Raises:
-        ConfigError: there are none at ``path``, or task or parameters differ; the message names
-            every difference.
+        ConfigError: there are none at ``path``, their files are damaged, or task or parameters
+            differ; the message names every difference.
     """
     path = Path(path)
     try:
-        metadata = json.loads((path / _METADATA_FILE).read_text())
-    except (OSError, json.JSONDecodeError) as error:
+        metadata = json.loads((path / _METADATA_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
-    if not {"task", "env"} <= metadata.keys():
+    check(path)
+    kinds = {"task": str, "env": dict}
+    if not isinstance(metadata, dict) or any(
+        not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
+    ):
         raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
     # A field that is missing in the file was added later and has its default value.
     found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}

@@ -12,6 +12,7 @@ from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
@@ -25,7 +26,7 @@ HALF_TURN = (-math.pi / 2, math.pi / 2)
 
 
 @CONTROLS.register("close_loop")
-class CloseLoopEnv(ManipulationEnv):
+class CloseLoopEnv(RecordedPosition, ManipulationEnv):
     """A task under close-loop control (paper section 3.2, appendix A.2, G.2).
 
     An action moves the tool by at most `dpos` along each axis and turns it by at most `drot`,

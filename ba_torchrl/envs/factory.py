@@ -62,6 +62,9 @@ def make_vector(
     parallel: bool,
     start_method: str,
     register_modules: Sequence[str | ModuleType] = (),
+    timeout_s: float = 60.0,
+    max_restarts: int = 5,
+    start_timeout_s: float = 120.0,
     **config: Any,
 ) -> EnvBase:
     """Make environments that step together; see `ba_torchrl.make_vector_env`."""
@@ -76,6 +79,9 @@ def make_vector(
         seed=settings.seed,
         parallel=parallel,
         start_method=start_method,
+        timeout_s=timeout_s,
+        max_restarts=max_restarts,
+        start_timeout_s=start_timeout_s,
     )
 
 

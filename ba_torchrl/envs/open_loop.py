@@ -16,6 +16,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
 from ba_torchrl.envs.episodes import SETTLE_STEPS
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.rendering import ArmDisplay, RelativePoint
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import ConfigError
@@ -36,7 +37,7 @@ HOME_TOLERANCE_RAD = 1e-6
 
 
 @CONTROLS.register("open_loop")
-class OpenLoopEnv(ManipulationEnv):
+class OpenLoopEnv(RecordedPosition, ManipulationEnv):
     """A task under open-loop control (paper section 3.2, appendix A.1, G.1).
 
     An action is a pose and a primitive. A pick with an object in the gripper and a place without

@@ -150,7 +150,7 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
     path = Path(path)
     if path.is_dir():
         path /= SCALARS_FILE
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8", errors="replace")
     rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
     if tuple(next(rows, ())) != _COLUMNS:
         raise ValueError(f"{path} does not start with the columns {', '.join(_COLUMNS)}")

@@ -17,7 +17,7 @@ from typing import Any
 from jinja2 import Environment
 
 from ba_torchrl.record.plots import plot_panels
-from ba_torchrl.record.results import now, read_failure
+from ba_torchrl.record.results import now, why_unfinished
 from ba_torchrl.record.summary import (
     COLUMNS,
     CONFIDENCE,
@@ -56,7 +56,6 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: there is no finished run.
-        ValueError: a result cannot be read.
     """
     sections, unfinished = load_sections(roots)
     folder = Path(folder)
@@ -68,8 +67,7 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
         writer.writeheader()
         writer.writerows(row for table in tables for row in table)
     left_out = [
-        {"path": _relative(path, folder), "reason": read_failure(path) or "interrupted"}
-        for path in unfinished
+        {"path": _relative(path, folder), "reason": why_unfinished(path)} for path in unfinished
     ]
     texts = [_markdown(section, table) for section, table in zip(sections, tables, strict=True)]
     if left_out:

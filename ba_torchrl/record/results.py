@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError
 
 from ba_torchrl import __version__
 from ba_torchrl.config import StrictModel
+from ba_torchrl.data.state_files import write_text
 
 RESULT_FILE = "result.json"
 CONFIG_FILE = "config.json"
@@ -37,6 +38,10 @@ NON_LEARNING_FIELDS = frozenset(
         "threads",
         "parallel",
         "start_method",
+        "timeout_s",
+        "max_restarts",
+        "start_timeout_s",
+        "save_minutes",
         "logger",
         "log_every",
         "video_episodes",
@@ -106,11 +111,7 @@ class RunResult(StrictModel):
 
 def write_result(folder: str | Path, result: RunResult) -> Path:
     """Write ``result.json`` into a run folder, atomically."""
-    path = Path(folder) / RESULT_FILE
-    scratch = path.with_suffix(".tmp")
-    scratch.write_text(result.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    os.replace(scratch, path)
-    return path
+    return write_text(Path(folder) / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
 
 
 def read_result(folder: str | Path) -> RunResult:
@@ -122,9 +123,10 @@ def read_result(folder: str | Path) -> RunResult:
     """
     path = Path(folder) / RESULT_FILE
     try:
-        return RunResult.model_validate_json(path.read_text(encoding="utf-8"))
+        return RunResult.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        raise ValueError(f"{path} is not the result of a run: {error}") from None
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{path} is not the result of a run: {reason}") from None
 
 
 def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
@@ -144,7 +146,19 @@ def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
 def read_failure(folder: str | Path) -> str | None:
     """Return why a benchmark's last run in a folder failed, None if it did not fail."""
     path = Path(folder) / FAILURE_FILE
-    return json.loads(path.read_text(encoding="utf-8"))["reason"] if path.exists() else None
+    try:
+        return str(json.loads(path.read_text(encoding="utf-8"))["reason"])
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError):
+        return f"{FAILURE_FILE} is damaged"
+
+
+def why_unfinished(folder: str | Path) -> str:
+    """Return why a run folder holds no result that can be read."""
+    if (Path(folder) / RESULT_FILE).exists():
+        return f"{RESULT_FILE} is damaged"
+    return read_failure(folder) or "interrupted"
 
 
 def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -5,6 +5,7 @@ Runs with different settings are not averaged; their methods get different names
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from ba_torchrl.record.results import (
     read_result,
     run_folders,
 )
+
+logger = logging.getLogger(__name__)
 
 CONFIDENCE = 0.95
 RESAMPLES = 9999
@@ -120,25 +123,31 @@ def load_sections(roots: Iterable[str | Path]) -> tuple[list[Section], list[Path
 
     Returns:
         Sections in the order of the benchmarks' names, runs without a benchmark last; and the
-        folders of unfinished runs.
+        folders of unfinished runs, those with a damaged result included.
 
     Raises:
         FileNotFoundError: a folder is missing, or none holds a finished run.
-        ValueError: a result cannot be read, or a run is found twice.
+        ValueError: a run is found twice.
     """
     roots = [Path(root) for root in roots]
     for root in roots:
         if not root.is_dir():
             raise FileNotFoundError(f"there is no folder {root}")
     finished, unfinished = run_folders(roots)
-    if not finished:
+    runs = []
+    for folder in finished:
+        try:
+            runs.append(Run(folder, read_result(folder)))
+        except ValueError as error:
+            logger.warning("left out: %s", error)
+            unfinished.append(folder)
+    if not runs:
         raise FileNotFoundError(
             f"no finished run below {', '.join(map(str, roots))}: "
             "a run leaves its result.json when it ends"
         )
     by_title: dict[str, list[Run]] = {}
-    for folder in finished:
-        run = Run(folder, read_result(folder))
+    for run in runs:
         by_title.setdefault(run.result.benchmark or OTHER_RUNS, []).append(run)
     titles = sorted(by_title, key=lambda title: (title == OTHER_RUNS, title))
     return [Section(title, _grouped(by_title[title])) for title in titles], unfinished

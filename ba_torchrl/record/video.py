@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.errors import ConfigError
 
 _SUFFIXES = (".mp4", ".gif")
 _GIF_COLORS = 128
@@ -45,6 +47,23 @@ class FrameRecorder:
         self.record()
 
 
+def check_video(path: str | Path, fps: float) -> None:
+    """Check the name and the speed of a video.
+
+    Args:
+        path: ends in ``.mp4`` or ``.gif``.
+        fps: frames per second.
+
+    Raises:
+        ConfigError: the suffix is unknown, or ``fps`` is not a positive number.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ConfigError(f"a video ends in {' or '.join(_SUFFIXES)}, not {path.name!r}")
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < math.inf:
+        raise ConfigError(f"fps must be positive, got {fps!r}")
+
+
 def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> Path:
     """Write images as a video.
 
@@ -64,10 +83,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise ValueError(f"a video ends in {' or '.join(_SUFFIXES)}, not {path.name!r}")
-    if not fps > 0:
-        raise ValueError(f"fps must be positive, got {fps}")
+    check_video(path, fps)
     pictures = _checked(frames)
     try:
         import imageio

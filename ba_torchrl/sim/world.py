@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import tempfile
 import weakref
@@ -16,6 +15,7 @@ import pybullet_data
 from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.articulated import ArticulatedBody, ArticulatedLink, PrismaticJoint
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.display import why_no_display
 from ba_torchrl.sim.shapes import Color, Shape
 
 
@@ -318,10 +318,10 @@ def _enable_collisions(client: int, body: int, is_static: bool) -> None:
 
 def _connect_window() -> int:
     """Open PyBullet's window and return its client."""
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        # PyBullet would terminate the process
+    reason = why_no_display() if sys.platform.startswith("linux") else None
+    if reason is not None:
         raise SimulationError(
-            "render=True opens a window, but there is no display (DISPLAY is not set): use "
+            f"render=True opens a window, but there is no display ({reason}): use "
             "env.render() for images, or run under a virtual display such as xvfb-run"
         )
     try:

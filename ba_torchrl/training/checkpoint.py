@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import json
-import os
+import math
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Algorithm, Problem
+from ba_torchrl.data.state_files import write_text
 from ba_torchrl.envs.factory import make_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.durable import (
+    DurableCheckpoint,
+    first_sound,
+    remove_leftovers,
+    saved_steps,
+    step_of,
+)
 
 Which = Literal["best", "latest"]
 """Of a run's checkpoints, the one with the highest success rate in evaluation, or the last."""
@@ -25,8 +33,7 @@ Which = Literal["best", "latest"]
 class Checkpoints:
     """The checkpoints of a run folder: the latest ones and the best.
 
-    TorchRL publishes each under its final name only when it is complete: after a crash the
-    previous one is intact.
+    Each gets its final name when it is complete on the disk, with checksums of its files.
 
     Args:
         folder: the run folder.
@@ -38,8 +45,10 @@ class Checkpoints:
     def __init__(
         self, folder: Path, algorithm: Algorithm, device: torch.device, keep_last: int = 2
     ) -> None:
+        self._folder = folder
         self._device = device
-        self._checkpoint = Checkpoint(algorithm=algorithm)
+        self._checkpoint = DurableCheckpoint(algorithm=algorithm)
+        remove_leftovers(folder / "checkpoints")
         self._rotation = _rotation(folder, keep_last)
 
     def save(self, updates: int, success_rate: float) -> Path:
@@ -54,42 +63,32 @@ class Checkpoints:
 
     def has(self, updates: int) -> bool:
         """Whether there is a checkpoint of the policy after so many updates."""
-        return any(
-            int(path.name.rsplit("-", 1)[-1]) == updates for path in self._rotation.checkpoints()
-        )
+        return any(step_of(path) == updates for path in self._rotation.checkpoints())
 
     def latest(self) -> Path:
-        """Return the folder of the latest checkpoint.
+        """Return the folder of the latest checkpoint whose files are whole.
 
         Raises:
-            ConfigError: nothing was saved yet.
+            ConfigError: there is none.
         """
-        return self._existing(self._rotation.latest())
+        return find_checkpoint(self._folder, "latest")
 
     def load_best(self) -> Path:
         """Put the algorithm back to the checkpoint with the best evaluation; return its folder.
 
         Raises:
-            ConfigError: nothing was saved yet.
+            ConfigError: there is none.
         """
-        path = self._existing(self._rotation.best())
+        path = find_checkpoint(self._folder, "best")
         self._checkpoint.load(path, map_location=self._device)
         return path
-
-    @staticmethod
-    def _existing(path: Path | None) -> Path:
-        if path is None:
-            raise ConfigError("there is no checkpoint yet")
-        return Path(path)
 
 
 def write_config(config: ExperimentConfig) -> None:
     """Write the run's configuration into its folder; the file appears when it is complete."""
     config.folder.mkdir(parents=True, exist_ok=True)
     text = json.dumps(config.model_dump(mode="json"), indent=2)
-    scratch = config.folder / f"{CONFIG_FILE}.tmp"
-    scratch.write_text(text + "\n")
-    os.replace(scratch, config.folder / CONFIG_FILE)
+    write_text(config.folder / CONFIG_FILE, text + "\n")
 
 
 def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
@@ -104,10 +103,10 @@ def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
     """
     file = Path(folder) / CONFIG_FILE
     try:
-        values = json.loads(file.read_text())
-    except (OSError, json.JSONDecodeError) as error:
+        values = {**json.loads(file.read_text(encoding="utf-8")), **changes}
+    except (OSError, ValueError, TypeError) as error:
         raise ConfigError(f"cannot read {file}: {error}") from None
-    return ExperimentConfig.parse({**values, **changes}, what=str(file))
+    return ExperimentConfig.parse(values, what=str(file))
 
 
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
@@ -115,19 +114,24 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
 
     Args:
         path: a run folder, or one of its checkpoints.
-        which: of the checkpoints of a run folder: "best" in evaluation, or "latest".
+        which: of the checkpoints of a run folder: "best" in evaluation, or "latest". One with
+            damaged files is passed over with a warning.
 
     Raises:
-        ConfigError: there is none, or ``which`` is something else.
+        ConfigError: there is none whose files are whole, or ``which`` is something else.
     """
     if which not in get_args(Which):
         raise ConfigError(f"which: {which!r} is none of {', '.join(get_args(Which))}")
     path = Path(path)
     if (path / "checkpoints").is_dir():
-        rotation = _rotation(path)
-        found = rotation.best() if which == "best" else rotation.latest()
+        saved = saved_steps(path / "checkpoints")
+        if which == "best":  # the newest of equal ones
+            saved = sorted(saved, key=_success_rate, reverse=True)
+        found = first_sound(saved)
         if found is not None:
-            return Path(found)
+            return found
+        if saved:
+            raise ConfigError(f"all checkpoints of {path} are damaged; see the warnings above")
     if path.parent.name == "checkpoints" and path.exists():
         return path
     raise ConfigError(
@@ -148,12 +152,13 @@ def load(
             was trained on a GPU.
 
     Raises:
-        ConfigError: there is no checkpoint, or its configuration does not parse.
+        ConfigError: there is no checkpoint, its files are damaged or are not plain data, or its
+            configuration does not parse.
     """
     checkpoint = find_checkpoint(path, which)
     config = read_config(checkpoint.parent.parent, **changes)
     algorithm = build_algorithm(config)
-    Checkpoint(algorithm=algorithm).load(checkpoint, map_location=config.torch_device)
+    DurableCheckpoint(algorithm=algorithm).load(checkpoint, map_location=config.torch_device)
     return config, algorithm
 
 
@@ -195,7 +200,18 @@ def problem_of(config: ExperimentConfig) -> Problem:
     )
 
 
-def _rotation(folder: Path, keep_last: int = 1) -> CheckpointRotation:
+def _success_rate(checkpoint: Path) -> float:
+    """Return the success rate of a checkpoint, infinity if it cannot be read.
+
+    It is then examined first, and the warning names it.
+    """
+    try:
+        return float(Checkpoint.manifest(checkpoint)["metadata"]["success_rate"])
+    except (CheckpointError, OSError, ValueError, KeyError, TypeError):
+        return math.inf
+
+
+def _rotation(folder: Path, keep_last: int) -> CheckpointRotation:
     return CheckpointRotation(
         folder / "checkpoints", keep_last=keep_last, keep_best=("success_rate", "max")
     )

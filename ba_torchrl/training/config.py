@@ -50,12 +50,19 @@ class ExperimentConfig(StrictModel):
     """Where the learner runs; "auto" takes a GPU if there is one."""
     threads: int | None = Field(default=None, ge=1)
     """torch threads of the learner; None leaves torch's choice."""
-    num_envs: int = Field(default=5, ge=1)
+    num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool = True
     """One process per environment, or all in the learner's process."""
     start_method: Literal["spawn", "fork"] = "spawn"
     """How these processes start."""
+    timeout_s: float = Field(default=60.0, gt=0)
+    """Seconds after which a process that does not answer is replaced."""
+    max_restarts: int = Field(default=5, ge=0)
+    """Largest number of failures in a row of a process: of attempts to start it, or of resets and
+    steps without a completed step."""
+    start_timeout_s: float = Field(default=120.0, gt=0)
+    """Seconds after which a process that does not start is replaced."""
     demonstrations: int = Field(default=100, ge=0)
     """Expert episodes in the replay before the first update; reference implementation."""
     demonstrations_source: Source = "expert"
@@ -82,6 +89,8 @@ class ExperimentConfig(StrictModel):
     report: Literal["last", "best"] = "last"
     """The reported policy: the last one, or that of the checkpoint with the best evaluation. The
     episodes of its evaluation differ from those that selected the checkpoint."""
+    save_minutes: float = Field(default=10.0, gt=0)
+    """Minutes after which the state for ``resume`` is saved, besides at every evaluation."""
     log_every: int = Field(default=50, ge=1)
     """Updates between rows of the losses."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"
@@ -90,7 +99,7 @@ class ExperimentConfig(StrictModel):
     """Greedy episodes in the video at the end."""
     label: str = "run"
     """Name of the curve in plots, such as "sacfd equi"."""
-    run_dir: str = "runs/run"
+    run_dir: str = Field(default="runs/run", min_length=1)
     """Folder of the run's files."""
     resume: bool = False
     """Continue the run in that folder if it was interrupted."""
@@ -176,6 +185,12 @@ class ExperimentConfig(StrictModel):
             )
         if config.algorithm_config.needs_pretraining and not config.pretrain_updates:
             raise ConfigError("algorithm.init: 'bc' takes effect in pretrain_updates; set them")
+        capacity = getattr(config.algorithm_config, "capacity", None)
+        if capacity is not None and config.min_replay > capacity:
+            raise ConfigError(
+                f"min_replay: {config.min_replay} transitions are more than the replay holds "
+                f"({capacity}); the run would never start to learn"
+            )
         config._check_demonstrations()
         if not is_available(config.logger):
             raise ConfigError(
@@ -183,8 +198,8 @@ class ExperimentConfig(StrictModel):
                 f"pip install 'ba-torchrl[{config.logger}]'"
             )
         try:
-            torch.empty(0, device=config.torch_device)
-        except (RuntimeError, AssertionError) as error:
+            torch.zeros(1, device=config.torch_device).item()
+        except (RuntimeError, AssertionError, NotImplementedError) as error:
             reason = str(error).splitlines()[0]
             raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
         return config.model_copy(update={"plugins": config._all_plugins()})

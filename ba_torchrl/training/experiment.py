@@ -10,116 +10,38 @@ from typing import Self
 
 import torch
 from tensordict import TensorDict
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
-from ba_torchrl import make_vector_env
-from ba_torchrl.algorithms.base import Algorithm
 from ba_torchrl.algorithms.seeds import SeedUse
-from ba_torchrl.data.demo_files import load_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import ScalarLog, progress_bar
 from ba_torchrl.record.results import CurvePoint
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
+from ba_torchrl.training.collection import gather_demonstrations, make_collector, make_env
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
+from ba_torchrl.training.interruption import Interruption, StopSignals, positions_of
 from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
+from ba_torchrl.training.run_lock import RunLock
 
 logger = logging.getLogger(__name__)
-
-
-def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
-    """Return the environments of a run, ready to be reset.
-
-    Args:
-        config: of the run.
-        seed: of the first environment.
-        changes: fields of `EnvConfig` that differ from the run's.
-    """
-    return make_vector_env(
-        config.task,
-        config.num_envs,
-        parallel=config.parallel,
-        start_method=config.start_method,
-        register_modules=config.plugins,
-        **{**config.env, "seed": seed, **changes},
-    )
-
-
-def make_collector(env: EnvBase, algorithm: Algorithm, config: ExperimentConfig) -> Collector:
-    """Return a collector of one step of every environment at a time, flattened to [num_envs].
-
-    Args:
-        env: the environments, on the CPU.
-        algorithm: whose policy explores.
-        config: of the run.
-    """
-    return Collector(
-        env,
-        algorithm.policy,
-        frames_per_batch=config.num_envs,
-        total_frames=-1,
-        postproc=lambda data: data.reshape(-1),
-        policy_device=config.torch_device,
-        storing_device="cpu",
-        auto_register_policy_transforms=False,
-    )
-
-
-def gather_demonstrations(config: ExperimentConfig, algorithm: Algorithm) -> list[TensorDict]:
-    """Return the episodes [T] of a run's demonstrations, read from a folder or played now.
-
-    Args:
-        config: of the run.
-        algorithm: whose policy must be able to choose the demonstrated actions.
-
-    Raises:
-        ConfigError: the folder holds fewer than the run asks for.
-        RuntimeError: no episode can be used.
-    """
-    if config.demonstrations_path is not None:
-        episodes = load_demonstrations(config.demonstrations_path, task=config.task, env=config.env)
-        if len(episodes) < config.demonstrations:
-            raise ConfigError(
-                f"{config.demonstrations_path} holds {len(episodes)} episodes, fewer than "
-                f"demonstrations={config.demonstrations}"
-            )
-        return episodes[: config.demonstrations]
-    seed = config.derived_seed(SeedUse.DEMONSTRATIONS)
-    env = make_env(config, seed, **source_config(config.demonstrations_source))
-    try:
-        episodes = collect_demonstrations(
-            env,
-            config.demonstrations,
-            seed=seed,
-            source=config.demonstrations_source,
-            only_successful=config.only_successful_demonstrations,
-            nearest_action=algorithm.nearest_action,
-        )
-    finally:
-        env.close()
-    if not episodes:
-        raise RuntimeError(
-            f"no episode of the source {config.demonstrations_source!r} can be used; see "
-            "demonstrations_source and only_successful_demonstrations"
-        )
-    return episodes
 
 
 class Experiment:
     """A training run, from demonstrations to the last evaluation.
 
     Args:
-        config: the run. With ``resume`` an interrupted run continues from its last evaluation; see
+        config: the run. With ``resume`` an interrupted run continues from the last saved state; see
             `ba_torchrl.training.resume`.
         progress: show a progress bar.
 
     Raises:
-        ConfigError: the run folder holds another run, or this one with other settings.
+        ConfigError: the run folder holds another run, or this one with other settings, or another
+            process runs it.
     """
 
     def __init__(self, config: ExperimentConfig, progress: bool = True) -> None:
@@ -128,6 +50,7 @@ class Experiment:
         if config.threads is not None:
             torch.set_num_threads(config.threads)
         self.algorithm = build_algorithm(config)
+        self._lock = RunLock(config.folder)
         open_run_folder(config)
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)
         self.checkpoints = Checkpoints(config.folder, self.algorithm, config.torch_device)
@@ -138,27 +61,41 @@ class Experiment:
         self._state = ResumeState(
             config.folder, self.algorithm, self._progress, config.torch_device
         )
-        self._started = time.perf_counter()
+        self._signals = StopSignals()
+        self._is_between_updates = False
+        """Whether the state can be saved: there is one, and no update is under way."""
+        self._started = self._last_save = time.perf_counter()
         self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 
     def run(self) -> Result:
-        """Train, evaluate, and write curve, video and checkpoint into the run folder."""
-        self._started = time.perf_counter()
+        """Train, evaluate, and write curve, video and checkpoint into the run folder.
+
+        Raises:
+            RunStopped: SIGINT or SIGTERM was received, and the state is saved.
+        """
+        self._started = self._last_save = time.perf_counter()
         try:
-            if not (self.config.resume and self._resume()):
-                self._demonstrate()
-            self._learn()
-            return self._finish()
+            with self._signals:
+                if not (self.config.resume and self._resume()):
+                    self._demonstrate()
+                self._learn()
+                return self._finish()
+        except Interruption:
+            raise self._signals.stopped(self._save_if_possible(), self.config.folder) from None
+        except Exception:
+            self._save_if_possible()
+            raise
         finally:
             self.close()
 
     def close(self) -> None:
-        """Close environments and loggers."""
+        """Close environments and loggers, and unlock the run folder."""
         self._bar.close()
         for env in (self._train_env, self._eval_env):
             if env is not None and not env.is_closed:
                 env.close()
         self.log.close()
+        self._lock.release()
 
     def __enter__(self) -> Self:
         return self
@@ -169,23 +106,31 @@ class Experiment:
     # -- stages ------------------------------------------------------------------------------
 
     def _resume(self) -> bool:
-        """Restore the state of the last evaluation; return whether there is one."""
+        """Restore the last saved state; return whether there is one."""
         if not self._state.load():
             return False
+        self._is_between_updates = True
         updates, progress = self.algorithm.updates, self._progress
         progress.resumed_at.append(updates)
         self._started -= progress.seconds
         self._bar.update(updates)
-        if not self.checkpoints.has(updates):  # the interruption came between state and checkpoint
-            self.checkpoints.save(updates, progress.curve[-1].success_rate)
+        last = progress.curve[-1] if progress.curve else None
+        if last and last.updates == updates and not self.checkpoints.has(updates):
+            self.checkpoints.save(updates, last.success_rate)  # interrupted between the two
         logger.info("the run in %s continues after update %d", self.config.folder, updates)
+        self._evaluate_if_due()  # the run was stopped during an evaluation
         return True
 
     def _demonstrate(self) -> None:
         """Fill the replay with demonstrations."""
-        if not self.config.demonstrations:
-            return
-        episodes = gather_demonstrations(self.config, self.algorithm)
+        if self.config.demonstrations:
+            self._store_demonstrations()
+        self._is_between_updates = True
+
+    def _store_demonstrations(self) -> None:
+        episodes = gather_demonstrations(
+            self.config, self.algorithm, lambda _: self._signals.check()
+        )
         self.algorithm.on_demonstrations(episodes)
         self.log.write(
             0,
@@ -204,22 +149,40 @@ class Experiment:
             self._update(algorithm.pretrain_update)
         if algorithm.updates == config.total_updates:
             return
-        # A resumed run plays other episodes than before its interruption.
-        part = self._progress.resumed_at[-1] if self._progress.resumed_at else 0
-        seed = config.derived_seed(SeedUse.COLLECTION, part)
-        self._train_env = make_env(config, seed, expert=algorithm.stores_expert_action)
-        collector = make_collector(self._train_env, algorithm, config)
+        collector = self._start_collection()
+        steps = iter(collector)
         try:
-            for data in collector:
-                self._store(data)
-                if algorithm.replay_size < config.min_replay:
-                    continue
-                for _ in range(config.updates_per_step):
-                    self._update(algorithm.update)
-                    if algorithm.updates == config.total_updates:
-                        return
+            while not self._take_pending_updates():
+                self._store(next(steps))
+                if algorithm.replay_size >= config.min_replay:
+                    self._progress.pending_updates = config.updates_per_step
+                self._stop_or_save()
         finally:
             collector.shutdown(close_env=False)
+
+    def _start_collection(self) -> Collector:
+        """Return a collector, which continues the episodes of a resumed run."""
+        config, progress = self.config, self._progress
+        # Without positions, a resumed run plays other episodes than before its interruption.
+        part = progress.resumed_at[-1] if progress.env_steps and progress.resumed_at else 0
+        seed = config.derived_seed(SeedUse.COLLECTION, part)
+        generators = GlobalRNGState().state_dict()
+        self._train_env = make_env(config, seed, expert=self.algorithm.stores_expert_action)
+        if progress.positions is not None:
+            self._train_env.continue_from(progress.positions)
+        collector = make_collector(self._train_env, self.algorithm, config)
+        if progress.positions is not None:
+            GlobalRNGState().load_state_dict(generators)
+        return collector
+
+    def _take_pending_updates(self) -> bool:
+        """Take the updates of the last step of collection; return whether the run is complete."""
+        while self._progress.pending_updates:
+            if self.algorithm.updates == self.config.total_updates:
+                return True
+            self._progress.pending_updates -= 1
+            self._update(self.algorithm.update)
+        return self.algorithm.updates == self.config.total_updates
 
     def _finish(self) -> Result:
         """Run the evaluation that is reported, on new episodes; write curve, video and record."""
@@ -254,7 +217,9 @@ class Experiment:
     def _update(self, take_update: Callable[[], TensorDict]) -> None:
         """Take one update; log and evaluate if they are due."""
         config = self.config
+        self._is_between_updates = False
         scalars = take_update()
+        self._is_between_updates = True
         updates = self.algorithm.updates
         self._bar.update()
         if updates % config.log_every == 0:
@@ -264,29 +229,62 @@ class Experiment:
             if progress.recent:
                 values["train/success_rate"] = sum(progress.recent) / len(progress.recent)
             self.log.write(updates, values)
-        if updates % config.eval_every == 0 and updates < config.total_updates:
+        self._evaluate_if_due()
+        self._stop_or_save()
+
+    def _evaluate_if_due(self) -> None:
+        """Evaluate at every multiple of ``eval_every``, except at the end of the run."""
+        updates, curve = self.algorithm.updates, self._progress.curve
+        is_new = updates > (curve[-1].updates if curve else 0)
+        if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
             self._evaluate_and_save()
+
+    def _stop_or_save(self) -> None:
+        """Stop after a signal; save the state if the last save was long ago."""
+        self._signals.check()
+        if time.perf_counter() - self._last_save > 60 * self.config.save_minutes:
+            self._save()
+
+    def _save(self) -> None:
+        """Save the state, with the positions of the environments in their episodes."""
+        self._progress.seconds = time.perf_counter() - self._started
+        if self._train_env is not None:
+            self._progress.positions = positions_of(self._train_env)
+        self._state.save(self.algorithm.updates)
+        self._last_save = time.perf_counter()
+
+    def _save_if_possible(self) -> bool:
+        """Save the state of a run that ends early; return whether it could be saved."""
+        if not self._is_between_updates:
+            return False
+        try:
+            self._save()
+        except OSError as error:  # the disk is full, for example; the state before is whole
+            logger.error("the state could not be saved: %s", error)
+            return False
+        return True
 
     def _evaluate_and_save(self) -> None:
         """Add a point to the learning curve; save the state and a checkpoint with its rate."""
         updates, progress = self.algorithm.updates, self._progress
         evaluation = self._evaluate(self.config.eval_episodes, SeedUse.EVALUATION)
-        progress.seconds = time.perf_counter() - self._started
         progress.curve.append(
             CurvePoint(
                 updates=updates,
                 env_steps=progress.env_steps,
-                seconds=progress.seconds,
+                seconds=time.perf_counter() - self._started,
                 **asdict(evaluation),
             )
         )
         self.log.write(updates, evaluation.scalars("eval"))
         self._bar.set_postfix(success=f"{evaluation.success_rate:.2f}")
-        self._state.save(updates)
+        self._save()
         self.checkpoints.save(updates, evaluation.success_rate)
 
     def _evaluate(self, episodes: int, use: SeedUse) -> Evaluation:
         seed = self.config.derived_seed(use)
         if self._eval_env is None:
             self._eval_env = make_env(self.config, seed)
-        return evaluate(self._eval_env, self._greedy, episodes, seed)
+        return evaluate(
+            self._eval_env, self._greedy, episodes, seed, lambda _: self._signals.check()
+        )

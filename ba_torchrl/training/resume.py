@@ -1,9 +1,10 @@
-"""Resuming: the state of a run at its last evaluation, from which an interrupted run continues.
+"""Resuming: the saved state of a run, from which an interrupted run continues.
 
 Saved: the algorithm (networks, optimiser, schedules, generators), its replay with priorities, the
-process's random number generators, the learning curve and all counters. Not saved: the episodes in
-progress, which start again with other seeds, and the updates since the last evaluation, which are
-repeated. A resumed run is therefore another sample of the same run, not the same bits.
+process's random number generators, the learning curve, all counters, and the position of every
+environment in its episode. On a CPU, a resumed run therefore continues bit for bit, and repeats
+what came after the last save. If a worker process had failed when the state was saved, the episodes
+in progress are replaced by episodes of other seeds.
 """
 
 from __future__ import annotations
@@ -17,17 +18,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 
 from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
 from ba_torchrl.training.checkpoint import read_config, write_config
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.durable import (
+    DurableCheckpoint,
+    first_sound,
+    remove_leftovers,
+    saved_steps,
+    step_of,
+)
 
 logger = logging.getLogger(__name__)
 
 RECENT_EPISODES = 100
+KEPT_STATES = 2
 _FOLDER = "resume"
 
 
@@ -44,6 +54,10 @@ class Progress:
     """Wall time until the state was saved."""
     resumed_at: list[int] = field(default_factory=list)
     """Updates after which the run was resumed."""
+    pending_updates: int = 0
+    """Updates still to be taken for the last step of collection."""
+    positions: list[Position] | None = None
+    """Position of each environment in its episodes; None before the collection starts."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything as plain values."""
@@ -59,10 +73,10 @@ class Progress:
 
 
 class ResumeState:
-    """The state that a run saves at every evaluation and deletes when it finishes; it is large.
+    """The state that a run saves regularly and deletes when it finishes; it is large.
 
-    TorchRL publishes each state under its final name only when it is complete, and deletes the
-    previous one after that: after a crash while writing, that one is intact.
+    Each state gets its final name when it is complete on the disk, with checksums of its files. The
+    last two are kept: if the newest is damaged, the run continues from the one before.
 
     Args:
         folder: the run folder.
@@ -76,26 +90,37 @@ class ResumeState:
     ) -> None:
         self._folder = folder / _FOLDER
         self._device = device
-        self._checkpoint = Checkpoint(
+        self._checkpoint = DurableCheckpoint(
             algorithm=algorithm,
             replay=_Replay(algorithm),
             progress=progress,
             generators=_Generators(),
         )
-        self._rotation = CheckpointRotation(self._folder, keep_last=1)
+        self._rotation = CheckpointRotation(self._folder, keep_last=KEPT_STATES)
 
     def save(self, updates: int) -> None:
         """Write the state of a run after so many updates."""
         self._rotation.save(self._checkpoint, step=updates)
 
     def load(self) -> bool:
-        """Restore the last state; return whether there is one."""
-        for leftover in self._folder.glob(".*"):  # a state whose writing was interrupted
-            shutil.rmtree(leftover)
-        latest = self._rotation.latest()
-        if latest is None:
+        """Restore the newest state whose files are whole; return whether there is any state.
+
+        Raises:
+            ConfigError: all states are damaged, or hold files that are not plain data.
+        """
+        remove_leftovers(self._folder)
+        states = saved_steps(self._folder)
+        if not states:
             return False
-        self._checkpoint.load(latest, map_location=self._device)
+        sound = first_sound(states)
+        if sound is None:
+            raise ConfigError(
+                f"all states in {self._folder} are damaged: start the run again in another "
+                "run_dir, or evaluate its checkpoints"
+            )
+        self._checkpoint.load(sound, map_location=self._device)
+        for damaged in states[: states.index(sound)]:
+            shutil.rmtree(damaged)
         return True
 
     def remove(self) -> None:
@@ -106,8 +131,8 @@ class ResumeState:
 def resumable_updates(folder: str | Path) -> int | None:
     """Return the update after which the run in a folder can be resumed, None if it cannot."""
     folder = Path(folder) / _FOLDER
-    latest = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
-    return None if latest is None else int(latest.name.rsplit("-", 1)[-1])
+    states = saved_steps(folder)
+    return step_of(states[0]) if states else None
 
 
 def open_run_folder(config: ExperimentConfig) -> None:
@@ -135,7 +160,7 @@ def open_run_folder(config: ExperimentConfig) -> None:
                 raise ConfigError(
                     f"{folder} has checkpoints, but nothing to resume from; choose another run_dir"
                 )
-            logger.warning("the run in %s has no evaluation yet: starting it again", folder)
+            logger.warning("the run in %s has no saved state yet: starting it again", folder)
     write_config(config)
 
 

@@ -6,6 +6,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
+from ba_torchrl.data.state_files import seal
 from ba_torchrl.errors import ConfigError
 
 TASK = "open_loop/block_stacking"
@@ -79,11 +80,13 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
     metadata = json.loads(file.read_text())
     assert metadata["env"].pop("object_type") == "cube"
     file.write_text(json.dumps(metadata))
+    seal(tmp_path)
     assert len(load_demonstrations(tmp_path, task=TASK, env=ENV)) == len(episodes)
     with pytest.raises(ConfigError, match="object_type: collected with 'cube', needed 'cylinder'"):
         load_demonstrations(tmp_path, task=TASK, env={**ENV, "object_type": "cylinder"})
     del metadata["task"]
     file.write_text(json.dumps(metadata))
+    seal(tmp_path)
     with pytest.raises(ConfigError, match="does not say what was collected"):
         load_demonstrations(tmp_path, task=TASK, env=ENV)
 

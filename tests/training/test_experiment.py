@@ -140,7 +140,7 @@ def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
     rates = iter([0.9, 0.4, 0.7])
     seeds = []
 
-    def fake(env, policy, episodes, seed):
+    def fake(env, policy, episodes, seed, on_episode):
         seeds.append(seed)
         weights.append(next(experiment.algorithm.loss.parameters()).detach().clone())
         return Evaluation(episodes, next(rates), 0.0, 1.0)

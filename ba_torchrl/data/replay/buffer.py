@@ -17,6 +17,7 @@ from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.frames import FrameTable
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
+from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError
 
@@ -214,14 +215,16 @@ class FrameStorage(LazyTensorStorage):
             )
 
     def dumps(self, path: str | Path) -> None:
-        """Write the contents into a folder, which is created if needed."""
-        Path(path).mkdir(parents=True, exist_ok=True)
-        torch.save(self.state_dict(), Path(path) / "frames.pt")
+        """Write the contents into a folder, as plain data."""
+        write_state(path, self.state_dict())
 
     def loads(self, path: str | Path) -> None:
-        """Read the contents from a folder that ``dumps`` wrote."""
-        # Memory-mapped, so that the frames are not held in memory twice.
-        self.load_state_dict(torch.load(Path(path) / "frames.pt", weights_only=True, mmap=True))
+        """Read a folder that ``dumps`` wrote.
+
+        Raises:
+            ConfigError: it holds files that are not plain data.
+        """
+        self.load_state_dict(read_state(path))
 
 
 class FrameReplayBuffer(TensorDictReplayBuffer):
@@ -301,6 +304,18 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             return torch.zeros(0, dtype=torch.long)
         data = self.writer.select_fitting(data)
         return super().extend(data, update_priority=update_priority)
+
+    def dumps(self, path: str | Path) -> None:
+        """Write transitions, priorities and the state of the draws into a folder, as plain data."""
+        write_state(path, self.state_dict())
+
+    def loads(self, path: str | Path) -> None:
+        """Read a folder that ``dumps`` wrote.
+
+        Raises:
+            ConfigError: it holds files that are not plain data.
+        """
+        self.load_state_dict(read_state(path))
 
     def _check_schema(self, data: TensorDictBase) -> None:
         found = {key: (value.dtype, value.shape[1:]) for key, value in data.items(True, True)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,8 +14,6 @@ from ba_torchrl.data.replay import segment_tree
 from ba_torchrl.envs import keys
 
 segment_tree.install()
-
-_FILE = "sampler.pt"
 
 
 class ExpertPrioritizedSampler(PrioritizedSampler):
@@ -180,15 +177,6 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         self._max_priority = None if largest is None else (largest, place)
         self.beta = state_dict["beta"]
         self.generator.set_state(state_dict["generator"].cpu())
-
-    def dumps(self, path: str | Path) -> None:
-        """Write the state into a folder, which is created if needed."""
-        Path(path).mkdir(parents=True, exist_ok=True)
-        torch.save(self.state_dict(), Path(path) / _FILE)
-
-    def loads(self, path: str | Path) -> None:
-        """Read the state from a folder that ``dumps`` wrote."""
-        self.load_state_dict(torch.load(Path(path) / _FILE, weights_only=True))
 
 
 def _flat_index(index: int | Tensor | tuple[Tensor, ...], storage: Storage | None) -> Tensor:

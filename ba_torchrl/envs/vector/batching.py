@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from tensordict import TensorDictBase
 
 from ba_torchrl.envs.checks import check_actions
+from ba_torchrl.envs.positions import Position
 
 
 class SeededVector:
@@ -27,6 +29,26 @@ class SeededVector:
         for index in range(self.num_workers):
             self._seed_env(index, seed + index)
         return seed if static_seed else seed + self.num_workers
+
+    def get_positions(self) -> list[Position]:
+        """Return the position of each environment in its episodes; see `RecordedPosition`.
+
+        Raises:
+            WorkerError: a worker has failed.
+            SimulationError: the environments were not reset.
+        """
+        raise NotImplementedError
+
+    def continue_from(self, positions: Sequence[Position]) -> None:
+        """Continue the episodes of `get_positions`; the next reset returns their observations.
+
+        Args:
+            positions: of as many environments of the same task and parameters.
+
+        Raises:
+            WorkerError: a worker has failed.
+        """
+        raise NotImplementedError
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any

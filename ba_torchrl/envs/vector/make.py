@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Literal
 
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, SerialEnv
 
 from ba_torchrl.envs.checks import check_actions
+from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.parallel import VectorEnv
+from ba_torchrl.errors import ConfigError
 
 __all__ = ["SerialVectorEnv", "VectorEnv", "check_actions", "make_vector_env"]
 
 MakeEnv = Callable[[], EnvBase]
+
+MAX_ENVS = 1024
+_SHARED_MEMORY = Path("/dev/shm")
 
 
 def make_vector_env(
@@ -28,6 +36,7 @@ def make_vector_env(
     use_buffers: bool | None = None,
     timeout_s: float = 60.0,
     max_restarts: int = 5,
+    start_timeout_s: float = 120.0,
 ) -> SerialVectorEnv | VectorEnv:
     """Return ``num_envs`` environments as one, with batch size [num_envs], ready to be reset.
 
@@ -44,17 +53,21 @@ def make_vector_env(
         use_buffers: whether data pass through shared memory (the default, faster for steps of a
             few milliseconds) or through pipes.
         timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: largest number of consecutive replacements of a worker without a completed
-            step.
+        max_restarts: largest number of failures in a row of a worker; see `VectorEnv`.
+        start_timeout_s: seconds after which a worker that does not start is replaced.
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.
+        ConfigError: there are not enough file handles, processes or shared memory for
+            ``num_envs``.
         RuntimeError: a worker could not be started.
     """
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, got {num_envs}")
     if not callable(make_env) and len(make_env) != num_envs:
         raise ValueError(f"{len(make_env)} functions were given for {num_envs} environments")
+    if num_envs > MAX_ENVS:
+        raise ConfigError(f"num_envs: at most {MAX_ENVS}, the number of worlds of PyBullet")
     env: SerialVectorEnv | VectorEnv
     if parallel:
         env = VectorEnv(
@@ -62,20 +75,57 @@ def make_vector_env(
             make_env,
             timeout_s=timeout_s,
             max_restarts=max_restarts,
+            start_timeout_s=start_timeout_s,
             mp_start_method=start_method,
             num_threads=num_threads,
             use_buffers=True if use_buffers is None else use_buffers,
         )
     else:
         env = SerialVectorEnv(num_envs, make_env)
-    env.start()
+    try:
+        if parallel and env._use_buffers:
+            _check_shared_memory(env)
+        env.start()
+    except OSError as error:
+        if error.errno not in (errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.ENOMEM):
+            raise
+        raise ConfigError(
+            f"{num_envs} processes cannot be started ({error.strerror}): lower num_envs, or raise "
+            "the limits that `ulimit -n` and `ulimit -u` show"
+        ) from error
     if seed is not None:
         env.set_seed(seed)
     return env
 
 
+def _check_shared_memory(env: VectorEnv) -> None:
+    """Check the space for the observations of all workers; too little would end this process.
+
+    Raises:
+        ConfigError: there is not enough.
+    """
+    if not _SHARED_MEMORY.is_dir():
+        return
+    needed = sum(value.nbytes for value in env.fake_tensordict().values(True, True))
+    free = shutil.disk_usage(_SHARED_MEMORY).free
+    if needed > free:
+        raise ConfigError(
+            f"{_SHARED_MEMORY} has {free / 1e6:.1f} MB free, {env.num_workers} environments need "
+            f"{needed / 1e6:.1f} MB: lower num_envs, or enlarge it (docker run --shm-size)"
+        )
+
+
 class SerialVectorEnv(SeededVector, SerialEnv):
     """Environments that step sequentially in this process."""
+
+    def get_positions(self) -> list[Position]:
+        """Return the position of each environment; see `SeededVector.get_positions`."""
+        return [env.get_position() for env in self._envs]
+
+    def continue_from(self, positions: Sequence[Position]) -> None:
+        """Continue episodes; see `SeededVector.continue_from`."""
+        for env, position in zip(self._envs, positions, strict=True):
+            env.continue_from(position)
 
     def _seed_env(self, index: int, seed: int) -> None:
         self._envs[index].set_seed(seed, static_seed=True)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from multiprocessing.connection import wait
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,15 +17,18 @@ from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
 from torchrl.envs.batched_envs import _run_worker_pipe_direct, _run_worker_pipe_shared_mem
 
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.vector.answers import ask_all, collect_flags, collect_messages
 from ba_torchrl.envs.vector.batching import SeededVector
-from ba_torchrl.envs.vector.worker import Worker, wait_until
+from ba_torchrl.envs.vector.worker import Worker
 from ba_torchrl.errors import WorkerError
 
 logger = logging.getLogger(__name__)
 
 MakeEnv = Callable[[], EnvBase]
 
-_HEALTH_CHECK_S = 5e-3
+_STEP_S = 1.0
+"""Upper bound of the duration of a step that is repeated."""
 _LOST_STEP = {
     keys.REWARD: 0,
     keys.TERMINATED: False,
@@ -49,8 +51,9 @@ class VectorEnv(SeededVector, ParallelEnv):
         num_workers: number of environments.
         create_env_fn: builds one environment, or one such function per environment.
         timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: largest number of consecutive replacements of a worker without a completed
-            step.
+        max_restarts: largest number of failures in a row of a worker: of attempts to start it, or
+            of resets and steps without a completed step. The end of an idle worker does not count.
+        start_timeout_s: seconds after which a worker that does not start is replaced.
         parallel_options: further options of `torchrl.envs.ParallelEnv`.
 
     Raises:
@@ -64,6 +67,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         *,
         timeout_s: float = 60.0,
         max_restarts: int = 5,
+        start_timeout_s: float = 120.0,
         **parallel_options: Any,
     ) -> None:
         parallel_options.setdefault("shutdown_timeout", 5.0)
@@ -73,6 +77,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             raise ValueError(f"environments in workers need the entries {sorted(missing)}")
         self.timeout_s = timeout_s
         self.max_restarts = max_restarts
+        self.start_timeout_s = start_timeout_s
         self.restarts = 0
         self._failures_in_a_row = [0] * num_workers
         self._replacements = [0] * num_workers  # since the last seed
@@ -84,6 +89,18 @@ class VectorEnv(SeededVector, ParallelEnv):
     def worker_pids(self) -> list[int]:
         """Process ids of the workers, by environment."""
         return [worker.process.pid for worker in self.parent_channels]
+
+    def get_positions(self) -> list[Position]:
+        """Return the position of each environment; see `SeededVector.get_positions`."""
+        arguments = [()] * self.num_workers
+        return ask_all(self.parent_channels, "get_position", arguments, self.timeout_s)
+
+    def continue_from(self, positions: Sequence[Position]) -> None:
+        """Continue episodes; see `SeededVector.continue_from`."""
+        steps = max(sum(map(len, position["actions"])) for position in positions)
+        arguments = [(position,) for position in positions]
+        timeout_s = self.timeout_s + steps * _STEP_S
+        ask_all(self.parent_channels, "continue_from", arguments, timeout_s)
 
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
@@ -127,7 +144,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             worker.check()
             _seed(worker, seed)
         except WorkerError as error:
-            self._replace(index, error, seed)
+            self._replace({index: error}, seed)
             self._lost.add(index)
 
     def _start_workers(self) -> None:
@@ -169,9 +186,10 @@ class VectorEnv(SeededVector, ParallelEnv):
             "num_threads": self.num_sub_threads,
             "filter_warnings": self._filter_warnings_subprocess(),
         }
+        limits = self._mp_start_method, self.timeout_s, self.start_timeout_s
         if not self._use_buffers:
             options["consolidate"] = self.consolidate
-            return Worker(_run_worker_pipe_direct, options, self._mp_start_method, self.timeout_s)
+            return Worker(_run_worker_pipe_direct, options, *limits)
         self._shm_done_flags[index] = 0
         options |= {
             "worker_idx": index,
@@ -182,7 +200,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             "_selected_step_keys": self._selected_step_keys,
             "_non_tensor_keys": self._non_tensor_keys,
         }
-        return Worker(_run_worker_pipe_shared_mem, options, self._mp_start_method, self.timeout_s)
+        return Worker(_run_worker_pipe_shared_mem, options, *limits)
 
     @property
     def _events(self) -> list[Any]:
@@ -215,38 +233,67 @@ class VectorEnv(SeededVector, ParallelEnv):
                 worker.muted = False
 
     def _replace_dead(self) -> None:
+        """Replace the workers that have ended since their last answer."""
+        dead = {}
         for index, worker in enumerate(self.parent_channels):
             try:
                 worker.check()
             except WorkerError as error:
-                self._replace(index, error)
-                self._lost.add(index)
+                dead[index] = error
+        self._replace(dead)
+        self._lost |= dead.keys()
 
-    def _replace(self, index: int, cause: WorkerError, seed: int | None = None) -> None:
-        """Start and seed a new process for worker ``index``; it must be reset before a step."""
-        while True:
-            self._failures_in_a_row[index] += 1
-            if self._failures_in_a_row[index] > self.max_restarts:
-                self.close()
-                raise RuntimeError(
-                    f"worker {index} failed {self.max_restarts + 1} times without completing a "
-                    f"step; the last time {cause}. All workers were closed. Use parallel=False to "
-                    "see the error where it happens, or raise timeout_s or max_restarts"
+    def _count_failure(self, index: int, cause: WorkerError) -> None:
+        """Count a failure in a reset or a step.
+
+        Raises:
+            RuntimeError: there were too many without a completed step.
+        """
+        self._failures_in_a_row[index] += 1
+        self._check_limit(index, self._failures_in_a_row[index], "completing a step", cause)
+
+    def _check_limit(self, index: int, failures: int, success: str, cause: WorkerError) -> None:
+        if failures <= self.max_restarts:
+            return
+        self.close()
+        raise RuntimeError(
+            f"worker {index} failed {failures} times without {success}; the last time {cause}. All "
+            "workers were closed. Use parallel=False to see the error where it happens, or raise "
+            "timeout_s, start_timeout_s or max_restarts"
+        )
+
+    def _replace(self, causes: Mapping[int, WorkerError], seed: int | None = None) -> None:
+        """Start and seed new processes, all at once; they must be reset before a step.
+
+        Args:
+            causes: why each worker is replaced, by index.
+            seed: None for unused ones.
+
+        Raises:
+            RuntimeError: a worker cannot be started.
+        """
+        attempts = 0
+        while causes:
+            for index, cause in causes.items():
+                self._check_limit(index, attempts, "starting", cause)
+                self.restarts += 1
+                self._replacements[index] += 1
+                # As text: the traceback in a stored log record would keep the ended worker alive.
+                logger.warning(
+                    "worker %d is replaced (restart %d): %s", index, self.restarts, str(cause)
                 )
-            self.restarts += 1
-            self._replacements[index] += 1
-            # As text: the traceback in a stored log record would keep the ended worker alive.
-            logger.warning(
-                "worker %d is replaced (restart %d): %s", index, self.restarts, str(cause)
-            )
-            self.parent_channels[index].kill()
-            worker = self.parent_channels[index] = self._launch(index)
-            try:
-                worker.wait_until_ready()
-                _seed(worker, self._new_seed(index) if seed is None else seed)
-                return
-            except WorkerError as error:
-                cause = error
+                self.parent_channels[index].kill()
+                self.parent_channels[index] = self._launch(index)
+            attempts += 1
+            failed = {}
+            for index in causes:
+                worker = self.parent_channels[index]
+                try:
+                    worker.wait_until_ready()
+                    _seed(worker, self._new_seed(index) if seed is None else seed)
+                except WorkerError as error:
+                    failed[index] = error
+            causes = failed
 
     def _new_seed(self, index: int) -> int:
         """Return an unused seed, which is the same in every repetition of the run."""
@@ -257,10 +304,11 @@ class VectorEnv(SeededVector, ParallelEnv):
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
         workers = {index: self.parent_channels[index] for index in workers_range}
         failures = self._collect([index for index in workers if not workers[index].muted])
+        for index, cause in failures.items():
+            self._count_failure(index, cause)
+        self._replace(failures)
         for index, worker in workers.items():
-            if index in failures:
-                self._replace(index, failures[index])
-            elif not worker.muted and worker.command != "reset":
+            if index not in failures and not worker.muted and worker.command != "reset":
                 self._failures_in_a_row[index] = 0
             if index in failures or worker.muted:
                 self._recover(index, worker.message)
@@ -271,10 +319,13 @@ class VectorEnv(SeededVector, ParallelEnv):
         pending = set(indices)
         failures: dict[int, WorkerError] = {}
         deadline = time.monotonic() + self.timeout_s
-        collect = self._collect_flags if self._use_buffers else self._collect_messages
         try:
             while pending:
-                failed = collect(pending)
+                workers = self.parent_channels
+                if self._use_buffers:
+                    failed = collect_flags(workers, pending, self._shm_done_flags)
+                else:
+                    failed = collect_messages(workers, pending)
                 if time.monotonic() > deadline:
                     late = f"it did not finish within {self.timeout_s:g} s"
                     failed = {index: WorkerError(late) for index in pending} | failed
@@ -285,41 +336,6 @@ class VectorEnv(SeededVector, ParallelEnv):
             for index in pending:
                 self.parent_channels[index].abort()
             raise
-        return failures
-
-    def _collect_flags(self, pending: set[int]) -> dict[int, WorkerError]:
-        """Remove workers that answered from ``pending``; return the errors of ended workers."""
-        flags = self._shm_done_flags
-
-        def all_answered() -> bool:
-            for index in tuple(pending):
-                if flags[index]:
-                    flags[index] = 0
-                    pending.discard(index)
-            return not pending
-
-        failures: dict[int, WorkerError] = {}
-        if wait_until(all_answered, _HEALTH_CHECK_S):
-            return failures
-        for index in pending:
-            try:
-                self.parent_channels[index].check()
-            except WorkerError as error:
-                if not flags[index]:  # else it answered before it ended
-                    failures[index] = error
-        return failures
-
-    def _collect_messages(self, pending: set[int]) -> dict[int, WorkerError]:
-        """As `_collect_flags`, for workers that answer through pipes."""
-        failures: dict[int, WorkerError] = {}
-        workers = {self.parent_channels[index].pipe: index for index in pending}
-        for pipe in wait(list(workers), _HEALTH_CHECK_S):
-            worker = self.parent_channels[workers[pipe]]
-            try:
-                worker.inbox.append(worker.read(0.0))  # TorchRL reads it from the inbox
-                pending.discard(workers[pipe])
-            except WorkerError as error:
-                failures[workers[pipe]] = error
         return failures
 
     def _recover(self, index: int, message: tuple[Any, Any]) -> None:
@@ -337,7 +353,8 @@ class VectorEnv(SeededVector, ParallelEnv):
             failures = self._collect([index])
             if not failures:
                 return
-            self._replace(index, failures[index])
+            self._count_failure(index, failures[index])
+            self._replace(failures)
 
     def _write_lost_step(self, index: int) -> None:
         """Write the answer to a step that was lost."""

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import logging
 import os
 import pickle
 import signal
+import sys
+import threading
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable
+from multiprocessing import util
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import torchrl
@@ -23,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 _FAILED = "failed"
 _IDLE_TIMEOUT_S = 1e6  # by default TorchRL's workers end after 10,000 s without a command
-_START_TIMEOUT_S = 120.0  # a spawned worker imports torch first
+_PR_SET_PDEATHSIG = 1
 _BUSY_WAIT_S = 100e-6
 _POLL_INTERVAL_S = 30e-6
 
@@ -39,6 +44,7 @@ class Worker:
         options: keyword arguments of ``loop``, except the two ends of the pipe and the event.
         start_method: "spawn" or "fork"; None for the default of this process.
         timeout_s: seconds to wait for an answer.
+        start_timeout_s: seconds to wait until the environment is built.
     """
 
     def __init__(
@@ -47,6 +53,7 @@ class Worker:
         options: dict[str, Any],
         start_method: str | None,
         timeout_s: float,
+        start_timeout_s: float,
     ) -> None:
         context = mp.get_context(start_method)
         self.pipe, child_pipe = context.Pipe()
@@ -54,16 +61,22 @@ class Worker:
         self.inbox: deque[Any] = deque()
         self.message: tuple[Any, Any] = ("start", None)
         self.muted = False  # commands are dropped, because the episode is lost
-        self._timeout_s = timeout_s
+        self._timeout_s, self._start_timeout_s = timeout_s, start_timeout_s
         options = {
             **options,
             "parent_pipe": self.pipe,
             "child_pipe": child_pipe,
             "mp_event": self.event,
         }
-        # Daemonic: it ends with the parent, even without a call of close.
-        self.process = context.Process(target=_run_worker, args=(loop, options), daemon=True)
+        # The worker is killed when the thread that started it ends, so only for the main thread.
+        is_main = threading.current_thread() is threading.main_thread()
+        parent = os.getpid() if is_main else None
+        self.process = context.Process(
+            target=_run_worker, args=(loop, options, parent), daemon=True
+        )
         self.process.start()
+        # At the end of this process, before multiprocessing sends SIGTERM, which workers ignore.
+        self._at_exit = util.Finalize(self, _kill, (self.process,), exitpriority=10)
         child_pipe.close()  # else the pipe stays open when the worker ends
 
     @property
@@ -77,7 +90,7 @@ class Worker:
         Raises:
             WorkerError: the environment could not be built.
         """
-        self.read(_START_TIMEOUT_S)
+        self.read(self._start_timeout_s)
         self.send(("init", None))
 
     def send(self, message: tuple[Any, Any]) -> None:
@@ -137,6 +150,7 @@ class Worker:
 
     def kill(self) -> None:
         """Kill the process and release its resources."""
+        self._at_exit.cancel()
         self.abort()
         self.process.close()
         self.pipe.close()
@@ -151,11 +165,27 @@ class Worker:
         return f"its process was ended by {signal.Signals(-code).name}"
 
 
-def _run_worker(loop: Callable[..., None], options: dict[str, Any]) -> None:
+def _kill(process: BaseProcess) -> None:
+    process.kill()
+    process.join()
+
+
+def _end_with(parent: int) -> None:
+    """Let the kernel kill this process when its parent ends, even if it hangs or is stopped."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it ended before
+            os._exit(1)
+
+
+def _run_worker(loop: Callable[..., None], options: dict[str, Any], parent: int | None) -> None:
     """Run TorchRL's loop in a worker process, and send its exception to the parent."""
-    # The parent handles interrupts; the worker does not inherit its handlers.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if parent is not None:
+        _end_with(parent)
+    # The parent handles the signals that a scheduler or a terminal sends to all processes, saves
+    # its state with the workers' help and ends them.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     torchrl._utils.BATCHED_PIPE_TIMEOUT = _IDLE_TIMEOUT_S
     pipe: Connection = options["child_pipe"]
     try:

@@ -19,15 +19,18 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.record.results import FAILURE_FILE, RESULT_FILE, now
+from ba_torchrl.data.state_files import write_text
+from ba_torchrl.record.results import FAILURE_FILE, now
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import status
+from ba_torchrl.training.run_lock import lock_holder
 
 LOG_FILE = "run.log"
 LOG_LINES = 20
 """Last lines of a failed run's output that are recorded."""
 POLL_S = 0.2
+SAVE_S = 60.0
+"""Time for a run to save its state before it is killed."""
 WORKER = (sys.executable, "-m", "ba_torchrl.training.grid.run_one")
 
 
@@ -49,20 +52,28 @@ def run_all(
         worker: command that reads a run's configuration as JSON from its standard input.
 
     Returns:
-        By run folder, the reason of its failure.
+        By run folder, the reason of its failure. Runs that another process runs are left to it.
 
     Raises:
-        ConfigError: a folder holds a run with other settings, in which case nothing was started;
-            or another process runs one of them.
+        ConfigError: a folder holds a run with other settings, in which case nothing was started.
     """
-    waiting = deque(run for run in runs if status(run).state != "done")
+    states = [(run, status(run)) for run in runs]
+    waiting = deque(run for run, found in states if found.state not in ("done", "running"))
+    for run, found in states:
+        if found.state == "running":
+            _report_skipped(run, found.detail)
     running: list[_Job] = []
     failures: dict[Path, str] = {}
     bar = tqdm(total=len(runs), initial=len(runs) - len(waiting), unit="run", disable=not progress)
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
-                running.append(_Job(waiting.popleft(), worker, max_hours))
+                run = waiting.popleft()
+                try:
+                    running.append(_Job(run, worker, max_hours))
+                except BlockingIOError:
+                    _report_skipped(run, lock_holder(run.folder) or "another process")
+                    bar.update()
                 bar.set_postfix_str(", ".join(f"{job}" for job in running))
             time.sleep(POLL_S)
             for job in [job for job in running if job.has_ended()]:
@@ -74,13 +85,23 @@ def run_all(
                 bar.update()
     finally:
         for job in running:
+            job.terminate()
+        for job in running:
             job.stop()
         bar.close()
     return failures
 
 
+def _report_skipped(run: ExperimentConfig, process: str) -> None:
+    tqdm.write(f"skipped: {process} runs the experiment in {run.folder}")
+
+
 class _Job:
-    """A run in a separate process."""
+    """A run in a separate process.
+
+    Raises:
+        BlockingIOError: another process runs it.
+    """
 
     def __init__(
         self, run: ExperimentConfig, worker: Sequence[str], max_hours: float | None
@@ -94,7 +115,7 @@ class _Job:
             fcntl.flock(self._log, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._log.close()
-            raise ConfigError(f"another process runs the experiment in {run.folder}") from None
+            raise
         (run.folder / FAILURE_FILE).unlink(missing_ok=True)
         self._process = subprocess.Popen(
             worker,
@@ -124,7 +145,7 @@ class _Job:
         """Record how the process ended; return the reason of a failure, None otherwise."""
         self._log.close()
         code = self._process.returncode
-        if (self.run.folder / RESULT_FILE).exists():
+        if status(self.run).state == "done":
             return None
         reason = f"exit status {code}"
         if self._timed_out:
@@ -136,12 +157,21 @@ class _Job:
         if code > 0 and last:
             reason += f": {last}"
         failure = {"reason": reason, "when": now(), "log": lines[-LOG_LINES:]}
-        (self.run.folder / FAILURE_FILE).write_text(json.dumps(failure, indent=2) + "\n")
+        write_text(self.run.folder / FAILURE_FILE, json.dumps(failure, indent=2) + "\n")
         return reason
 
-    def stop(self) -> None:
-        """Kill the process and its child processes."""
+    def terminate(self) -> None:
+        """Ask the process to save its state and end."""
         if self._process.poll() is None:
+            self._process.terminate()
+
+    def stop(self) -> None:
+        """End the process, which saves its state first; kill it and its child processes if it does
+        not end in time."""
+        self.terminate()
+        try:
+            self._process.wait(SAVE_S)
+        except subprocess.TimeoutExpired:
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
+            self._process.wait()
         self._log.close()

@@ -25,9 +25,10 @@ from ba_torchrl.record.results import (
     read_result,
 )
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training.checkpoint import build_algorithm, problem_of
+from ba_torchrl.training.checkpoint import build_algorithm, problem_of, read_config
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.resume import check_same_run, resumable_updates
+from ba_torchrl.training.run_lock import lock_holder
 
 SET_BY_THE_GRID = ("task", "seed", "label", "run_dir", "resume", "benchmark")
 """Fields of `ExperimentConfig` that differ from run to run."""
@@ -35,7 +36,7 @@ SET_BY_THE_GRID = ("task", "seed", "label", "run_dir", "resume", "benchmark")
 Overrides = dict[str, dict[str, Any]]
 Preset = Callable[[Literal["algorithm", "network"], str], dict[str, Any]]
 """From a group and a name to the values of that preset file; raises with the known names."""
-State = Literal["done", "interrupted", "failed", "missing"]
+State = Literal["done", "running", "interrupted", "failed", "missing"]
 
 
 class BenchmarkConfig(StrictModel):
@@ -162,14 +163,17 @@ def plan(
 
 
 def status(run: ExperimentConfig) -> Status:
-    """Return the state of a run.
+    """Return the state of a run. One whose files are damaged has failed.
 
     Raises:
         ConfigError: its folder holds a run with other settings.
     """
     folder = run.folder
     if (folder / RESULT_FILE).exists():
-        result = read_result(folder)
+        try:
+            result = read_result(folder)
+        except ValueError as error:
+            return Status("failed", f"{error}; delete the folder to start the run again")
         found = differences(result.config, run.resolved())
         if found:
             lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
@@ -179,7 +183,14 @@ def status(run: ExperimentConfig) -> Status:
             )
         return Status("done", f"success {result.final.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
+        try:
+            read_config(folder, device=run.device)
+        except ConfigError as error:
+            return Status("failed", f"{error}; delete the folder to start the run again")
         check_same_run(run)
+    holder = lock_holder(folder)
+    if holder is not None:
+        return Status("running", holder)
     reason = read_failure(folder)
     if reason is not None:
         return Status("failed", reason)

@@ -18,10 +18,15 @@ def main() -> None:
     from ba_torchrl.record.logging import limit_library_logs
     from ba_torchrl.training.config import ExperimentConfig
     from ba_torchrl.training.experiment import Experiment
+    from ba_torchrl.training.interruption import RunStopped
 
     logging.basicConfig(level=logging.INFO)
     limit_library_logs()
-    Experiment(ExperimentConfig.parse(json.load(sys.stdin)), progress=False).run()
+    try:
+        Experiment(ExperimentConfig.parse(json.load(sys.stdin)), progress=False).run()
+    except RunStopped as stopped:
+        logging.getLogger(__name__).warning("%s", stopped)
+        raise
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import pytest
 import torch
 from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
 
+from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.make import VectorEnv
 
 
@@ -172,12 +173,12 @@ class TestFailures:
         env = make_fakes(2, use_buffers=use_buffers)
         before = env.reset()
 
-        def interrupt(pending):
+        def interrupt(*_):
             raise KeyboardInterrupt
 
-        name = "_collect_flags" if use_buffers else "_collect_messages"
+        name = "collect_flags" if use_buffers else "collect_messages"
         with monkeypatch.context() as patch:
-            patch.setattr(env, name, interrupt)
+            patch.setattr(parallel, name, interrupt)
             with pytest.raises(KeyboardInterrupt):
                 env.step(act(env, before.clone()))
         state = env.reset()

@@ -18,6 +18,7 @@ from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.plan import status
+from ba_torchrl.training.run_lock import RunLock
 from tests.training.grid.grids import COMMON, REACH, planned
 
 ROOT = Path(__file__).parents[3]
@@ -133,7 +134,7 @@ def test_jobs_run_at_the_same_time(tmp_path, fake):
 
 def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
     runs = planned(tmp_path)
-    processes = []
+    processes, interrupted = [], []
     start = subprocess.Popen
 
     def remember(*args, **kwargs):
@@ -141,14 +142,15 @@ def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
         return processes[-1]
 
     def interrupt(seconds):
-        if calls(runs[0]):
+        if calls(runs[0]) and not interrupted:
+            interrupted.append(True)
             raise KeyboardInterrupt
 
     monkeypatch.setattr(jobs.subprocess, "Popen", remember)
     monkeypatch.setattr(jobs.time, "sleep", interrupt)
     with pytest.raises(KeyboardInterrupt):
         fake(runs, {0: "hang"})
-    assert [process.returncode for process in processes] == [-signal.SIGKILL]
+    assert [process.returncode for process in processes] == [-signal.SIGTERM]
     assert status(runs[0]).state == "missing"
 
 
@@ -160,16 +162,59 @@ def test_a_folder_with_other_settings_is_refused_before_anything_starts(tmp_path
     assert calls(changed[1]) == 0
 
 
-def test_a_run_of_another_process_is_refused(tmp_path, fake):
+def test_a_run_of_another_process_is_left_to_it(tmp_path, fake, capsys):
     runs = planned(tmp_path)
     runs[1].folder.mkdir(parents=True)
     with (runs[1].folder / "run.log").open("a") as log:
         fcntl.flock(log, fcntl.LOCK_EX)
-        with pytest.raises(ConfigError, match=r"another process runs .*seed1"):
-            fake(runs)
-    assert calls(runs[1]) == 0
+        assert fake(runs) == {}
+    assert "skipped: another process runs the experiment in" in capsys.readouterr().out
+    assert (calls(runs[0]), calls(runs[1])) == (1, 0)
     assert fake(runs) == {}
     assert (calls(runs[0]), calls(runs[1])) == (1, 1)
+
+
+def test_a_run_that_still_works_is_skipped_by_the_name_of_its_process(tmp_path, fake, capsys):
+    runs = planned(tmp_path)
+    lock = RunLock(runs[0].folder)
+    assert str(status(runs[0])).startswith(f"running: process {os.getpid()} on ")
+    assert fake(runs) == {}
+    assert f"skipped: process {os.getpid()} on " in capsys.readouterr().out
+    assert (calls(runs[0]), calls(runs[1])) == (0, 1)
+    lock.release()
+    assert fake(runs) == {}
+    assert status(runs[0]).state == "done"
+
+
+@pytest.mark.parametrize("content", [b"", b'{"task": "clo', b"\x80\x04\x95", b"[]"])
+def test_a_damaged_result_concerns_its_run_only(tmp_path, fake, content):
+    runs = planned(tmp_path, seeds=3)
+    assert fake(runs) == {}
+    (runs[1].folder / "result.json").write_bytes(content)
+    assert [status(run).state for run in runs] == ["done", "failed", "done"]
+    assert "delete the folder" in status(runs[1]).detail
+    page = write_report([tmp_path], tmp_path / "report")
+    assert "result.json is damaged" in (page.parent / "table.md").read_text()
+
+
+@pytest.mark.parametrize("content", [b"", b'{"rea', b"\x80\x04\x95", b"[]", b"{}"])
+def test_a_damaged_record_of_a_failure_concerns_its_run_only(tmp_path, fake, content):
+    runs = planned(tmp_path)
+    assert len(fake(runs, {0: "fail"})) == 1
+    (runs[0].folder / "failure.json").write_bytes(content)
+    assert str(status(runs[0])) == "failed: failure.json is damaged"
+    write_report([tmp_path], tmp_path / "report")
+    assert fake(runs) == {}
+
+
+def test_a_damaged_configuration_concerns_its_run_only(tmp_path, fake):
+    runs = planned(tmp_path)
+    runs[0].folder.mkdir(parents=True)
+    (runs[0].folder / "config.json").write_text('{"task": ')
+    assert status(runs[0]).state == "failed"
+    assert "config.json" in status(runs[0]).detail
+    fake(runs[1:])
+    assert status(runs[1]).state == "done"
 
 
 def test_a_killed_run_is_resumed_in_a_new_process(tmp_path):

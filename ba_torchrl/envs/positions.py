@@ -1,0 +1,100 @@
+"""The position of an environment in its episodes, which another process can continue from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import SimulationError
+
+Position = dict[str, Any]
+"""``seed``; ``episode``, the number of the first of some episodes; and ``actions``, float32
+[T, A], of each of them up to the present. For most tasks this is the current episode only. Tasks
+whose episodes depend on earlier ones need all episodes since the seed was set."""
+
+
+class RecordedPosition:
+    """Mix-in of environments: records the actions, and continues from a recorded position.
+
+    The episode is played again with the same actions, which gives the same bits in any process.
+    Reading the position does not affect the simulation, unlike `ManipulationEnv.get_state`.
+    """
+
+    _first_episode = 0
+    _played: list[list[torch.Tensor]] | None = None
+    _resumed: TensorDict | None = None
+
+    def get_position(self) -> Position:
+        """Return the position.
+
+        Raises:
+            SimulationError: the environment was not reset, or its state was saved or set by other
+                means, after which the actions do not determine it.
+        """
+        if not self._played:
+            raise SimulationError("the actions since the last reset do not determine the state")
+        size = len(self.action_sequence)
+        return {
+            "seed": self.base_seed,
+            "episode": self._first_episode,
+            "actions": [
+                np.stack([action.numpy() for action in actions])
+                if actions
+                else np.zeros((0, size), dtype=np.float32)
+                for actions in self._played
+            ],
+        }
+
+    def continue_from(self, position: Position) -> None:
+        """Play the episodes of a position again; the next `reset` returns its observation.
+
+        Args:
+            position: of an environment of the same task and parameters.
+        """
+        self._set_seed(position["seed"])
+        self._episode = position["episode"]
+        for actions in position["actions"]:
+            self._reset()
+            for action in actions:
+                self._step(TensorDict({keys.ACTION: torch.from_numpy(action.copy())}, []))
+        self._resumed = self._tensordict(self._observation)
+
+    def get_state(self) -> Any:
+        """As `ManipulationEnv.get_state`, after which the position is unknown."""
+        self._played = None
+        return super().get_state()
+
+    def set_state(self, state: Any) -> TensorDict:
+        """As `ManipulationEnv.set_state`, after which the position is unknown."""
+        self._played = None
+        return super().set_state(state)
+
+    def _set_seed(self, seed: int | None) -> None:
+        super()._set_seed(seed)
+        self._first_episode, self._played, self._resumed = 0, [], None
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **options: Any
+    ) -> TensorDict:
+        if self._resumed is not None and seed is None:
+            resumed, self._resumed = self._resumed, None
+            return resumed
+        scene = self._episodes.scene
+        depends = self.task_class.needs_fresh_world or (scene is not None and scene.task.continues)
+        result = super()._reset(tensordict, seed=seed, **options)
+        if not depends:
+            self._first_episode, self._played = self._episode - 1, [[]]
+        elif self._played is not None:
+            self._played.append([])
+        return result
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._resumed = None
+        result = super()._step(tensordict)
+        if self._played is not None:
+            self._played[-1].append(tensordict.get(keys.ACTION).detach().clone())
+        return result

@@ -1,0 +1,83 @@
+"""What recipes check before their work starts, and how they report errors of configuration."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from ba_torchrl.errors import ConfigError
+
+EXIT_CODE = 2
+_RESOURCES = {
+    errno.EACCES,
+    errno.EDQUOT,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOSPC,
+    errno.EPERM,
+    errno.EROFS,
+}
+
+
+def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+    """Decorate a recipe: errors of configuration and of resources are printed without traceback.
+
+    Resources are disk space, file handles and permissions. The exit code is `EXIT_CODE`.
+    """
+
+    @functools.wraps(main)
+    def decorated(settings: DictConfig) -> None:
+        try:
+            main(settings)
+        except ConfigError as error:
+            _end(error)
+        except OSError as error:
+            if error.errno not in _RESOURCES:
+                raise
+            _end(error)
+
+    return decorated
+
+
+def check_counts(settings: DictConfig, *names: str, least: int = 1) -> None:
+    """Check that settings are whole numbers.
+
+    Args:
+        settings: of the recipe.
+        names: of the settings.
+        least: smallest value.
+
+    Raises:
+        ConfigError: one of them is not, or is too small.
+    """
+    for name in names:
+        value: Any = settings[name]
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise ConfigError(f"{name}: must be a whole number of at least {least}, got {value!r}")
+
+
+def check_writable(path: str | Path) -> None:
+    """Check that a file can be written to the folder of a path, which is created if needed.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    folder = Path(path).parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigError(f"cannot write to {folder}: {error.strerror}") from None
+
+
+def _end(error: Exception) -> None:
+    sys.stderr.write(f"error: {error}\n")
+    sys.exit(EXIT_CODE)

@@ -1,0 +1,96 @@
+"""Saving that survives a loss of power: checkpoints on the disk, checked before they are loaded."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointLoadResult
+
+from ba_torchrl.data.state_files import check, check_space, publish, seal
+from ba_torchrl.errors import ConfigError, DamagedFilesError
+
+logger = logging.getLogger(__name__)
+
+
+class DurableCheckpoint(Checkpoint):
+    """TorchRL's checkpoint as a folder of data that appears when it is complete on the disk.
+
+    Args:
+        components: what is saved, by name.
+    """
+
+    def save(self, path: str | Path, **options: Any) -> Path:
+        """Write a checkpoint; see TorchRL.
+
+        Raises:
+            OSError: there is not enough space.
+        """
+        path = Path(path)
+        for component in self.components.values():
+            if hasattr(component, "state_dict"):
+                check_space(path, component.state_dict())
+        scratch = path.with_name(f".{path.name}.scratch")
+        shutil.rmtree(scratch, ignore_errors=True)
+        try:
+            super().save(scratch, **options)
+            seal(scratch)
+            publish(scratch, path)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+        return path
+
+    def load(self, path: str | Path, **options: Any) -> CheckpointLoadResult:
+        """Check and load a checkpoint; see TorchRL.
+
+        Raises:
+            DamagedFilesError: a file is missing, altered or shorter than written.
+            ConfigError: a file is not plain data, or its content does not fit the components.
+        """
+        check(path)
+        try:
+            return super().load(path, **options)
+        except (CheckpointError, OSError, ValueError, KeyError, TypeError) as error:
+            reason = " ".join(str(error).split())
+            raise ConfigError(
+                f"{path} does not fit this version or configuration: {reason}"
+            ) from error
+
+
+def saved_steps(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder of TorchRL's `CheckpointRotation`, the newest first.
+
+    Those that cannot be read are included.
+    """
+    found = (path for path in folder.glob("checkpoint-*") if step_of(path) is not None)
+    return sorted(found, key=step_of, reverse=True)
+
+
+def step_of(path: Path) -> int | None:
+    """Return the step of a checkpoint's folder, None if its name has none."""
+    step = path.name.removeprefix("checkpoint-")
+    return int(step) if step.isdigit() else None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what an interrupted save left in a folder of checkpoints."""
+    for leftover in folder.glob(".checkpoint-*"):
+        shutil.rmtree(leftover)
+
+
+def first_sound(paths: Iterable[Path]) -> Path | None:
+    """Return the first of some checkpoints whose files are whole, None if none is.
+
+    A warning names each one that is passed over.
+    """
+    for path in paths:
+        try:
+            check(path)
+        except DamagedFilesError as error:
+            logger.warning("%s: passed over for the one before: %s", path.name, error)
+        else:
+            return path
+    return None

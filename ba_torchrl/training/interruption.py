@@ -1,0 +1,96 @@
+"""Stopping a run by a signal: it ends between two updates, with its state saved."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from pathlib import Path
+from types import FrameType
+from typing import Self
+
+from torchrl.envs import EnvBase
+
+from ba_torchrl.envs.positions import Position
+from ba_torchrl.errors import SimulationError, WorkerError
+
+logger = logging.getLogger(__name__)
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interruption(BaseException):
+    """Raised inside a run where it can stop; `Experiment.run` turns it into `RunStopped`."""
+
+
+class RunStopped(SystemExit):
+    """A signal ended the run; the message says what was saved. The exit code is 128 + signal.
+
+    Args:
+        message: one line.
+        signum: number of the signal.
+    """
+
+    def __init__(self, message: str, signum: int) -> None:
+        super().__init__(128 + signum)
+        self.message = message
+
+    def __str__(self) -> str:
+        return self.message
+
+
+class StopSignals:
+    """Context in which SIGINT and SIGTERM are noted for `check`; a second one has its usual effect.
+
+    Outside the main thread, where Python allows no handlers, signals are left alone.
+    """
+
+    def __init__(self) -> None:
+        self._received: int | None = None
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._note) for number in STOP_SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._restore()
+
+    def check(self) -> None:
+        """Raise `Interruption` if a signal was received."""
+        if self._received is not None:
+            raise Interruption
+
+    def stopped(self, is_saved: bool, folder: Path) -> RunStopped:
+        """Return the exception that ends the process.
+
+        Args:
+            is_saved: whether the state is saved.
+            folder: of the run.
+        """
+        name = signal.Signals(self._received).name
+        what = "state saved" if is_saved else "nothing to save yet"
+        return RunStopped(
+            f"stopped by {name}, {what}: run_dir={folder} resume=true continues", self._received
+        )
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._received = number
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+
+def positions_of(env: EnvBase) -> list[Position] | None:
+    """Return the positions of a run's environments, None if one has failed."""
+    if env.is_closed:
+        return None
+    try:
+        return env.get_positions()
+    except (SimulationError, WorkerError) as error:
+        logger.warning("saved without the episodes in progress: %s", error)
+        return None

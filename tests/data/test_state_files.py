@@ -1,0 +1,146 @@
+"""Checksums of folders, atomic text files, and states without pickle."""
+
+import json
+import os
+
+import pytest
+import torch
+
+from ba_torchrl.data import state_files
+from ba_torchrl.data.state_files import (
+    CHECKSUMS_FILE,
+    check,
+    publish,
+    read_state,
+    seal,
+    write_state,
+    write_text,
+)
+from ba_torchrl.errors import ConfigError, DamagedFilesError
+
+STATE = {
+    "weights": torch.arange(6.0).reshape(2, 3),
+    "empty": torch.zeros(0, dtype=torch.uint8),
+    "nested": {"step": 3, "largest": (0.25, 7), "rows": [True, None, "text"]},
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / "state"
+    write_state(path / "part", STATE)
+    seal(path)
+    return path
+
+
+def weights_of(folder):
+    return max(folder.rglob("*.memmap"), key=lambda path: path.stat().st_size)
+
+
+def test_a_state_is_read_as_it_was_written(folder):
+    check(folder)
+    state = read_state(folder / "part")
+    assert torch.equal(state["weights"], STATE["weights"])
+    assert state["empty"].shape == (0,)
+    assert state["nested"] == STATE["nested"]
+    assert {path.suffix for path in folder.rglob("*") if path.is_file()} == {".json", ".memmap"}
+
+
+def test_the_tensors_read_do_not_depend_on_the_files(folder):
+    state = read_state(folder / "part")
+    weights_of(folder).write_bytes(b"\xff" * 24)
+    assert torch.equal(state["weights"], STATE["weights"])
+
+
+def cut_in_half(folder):
+    path = weights_of(folder)
+    os.truncate(path, path.stat().st_size // 2)
+    return "12 bytes, 24 were written"
+
+
+def flip_one_bit(folder):
+    path = weights_of(folder)
+    content = bytearray(path.read_bytes())
+    content[5] ^= 1
+    path.write_bytes(content)
+    return "its checksum differs"
+
+
+def delete_one(folder):
+    weights_of(folder).unlink()
+    return "is missing"
+
+
+def add_one(folder):
+    (folder / "more.memmap").write_bytes(b"abc")
+    return "is not listed"
+
+
+def tear_the_checksums(folder):
+    path = folder / CHECKSUMS_FILE
+    path.write_text(path.read_text()[:-20])
+    return "is damaged"
+
+
+def empty_the_checksums(folder):
+    (folder / CHECKSUMS_FILE).write_text("[1]")
+    return "is damaged"
+
+
+def delete_the_checksums(folder):
+    (folder / CHECKSUMS_FILE).unlink()
+    return f"has no {CHECKSUMS_FILE}"
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        cut_in_half,
+        flip_one_bit,
+        delete_one,
+        add_one,
+        tear_the_checksums,
+        empty_the_checksums,
+        delete_the_checksums,
+    ],
+)
+def test_damage_is_found_and_named(folder, damage):
+    with pytest.raises(DamagedFilesError, match=damage(folder)) as error:
+        check(folder)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["other.pickle", "state.pt", "prefetch.pkl", "state.tdz"])
+def test_files_that_a_library_would_unpickle_are_refused(folder, name):
+    (folder / "part" / name).write_bytes(b"")
+    for opened in (check, lambda path: read_state(path / "part"), seal):
+        with pytest.raises(ConfigError, match="is not opened"):
+            opened(folder)
+
+
+def test_links_are_refused(folder, tmp_path):
+    elsewhere = tmp_path / "elsewhere.json"
+    elsewhere.write_text("{}")
+    (folder / "link.json").symlink_to(elsewhere)
+    with pytest.raises(ConfigError, match="is not opened"):
+        check(folder)
+
+
+def test_a_published_folder_replaces_the_one_before(folder, tmp_path):
+    scratch = tmp_path / ".scratch"
+    write_state(scratch, {"step": 4})
+    seal(scratch)
+    publish(scratch, folder)
+    check(folder)
+    assert read_state(folder) == {"step": 4}
+    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+
+
+def test_a_text_file_is_whole_or_not_there(tmp_path, monkeypatch):
+    path = tmp_path / "result.json"
+    write_text(path, "{}\n")
+    monkeypatch.setattr(state_files.os, "fsync", lambda _: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        write_text(path, "x" * 100)
+    assert json.loads(path.read_text()) == {}
+    assert list(tmp_path.iterdir()) == [path]

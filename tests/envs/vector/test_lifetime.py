@@ -1,0 +1,124 @@
+"""Deaths that go on slow a vector of environments and do not end it; no worker survives it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import fake_env
+import pytest
+import torch
+from fake_env import BUFFERS, act
+
+import ba_torchrl
+
+PARENT = """
+import os, signal, sys, time
+sys.path.insert(0, {tests!r})
+from fake_env import FakeEnv
+from ba_torchrl.envs.vector.make import make_vector_env
+
+if __name__ == "__main__":
+    env = make_vector_env(FakeEnv, 3, start_method={method!r})
+    env.reset()
+    os.kill(env.worker_pids[0], signal.SIGSTOP)  # hangs
+    print(*env.worker_pids, flush=True)
+    {end}
+"""
+FAKES = Path(fake_env.__file__).parent
+
+
+def is_running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_until_gone(pids, seconds=10.0):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if not any(map(is_running, pids)):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize(
+    ("how", "method"), [("killed", "fork"), ("killed", "spawn"), ("ended", "fork")]
+)
+def test_no_worker_survives_its_parent(tmp_path, how, method):
+    script = tmp_path / "parent.py"
+    end = "time.sleep(100)" if how == "killed" else "sys.exit(0)"
+    script.write_text(PARENT.format(tests=str(FAKES), method=method, end=end))
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    pids = [int(pid) for pid in parent.stdout.readline().split()]
+    assert len(pids) == 3
+    if how == "killed":
+        parent.kill()
+    assert parent.wait(10) == (-signal.SIGKILL if how == "killed" else 0)
+    assert wait_until_gone(pids)
+
+
+@BUFFERS
+def test_a_trickle_of_deaths_does_not_end_the_environments(make_fakes, use_buffers):
+    env = make_fakes(2, use_buffers=use_buffers, max_restarts=1)
+    state, lost = env.reset(), 0
+    for number in range(8):
+        # between two steps, in turn, and sooner than any completes one
+        os.kill(env.worker_pids[number % 2], signal.SIGKILL)
+        env.parent_channels[number % 2].process.join()
+        step, state = env.step_and_maybe_reset(act(env, state))
+        lost += int(step["next", "fault"].sum())
+    assert env.restarts == lost == 8
+    step, state = env.step_and_maybe_reset(act(env, state))
+    assert not step["next", "fault"].any()
+
+
+def test_workers_that_ended_together_start_together(make_fakes, monkeypatch):
+    env = make_fakes(3)
+    state = env.reset()
+    order, launch = [], env._launch
+
+    def recorded(index):
+        worker = launch(index)
+        ready = worker.wait_until_ready
+        worker.wait_until_ready = lambda: (order.append(f"wait {index}"), ready())
+        order.append(f"launch {index}")
+        return worker
+
+    monkeypatch.setattr(env, "_launch", recorded)
+    for worker in env.parent_channels[:2]:
+        os.kill(worker.process.pid, signal.SIGKILL)
+        worker.process.join()
+    env.step(act(env, state))
+    assert order == ["launch 0", "launch 1", "wait 0", "wait 1"]
+
+
+def test_signals_for_all_processes_leave_the_workers_to_the_parent(make_fakes):
+    env = make_fakes(2)
+    state = env.reset()
+    for pid in env.worker_pids:
+        os.kill(pid, signal.SIGTERM)
+        os.kill(pid, signal.SIGINT)
+    step = env.step(act(env, state))
+    assert not step["next", "fault"].any()
+    assert env.restarts == 0
+
+
+def test_the_limits_are_parameters_of_make_vector_env():
+    env = ba_torchrl.make_vector_env(
+        "close_loop/block_reaching",
+        1,
+        start_method="fork",
+        timeout_s=7.0,
+        max_restarts=3,
+        start_timeout_s=50.0,
+        obs_size=16,
+        seed=0,
+    )
+    assert (env.timeout_s, env.max_restarts, env.start_timeout_s) == (7.0, 3, 50.0)
+    assert isinstance(env.reset()["pixels"], torch.Tensor)
+    env.close()

@@ -1,0 +1,305 @@
+"""Damaged and poisoned files of runs and demonstrations: none runs code, older states serve."""
+
+import contextlib
+import json
+import os
+import pickle
+import shutil
+
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.state_files import CHECKSUMS_FILE, _fingerprint
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.record.results import read_result
+from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.resume import resumable_updates
+
+TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
+TINY = {
+    "task": TASK,
+    "env": ENV,
+    "algorithm": {"name": "sac", "batch_size": 4, "replay": "prioritized", "buffer_size": 50},
+    "network": {"name": "cnn", "width": 0.125},
+    "num_envs": 1,
+    "parallel": False,
+    "demonstrations": 1,
+    "total_updates": 9,
+    "min_replay": 2,
+    "eval_every": 2,
+    "eval_episodes": 1,
+    "final_eval_episodes": 1,
+    "log_every": 1,
+    "video_episodes": 0,
+    "device": "cpu",
+}
+SIDECARS = ("other.pickle", "pickle.pkl", "prefetch.pkl", "state.pt", "transform.t", "frames.pt")
+
+
+class Interrupted(BaseException):
+    """An exception that no code handles."""
+
+
+class Planted:
+    """Unpickling it creates a file."""
+
+    def __init__(self, trace):
+        self.trace = trace
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.trace),)
+
+
+def config_for(folder, **changes):
+    return ExperimentConfig.parse({**TINY, "run_dir": str(folder), **changes})
+
+
+@pytest.fixture(scope="module")
+def interrupted_run(tmp_path_factory):
+    """A run folder with the states after 2 and 4 updates."""
+    folder = tmp_path_factory.mktemp("interrupted") / "run"
+    experiment = Experiment(config_for(folder), progress=False)
+    update = experiment.algorithm.update
+
+    def stop():
+        if experiment.algorithm.updates == 5:
+            raise Interrupted
+        return update()
+
+    experiment.algorithm.update = stop
+    with pytest.raises(Interrupted):
+        experiment.run()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory):
+    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, seed=0, expert=True, **ENV)
+    episodes = collect_demonstrations(env, 2, seed=0)
+    env.close()
+    path = tmp_path_factory.mktemp("demos") / "demos"
+    save_demonstrations(path, episodes, task=TASK, env=ENV, seed=0)
+    return path
+
+
+@pytest.fixture
+def run(interrupted_run, tmp_path):
+    return shutil.copytree(interrupted_run, tmp_path / "run")
+
+
+def resume(folder):
+    experiment = Experiment(config_for(folder, resume=True), progress=False)
+    try:
+        experiment._resume()
+    finally:
+        experiment.close()
+    return experiment
+
+
+def reseal(folder):
+    """Write checksums of every file, as somebody does who plants one."""
+    files = {
+        path.relative_to(folder).as_posix(): _fingerprint(path)
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != CHECKSUMS_FILE
+    }
+    (folder / CHECKSUMS_FILE).write_text(json.dumps({"crc32": files}))
+
+
+def representatives(folder):
+    """Return the files of a folder, one of those that differ only in their number."""
+    chosen = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            name = "".join(c for c in path.relative_to(folder).as_posix() if not c.isdigit())
+            chosen.setdefault(name, path.relative_to(folder))
+    return list(chosen.values())
+
+
+def plant_everywhere(folder, payload):
+    """Yield once for each file of a sealed folder that is replaced or added, then undo it."""
+    for name in representatives(folder):
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(payload)
+        if name.name != CHECKSUMS_FILE:
+            reseal(folder)
+        yield str(name)
+        (folder / name).write_bytes(content)
+    for parent in [folder, *(path for path in sorted(folder.rglob("*")) if path.is_dir())]:
+        for name in SIDECARS:
+            (parent / name).write_bytes(payload)
+        reseal(folder)
+        yield f"{parent.relative_to(folder)}/*.pickle"
+        for name in SIDECARS:
+            (parent / name).unlink()
+    reseal(folder)
+
+
+def assert_no_file_runs(folder, open_folder, tmp_path):
+    trace = tmp_path / "trace"
+    planted = Planted(trace)
+    pickle.loads(pickle.dumps(planted))
+    trace.rmdir()  # the payload works
+    torch_file = tmp_path / "planted.pt"
+    torch.save(planted, torch_file)
+    count = 0
+    for payload in (pickle.dumps(planted), torch_file.read_bytes()):
+        for name in plant_everywhere(folder, payload):
+            with contextlib.suppress(ConfigError):  # a replaced tensor may be read, as numbers
+                open_folder()
+            assert not trace.exists(), name
+            count += 1
+    assert count > 10
+    open_folder()
+
+
+def test_no_file_of_a_checkpoint_runs_code(run, tmp_path):
+    checkpoint = find_checkpoint(run, "latest")
+    assert_no_file_runs(checkpoint, lambda: load(checkpoint), tmp_path)
+
+
+def test_no_file_of_a_state_runs_code(run, tmp_path):
+    newest = max((run / "resume").iterdir())
+    only = shutil.copytree(run, tmp_path / "copy")
+    shutil.rmtree(only / "resume")
+    state = shutil.copytree(newest, only / "resume" / newest.name)
+    spare = shutil.copytree(newest, tmp_path / "spare")
+
+    def open_state():
+        experiment = Experiment(config_for(only, resume=True), progress=False)
+        try:
+            experiment._state.load()
+        finally:
+            experiment.close()
+            if not state.exists():
+                shutil.copytree(spare, state)
+
+    assert_no_file_runs(state, open_state, tmp_path)
+
+
+def test_no_file_of_demonstrations_runs_code(demonstrations, tmp_path):
+    folder = shutil.copytree(demonstrations, tmp_path / "demos")
+    assert_no_file_runs(folder, lambda: load_demonstrations(folder, task=TASK, env=ENV), tmp_path)
+
+
+def test_an_object_declared_in_a_data_set_is_not_unpickled(demonstrations, tmp_path):
+    """TensorDict stores what is no tensor as ``other.pickle`` beside a ``meta.json``."""
+    from tensordict import NonTensorData, TensorDict
+
+    folder, trace = tmp_path / "demos", tmp_path / "trace"
+    data = TensorDict.load_memmap(demonstrations).clone()
+    data["note"] = NonTensorData(Planted(trace), batch_size=data.batch_size)
+    data.memmap(folder, copy_existing=True)
+    shutil.copy(demonstrations / "demonstrations.json", folder)
+    assert list(folder.rglob("*.pickle"))
+    reseal(folder)
+    with pytest.raises(ConfigError, match="is not opened"):
+        load_demonstrations(folder, task=TASK, env=ENV)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "opened"),
+    [
+        ("config.json", read_config),
+        ("result.json", read_result),
+        ("scalars.csv", read_scalars),
+    ],
+)
+def test_no_record_of_a_run_runs_code(tmp_path, name, opened):
+    trace = tmp_path / "trace"
+    (tmp_path / name).write_bytes(pickle.dumps(Planted(trace)))
+    with pytest.raises(ValueError, match=name):
+        opened(tmp_path)
+    assert not trace.exists()
+
+
+def test_a_replay_holds_no_pickle(run):
+    assert {path.suffix for path in (run / "resume").rglob("*") if path.is_file()} == {
+        ".json",
+        ".memmap",
+    }
+
+
+# -- damage ------------------------------------------------------------------------------------
+
+
+def cut(path):
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    for place in range(0, 64):
+        content[place * len(content) // 64] ^= 0xFF
+    path.write_bytes(content)
+
+
+def largest(folder):
+    return max(folder.rglob("*.memmap"), key=lambda path: path.stat().st_size)
+
+
+@pytest.mark.parametrize("damage", [cut, flip])
+def test_a_damaged_state_falls_back_to_the_one_before(run, damage, caplog):
+    assert resumable_updates(run) == 4
+    damage(largest(max((run / "resume").iterdir())))
+    experiment = resume(run)
+    assert experiment.algorithm.updates == 2
+    assert "passed over for the one before" in caplog.text
+    assert len(list((run / "resume").iterdir())) == 1  # the damaged one is deleted
+
+
+def test_a_torn_manifest_of_the_newest_state_is_reported(run, caplog):
+    cut(max((run / "resume").iterdir()) / "manifest.json")
+    assert resume(run).algorithm.updates == 2
+    assert "manifest.json" in caplog.text
+
+
+def test_a_run_whose_states_are_all_damaged_says_what_to_do(run):
+    for state in (run / "resume").iterdir():
+        cut(largest(state))
+    with pytest.raises(ConfigError, match="start the run again in another run_dir") as error:
+        resume(run)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("which", ["latest", "best"])
+@pytest.mark.parametrize("damage", [cut, flip])
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(run, which, damage, caplog):
+    newest = find_checkpoint(run, which)  # of equal ones the newest is the best
+    damage(largest(newest))
+    older = find_checkpoint(run, which)
+    assert older != newest
+    assert newest.name in caplog.text
+    assert load(run, which)[1].updates == int(older.name[-1])
+    with pytest.raises(ConfigError, match=str(newest)):  # asked for by name
+        load(newest)
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_is_refused(run):
+    for checkpoint in (run / "checkpoints").iterdir():
+        cut(checkpoint / "manifest.json")
+    with pytest.raises(ConfigError, match="all checkpoints"):
+        load(run)
+
+
+def test_damaged_demonstrations_are_refused(demonstrations, tmp_path):
+    folder = shutil.copytree(demonstrations, tmp_path / "demos")
+    flip(largest(folder))
+    with pytest.raises(ConfigError, match="its checksum differs"):
+        load_demonstrations(folder, task=TASK, env=ENV)
+
+
+def test_leftovers_of_an_interrupted_save_are_removed(run):
+    for part in ("resume", "checkpoints"):
+        newest = max((run / part).iterdir())
+        shutil.copytree(newest, newest.with_name(f".{newest.name}.scratch"))
+    resume(run)
+    for part in ("resume", "checkpoints"):
+        assert not list((run / part).glob(".*"))
