@@ -70,7 +70,7 @@ class PickPlaceLimits:
     """Distance from the target at which lowering a held body starts."""
     lowering_steps: int = 2
     release_rest_steps: int = 1
-    """Physics steps after lowering, in which a body that has no contact yet comes to rest in the
+    """Physics steps after lowering in which a body that has no contact yet comes to rest in the
     gripper. Otherwise it would hit its support with the speed of the last step, and tilt."""
     release_opening: float = 0.12
     """Increase of the opening for a release."""

@@ -131,7 +131,8 @@ class PickPlace:
             reached, limits = self.robot.tool_frame().position, self.limits
             down = self._approach_point(reached, rotation, -limits.pre_place_height_m)
             self.motion.move_straight(reached, down, rotation, self.held, limits.lowering_steps)
-            self.world.step(limits.release_rest_steps)
+            if not self.motion.outer_contacts(self.held):
+                self.world.step(limits.release_rest_steps)
             self.on_contact()
             self._detach()
             self._open_fingers()
