@@ -240,6 +240,7 @@ TRAINING = (
 )
 
 
+@pytest.mark.slow
 def test_the_recipes_take_a_plugin(folder):
     recipes = ROOT / "recipes"
     out = run(folder, recipes / "train.py", PLUGIN, *TRAINING, "run_dir=runs/one").stdout
@@ -308,6 +309,7 @@ print(json.dumps(list(rollout["opening"].shape)))
     assert last_line(run(folder, "-c", code)) == [1, 3, 1]
 
 
+@pytest.mark.slow
 def test_a_benchmark_with_a_plugin_runs_its_jobs(folder):
     arguments = [
         PLUGIN,

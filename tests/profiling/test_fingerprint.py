@@ -62,6 +62,7 @@ def test_every_task_has_cases_and_names_are_unique():
     assert task == "open_loop/covid_test"
 
 
+@pytest.mark.slow
 def test_the_recipe_records_and_compares(tmp_path):
     """The recipe runs cases in spawned processes; a changed record gives exit code 1."""
     path = tmp_path / "record.json"

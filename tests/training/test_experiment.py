@@ -70,7 +70,7 @@ def test_a_run_writes_its_files(tmp_path):
     assert find_checkpoint(folder).name.endswith("6")
 
 
-@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_runs_of_one_seed_are_equal_and_of_two_differ(tmp_path, parallel):
     def losses(name, seed):
         config = tiny(

@@ -165,6 +165,7 @@ def test_a_run_stopped_before_its_first_update_continues_its_collection(
     assert_same(run(config_for(tmp_path, pretrain_updates=0, resume=True)), whole)
 
 
+@pytest.mark.slow
 def test_open_loop_in_worker_processes_continues_with_the_same_bits(tmp_path):
     options = {"base": SDQFD, "parallel": True, "start_method": "fork", "updates_per_step": 1}
     whole = run(config_for(tmp_path / "whole", **options))

@@ -217,6 +217,7 @@ def test_a_damaged_configuration_concerns_its_run_only(tmp_path, fake):
     assert status(runs[1]).state == "done"
 
 
+@pytest.mark.slow
 def test_a_killed_run_is_resumed_in_a_new_process(tmp_path):
     (run,) = planned(tmp_path, seeds=[5], common={"total_updates": 90, "eval_every": 15})
     state = run.folder / "resume"
