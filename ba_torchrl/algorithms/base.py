@@ -156,6 +156,11 @@ class AlgorithmConfig(StrictModel, ABC):
         """Whether the run must take updates before the first collection."""
         return False
 
+    @property
+    def capacity(self) -> int | None:
+        """Largest number of stored transitions; None without a limit."""
+        return None
+
     def check(self, network: NetworkConfig, control: Control) -> None:
         """Check that the algorithm supports the task's control, and that the network does.
 

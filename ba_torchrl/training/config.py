@@ -185,7 +185,7 @@ class ExperimentConfig(StrictModel):
             )
         if config.algorithm_config.needs_pretraining and not config.pretrain_updates:
             raise ConfigError("algorithm.init: 'bc' takes effect in pretrain_updates; set them")
-        capacity = getattr(config.algorithm_config, "capacity", None)
+        capacity = config.algorithm_config.capacity
         if capacity is not None and config.min_replay > capacity:
             raise ConfigError(
                 f"min_replay: {config.min_replay} transitions are more than the replay holds "
