@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar, Literal
 
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
-from torchrl.objectives import LossModule
-
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.imitators import Imitator, make_imitator
+from ba_torchrl.algorithms.imitators import ImitationLearning
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
 from ba_torchrl.modules.base import NetworkConfig
 
@@ -40,7 +34,7 @@ class BCConfig(LearnerConfig):
         return BC(self, network, problem)
 
 
-class BC(Learner):
+class BC(ImitationLearning, Learner):
     """A policy trained on demonstrations only.
 
     Args:
@@ -48,28 +42,3 @@ class BC(Learner):
         network: builds the network of the policy.
         problem: images, actions, device, seed and length of the run.
     """
-
-    def make_networks(self, network: NetworkConfig) -> Imitator:
-        """Return the policy with its loss."""
-        self.imitator = make_imitator(network, self.problem, self.images)
-        return self.imitator
-
-    def make_policy(self, networks: Imitator) -> TensorDictModuleBase:
-        """Return the policy."""
-        return networks.policy
-
-    def make_loss(self, networks: Imitator) -> LossModule:
-        """Return the loss between the policy and the demonstrated actions."""
-        return networks.make_loss()
-
-    def nearest_action(self, action: Tensor) -> Tensor:
-        """Return the nearest action that the policy can choose."""
-        return self.imitator.nearest_action(action)
-
-    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store demonstrations with actions that the policy can choose.
-
-        Args:
-            episodes: TensorDicts [T].
-        """
-        super().on_demonstrations([self.imitator.as_demonstration(each) for each in episodes])

@@ -7,7 +7,6 @@ and the policy's otherwise; the stored label is always the expert's.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -16,10 +15,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
-from torchrl.objectives import LossModule
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.imitators import Imitator, make_imitator
+from ba_torchrl.algorithms.imitators import ImitationLearning, Imitator
 from ba_torchrl.algorithms.learner import Learner, LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.envs import keys
@@ -96,7 +94,7 @@ class MixedPolicy(TensorDictModuleBase):
         self._generator.set_state(state.cpu())
 
 
-class DAgger(Learner):
+class DAgger(ImitationLearning, Learner):
     """A policy trained on the expert's actions in the states of both.
 
     Args:
@@ -114,31 +112,6 @@ class DAgger(Learner):
         seed = problem.derived_seed(SeedUse.MIXTURE)
         self.policy = MixedPolicy(self.policy, self.imitator, seed)
         self._set_beta()
-
-    def make_networks(self, network: NetworkConfig) -> Imitator:
-        """Return the policy with its loss."""
-        self.imitator = make_imitator(network, self.problem, self.images)
-        return self.imitator
-
-    def make_policy(self, networks: Imitator) -> TensorDictModuleBase:
-        """Return the policy."""
-        return networks.policy
-
-    def make_loss(self, networks: Imitator) -> LossModule:
-        """Return the loss between the policy and the expert's actions."""
-        return networks.make_loss()
-
-    def nearest_action(self, action: Tensor) -> Tensor:
-        """Return the nearest action that the policy can choose."""
-        return self.imitator.nearest_action(action)
-
-    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store demonstrations with actions that the policy can choose.
-
-        Args:
-            episodes: TensorDicts [T].
-        """
-        super().on_demonstrations([self.imitator.as_demonstration(each) for each in episodes])
 
     def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
         """Return the transitions [N], with the expert's action in place of the executed one.

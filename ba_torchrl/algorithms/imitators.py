@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from tensordict import TensorDictBase
@@ -111,3 +111,35 @@ def make_imitator(
     """
     kinds = {"close_loop": GaussianImitator, "open_loop": SpatialImitator}
     return kinds[problem.control](network, problem, images)
+
+
+class ImitationLearning:
+    """Mixin of a `Learner` whose policy is trained by the loss of an `Imitator` alone."""
+
+    problem: Problem
+    images: Mapping[str, ImageSpec]
+
+    def make_networks(self, network: NetworkConfig) -> Imitator:
+        """Return the policy with its loss."""
+        self.imitator = make_imitator(network, self.problem, self.images)
+        return self.imitator
+
+    def make_policy(self, networks: Imitator) -> TensorDictModuleBase:
+        """Return the policy."""
+        return networks.policy
+
+    def make_loss(self, networks: Imitator) -> LossModule:
+        """Return the loss between the policy and the expert's actions."""
+        return networks.make_loss()
+
+    def nearest_action(self, action: Tensor) -> Tensor:
+        """Return the nearest action that the policy can choose."""
+        return self.imitator.nearest_action(action)
+
+    def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
+        """Store demonstrations with actions that the policy can choose.
+
+        Args:
+            episodes: TensorDicts [T].
+        """
+        super().on_demonstrations([self.imitator.as_demonstration(each) for each in episodes])

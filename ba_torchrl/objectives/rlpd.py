@@ -10,13 +10,13 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.base import TransitionLoss
+from ba_torchrl.objectives.shared_encoder import SharedEncoderCritics
 
 
-class RLPDLoss(TransitionLoss):
+class RLPDLoss(SharedEncoderCritics, TransitionLoss):
     """Soft Actor-Critic with an ensemble of K critics on a shared encoder.
 
     With a random subset M of the target critics, drawn in each call for the whole batch, and
@@ -160,26 +160,6 @@ class RLPDLoss(TransitionLoss):
         if self.entropy_backup:
             value = value - self.alpha * log_prob.unsqueeze(-1)
         return self.value_estimator.value_estimate(tensordict, next_value=value)
-
-    def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return an action [B, A] drawn with gradient and its log-probability [B]."""
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            observation = tensordict.select(*self.actor_network.in_keys)
-            return compute_rsample_log_prob(self.actor_network.get_dist(observation))
-
-    def _features(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        with params.to_module(self.encoder_network, preserve_module_state=False):
-            observation = tensordict.select(*self.encoder_network.in_keys)
-            return self.encoder_network(observation)[self.encoder_network.out_keys[0]]
-
-    def _values(self, features: Tensor, action: Tensor, params: TensorDictBase) -> Tensor:
-        """Return the values [B, K] of an action at given features."""
-        inputs = TensorDict(
-            {self.encoder_network.out_keys[0]: features, self.tensor_keys.action: action},
-            batch_size=action.shape[:-1],
-        )
-        with params.to_module(self.qvalue_network, preserve_module_state=False):
-            return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
 
     def get_generator_state(self) -> Tensor:
         """Return the state of the generator of subsets."""

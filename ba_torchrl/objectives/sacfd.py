@@ -10,7 +10,6 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.base import (
@@ -22,9 +21,10 @@ from ba_torchrl.objectives.base import (
     reduce_over,
     weighted,
 )
+from ba_torchrl.objectives.shared_encoder import SharedEncoderCritics
 
 
-class SACfDLoss(TransitionLoss):
+class SACfDLoss(SharedEncoderCritics, TransitionLoss):
     """Soft Actor-Critic with a behaviour term on the demonstrations in the batch (appendix G.2).
 
     With twin values q_1 and q_2 of the stored action, an action a ~ pi drawn from the policy, and
@@ -195,7 +195,7 @@ class SACfDLoss(TransitionLoss):
         state = self._observation(tensordict, self.views)
         features = self._features(state, self.encoder_network_params)
         action = self._for_views(tensordict[self.tensor_keys.action])
-        q = self._twin_values(features, action, self.qvalue_network_params)
+        q = self._values(features, action, self.qvalue_network_params)
         error = q - self._for_views(target)
         squared = self._over_views(error.square().sum(dim=-1))
         loss_qvalue = self._reduced(squared, weights.of("critic"))
@@ -205,7 +205,7 @@ class SACfDLoss(TransitionLoss):
         sample, log_prob = self._sample_action(state)
         # Detached features and heads: the gradient reaches the actor's parameters only, through the
         # action.
-        q_pi = self._twin_values(features.detach(), sample, self.qvalue_network_params.data)
+        q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
         policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
         is_expert = self._expert_flag(tensordict)
         error = self._over_views((sample - action).square().mean(dim=-1))
@@ -257,7 +257,7 @@ class SACfDLoss(TransitionLoss):
         following = self._observation(tensordict.get(keys.NEXT), self.target_views)
         action, log_prob = self._sample_action(following)
         features = self._features(following, self.target_encoder_network_params)
-        q = self._twin_values(features, action, self.target_qvalue_network_params)
+        q = self._values(features, action, self.target_qvalue_network_params)
         value = q.amin(dim=-1) - self.alpha * log_prob
         if self.target_views > 1:
             value = value.mean(dim=-1)
@@ -280,26 +280,6 @@ class SACfDLoss(TransitionLoss):
     def _over_views(self, losses: Tensor) -> Tensor:
         """Return the losses of samples [..., B], means over those of their views."""
         return losses.mean(dim=-1) if self.views > 1 else losses
-
-    def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return an action [..., A] drawn with gradient and its log-probability [...]."""
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            observation = tensordict.select(*self.actor_network.in_keys)
-            return compute_rsample_log_prob(self.actor_network.get_dist(observation))
-
-    def _features(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        with params.to_module(self.encoder_network, preserve_module_state=False):
-            observation = tensordict.select(*self.encoder_network.in_keys)
-            return self.encoder_network(observation)[self.encoder_network.out_keys[0]]
-
-    def _twin_values(self, features: Tensor, action: Tensor, params: TensorDictBase) -> Tensor:
-        """Return the values [..., 2] of an action at given features."""
-        inputs = TensorDict(
-            {self.encoder_network.out_keys[0]: features, self.tensor_keys.action: action},
-            batch_size=action.shape[:-1],
-        )
-        with params.to_module(self.qvalue_network, preserve_module_state=False):
-            return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
 
     def _expert_flag(self, tensordict: TensorDictBase) -> Tensor:
         """Return the flag of demonstrations, bool [..., B]; False for plain SAC without it.
