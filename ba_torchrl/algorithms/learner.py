@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import nn
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
@@ -32,8 +33,6 @@ from ba_torchrl.objectives.imitation import BehaviourCloningLoss
 Init = Literal["random", "bc"]
 """How the policy is initialised."""
 
-_STATEFUL_PARTS = ("loss", "optimizer", "scheduler", "stored_augmentation", "augmentation")
-
 
 class LearnerConfig(AlgorithmConfig):
     """Hyper-parameters of every algorithm that learns from a replay."""
@@ -46,6 +45,9 @@ class LearnerConfig(AlgorithmConfig):
     """Adam's L2 term on the networks' parameters."""
     gradient_clamp: float | None = Field(default=None, gt=0)
     """Bound of each element of the networks' gradient; None for no bound."""
+    policy_average: float = Field(default=0.0, ge=0, lt=1)
+    """Decay of the exponential moving average of the policy's parameters with which the policy
+    acts; 0 for acting with the last parameters. None in the appendix."""
     batch_size: int = Field(default=64, ge=1)
     """Transitions per update."""
     replay: ReplayKind = "uniform"
@@ -110,9 +112,13 @@ class Learner(Algorithm):
         self.observation_keys = [*self.images, keys.HOLDING]
         self.codecs = make_codecs(self.images)
         networks = self.make_networks(network)
-        policy = ActingPolicy(self.make_policy(networks), self.make_acting_transforms())
+        policy = self.make_policy(networks)
         self.loss = self.make_loss(networks).to(problem.device)
-        self.policy = policy.to(problem.device)
+        self.trained_policy = policy.to(problem.device)
+        self.averaged_policy = self.make_averaged_policy()
+        averaged = self.averaged_policy
+        acting = self.trained_policy if averaged is None else averaged.module
+        self.policy = ActingPolicy(acting, self.make_acting_transforms()).to(problem.device)
         self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
@@ -135,13 +141,20 @@ class Learner(Algorithm):
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
 
+    def make_averaged_policy(self) -> AveragedModel | None:
+        """Return the moving average of the policy that acts; None if the policy itself acts."""
+        if not self.config.policy_average:
+            return None
+        average = get_ema_multi_avg_fn(self.config.policy_average)
+        return AveragedModel(self.trained_policy, multi_avg_fn=average)
+
     def make_init_loss(self) -> LossModule:
         """Return the loss of the pretraining updates with ``init="bc"``.
 
         Raises:
             ConfigError: the policy is not a distribution of actions.
         """
-        policy = self.policy.policy
+        policy = self.trained_policy
         if not isinstance(policy, ProbabilisticTensorDictSequential):
             raise ConfigError(
                 f"init: {type(self).__name__} has no actor that behaviour cloning could initialise"
@@ -258,7 +271,7 @@ class Learner(Algorithm):
         return self.minimize(self.init_loss(self.sample()))
 
     def minimize(self, scalars: TensorDictBase) -> TensorDict:
-        """Take one gradient step on a sum of losses, update the target network and count it.
+        """Take one gradient step on a sum of losses, update target and average, and count it.
 
         Args:
             scalars: losses, whose names begin with "loss_", and diagnostics.
@@ -270,6 +283,8 @@ class Learner(Algorithm):
             FloatingPointError: a loss is not finite.
         """
         self.step(scalars)
+        if self.averaged_policy is not None:
+            self.averaged_policy.update_parameters(self.trained_policy)
         self.updates += 1
         return scalars.detach()
 
@@ -301,15 +316,21 @@ class Learner(Algorithm):
 
     # -- state -------------------------------------------------------------------------------
 
+    def _stateful_parts(self) -> dict[str, Any]:
+        names = ["loss", "optimizer", "scheduler", "stored_augmentation", "augmentation"]
+        if self.averaged_policy is not None:
+            names.append("averaged_policy")
+        return {name: getattr(self, name) for name in names}
+
     def state_dict(self) -> dict[str, Any]:
         """Return networks, target, optimiser, schedule, augmentations and number of updates."""
-        parts = {name: getattr(self, name).state_dict() for name in _STATEFUL_PARTS}
-        return {**parts, "updates": self.updates}
+        state = {name: part.state_dict() for name, part in self._stateful_parts().items()}
+        return {**state, "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
-        for name in _STATEFUL_PARTS:
-            getattr(self, name).load_state_dict(state[name])
+        for name, part in self._stateful_parts().items():
+            part.load_state_dict(state[name])
         self.updates = state["updates"]
 
     def save_replay(self, folder: Path) -> None:

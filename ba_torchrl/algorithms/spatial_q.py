@@ -101,8 +101,13 @@ class SpatialQ(Learner):
 
     def make_policy(self, networks: SpatialValues) -> TensorDictModule:
         """Return the epsilon-greedy policy."""
-        self.explorer = SpatialPolicy(networks, seed=self.problem.derived_seed(SeedUse.EXPLORATION))
-        return spatial_policy(self.explorer)
+        seed = self.problem.derived_seed(SeedUse.EXPLORATION)
+        return spatial_policy(SpatialPolicy(networks, seed))
+
+    @property
+    def explorer(self) -> SpatialPolicy:
+        """The module that chooses actions."""
+        return self.policy.policy.module
 
     def make_loss(self, networks: SpatialValues) -> LevelDQNLoss:
         """Return the TD loss with the term on demonstrated actions."""

@@ -282,8 +282,9 @@ def test_the_policy_explores_under_random_and_is_greedy_under_deterministic(algo
     assert torch.equal(first, second)
 
 
-def test_epsilon_decreases_over_its_updates():
-    spatial = build("spatial_q")
+@pytest.mark.parametrize("policy_average", [0.0, 0.9])
+def test_epsilon_decreases_over_its_updates(policy_average):
+    spatial = build("spatial_q", policy_average=policy_average)
     spatial.extend(transitions(spatial))
     shares = []
     for _ in range(6):
