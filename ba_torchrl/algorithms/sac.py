@@ -53,6 +53,8 @@ class SACConfig(LearnerConfig):
     """Initial entropy temperature."""
     target_entropy: float = -5.0
     """Entropy that the temperature is tuned for, nats."""
+    entropy_backup: bool = True
+    """Whether targets have the entropy term."""
     demonstration_weight: float = Field(default=1.0, ge=0)
     """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
     augmentation: Literal["none", "so2"] = "none"
@@ -152,6 +154,7 @@ class SAC(Learner):
             ),
             alpha_init=config.alpha_init,
             target_entropy=config.target_entropy,
+            entropy_backup=config.entropy_backup,
             demonstration_weight=config.demonstration_weight,
             weighted_terms=config.importance_weighted,
             weight_norm=config.importance_norm,

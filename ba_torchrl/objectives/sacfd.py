@@ -36,6 +36,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                       * mean over experts of w_i mean over components (a - a_i)^2
         loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
+    Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
+
     u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
     "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are
     ones.
@@ -59,6 +61,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         qvalue_network: from features and action to twin values [..., 2].
         alpha_init: initial entropy temperature.
         target_entropy: entropy that the temperature is tuned for, nats.
+        entropy_backup: whether y has the entropy term; without it, y is the return alone.
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
             flag in the batch.
         reduction: of the samples' losses; the formulas above are "mean".
@@ -121,6 +124,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         *,
         alpha_init: float = 0.01,
         target_entropy: float = -5.0,
+        entropy_backup: bool = True,
         demonstration_weight: float = 1.0,
         reduction: Reduction | None = None,
         weighted_terms: WeightedTerms = "critic_and_policy",
@@ -147,6 +151,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         )
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
         self._needs_expert_flag = demonstration_weight != 0
+        self.entropy_backup = entropy_backup
         self.views = views
         self.target_views = target_views
         self.contrastive = None if contrastive is None else contrastive.to(device)
@@ -258,7 +263,9 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         action, log_prob = self._sample_action(following)
         features = self._features(following, self.target_encoder_network_params)
         q = self._values(features, action, self.target_qvalue_network_params)
-        value = q.amin(dim=-1) - self.alpha * log_prob
+        value = q.amin(dim=-1)
+        if self.entropy_backup:
+            value = value - self.alpha * log_prob
         if self.target_views > 1:
             value = value.mean(dim=-1)
         return self.value_estimator.value_estimate(tensordict, next_value=value.unsqueeze(-1))

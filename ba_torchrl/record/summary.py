@@ -16,6 +16,7 @@ from scipy.stats import bootstrap
 
 from ba_torchrl.record.results import (
     NON_LEARNING_FIELDS,
+    CurvePoint,
     RunResult,
     differences,
     read_result,
@@ -66,14 +67,25 @@ class Group:
     """Runs in the order of seeds."""
 
     @property
+    def curves(self) -> list[list[CurvePoint]]:
+        """Curves of all seeds, of the same length.
+
+        The last point of a run that ended at `stop_at_success` stands for all later ones.
+        """
+        curves = [run.result.curve for run in self.runs]
+        length = max(map(len, curves))
+        return [curve + curve[-1:] * (length - len(curve)) for curve in curves]
+
+    @property
     def updates(self) -> np.ndarray:
         """Updates at the points of the curve, [n]."""
-        return np.array([point.updates for point in self.runs[0].result.curve])
+        longest = max((run.result.curve for run in self.runs), key=len)
+        return np.array([point.updates for point in longest])
 
     @property
     def rates(self) -> np.ndarray:
         """Success rate of every seed at the points of the curve, [seeds, n]."""
-        return np.array([[p.success_rate for p in run.result.curve] for run in self.runs])
+        return np.array([[point.success_rate for point in curve] for curve in self.curves])
 
     @property
     def by_seed(self) -> dict[int, float]:
@@ -93,8 +105,9 @@ class Group:
         reached = np.flatnonzero(self.rates.mean(0) >= rate)
         if not reached.size:
             return float("nan"), float("nan")
-        points = [run.result.curve[reached[0]] for run in self.runs]
-        return float(points[0].updates), float(np.mean([point.env_steps for point in points]))
+        points = [curve[reached[0]] for curve in self.curves]
+        steps = np.mean([point.env_steps for point in points])
+        return float(self.updates[reached[0]]), float(steps)
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,9 @@ class ExperimentConfig(StrictModel):
     the latest ones are kept."""
     eval_episodes: int = Field(default=100, ge=1)
     """Episodes of each of these evaluations; reference implementation."""
+    stop_at_success: float | None = Field(default=None, gt=0, le=1)
+    """Success rate that ends the run when two evaluations in a row reach it; None for all updates.
+    If it is set, every evaluation has other episodes."""
     final_eval_episodes: int = Field(default=100, ge=1)
     """Episodes of the last evaluation, which is reported."""
     report: Literal["last", "best"] = "last"

@@ -22,6 +22,7 @@ from ba_torchrl.record.results import CurvePoint
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
 from ba_torchrl.training.collection import gather_demonstrations, make_collector, make_env
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.duration import UpdateTimer, compute_path
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals, positions_of
 from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
@@ -61,6 +62,7 @@ class Experiment:
         self._state = ResumeState(
             config.folder, self.algorithm, self._progress, config.torch_device
         )
+        self._timer = UpdateTimer()
         self._signals = StopSignals()
         self._is_between_updates = False
         """Whether the state can be saved: there is one, and no update is under way."""
@@ -145,9 +147,9 @@ class Experiment:
         config, algorithm = self.config, self.algorithm
         collects = config.algorithm_config.collects
         pretrain_updates = config.pretrain_updates if collects else config.total_updates
-        while algorithm.updates < pretrain_updates:
+        while algorithm.updates < pretrain_updates and not self._is_complete:
             self._update(algorithm.pretrain_update)
-        if algorithm.updates == config.total_updates:
+        if self._is_complete:
             return
         collector = self._start_collection()
         steps = iter(collector)
@@ -159,6 +161,8 @@ class Experiment:
                 self._stop_or_save()
         finally:
             collector.shutdown(close_env=False)
+        if algorithm.updates < config.total_updates:
+            logger.info("the run ends at update %d: stop_at_success", algorithm.updates)
 
     def _start_collection(self) -> Collector:
         """Return a collector, which continues the episodes of a resumed run."""
@@ -177,12 +181,20 @@ class Experiment:
 
     def _take_pending_updates(self) -> bool:
         """Take the updates of the last step of collection; return whether the run is complete."""
-        while self._progress.pending_updates:
-            if self.algorithm.updates == self.config.total_updates:
-                return True
+        while self._progress.pending_updates and not self._is_complete:
             self._progress.pending_updates -= 1
             self._update(self.algorithm.update)
-        return self.algorithm.updates == self.config.total_updates
+        return self._is_complete
+
+    @property
+    def _is_complete(self) -> bool:
+        """Whether all updates are taken, or the last evaluations reach `stop_at_success`."""
+        if self.algorithm.updates == self.config.total_updates:
+            return True
+        target, last = self.config.stop_at_success, self._progress.curve[-2:]
+        if target is None or len(last) < 2:
+            return False
+        return all(point.success_rate >= target for point in last)
 
     def _finish(self) -> Result:
         """Run the evaluation that is reported, on new episodes; write curve, video and record."""
@@ -222,6 +234,7 @@ class Experiment:
         self._is_between_updates = True
         updates = self.algorithm.updates
         self._bar.update()
+        self._log_duration(self._timer.tick())
         if updates % config.log_every == 0:
             values = {f"train/{key}": float(value) for key, value in scalars.items()}
             progress = self._progress
@@ -231,6 +244,20 @@ class Experiment:
             self.log.write(updates, values)
         self._evaluate_if_due()
         self._stop_or_save()
+
+    def _log_duration(self, seconds_per_update: float | None) -> None:
+        """Log the expected duration of the remaining updates, if it has just been measured."""
+        if seconds_per_update is None:
+            return
+        remaining = self.config.total_updates - self.algorithm.updates
+        minutes = remaining * seconds_per_update / 60
+        logger.info(
+            "%s: %.2f s an update, %.0f minutes for the remaining %d, evaluations not included",
+            compute_path(self.config),
+            seconds_per_update,
+            minutes,
+            remaining,
+        )
 
     def _evaluate_if_due(self) -> None:
         """Evaluate at every multiple of ``eval_every``, except at the end of the run."""
@@ -267,7 +294,9 @@ class Experiment:
     def _evaluate_and_save(self) -> None:
         """Add a point to the learning curve; save the state and a checkpoint with its rate."""
         updates, progress = self.algorithm.updates, self._progress
-        evaluation = self._evaluate(self.config.eval_episodes, SeedUse.EVALUATION)
+        # A run must not end because the same episodes succeed twice.
+        part = 0 if self.config.stop_at_success is None else len(progress.curve)
+        evaluation = self._evaluate(self.config.eval_episodes, SeedUse.EVALUATION, part)
         progress.curve.append(
             CurvePoint(
                 updates=updates,
@@ -281,8 +310,8 @@ class Experiment:
         self._save()
         self.checkpoints.save(updates, evaluation.success_rate)
 
-    def _evaluate(self, episodes: int, use: SeedUse) -> Evaluation:
-        seed = self.config.derived_seed(use)
+    def _evaluate(self, episodes: int, use: SeedUse, part: int = 0) -> Evaluation:
+        seed = self.config.derived_seed(use, part)
         if self._eval_env is None:
             self._eval_env = make_env(self.config, seed)
         return evaluate(

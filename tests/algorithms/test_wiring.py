@@ -30,6 +30,7 @@ SAC = {
     "tau": 0.3,
     "alpha_init": 0.25,
     "target_entropy": -2.5,
+    "entropy_backup": False,
     "demonstration_weight": 3.0,
     "batch_size": 6,
     "buffer_size": 77,
@@ -150,6 +151,7 @@ def test_the_terms_of_sac_have_their_values():
     loss = build("sac").loss
     assert float(loss.alpha) == pytest.approx(0.25)
     assert float(loss.target_entropy) == -2.5
+    assert not loss.entropy_backup
     assert float(loss.demonstration_weight) == 3.0
 
 

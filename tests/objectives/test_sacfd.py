@@ -45,6 +45,7 @@ def by_hand(
     demonstration_weight,
     terms="critic_and_policy",
     norm="max",
+    entropy_backup=True,
 ):
     """The terms of the loss, computed with Python floats and loops."""
 
@@ -76,7 +77,8 @@ def by_hand(
         x, following = observation(data, i), observation(data[keys.NEXT], i)
         stored = data[keys.ACTION][i].tolist()
         next_action, next_log_prob = policy(following)
-        bootstrap = min(q(following, next_action, "target_")) - alpha * next_log_prob
+        bootstrap = min(q(following, next_action, "target_"))
+        bootstrap -= alpha * next_log_prob * entropy_backup
         y = float(data[keys.NEXT, keys.REWARD][i])
         if not data[keys.NEXT, keys.TERMINATED][i]:
             y += gamma * bootstrap
@@ -133,6 +135,19 @@ def test_importance_weights_multiply_the_chosen_terms(terms, norm):
     out = loss(data)
     for name, value in expected.items():
         assert out[name].item() == pytest.approx(value, rel=1e-6), name
+
+
+def test_without_entropy_backup_the_target_is_the_return_alone():
+    data = batch()
+    losses = {}
+    for backup in (True, False):
+        loss = make(alpha_init=0.2, target_entropy=-1.5, entropy_backup=backup)
+        expected, _ = by_hand(loss, data, 0.99, 0.2, -1.5, 1.0, entropy_backup=backup)
+        out = loss(data)
+        for name, value in expected.items():
+            assert out[name].item() == pytest.approx(value, rel=1e-6), name
+        losses[backup] = out["loss_qvalue"].item()
+    assert losses[True] != pytest.approx(losses[False], rel=1e-3)
 
 
 def test_unknown_importance_weights_are_refused():

@@ -43,7 +43,7 @@ def write_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equ
                 "standard_error": 0.1,
                 "mean_length": 7.0,
             }
-            for updates, rate in zip(UPDATES, rates, strict=True)
+            for updates, rate in zip(UPDATES, rates, strict=False)
         ],
         "final": {
             "policy": "last",
@@ -101,6 +101,17 @@ def test_a_rate_that_is_never_reached_gives_nan(tmp_path):
     write_run(tmp_path / "a", (0.1, 0.2, 0.3))
     (section,), _ = load_sections([tmp_path])
     assert np.isnan(summarize(section)[0]["updates_to_80"])
+
+
+def test_the_last_point_of_a_run_that_ended_early_stands_for_later_ones(tmp_path):
+    for seed, rates in enumerate([(0.1, 0.5, 0.7), (0.9, 0.9)]):
+        write_run(tmp_path / f"seed{seed}", rates, seed=seed)
+    (section,), _ = load_sections([tmp_path])
+    (group,) = section.groups
+    assert group.updates.tolist() == list(UPDATES)
+    assert group.rates.tolist() == [[0.1, 0.5, 0.7], [0.9, 0.9, 0.9]]
+    # the mean is 0.8 at the last point, where the seeds have 1500 and 1001 steps
+    assert group.reaches(0.8) == (300.0, 1250.5)
 
 
 def test_the_row_of_all_tasks_has_methods_that_ran_on_all_of_them(tmp_path):

@@ -1,0 +1,44 @@
+import time
+
+import pytest
+import torch
+
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.duration import (
+    MEASURED_UPDATES,
+    WARM_UP_UPDATES,
+    UpdateTimer,
+    compute_path,
+)
+from ba_torchrl.training.experiment import Experiment
+from tests.training.test_experiment import TINY
+
+
+def test_the_first_updates_are_measured_once_without_the_very_first(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    timer, seen = UpdateTimer(), []
+    for update in range(60):
+        now[0] += 100.0 if update < WARM_UP_UPDATES else 0.5
+        seen.append(timer.tick())
+    index = WARM_UP_UPDATES + MEASURED_UPDATES - 1
+    assert seen[index] == pytest.approx(0.5)
+    assert all(value is None for i, value in enumerate(seen) if i != index)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_the_path_names_number_format_and_processor(tmp_path, precision):
+    network = {**TINY["network"], "precision": precision}
+    config = ExperimentConfig.parse({**TINY, "network": network, "device": "cpu"})
+    path = compute_path(config)
+    assert path.startswith(f"{precision} on ")
+    assert path.endswith(f"{torch.get_num_threads()} threads")
+
+
+def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog):
+    updates = WARM_UP_UPDATES + MEASURED_UPDATES + 4
+    changes = {"total_updates": updates, "eval_every": 100, "video_episodes": 0, "device": "cpu"}
+    config = ExperimentConfig.parse({**TINY, **changes, "run_dir": str(tmp_path / "run")})
+    with caplog.at_level("INFO"):
+        Experiment(config, progress=False).run()
+    assert "for the remaining 4" in caplog.text
