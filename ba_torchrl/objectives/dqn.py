@@ -47,84 +47,47 @@ class LevelValues(Protocol):
         ...
 
 
-def large_margin(
-    q: Tensor,
-    chosen: Tensor,
-    is_expert: Tensor,
-    margin: float,
-    reduction: Reduction = "mean",
-    weights: Tensor | None = None,
-) -> Tensor:
-    """Return the margin loss of DQfD (appendix E).
+def large_margin(q: Tensor, chosen: Tensor, margin: float) -> Tensor:
+    """Return the margin losses of DQfD [B] (appendix E).
 
-    max_a [Q(a) + margin * 1(a != a_e)] - Q(a_e); the mean is over the demonstrations.
+    max_a [Q(a) + margin * 1(a != a_e)] - Q(a_e).
 
     Args:
         q: values of all actions [B, N].
-        chosen: the stored action [B].
-        is_expert: bool [B].
+        chosen: the expert's action [B].
         margin: least difference of Q(a_e) to the other values.
-        reduction: of the samples' losses; zero for samples that are not demonstrations.
-        weights: [B] of the samples' losses.
     """
     of_chosen = q.gather(1, chosen[:, None])
     is_other = torch.ones_like(q).scatter_(1, chosen[:, None], 0.0)
-    excess = (q + margin * is_other).amax(dim=1) - of_chosen[:, 0]
-    return reduce_over(weighted(excess, weights), is_expert, reduction)
+    return (q + margin * is_other).amax(dim=1) - of_chosen[:, 0]
 
 
-def strict_large_margin(
-    q: Tensor,
-    chosen: Tensor,
-    is_expert: Tensor,
-    margin: float,
-    reduction: Reduction = "mean",
-    weights: Tensor | None = None,
-) -> Tensor:
-    """Return the margin loss of SDQfD, which applies to every violating action (appendix E).
+def strict_large_margin(q: Tensor, chosen: Tensor, margin: float) -> Tensor:
+    """Return the margin losses of SDQfD [B], which have every violating action (appendix E).
 
     The mean of Q(a) - Q(a_e) + margin over {a != a_e: Q(a) > Q(a_e) - margin}, zero if that set is
-    empty. The loss is averaged over the whole batch, with zero for samples that are not
-    demonstrations.
+    empty.
 
     Args:
         q: values of all actions [B, N].
-        chosen: the stored action [B].
-        is_expert: bool [B].
+        chosen: the expert's action [B].
         margin: least difference of Q(a_e) to the other values.
-        reduction: of the samples' losses.
-        weights: [B] of the samples' losses.
     """
+    # The gap of the expert's action is the margin, which is taken out of sum and count.
     gap = q - q.gather(1, chosen[:, None]) + margin
-    violates = (gap > 0).scatter(1, chosen[:, None], False)
-    violates &= is_expert[:, None]
-    count = violates.sum(dim=1).clamp_min(1)
-    losses = torch.where(violates, gap, 0.0).sum(dim=1) / count
-    return reduce_loss(weighted(losses, weights), reduction)
+    count = (gap.detach() > 0).sum(dim=1) - int(margin > 0)
+    return (gap.relu().sum(dim=1) - margin) / count.clamp_min(1)
 
 
-def cross_entropy(
-    q: Tensor,
-    chosen: Tensor,
-    is_expert: Tensor,
-    beta: float,
-    reduction: Reduction = "mean",
-    weights: Tensor | None = None,
-) -> Tensor:
-    """Return the loss of ADET: the cross-entropy of softmax(beta Q) with the expert's action.
-
-    The mean is over the demonstrations.
+def cross_entropy(q: Tensor, chosen: Tensor, beta: float) -> Tensor:
+    """Return the losses of ADET [B]: the cross-entropy of softmax(beta Q) with the expert's action.
 
     Args:
         q: values of all actions [B, N].
-        chosen: the stored action [B].
-        is_expert: bool [B].
+        chosen: the expert's action [B].
         beta: inverse temperature.
-        reduction: of the samples' losses; zero for samples that are not demonstrations.
-        weights: [B] of the samples' losses.
     """
-    losses = F.cross_entropy(beta * q, chosen, reduction="none")
-    return reduce_over(weighted(losses, weights), is_expert, reduction)
+    return F.cross_entropy(beta * q, chosen, reduction="none")
 
 
 class LevelDQNLoss(TransitionLoss):
@@ -144,8 +107,9 @@ class LevelDQNLoss(TransitionLoss):
     Args:
         value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a
             single level, see `SingleLevelValues`.
-        demonstrations: "dqfd" `large_margin`, "sdqfd" `strict_large_margin`, "adet"
-            `cross_entropy`, or "none" for plain DQN, which needs no expert flag in the batch.
+        demonstrations: "dqfd" `large_margin` and "adet" `cross_entropy`, means over the
+            demonstrations in the batch; "sdqfd" `strict_large_margin`, a mean over the batch, with
+            zero for other samples; or "none" for plain DQN, which needs no expert flag.
         demonstration_weight: weight of that term.
         margin: margin of "dqfd" and "sdqfd".
         first_beta: inverse temperature of "adet" at the first level.
@@ -244,15 +208,16 @@ class LevelDQNLoss(TransitionLoss):
         errors = weighted(errors, None if td_weights is None else td_weights[:, None, None])
         difference = (q.detach() - target[..., None]).abs().mean(dim=-1)
         tensordict.set(self.tensor_keys.priority, difference)
-        demonstration = self._demonstration_error(
-            tensordict, levels, self.reduction, weights.of("all")
+        demonstration, is_expert = self._demonstration_losses(tensordict, levels)
+        of_batch = self._reduce_demonstrations(
+            weighted(demonstration, weights.of("all")), is_expert, self.reduction
         )
         return TensorDict(
             {
                 "loss_qvalue": self._sum_over_levels(errors[:, 0]),
-                "loss_demonstration": self.demonstration_weight * demonstration,
-                "demonstration_error": self._demonstration_error(
-                    tensordict, [(q.detach(), chosen) for q, chosen in levels], "mean"
+                "loss_demonstration": self.demonstration_weight * of_batch,
+                "demonstration_error": self._reduce_demonstrations(
+                    demonstration.detach(), is_expert, "mean"
                 ),
                 "td_error": difference.mean(),
                 "q_value": q.detach().mean(),
@@ -276,26 +241,35 @@ class LevelDQNLoss(TransitionLoss):
             return losses.sum(dim=-1)
         return (losses.mean(dim=0) if self.reduction == "mean" else losses.sum(dim=0)).sum()
 
-    def _demonstration_error(
-        self,
-        tensordict: TensorDictBase,
-        levels: list[tuple[Tensor, Tensor]],
-        reduction: Reduction,
-        weights: Tensor | None = None,
-    ) -> Tensor:
-        """Return the sum of the levels' terms, zero without demonstrations in the batch."""
+    def _demonstration_losses(
+        self, tensordict: TensorDictBase, levels: list[tuple[Tensor, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the sums of the levels' terms [B], zero without demonstration, and flags [B]."""
+        losses = levels[0][0].new_zeros(len(levels[0][0]))
         if self.demonstrations == "none":
-            return reduce_loss(levels[0][0].new_zeros(len(levels[0][0])), reduction)
+            return losses, torch.zeros_like(losses, dtype=torch.bool)
         is_expert = tensordict[self.tensor_keys.is_expert].reshape(-1)
-        terms = []
-        for number, (q, chosen) in enumerate(levels):
-            if self.demonstrations == "adet":
-                beta = self.later_beta if number else self.first_beta
-                terms.append(cross_entropy(q, chosen, is_expert, beta, reduction, weights))
-            elif self.demonstrations == "dqfd":
-                terms.append(large_margin(q, chosen, is_expert, self.margin, reduction, weights))
-            else:
-                terms.append(
-                    strict_large_margin(q, chosen, is_expert, self.margin, reduction, weights)
-                )
-        return torch.stack(terms).sum(dim=0)
+        if is_expert.device.type != "cpu":  # the number of demonstrations is not known on the CPU
+            terms = torch.stack([self._term(i, *level) for i, level in enumerate(levels)])
+            return torch.where(is_expert, terms.sum(dim=0), 0.0), is_expert
+        rows = is_expert.nonzero()[:, 0]
+        if len(rows):
+            of_experts = [(q[rows], chosen[rows]) for q, chosen in levels]
+            terms = torch.stack([self._term(i, *level) for i, level in enumerate(of_experts)])
+            losses = losses.index_put((rows,), terms.sum(dim=0))
+        return losses, is_expert
+
+    def _term(self, level: int, q: Tensor, chosen: Tensor) -> Tensor:
+        """Return the losses [n] of a level's values [n, N] and the experts' choices [n]."""
+        if self.demonstrations == "adet":
+            return cross_entropy(q, chosen, self.later_beta if level else self.first_beta)
+        term = large_margin if self.demonstrations == "dqfd" else strict_large_margin
+        return term(q, chosen, self.margin)
+
+    def _reduce_demonstrations(
+        self, losses: Tensor, is_expert: Tensor, reduction: Reduction
+    ) -> Tensor:
+        """Return losses [B] reduced over the demonstrations, for "sdqfd" over the batch."""
+        if self.demonstrations == "sdqfd":
+            return reduce_loss(losses, reduction)
+        return reduce_over(losses, is_expert, reduction)

@@ -163,37 +163,46 @@ def test_importance_weights_multiply_the_chosen_terms(terms, norm, kind):
 
 def test_the_strict_margin_is_zero_without_a_violating_action():
     q = torch.tensor([[0.0, 1.0, 0.3], [0.5, 0.2, 0.55]], requires_grad=True)
-    chosen, experts = torch.tensor([1, 2]), torch.tensor([True, False])
-    value = strict_large_margin(q, chosen, experts, margin=0.1)
-    value.backward()
-    assert value == 0
+    values = strict_large_margin(q, torch.tensor([1, 2]), margin=0.1)
+    values[0].backward()
+    assert values[0] == 0
     assert not q.grad.any()
 
 
-def test_the_strict_margin_has_gradients_for_every_violation_and_averages_the_batch():
+def test_the_strict_margin_has_gradients_for_every_violation():
     # expert's 0.5: 0.45 and 0.9 violate a margin of 0.1, by 0.05 and 0.5; 0.4 just not
     q = torch.tensor([[0.5, 0.45, 0.9, 0.39999], [9.0, 0.0, 0.0, 0.0]], requires_grad=True)
-    chosen = torch.tensor([0, 1])
-    value = strict_large_margin(q, chosen, torch.tensor([True, False]), margin=0.1)
-    assert value.item() == pytest.approx((0.05 + 0.5) / 2 / 2, rel=1e-4)
-    value.backward()
-    assert q.grad[0].tolist() == pytest.approx([-0.5, 0.25, 0.25, 0.0])
+    values = strict_large_margin(q, torch.tensor([0, 1]), margin=0.1)
+    assert values[0].item() == pytest.approx((0.05 + 0.5) / 2, rel=1e-4)
+    values[0].backward()
+    assert q.grad[0].tolist() == pytest.approx([-1.0, 0.5, 0.5, 0.0])
     assert not q.grad[1].any()
 
 
-def test_the_margin_of_dqfd_has_gradients_for_the_worst_violation_of_experts_only():
+@pytest.mark.parametrize("margin", [0.0, 0.1, 3.0])
+def test_the_strict_margin_equals_a_loop_over_actions(margin):
+    q = torch.randn(5, 40, dtype=torch.float64)
+    q[4] = q[4].round()  # equal values
+    chosen = torch.randint(40, (5,))
+    expected = []
+    for values, best in zip(q.tolist(), chosen.tolist(), strict=True):
+        others = [v for index, v in enumerate(values) if index != best]
+        violations = [v - values[best] + margin for v in others if v > values[best] - margin]
+        expected.append(sum(violations) / max(len(violations), 1))
+    assert strict_large_margin(q, chosen, margin).tolist() == pytest.approx(expected)
+
+
+def test_the_margin_of_dqfd_has_gradients_for_the_worst_violation():
     q = torch.tensor([[0.5, 0.45, 0.9], [9.0, 0.0, 0.0]], requires_grad=True)
-    value = large_margin(q, torch.tensor([0, 1]), torch.tensor([True, False]), margin=0.1)
-    assert value.item() == pytest.approx(0.5)
-    value.backward()
+    values = large_margin(q, torch.tensor([0, 1]), margin=0.1)
+    assert values[0].item() == pytest.approx(0.5)
+    values[0].backward()
     assert q.grad[0].tolist() == pytest.approx([-1.0, 0.0, 1.0])
 
 
 def test_cross_entropy_of_even_values_is_the_logarithm_of_their_number():
-    value = cross_entropy(
-        torch.zeros(2, 5), torch.tensor([0, 3]), torch.tensor([True, True]), beta=100.0
-    )
-    assert value.item() == pytest.approx(math.log(5))
+    losses = cross_entropy(torch.zeros(2, 5), torch.tensor([0, 3]), beta=100.0)
+    assert losses.tolist() == pytest.approx([math.log(5)] * 2)
 
 
 def test_a_truncated_step_bootstraps_and_a_terminated_one_does_not():
@@ -255,16 +264,22 @@ def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum(demonstra
         assert torch.equal(found["none"][name], found["mean"][name])
 
 
-@pytest.mark.parametrize("function", [large_margin, strict_large_margin])
-def test_samples_that_are_not_demonstrations_have_no_margin_loss(function):
-    q, chosen = torch.rand(6, 5), torch.arange(6) % 5
-    is_expert = torch.tensor([True, False] * 3)
-    losses = function(q, chosen, is_expert, 2.0, reduction="none")
-    assert (losses[1::2] == 0).all()
-    assert (losses[::2] > 0).all()
-    share = 3 if function is large_margin else 6
-    mean = function(q, chosen, is_expert, 2.0)
-    torch.testing.assert_close(mean, losses.sum() / share)
+@pytest.mark.parametrize("demonstrations", ["dqfd", "sdqfd", "adet"])
+def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstrations):
+    data = batch()
+    is_expert = data["is_expert"][:, 0]
+    assert 0 < is_expert.sum() < len(data)
+
+    def of(reduction):
+        torch.manual_seed(0)
+        loss = make_loss(demonstrations=demonstrations, margin=2.0, reduction=reduction)
+        return loss(data.clone())["loss_demonstration"].detach()
+
+    losses = of("none")
+    assert (losses[~is_expert] == 0).all()
+    assert (losses[is_expert] > 0).all()
+    share = len(data) if demonstrations == "sdqfd" else is_expert.sum()
+    torch.testing.assert_close(of("mean"), losses.sum() / share)
 
 
 def test_an_unknown_reduction_is_refused():
@@ -305,7 +320,7 @@ def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
         best = network(data["next", "pixels"]).max(dim=1, keepdim=True).values
         target = data["next", "reward"] + GAMMA * ~data["next", "terminated"] * best
         wanted = nn.functional.huber_loss(q.gather(1, index[:, None]), target)
-        margin = strict_large_margin(q, index, data["is_expert"][:, 0], 0.3)
+        margin = (strict_large_margin(q, index, 0.3) * data["is_expert"][:, 0]).mean()
     torch.testing.assert_close(found["loss_qvalue"], wanted)
     torch.testing.assert_close(found["demonstration_error"], margin)
     (found["loss_qvalue"] + found["loss_demonstration"]).backward()
