@@ -384,7 +384,7 @@ class ManipulationEnv(EnvBase):
             out[keys.REWARD] = torch.tensor([reward])
         for key in (keys.SUCCESS, keys.FAULT, keys.DONE, keys.TERMINATED, keys.TRUNCATED):
             out[key] = torch.tensor([ends.get(key, False)])
-        return TensorDict(out, batch_size=[])
+        return TensorDict(out, batch_size=[], device=self.device)
 
     def _on_fault(self) -> None:
         """Count and log a simulator fault; the next reset builds a new world."""

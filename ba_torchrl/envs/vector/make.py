@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, SerialEnv
 
@@ -132,4 +133,10 @@ class SerialVectorEnv(SeededVector, SerialEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check_actions(tensordict)
-        return super()._step(tensordict)
+        steps = tensordict.get("_step", None)
+        if steps is not None and not steps.all():
+            return super()._step(tensordict)
+        # TorchRL's copies through a buffer take three times as long.
+        states = tensordict.exclude("_step").unbind(0)
+        pairs = zip(self._envs, states, strict=True)
+        return torch.stack([env._step(state) for env, state in pairs])
