@@ -102,6 +102,8 @@ class World:
             raise SimulationError("PyBullet has no free client: close environments not in use")
         self._disconnect = weakref.finalize(self, _disconnect, self.client)
         self.bodies: list[Body] = []
+        self.moving_bodies: list[Body] = []
+        """The bodies that are not static."""
         self.steps = 0
         """Number of physics steps since construction."""
         self._pristine: Snapshot | None = None
@@ -145,7 +147,7 @@ class World:
         """
         self._check_not_sealed(name)
         body = Body(self.client, shape, name)
-        self.bodies.append(body)
+        self._register(body)
         return body
 
     def add_articulated(
@@ -166,7 +168,7 @@ class World:
         """
         self._check_not_sealed(name)
         body = ArticulatedBody(self.client, base, slider, joint, name)
-        self.bodies.extend(body.parts)
+        self._register(*body.parts)
         return body
 
     def seal(self) -> None:
@@ -245,10 +247,9 @@ class World:
     def is_still(self) -> bool:
         """Whether no visible body exceeds the speeds of a body at rest."""
         return all(
-            body.is_static
-            or body.is_hidden
+            body.is_hidden
             or body.is_still(self.physics.settle_speed_m_s, self.physics.settle_spin_rad_s)
-            for body in self.bodies
+            for body in self.moving_bodies
         )
 
     def settle(self, max_steps: int = 200) -> bool:
@@ -304,6 +305,11 @@ class World:
                 body.rebuild_collision_pairs()
             else:
                 _enable_collisions(self.client, body.id, body.is_static)
+
+    def _register(self, *bodies: Body) -> None:
+        """Add loaded bodies to the lists of bodies."""
+        self.bodies.extend(bodies)
+        self.moving_bodies.extend(body for body in bodies if not body.is_static)
 
     def _check_not_sealed(self, name: str) -> None:
         if self._pristine is not None:

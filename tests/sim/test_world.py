@@ -34,6 +34,16 @@ def test_restore_pristine_before_seal_raises():
         world.restore_pristine()
 
 
+def test_static_bodies_are_at_rest():
+    with World() as world:
+        shapes = [Box(size_m=(0.05, 0.05, 0.05), mass_kg=mass) for mass in (0.0, 0.1)]
+        static, moving = (world.add(shape, "box") for shape in shapes)
+        assert world.moving_bodies == [moving]
+        for body, is_still in ((static, True), (moving, False)):
+            pybullet.resetBaseVelocity(body.id, (1.0, 0, 0), physicsClientId=world.client)
+            assert world.is_still() == is_still
+
+
 def test_settle_returns_whether_bodies_came_to_rest():
     with World() as world:
         box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
