@@ -138,7 +138,7 @@ def evaluate_at_rest(scene: Scene) -> tuple[dict[str, bool], bool]:
     Raises:
         SimulationError: the position of a body is not finite.
     """
-    if not math.isfinite(sum(map(sum, (body.position for body in scene.world.bodies)))):
+    if not math.isfinite(sum(map(sum, (body.position for body in scene.world.moving_bodies)))):
         raise SimulationError("a body's position is not finite")
     conditions = scene.task.conditions()
     if all(conditions.values()):

@@ -152,14 +152,14 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
             primitive = PLACE if holding else PICK
         if primitive == PICK and not holding:
             before = self._heightmap(scene)
-            position = self._position(scene, command, before, primitive)
+            position = self._position(scene, command, primitive, before)
             body = controller.pick(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
             if body is not None:
                 after = self._heightmap(scene)
                 self._memory = {"in_hand": self._draw_in_hand(before, after, position, command)}
         elif primitive == PLACE and holding:
-            position = self._position(scene, command, self._heightmap(scene), primitive)
+            position = self._position(scene, command, primitive)
             controller.place(position, tool_rotation(*command.angles_rad))
             scene.world.settle(max_steps=SETTLE_STEPS)
         controller.update_grasp()
@@ -242,7 +242,7 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         command, image = self.actions.decode(action), None
         if before.held is not None:  # the inverse of a place is a pick, which has an in-hand image
             now = self._heightmap(scene)
-            position = self._position(scene, command, now, PICK)
+            position = self._position(scene, command, PICK, now)
             image = self._draw_in_hand(now, heights, position, command)
         return {**memory, "undo": (action, image)}
 
@@ -259,11 +259,24 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         )
 
     def _position(
-        self, scene: Scene, command: PickPlaceCommand, heights: np.ndarray, primitive: int
+        self,
+        scene: Scene,
+        command: PickPlaceCommand,
+        primitive: int,
+        heights: np.ndarray | None = None,
     ) -> tuple[float, float, float]:
-        """Return the target of the tool; the heightmap gives its height if the action has no z."""
+        """Return the target of the tool; the heightmap gives its height if the action has no z.
+
+        Args:
+            scene: the scene.
+            command: the action.
+            primitive: `PICK` or `PLACE`.
+            heights: the heightmap; None means that it is rendered if it is needed.
+        """
         if command.z_m is not None:
             return command.x_m, command.y_m, command.z_m
+        if heights is None:
+            heights = self._heightmap(scene)
         task, xy = scene.task, (command.x_m, command.y_m)
         half = task.window_m(scene.controller.held) / self.pixel_m
         rows, columns = (

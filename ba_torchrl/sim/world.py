@@ -102,6 +102,9 @@ class World:
             raise SimulationError("PyBullet has no free client: close environments not in use")
         self._disconnect = weakref.finalize(self, _disconnect, self.client)
         self.bodies: list[Body] = []
+        self.moving_bodies: list[Body] = []
+        """The bodies that are not static."""
+        self._moved_last: Body | None = None
         self.steps = 0
         """Number of physics steps since construction."""
         self._pristine: Snapshot | None = None
@@ -145,7 +148,7 @@ class World:
         """
         self._check_not_sealed(name)
         body = Body(self.client, shape, name)
-        self.bodies.append(body)
+        self._register(body)
         return body
 
     def add_articulated(
@@ -166,7 +169,7 @@ class World:
         """
         self._check_not_sealed(name)
         body = ArticulatedBody(self.client, base, slider, joint, name)
-        self.bodies.extend(body.parts)
+        self._register(*body.parts)
         return body
 
     def seal(self) -> None:
@@ -244,12 +247,11 @@ class World:
 
     def is_still(self) -> bool:
         """Whether no visible body exceeds the speeds of a body at rest."""
-        return all(
-            body.is_static
-            or body.is_hidden
-            or body.is_still(self.physics.settle_speed_m_s, self.physics.settle_spin_rad_s)
-            for body in self.bodies
-        )
+        # the body that moved at the last call is probably the one that still moves
+        if self._moved_last is not None and self._moves(self._moved_last):
+            return False
+        self._moved_last = next(filter(self._moves, self.moving_bodies), None)
+        return self._moved_last is None
 
     def settle(self, max_steps: int = 200) -> bool:
         """Step until `is_still` holds in two consecutive steps.
@@ -304,6 +306,16 @@ class World:
                 body.rebuild_collision_pairs()
             else:
                 _enable_collisions(self.client, body.id, body.is_static)
+
+    def _moves(self, body: Body) -> bool:
+        """Whether a body is visible and exceeds the speeds of a body at rest."""
+        limits = self.physics.settle_speed_m_s, self.physics.settle_spin_rad_s
+        return not (body.is_hidden or body.is_still(*limits))
+
+    def _register(self, *bodies: Body) -> None:
+        """Add loaded bodies to the lists of bodies."""
+        self.bodies.extend(bodies)
+        self.moving_bodies.extend(body for body in bodies if not body.is_static)
 
     def _check_not_sealed(self, name: str) -> None:
         if self._pristine is not None:

@@ -11,7 +11,7 @@ from ba_torchrl.sim.world import World
 INACTIVE_Z_M = 1e6
 """Height at which inactive bodies start to fall."""
 INACTIVE_X_M = 5.0
-"""Least x of inactive bodies, outside every workspace."""
+"""Least x of inactive bodies, outside every workspace; of static ones, least -x."""
 INACTIVE_SPACING_M = 0.3
 """Distance between inactive bodies."""
 COLUMNS = 10
@@ -24,7 +24,8 @@ class BodyPool:
     Inactive bodies are hidden and fall freely from a great height, for at least seven simulated
     minutes. A falling body costs less simulation time than a resting one. Only its pose changes:
     a change of its mass or collision filter would change the order of PyBullet's internal lists, so
-    that the simulation from a restored state would differ.
+    that the simulation from a restored state would differ. Inactive static bodies are away from the
+    falling ones, which would otherwise collide with them.
 
     Args:
         world: not sealed yet.
@@ -65,7 +66,7 @@ class BodyPool:
 
 
 def deactivate_body(body: Body, index: int) -> None:
-    """Hide a body and let it fall outside the workspace; see `BodyPool`.
+    """Hide a body outside the workspace, where it falls if it is not static; see `BodyPool`.
 
     Args:
         body: the body.
@@ -73,5 +74,5 @@ def deactivate_body(body: Body, index: int) -> None:
     """
     row, column = divmod(index, COLUMNS)
     x_m, y_m = INACTIVE_X_M + INACTIVE_SPACING_M * column, INACTIVE_SPACING_M * row
-    body.place((x_m, y_m, INACTIVE_Z_M))
+    body.place((-x_m if body.is_static else x_m, y_m, INACTIVE_Z_M))
     body.is_hidden = True

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
 
+import numba
 import numpy as np
 
 from ba_torchrl.errors import PlacementError
@@ -73,6 +74,7 @@ class Bumps(SlopedTerrain):
         low, high = SLOPE_RAD
         self.slopes_rad = [low + (i + 0.5) / VARIANTS * (high - low) for i in range(VARIANTS)]
         """Slope of each pyramid of the pool."""
+        self._slopes = np.tan(self.slopes_rad)
         self.top_m = self.base_m / 2 * math.tan(high)
         """Height of the platform."""
         self.pool = BodyPool(
@@ -87,6 +89,8 @@ class Bumps(SlopedTerrain):
         self.platform = world.add(
             Box(size_m=size, mass_kg=0.0, friction=FRICTION, color=PLATFORM_COLOR), "platform"
         )
+        pyramids = (body.id for body in self.pool.bodies)
+        self._support_ids = frozenset((world.floor, self.platform.id, *pyramids))
         self._set_layout(
             BumpLayout(tuple(range(PYRAMIDS_PER_ROW**2)), 0.0, PlanarFrame(*workspace.center, 0.0))
         )
@@ -94,8 +98,7 @@ class Bumps(SlopedTerrain):
     @property
     def support_ids(self) -> frozenset[int]:
         """PyBullet ids of the floor, all pyramids and the platform."""
-        pyramids = (body.id for body in self.pool.bodies)
-        return frozenset((self.world.floor, self.platform.id, *pyramids))
+        return self._support_ids
 
     @property
     def base_ids(self) -> frozenset[int]:
@@ -145,19 +148,15 @@ class Bumps(SlopedTerrain):
 
     def set_state(self, state: BumpLayout) -> None:
         """Restore the layout; the world restores the poses of pyramids and platform."""
-        self.layout = state
+        self._use_layout(state)
         self.pool.set_state(state.pyramids)
 
     def heights_m(self, points: np.ndarray) -> np.ndarray:
         """Return the heights [N] of the surface at points [N, 2], metres."""
-        grid = np.stack(self._frame.to_local(*points.T)) / self.base_m + PYRAMIDS_PER_ROW / 2
-        cells = np.clip(np.floor(grid).astype(np.int64), 0, PYRAMIDS_PER_ROW - 1)
-        offsets = np.abs(grid - cells - 0.5).max(axis=0)
-        slopes = np.tan([self.slopes_rad[i] for i in self.layout.pyramids])
-        slopes = slopes[PYRAMIDS_PER_ROW * cells[0] + cells[1]]
-        heights = slopes * self.base_m * np.maximum(0.5 - offsets, 0.0)
-        on_platform = self.build_area.outside_m(points) == 0
-        return np.where(on_platform, self.top_m, heights)
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        heights = np.empty(len(points))
+        _surface_heights(points, *self._surface, heights)
+        return heights
 
     def uneven_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
         """Return how far objects of a radius reach over the platform, [N] metres."""
@@ -202,9 +201,21 @@ class Bumps(SlopedTerrain):
         """The frame at the centre of the pyramids, its x axis along the rows."""
         return PlanarFrame(*self.workspace.center, self.layout.heading_rad)
 
+    def _use_layout(self, layout: BumpLayout) -> None:
+        """Compute heights from a layout."""
+        self.layout = layout
+        platform, (length, width) = layout.platform, self.platform_m
+        self._surface = (
+            np.array([*self.workspace.center, *_cos_sin(layout.heading_rad), self.base_m]),
+            self._slopes[list(layout.pyramids)],
+            np.array([platform.x, platform.y, *_cos_sin(platform.yaw_rad)]),
+            np.array([length / 2, width / 2, self.top_m]),
+            np.array([self.workspace.x, self.workspace.y]),
+        )
+
     def _set_layout(self, layout: BumpLayout) -> None:
         """Move the pyramids and the platform to a layout."""
-        self.layout = layout
+        self._use_layout(layout)
         self.pool.clear()
         half = (PYRAMIDS_PER_ROW - 1) / 2
         for cell, number in enumerate(layout.pyramids):
@@ -250,3 +261,43 @@ def _pyramid(base_m: float, slope_rad: float, color: Color) -> Solid:
         faces += [(i, j, j + 4), (i, j + 4, i + 4), (i + 4, j + 4, 8)]
     mesh = Mesh(np.array(vertices), np.array(faces, dtype=np.int64))
     return Solid(parts=(mesh,), mass_kg=0.0, friction=FRICTION, color=color)
+
+
+def _cos_sin(angle_rad: float) -> tuple[float, float]:
+    return math.cos(angle_rad), math.sin(angle_rad)
+
+
+@numba.njit(cache=True)
+def _surface_heights(points, bumps, slopes, platform, size, bounds, heights):  # noqa: ANN001, ANN202
+    """Compute the heights of the bumps and the platform.
+
+    Args:
+        points: [N, 2] metres.
+        bumps: x and y of the centre, cos and sin of the heading, edge of a pyramid's base.
+        slopes: [9] tangents of the pyramids' slopes, row by row.
+        platform: x and y of its centre, cos and sin of its yaw.
+        size: half the extents of the platform, and its height.
+        bounds: [2, 2] lower and upper bound of x and of y; the platform ends there.
+        heights: [N] result, metres.
+    """
+    center_x, center_y, cos, sin, base = bumps
+    platform_x, platform_y, platform_cos, platform_sin = platform
+    half_x, half_y, top = size
+    for n in range(points.shape[0]):
+        x, y = points[n]
+        dx, dy = x - platform_x, y - platform_y
+        if (
+            abs(platform_cos * dx + platform_sin * dy) <= half_x
+            and abs(platform_cos * dy - platform_sin * dx) <= half_y
+            and bounds[0, 0] <= x <= bounds[0, 1]
+            and bounds[1, 0] <= y <= bounds[1, 1]
+        ):
+            heights[n] = top
+            continue
+        dx, dy = x - center_x, y - center_y
+        row = (cos * dx + sin * dy) / base + PYRAMIDS_PER_ROW / 2
+        column = (cos * dy - sin * dx) / base + PYRAMIDS_PER_ROW / 2
+        i = min(max(math.floor(row), 0), PYRAMIDS_PER_ROW - 1)
+        j = min(max(math.floor(column), 0), PYRAMIDS_PER_ROW - 1)
+        offset = max(abs(row - i - 0.5), abs(column - j - 0.5))
+        heights[n] = slopes[PYRAMIDS_PER_ROW * i + j] * base * max(0.5 - offset, 0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -185,10 +186,7 @@ class SlopedTerrain(Terrain):
         Its lower face lies on the lowest plane above the surface, as seen from its centre of mass.
         """
         low, high = body.shape.bounds_m
-        axes = [
-            np.linspace(*ends, FOOTPRINT_POINTS) for ends in zip(low[:2], high[:2], strict=True)
-        ]
-        local = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        local = _grid(low[:2], high[:2])
         center = np.array(body.shape.center_of_mass_m) - (0.0, 0.0, low[2])
         slopes, height = np.zeros(2), 0.0
         for _ in range(RESTING_ITERATIONS):
@@ -200,11 +198,10 @@ class SlopedTerrain(Terrain):
             gradient, offset = lowest_plane(local, rises, below)
             slopes = slopes + np.linalg.solve(rotation[:2, :2].T, gradient)
             height += offset
-        rotation = np.array(quaternion_matrix(surface_quaternion(_normal(slopes), yaw_rad)))
-        points = local @ rotation[:, :2].T + (*xy, height)
+        orientation = surface_quaternion(_normal(slopes), yaw_rad)
+        points = local @ np.array(quaternion_matrix(orientation))[:, :2].T + (*xy, height)
         height += float((self.heights_m(points[:, :2]) - points[:, 2]).max())
-        surface = Pose((*xy, height), surface_quaternion(_normal(slopes), yaw_rad))
-        body.set_pose(*surface.compose(Pose((0.0, 0.0, -low[2]))))
+        body.set_pose(*Pose((*xy, height), orientation).compose(Pose((0.0, 0.0, -low[2]))))
 
     def gap_below_m(self, body: Body) -> float:
         """Return the least height of a body's vertices above the surface below them."""
@@ -279,12 +276,23 @@ def lowest_plane(
     Returns:
         Slopes [2] of the plane along both axes, and its height at the origin.
     """
-    deep = (*points.mean(axis=0), heights.min() - DEPTH_M)
-    planes = ConvexHull(np.vstack([np.column_stack([points, heights]), deep])).equations
+    vertices = np.empty((len(points) + 1, 3))
+    vertices[:-1, :2], vertices[:-1, 2] = points, heights
+    vertices[-1] = (*points.sum(axis=0) / len(points), heights.min() - DEPTH_M)
+    planes = ConvexHull(vertices).equations
     upper = planes[planes[:, 2] > 1e-9]  # the other faces contain the deep point
     slopes, offsets = -upper[:, :2] / upper[:, 2:3], -upper[:, 3] / upper[:, 2]
     lowest = int((slopes @ center + offsets).argmin())
     return slopes[lowest], float(offsets[lowest])
+
+
+@lru_cache(maxsize=8)
+def _grid(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
+    """Return a read-only grid of points [N, 2] of a rectangle, borders included."""
+    axes = [np.linspace(*ends, FOOTPRINT_POINTS) for ends in zip(low, high, strict=True)]
+    points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    points.flags.writeable = False
+    return points
 
 
 def _normal(slopes: np.ndarray) -> Vector:

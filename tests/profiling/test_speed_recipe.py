@@ -22,6 +22,7 @@ from ba_torchrl.profiling.table import (
     measure,
 )
 from ba_torchrl.sim.shapes import Box
+from ba_torchrl.sim.vision import depth
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 
@@ -77,6 +78,15 @@ def test_the_numpy_camera_agrees_with_the_compiled_one():
             one, two = (camera.heightmap((0.02, -0.01), 0.3, 96) for camera in cameras)
             assert (one > 0).mean() > 0.05
             np.testing.assert_allclose(one, two, atol=1e-9)
+
+
+def test_each_timed_image_is_drawn(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(depth, "rasterize_heights", lambda *_: drawn.append(1))
+    monkeypatch.setattr(np.testing, "assert_allclose", lambda *_, **__: None)
+    compiled = measure("simulation/depth_image", repeats=2, progress=False)[0]
+    assert "compiled" in compiled.work
+    assert len(drawn) > len(compiled.values) == 20
 
 
 def test_every_measurement_belongs_to_a_group():

@@ -105,6 +105,12 @@ def test_restore_resets_the_joint_and_repeats_the_trajectory():
         assert body.travel_m == 0.0
 
 
+def test_only_the_sliding_link_moves():
+    with World() as world:
+        body = add_slider(world)
+        assert world.moving_bodies == [body.slider]
+
+
 def test_heightmap_shows_both_links():
     with World() as world:
         body = add_slider(world)

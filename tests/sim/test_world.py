@@ -34,6 +34,36 @@ def test_restore_pristine_before_seal_raises():
         world.restore_pristine()
 
 
+def test_static_bodies_are_at_rest():
+    with World() as world:
+        shapes = [Box(size_m=(0.05, 0.05, 0.05), mass_kg=mass) for mass in (0.0, 0.1)]
+        static, moving = (world.add(shape, "box") for shape in shapes)
+        assert world.moving_bodies == [moving]
+        for body, is_still in ((static, True), (moving, False)):
+            pybullet.resetBaseVelocity(body.id, (1.0, 0, 0), physicsClientId=world.client)
+            assert world.is_still() == is_still
+
+
+def test_the_world_is_still_when_no_visible_body_moves():
+    with World() as world:
+        bodies = [world.add(Box(size_m=(0.05, 0.05, 0.05)), f"{i}") for i in range(3)]
+
+        def push(*speeds_m_s):
+            for body, speed in zip(bodies, speeds_m_s, strict=True):
+                pybullet.resetBaseVelocity(body.id, (speed, 0, 0), physicsClientId=world.client)
+            return world.is_still()
+
+        assert push(0.0, 0.0, 0.0)
+        assert not push(0.0, 0.0, 1.0)
+        assert not push(0.0, 1.0, 1.0)
+        assert not push(1.0, 0.0, 0.0)
+        bodies[0].is_hidden = True
+        assert world.is_still()
+        bodies[0].is_hidden = False
+        assert not world.is_still()
+        assert push(0.0, 0.0, 0.0)
+
+
 def test_settle_returns_whether_bodies_came_to_rest():
     with World() as world:
         box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")

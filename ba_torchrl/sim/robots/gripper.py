@@ -28,6 +28,10 @@ _RAY_START_BELOW_M, _RAY_END_ABOVE_M = 0.05, 0.1
 _CHAMFER_M = 2e-3
 _RAYS_AT_ONCE = 8192
 _POSITION = (0.45, 0.0, 0.25)
+_SIDES = np.array([-1.0, 1.0])
+"""Of the tool point, along the closing axis."""
+_EDGES = np.array([-1.0, 0.0, 1.0])
+"""Of a fingertip and its centre line, perpendicular to the closing axis."""
 
 
 class MeasurableRobot(Protocol):
@@ -115,16 +119,16 @@ class Gripper:
         """
         widest = max(opening * self.half_gap_m, self.tip_arc[0][0])
         depth_m = self.finger_depth_m
-        profile = [(0.0, 0.0), (depth_m / 2, 0.0)]
-        profile += [(depth_m, height) for height in (0.0, GRASP_HEIGHT_M, 2 * GRASP_HEIGHT_M)]
-        local = [
-            (side * (min(gap, widest) + depth), edge * self.half_width_m, -z - height)
-            for gap, z in self.tip_arc
-            for depth, height in profile
-            for side in (-1.0, 1.0)
-            for edge in (-1.0, 0.0, 1.0)
-        ]
-        return np.array(local) @ np.array(downward(0.0) if rotation is None else rotation).T
+        gaps, tips = np.array(self.tip_arc).T
+        depths = np.array([0.0, depth_m / 2, depth_m, depth_m, depth_m])
+        heights = np.array([0.0, 0.0, 0.0, GRASP_HEIGHT_M, 2 * GRASP_HEIGHT_M])
+        local = np.empty((len(gaps), len(depths), len(_SIDES), len(_EDGES), 3))
+        along = np.minimum(gaps, widest)[:, None] + depths
+        local[..., 0] = along[:, :, None, None] * _SIDES[:, None]
+        local[..., 1] = _EDGES * self.half_width_m
+        local[..., 2] = (-tips[:, None] - heights)[:, :, None, None]
+        rotation = downward(0.0) if rotation is None else rotation
+        return local.reshape(-1, 3) @ np.array(rotation).T
 
     def lowest_tool_m(self, rotation: Matrix | None = None, opening: float = 1.0) -> float:
         """Return the least height of the tool at which the fingers close clear of the floor.

@@ -11,10 +11,11 @@ direction allows, columns +y. Pixels are sampled at their centres.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -32,6 +33,8 @@ from ba_torchrl.sim.vision.kernels import (
     unproject,
 )
 from ba_torchrl.sim.vision.lens import FAR_M, NEAR_M, Lens, Range
+
+_NONE = np.empty((0, 3))
 
 
 class Renderable(Protocol):
@@ -75,18 +78,36 @@ class SceneMesh:
         self._bodies = [body for body in bodies if not isinstance(body.shape, Decal)]
         self._meshes: list[Mesh | None] = [None] * len(self._bodies)
         self._shown: list[int] | None = None
-        self._vertices = self._owner = self._faces = np.empty(0)
-        self._poses = self._world_vertices = np.empty(0)
+        self._poses: list[Pose] | None = None
+        self._decal_poses: list[Pose | None] | None = None
+        self._local_vertices = self._owner = np.empty(0)
+        self.vertices = self.faces = np.empty(0)
+        """The mesh at the last `refresh`: vertices [V, 3] in metres and faces [F, 3]."""
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return vertices [V, 3] in metres and faces [F, 3]; the next call overwrites both."""
+        """Return vertices [V, 3] in metres and faces [F, 3]; not to be modified.
+
+        The next call may overwrite both.
+        """
+        self.refresh()
+        return self.vertices, self.faces
+
+    def refresh(self) -> bool:
+        """Update the mesh; return whether it or a decal has changed since the last call."""
         shown = [n for n, body in enumerate(self._bodies) if not body.is_hidden]
+        poses = [self._bodies[n].pose for n in shown]
+        decal_poses = [None if decal.is_hidden else decal.pose for decal in self._decals]
+        has_moved = shown != self._shown or poses != self._poses
         if shown != self._shown:
             self._collect(shown)
-        for row, n in zip(self._poses, shown, strict=True):
-            row[:3], row[3:] = self._bodies[n].pose
-        transform(self._vertices, self._owner, self._poses, self._world_vertices)
-        return self._world_vertices, self._faces
+        if has_moved:
+            rows = np.array(
+                [(*position, *orientation) for position, orientation in poses], dtype=float
+            )
+            transform(self._local_vertices, self._owner, rows.reshape(-1, 7), self.vertices)
+        is_changed = has_moved or decal_poses != self._decal_poses
+        self._poses, self._decal_poses = poses, decal_poses
+        return is_changed
 
     def recesses(self) -> np.ndarray:
         """Return the recesses of the visible decals.
@@ -142,22 +163,80 @@ class SceneMesh:
             if self._meshes[n] is None:
                 self._meshes[n] = self._bodies[n].shape.mesh()
         meshes = [self._meshes[n] for n in shown]
-        starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-        self._owner = np.repeat(np.arange(len(meshes)), np.diff(starts))
-        self._vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)])
-        self._faces = np.concatenate(
-            [
-                np.empty((0, 3), dtype=np.int64),
-                *(mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)),
-            ]
-        )
-        self._poses = np.empty((len(meshes), 7))
-        self._world_vertices = np.empty_like(self._vertices)
+        counts = [len(mesh.vertices) for mesh in meshes]
+        starts = [0, *itertools.accumulate(counts)][: len(meshes)]
+        self._owner = np.repeat(np.arange(len(meshes)), counts)
+        self._local_vertices = np.concatenate([_NONE, *(mesh.vertices for mesh in meshes)])
+        faces = np.concatenate([_NONE.astype(np.int64), *(mesh.faces for mesh in meshes)])
+        offsets = np.repeat(starts, [len(mesh.faces) for mesh in meshes]).astype(np.int64)
+        self.faces = faces + offsets[:, None]
+        self.vertices = np.empty_like(self._local_vertices)
         self._shown = shown
+
+
+class _TopView(NamedTuple):
+    """The square that an orthographic height image shows."""
+
+    center_m: tuple[float, float]
+    side_m: float
+    pixels: int
+    yaw_rad: float
+
+    def floor(self) -> np.ndarray:
+        """Return the height image of the floor."""
+        return np.zeros((self.pixels, self.pixels))
+
+
+class _Layer:
+    """Bodies drawn over a height image.
+
+    Args:
+        bodies: the bodies.
+    """
+
+    def __init__(self, bodies: Iterable[Renderable]) -> None:
+        self._mesh = SceneMesh(bodies)
+        self._view: _TopView | None = None
+        self._below: np.ndarray | None = None
+        self._image = _NONE
+
+    def image(self, view: _TopView, below: np.ndarray | None) -> np.ndarray:
+        """Return a height image [pixels, pixels] with the bodies, drawn again only after a change.
+
+        Args:
+            view: the square that it shows.
+            below: image without the bodies; None is the floor.
+        """
+        is_changed = self._mesh.refresh()
+        if is_changed or view != self._view or below is not self._below:
+            self._view, self._below = view, below
+            self._image = view.floor() if below is None else below.copy()
+            self._rasterize(view, self._image)
+        return self._image
+
+    def draw(self, view: _TopView, image: np.ndarray) -> None:
+        """Draw the bodies over an image [pixels, pixels] that is not kept."""
+        self._view = None  # the next call of `image` does not see the changes since the last one
+        self._mesh.refresh()
+        self._rasterize(view, image)
+
+    def _rasterize(self, view: _TopView, image: np.ndarray) -> None:
+        (x, y), side_m, pixels, yaw = view
+        pixel = side_m / pixels
+        x0, y0 = x - side_m / 2, y - side_m / 2
+        self._mesh.paint_recesses(image, (x0, y0), pixel, yaw)
+        vertices = self._mesh.vertices
+        if yaw:
+            vertices = vertices.copy()
+            rotate_about(vertices, float(x), float(y), -float(yaw))
+        rasterize_heights(vertices, self._mesh.faces, x0, y0, pixel, image)
 
 
 class HeightCamera:
     """An orthographic camera that looks straight down on a set of bodies, but not on the robot.
+
+    While the view is the same, static bodies are drawn again only when they are placed, and an
+    unchanged scene is not drawn again.
 
     Args:
         bodies: what is visible besides the floor, which has height 0.
@@ -165,6 +244,10 @@ class HeightCamera:
 
     def __init__(self, bodies: Sequence[Renderable]) -> None:
         self.mesh = SceneMesh(bodies)
+        static = [body for body in bodies if body.shape.mass_kg == 0]
+        moving = [body for body in bodies if body.shape.mass_kg > 0]
+        self._layers = [_Layer(layer) for layer in (static, moving) if layer]
+        self._view: _TopView | None = None
 
     def heightmap(
         self, center_m: tuple[float, float], side_m: float, pixels: int, yaw_rad: float = 0.0
@@ -180,15 +263,16 @@ class HeightCamera:
         Returns:
             [pixels, pixels] float64, metres above the floor.
         """
-        image = np.zeros((pixels, pixels))
-        pixel = side_m / pixels
-        x0, y0 = center_m[0] - side_m / 2, center_m[1] - side_m / 2
-        self.mesh.paint_recesses(image, (x0, y0), pixel, yaw_rad)
-        vertices, faces = self.mesh.triangles()
-        if yaw_rad:
-            rotate_about(vertices, float(center_m[0]), float(center_m[1]), -float(yaw_rad))
-        rasterize_heights(vertices, faces, x0, y0, pixel, image)
-        return image
+        view = _TopView(tuple(center_m), side_m, pixels, yaw_rad)
+        if view != self._view or not self._layers:
+            self._view, image = view, view.floor()
+            for layer in self._layers:
+                layer.draw(view, image)
+            return image
+        below = None
+        for layer in self._layers:
+            below = layer.image(view, below)
+        return below.copy()
 
 
 def depth_image(meshes: Sequence[SceneMesh], lens: Lens, pixels: int) -> np.ndarray:

@@ -2,12 +2,13 @@
 
 import math
 
+import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
+from ba_torchrl.sim.robots.gripper import GRASP_HEIGHT_M, Gripper, measured_gripper
 from ba_torchrl.sim.world import World
 
 POSITION = (0.45, 0.0, 0.25)
@@ -150,3 +151,27 @@ def test_tip_height_is_interpolated():
     gripper = Gripper(0.04, 0.01, 0.02, 0.05, arc, outline=flat, closed_outline=flat)
     assert gripper.tip_height_m(0.01) == pytest.approx(-0.006)
     assert gripper.tip_height_m(0.1) == pytest.approx(0.006)
+
+
+@pytest.mark.parametrize("opening", [0.0, 0.6, 1.0])
+def test_the_tip_points_are_those_of_the_closing_fingers(name, opening):
+    gripper = measured_gripper(ROBOTS[name])
+    widest = max(opening * gripper.half_gap_m, gripper.tip_arc[0][0])
+    depth = gripper.finger_depth_m
+    points = gripper.tip_points(tool_rotation(0.0), opening).round(9)
+    expected = {
+        (
+            side * (min(gap, widest) + offset),
+            edge * gripper.half_width_m,
+            tip + height,
+        )
+        for gap, tip in gripper.tip_arc
+        for offset, height in [
+            (0.0, 0.0),
+            (depth / 2, 0.0),
+            *((depth, steps * GRASP_HEIGHT_M) for steps in (0, 1, 2)),
+        ]
+        for side in (-1, 1)
+        for edge in (-1, 0, 1)
+    }
+    assert {tuple(point) for point in points} == {tuple(np.round(p, 9)) for p in expected}

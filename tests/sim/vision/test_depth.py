@@ -8,6 +8,7 @@ import pytest
 
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
+from ba_torchrl.sim.vision import depth
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
     PosedShape,
@@ -200,3 +201,77 @@ def test_a_recess_shows_a_lower_floor():
     assert 100 < seen.sum() < lowered.sum()
     np.testing.assert_allclose(image[~seen], plain[~seen], atol=1e-9)
     np.testing.assert_allclose(image[seen], 0.62 / -rays[seen][:, 2], atol=1e-9)
+
+
+VIEW = ((0.02, -0.01), 0.4, 64, 0.0)
+
+
+@pytest.fixture
+def scene():
+    """Yield a static slab, a block and a recess, and a camera that has rendered them."""
+    with World() as world:
+        slab = world.add(Box(size_m=(0.2, 0.1, 0.02), mass_kg=0.0), "slab")
+        block = world.add(Box(size_m=(0.05, 0.05, 0.05)), "block")
+        goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), "goal")
+        slab.place((0.05, 0.0, 0.01), 0.4)
+        block.place((0.02, 0.03, 0.045), 0.7)
+        goal.place((-0.1, 0.0, 0.0), 0.2)
+        camera = HeightCamera(world.bodies)
+        for _ in range(2):
+            camera.heightmap(*VIEW)
+        yield {"slab": slab, "block": block, "goal": goal}, camera
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.6])
+@pytest.mark.parametrize("name", ["slab", "block", "goal"])
+def test_a_camera_shows_each_change_of_a_body(scene, name, yaw):
+    bodies, camera = scene
+    body, view = bodies[name], (*VIEW[:3], yaw)
+    images = [camera.heightmap(*view) for _ in range(2)]
+    for change in ("move", "hide", "show"):
+        if change == "move":
+            body.place((-0.05, -0.08, body.position[2]), 1.1)
+        else:
+            body.is_hidden = change == "hide"
+        images.append(camera.heightmap(*view))
+        assert np.array_equal(images[-1], HeightCamera(bodies.values()).heightmap(*view))
+        assert not np.array_equal(images[-1], images[-2])
+
+
+def test_a_camera_shows_each_change_of_the_view(scene):
+    bodies, camera = scene
+    changes = [((0.0, 0.0), *VIEW[1:]), (VIEW[0], 0.3, *VIEW[2:]), (*VIEW[:2], 80, 0.0)]
+    for number, view in enumerate((VIEW, *changes, (*VIEW[:3], 0.3), VIEW)):
+        bodies["block"].place((0.01 * number, 0.0, 0.025))
+        fresh = HeightCamera(bodies.values()).heightmap(*view)
+        for _ in range(3):
+            assert np.array_equal(camera.heightmap(*view), fresh)
+
+
+def test_an_image_belongs_to_the_caller(scene):
+    _, camera = scene
+    before = camera.heightmap(*VIEW)
+    camera.heightmap(*VIEW)[:] = 1.0
+    assert np.array_equal(camera.heightmap(*VIEW), before)
+
+
+def test_a_camera_draws_only_what_has_changed(scene, monkeypatch):
+    bodies, camera = scene
+    counts = []
+    rasterize = depth.rasterize_heights
+    monkeypatch.setattr(
+        depth,
+        "rasterize_heights",
+        lambda vertices, faces, *rest: (
+            counts.append(len(faces)),
+            rasterize(vertices, faces, *rest),
+        ),
+    )
+    camera.heightmap(*VIEW)
+    assert counts == []
+    bodies["block"].place((0.0, 0.0, 0.025))
+    camera.heightmap(*VIEW)
+    assert counts == [12]
+    bodies["slab"].place((0.0, 0.0, 0.01))
+    camera.heightmap(*VIEW)
+    assert counts == [12, 12, 12]  # the block is drawn over the slab again
