@@ -4,11 +4,14 @@ python recipes/benchmark.py benchmark=close_loop_4d seeds=4
 python recipes/benchmark.py benchmark=close_loop_4d dry_run=true       # list the states of the runs
 python recipes/benchmark.py tasks=[close_loop/block_picking] networks=[cnn] total_updates=600 \
     env.obs_size=64 network.width=0.5 folder=runs/small
+python recipes/benchmark.py benchmark=close_loop_4d launcher=ray launcher.cpus=4
+python recipes/benchmark.py benchmark=close_loop_4d launcher=submitit launcher.options.partition=gpu
 """
 
 import signal
 import sys
 from collections import Counter
+from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
@@ -17,7 +20,8 @@ from ba_torchrl.config import parse
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.command_line import plain_errors
-from ba_torchrl.training.grid.jobs import run_all
+from ba_torchrl.training.config import choose
+from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 
 hydra_schema.register(sys.argv[1:])
@@ -29,7 +33,7 @@ def main(settings: DictConfig) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
     limit_library_logs()
     values = OmegaConf.to_container(settings, resolve=True)
-    dry_run = values.pop("dry_run")
+    dry_run, only = values.pop("dry_run"), values.pop("only")
     grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields if name in values}
     config = parse(BenchmarkConfig, grid, "benchmark")
     runs = plan(config, values, hydra_schema.preset)
@@ -40,9 +44,16 @@ def main(settings: DictConfig) -> None:
         counts = Counter(state.state for state in states.values())
         print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
         return
+    if only is not None:
+        runs = [runs[only]]
+    launcher = choose(LAUNCHERS, config.launcher, "launcher")
+    launcher.check(runs)
     # the runs end with this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    failures = run_all(runs, jobs=config.jobs, max_hours=config.max_hours)
+    command = [sys.executable, *sys.argv]
+    failures = launcher.run_all(
+        Grid(runs, Path(config.folder), config.jobs, config.max_hours, command)
+    )
     states = {run.run_dir: status(run) for run in runs}
     done = sum(state.state == "done" for state in states.values())
     print(f"{done} of {len(runs)} runs done in {config.folder}")
@@ -51,6 +62,8 @@ def main(settings: DictConfig) -> None:
             print(f"  running {folder}: {state.detail}")
     for folder, reason in failures.items():
         print(f"  failed  {folder}: {reason}")
+    if only is not None:
+        return  # one of several jobs, which all end; the failure is recorded
     if failures:
         sys.exit(1)
     print(f"  next    python recipes/report.py {config.folder}")

@@ -4,6 +4,7 @@ python recipes/train.py task=close_loop/block_picking algorithm=sacfd_per networ
 python recipes/train.py --config-name quickstart
 python recipes/train.py task=close_loop/block_picking run_dir=runs/mine resume=true
 python recipes/train.py plugins=[my_tasks] task=mine/push_far
+python recipes/train.py num_envs=8 collector=multi_async collector.workers=4
 """
 
 from ba_torchrl._malloc import tune_malloc

@@ -62,10 +62,12 @@ class MixedPolicy(TensorDictModuleBase):
         seed: of the choice between the two.
     """
 
+    beta: Tensor
+
     def __init__(self, policy: TensorDictModuleBase, imitator: Imitator, seed: int) -> None:
         super().__init__()
         self.policy = policy
-        self.beta = 0.0
+        self.register_buffer("beta", torch.zeros(()))  # among the weights that workers receive
         self.in_keys = list(policy.in_keys)
         self.out_keys = [keys.ACTION]
         self._imitator = imitator
@@ -82,7 +84,7 @@ class MixedPolicy(TensorDictModuleBase):
             return out
         draws = torch.rand(*out.batch_size, 1, generator=self._generator)
         expert = self._imitator.nearest_action(out[keys.EXPERT_ACTION])
-        is_expert = (draws < self.beta).to(expert.device)
+        is_expert = draws.to(expert.device) < self.beta
         return out.set(keys.ACTION, torch.where(is_expert, expert, out[keys.ACTION]))
 
     def get_generator_state(self) -> Tensor:
@@ -110,7 +112,7 @@ class DAgger(ImitationLearning, Learner):
     def __init__(self, config: DAggerConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)
         seed = problem.derived_seed(SeedUse.MIXTURE)
-        self.policy = MixedPolicy(self.policy, self.imitator, seed)
+        self.policy = MixedPolicy(self.policy, self.imitator, seed).to(problem.device)
         self._set_beta()
 
     def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
@@ -133,7 +135,8 @@ class DAgger(ImitationLearning, Learner):
 
     def _set_beta(self) -> None:
         config = self.config
-        self.policy.beta = config.beta_init * max(1 - self.updates / config.beta_updates, 0.0)
+        beta = config.beta_init * max(1 - self.updates / config.beta_updates, 0.0)
+        self.policy.beta.fill_(beta)
 
     def state_dict(self) -> dict[str, Any]:
         """Return networks, optimiser, schedule, generators and number of updates."""

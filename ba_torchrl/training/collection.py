@@ -1,11 +1,13 @@
-"""Collection of a run's data: environments, collector and demonstrations."""
+"""Collection of a run's data: environments, collectors and demonstrations."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 from tensordict import TensorDict
-from torchrl.collectors import Collector
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
@@ -13,7 +15,11 @@ from ba_torchrl.algorithms.base import Algorithm
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.demo_files import load_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
+from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import load_plugins
+from ba_torchrl.training.checkpoint import build_algorithm
+from ba_torchrl.training.collectors.base import Collection, CollectionProblem
 from ba_torchrl.training.config import ExperimentConfig
 
 
@@ -38,24 +44,45 @@ def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
     )
 
 
-def make_collector(env: EnvBase, algorithm: Algorithm, config: ExperimentConfig) -> Collector:
-    """Return a collector of one step of every environment at a time, flattened to [num_envs].
+def start_collection(
+    config: ExperimentConfig,
+    algorithm: Algorithm,
+    seed: int,
+    positions: Sequence[Position] | None,
+) -> Collection:
+    """Start the collector of a run.
 
     Args:
-        env: the environments, on the CPU.
-        algorithm: whose policy explores.
         config: of the run.
+        algorithm: whose policy explores.
+        seed: of the first environment.
+        positions: from which the environments continue; None to start new episodes.
     """
-    return Collector(
-        env,
-        algorithm.policy,
-        frames_per_batch=config.num_envs,
-        total_frames=-1,
-        postproc=lambda data: data.reshape(-1),
-        policy_device=config.torch_device,
-        storing_device="cpu",
-        auto_register_policy_transforms=False,
+    values = config.model_dump(mode="json")  # which other processes read, plugins first
+    problem = CollectionProblem(
+        algorithm=algorithm,
+        device=config.torch_device,
+        num_envs=config.num_envs,
+        seed=seed,
+        make_env=partial(_make_some_envs, values, algorithm.stores_expert_action),
+        make_policy=partial(_make_policy, values),
+        start_method=config.start_method,
+        max_restarts=config.max_restarts,
     )
+    return config.collector_config.start(problem, positions)
+
+
+def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: int) -> EnvBase:
+    return make_env(_read(values, num_envs=num_envs), seed, expert=expert)
+
+
+def _make_policy(values: dict[str, Any], seed: int) -> TensorDictModuleBase:
+    return build_algorithm(_read(values, device="cpu", seed=seed)).policy
+
+
+def _read(values: dict[str, Any], **changes: int | str) -> ExperimentConfig:
+    load_plugins(values["plugins"])
+    return ExperimentConfig.model_validate({**values, **changes})
 
 
 def gather_demonstrations(

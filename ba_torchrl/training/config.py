@@ -21,6 +21,7 @@ from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.collectors.base import COLLECTORS, CollectorConfig
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
 """Fields of `EnvConfig` that are not for the user to set."""
@@ -35,7 +36,7 @@ class ExperimentConfig(StrictModel):
 
     plugins: list[str] = Field(default_factory=list)
     """Modules outside the package to import first. `parse` adds those that register the run's task,
-    robot, network and algorithm."""
+    robot, network, algorithm and collector."""
     task: str
     """Id of the task."""
     env: dict[str, Any] = Field(default_factory=dict)
@@ -63,6 +64,8 @@ class ExperimentConfig(StrictModel):
     steps without a completed step."""
     start_timeout_s: float = Field(default=120.0, gt=0)
     """Seconds after which a process that does not start is replaced."""
+    collector: dict[str, Any] = Field(default_factory=lambda: {"name": "single"})
+    """``name`` of a registered collector and its options: where the policy collects."""
     demonstrations: int = Field(default=100, ge=0)
     """Expert episodes in the replay before the first update; reference implementation."""
     demonstrations_source: Source = "expert"
@@ -117,12 +120,17 @@ class ExperimentConfig(StrictModel):
     @cached_property
     def network_config(self) -> NetworkConfig:
         """The network's hyper-parameters."""
-        return _choose(NETWORKS, self.network, "network")
+        return choose(NETWORKS, self.network, "network")
 
     @cached_property
     def algorithm_config(self) -> AlgorithmConfig:
         """The algorithm's hyper-parameters."""
-        return _choose(ALGORITHMS, self.algorithm, "algorithm")
+        return choose(ALGORITHMS, self.algorithm, "algorithm")
+
+    @cached_property
+    def collector_config(self) -> CollectorConfig:
+        """The collector's options."""
+        return choose(COLLECTORS, self.collector, "collector")
 
     def derived_seed(self, use: SeedUse, part: int = 0) -> int:
         """Return the first seed of the environments that serve ``use``.
@@ -145,6 +153,12 @@ class ExperimentConfig(StrictModel):
             "network": {
                 "name": self.network["name"],
                 **self.network_config.model_dump(mode="json"),
+            },
+            "collector": {
+                "name": self.collector["name"],
+                **self.collector_config.model_dump(
+                    mode="json", exclude=set(self.collector_config.resources)
+                ),
             },
         }
 
@@ -194,6 +208,7 @@ class ExperimentConfig(StrictModel):
                 f"min_replay: {config.min_replay} transitions are more than the replay holds "
                 f"({capacity}); the run would never start to learn"
             )
+        config.collector_config.check(config.num_envs)
         config._check_demonstrations()
         if not is_available(config.logger):
             raise ConfigError(
@@ -214,6 +229,7 @@ class ExperimentConfig(StrictModel):
             (ROBOTS, self.env_config.robot),
             (NETWORKS, self.network["name"]),
             (ALGORITHMS, self.algorithm["name"]),
+            (COLLECTORS, self.collector["name"]),
             *((OBSERVATIONS, name) for name in self.env_config.observations),
         )
         modules = (registry.plugin_module(name) for registry, name in used)
@@ -230,8 +246,17 @@ class ExperimentConfig(StrictModel):
             check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
 
 
-def _choose(registry: Any, values: dict[str, Any], kind: str) -> Any:
-    """Return the registered configuration class called ``values["name"]``, filled in."""
+def choose(registry: Any, values: dict[str, Any], kind: str) -> Any:
+    """Return the registered configuration class called ``values["name"]``, filled in.
+
+    Args:
+        registry: of configuration classes.
+        values: ``name`` and fields of that class.
+        kind: what is chosen, for error messages.
+
+    Raises:
+        ConfigError: the name is missing or unknown, or a field is.
+    """
     rest = dict(values)
     name = rest.pop("name", None)
     if name is None:

@@ -10,8 +10,6 @@ from typing import Self
 
 import torch
 from tensordict import TensorDict
-from torchrl.checkpoint import GlobalRNGState
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from ba_torchrl.algorithms.seeds import SeedUse
@@ -20,11 +18,12 @@ from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import ScalarLog, progress_bar
 from ba_torchrl.record.results import CurvePoint
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
-from ba_torchrl.training.collection import gather_demonstrations, make_collector, make_env
+from ba_torchrl.training.collection import gather_demonstrations, make_env, start_collection
+from ba_torchrl.training.collectors.base import Collection
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.duration import UpdateTimer, compute_path
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
-from ba_torchrl.training.interruption import Interruption, StopSignals, positions_of
+from ba_torchrl.training.interruption import Interruption, StopSignals
 from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
 from ba_torchrl.training.run_lock import RunLock
@@ -56,7 +55,7 @@ class Experiment:
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)
         self.checkpoints = Checkpoints(config.folder, self.algorithm, config.torch_device)
         self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
-        self._train_env: EnvBase | None = None
+        self._collection: Collection | None = None
         self._eval_env: EnvBase | None = None
         self._progress = Progress()
         self._state = ResumeState(
@@ -93,9 +92,10 @@ class Experiment:
     def close(self) -> None:
         """Close environments and loggers, and unlock the run folder."""
         self._bar.close()
-        for env in (self._train_env, self._eval_env):
-            if env is not None and not env.is_closed:
-                env.close()
+        if self._collection is not None:
+            self._collection.close()
+        if self._eval_env is not None and not self._eval_env.is_closed:
+            self._eval_env.close()
         self.log.close()
         self._lock.release()
 
@@ -151,33 +151,22 @@ class Experiment:
             self._update(algorithm.pretrain_update)
         if self._is_complete:
             return
-        collector = self._start_collection()
-        steps = iter(collector)
-        try:
-            while not self._take_pending_updates():
-                self._store(next(steps))
-                if algorithm.replay_size >= config.min_replay:
-                    self._progress.pending_updates = config.updates_per_step
-                self._stop_or_save()
-        finally:
-            collector.shutdown(close_env=False)
+        self._collection = self._start_collection()
+        while not self._take_pending_updates():
+            steps = self._store(next(self._collection))
+            if algorithm.replay_size >= config.min_replay:
+                self._progress.pending_updates = steps * config.updates_per_step
+            self._stop_or_save()
         if algorithm.updates < config.total_updates:
             logger.info("the run ends at update %d: stop_at_success", algorithm.updates)
 
-    def _start_collection(self) -> Collector:
-        """Return a collector, which continues the episodes of a resumed run."""
+    def _start_collection(self) -> Collection:
+        """Start to collect, and continue the episodes of a resumed run."""
         config, progress = self.config, self._progress
         # Without positions, a resumed run plays other episodes than before its interruption.
         part = progress.resumed_at[-1] if progress.env_steps and progress.resumed_at else 0
         seed = config.derived_seed(SeedUse.COLLECTION, part)
-        generators = GlobalRNGState().state_dict()
-        self._train_env = make_env(config, seed, expert=self.algorithm.stores_expert_action)
-        if progress.positions is not None:
-            self._train_env.continue_from(progress.positions)
-        collector = make_collector(self._train_env, self.algorithm, config)
-        if progress.positions is not None:
-            GlobalRNGState().load_state_dict(generators)
-        return collector
+        return start_collection(config, self.algorithm, seed, progress.positions)
 
     def _take_pending_updates(self) -> bool:
         """Take the updates of the last step of collection; return whether the run is complete."""
@@ -217,14 +206,20 @@ class Experiment:
 
     # -- parts -------------------------------------------------------------------------------
 
-    def _store(self, data: TensorDict) -> None:
-        """Add collected transitions to the replay and count steps, faults and successes."""
+    def _store(self, data: TensorDict) -> int:
+        """Add collected transitions to the replay and count steps, faults and successes.
+
+        Returns:
+            The number of steps of all environments together that were completed.
+        """
         progress, following = self._progress, data[keys.NEXT]
+        steps_before = progress.env_steps // self.config.num_envs
         progress.env_steps += data.numel()
         progress.faults += int(following[keys.FAULT].sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
         self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
+        return progress.env_steps // self.config.num_envs - steps_before
 
     def _update(self, take_update: Callable[[], TensorDict]) -> None:
         """Take one update; log and evaluate if they are due."""
@@ -239,6 +234,8 @@ class Experiment:
             values = {f"train/{key}": float(value) for key, value in scalars.items()}
             progress = self._progress
             values |= {"train/env_steps": progress.env_steps, "train/faults": progress.faults}
+            collector = {} if self._collection is None else self._collection.scalars
+            values |= {f"collector/{key}": value for key, value in collector.items()}
             if progress.recent:
                 values["train/success_rate"] = sum(progress.recent) / len(progress.recent)
             self.log.write(updates, values)
@@ -275,8 +272,8 @@ class Experiment:
     def _save(self) -> None:
         """Save the state, with the positions of the environments in their episodes."""
         self._progress.seconds = time.perf_counter() - self._started
-        if self._train_env is not None:
-            self._progress.positions = positions_of(self._train_env)
+        if self._collection is not None:
+            self._progress.positions = self._collection.get_positions()
         self._state.save(self.algorithm.updates)
         self._last_save = time.perf_counter()
 

@@ -20,7 +20,9 @@ from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
+from ba_torchrl.training.collectors.base import COLLECTORS
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
+from ba_torchrl.training.grid.launchers.base import LAUNCHERS
 from ba_torchrl.training.grid.plan import SET_BY_THE_GRID, BenchmarkConfig
 
 
@@ -33,16 +35,21 @@ def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
     }
 
 
-GROUPS = {"algorithm": ALGORITHMS, "network": NETWORKS}
+GROUPS = {
+    "algorithm": ALGORITHMS,
+    "network": NETWORKS,
+    "collector": COLLECTORS,
+    "launcher": LAUNCHERS,
+}
 """Folders of presets in ``configs``, and the registry that each chooses from."""
 
 
 def register(arguments: Sequence[str] = ()) -> None:
-    """Make the schemas known to Hydra: environment, experiment, grid, each algorithm and network.
+    """Make the schemas known to Hydra: environment, experiment, grid, each choice of a group.
 
-    An algorithm or a network from outside the package is also a preset, under its registered name
-    and with its defaults. Under ``algorithm``, ``network`` and ``per_...`` of a grid any field may
-    be set: the presets decide which exist, and `plan` checks them.
+    An algorithm or another choice from outside the package is also a preset, under its registered
+    name and with its defaults. Under ``algorithm``, ``network`` and ``per_...`` of a grid any field
+    may be set: the presets decide which exist, and `plan` checks them.
 
     Args:
         arguments: of the command line; plugins that it names are imported before.
@@ -73,7 +80,10 @@ def register(arguments: Sequence[str] = ()) -> None:
     store.store(name="grid", node=grid)
     for group, registry in GROUPS.items():
         for name in registry:
-            node = {"name": name, **defaults_of(registry[name])}
+            node = OmegaConf.create({"name": name, **defaults_of(registry[name])})
+            for field in node:
+                if OmegaConf.is_dict(node[field]):  # open: its entries are those of another program
+                    OmegaConf.set_struct(node[field], False)
             store.store(group=f"{group}/schema", name=name, node=node)
             if registry.plugin_module(name) is not None:
                 *folders, last = name.split("/")

@@ -43,12 +43,12 @@ def test_beta_decreases_linearly_to_zero():
     learner.extend(learner.to_transitions(visited(learner), is_expert=True))
     betas = []
     for _ in range(5):
-        betas.append(learner.policy.beta)
+        betas.append(learner.policy.beta.item())
         learner.update()
     assert betas == pytest.approx([0.6, 0.4, 0.2, 0.0, 0.0])
     other = build("dagger", beta_init=0.6, beta_updates=6, batch_size=4)
     other.load_state_dict(learner.state_dict())
-    assert other.policy.beta == pytest.approx(0.1)
+    assert other.policy.beta.item() == pytest.approx(0.1)
     states = [each.policy.get_generator_state() for each in (learner, other)]
     assert torch.equal(*states)
 
@@ -74,7 +74,7 @@ def test_two_iterations_of_a_run_in_the_open_loop(tmp_path):
 
 def test_the_executed_action_of_an_expert_is_on_the_grid(tmp_path):
     learner = run(tmp_path, "asr", {"name": "dagger", "beta_init": 1.0}, **OPEN)
-    learner.policy.beta = 1.0
+    learner.policy.beta.fill_(1.0)
     state = learner.replay.storage[:].select(*learner.observation_keys, keys.ACTION)
     state.rename_key_(keys.ACTION, keys.EXPERT_ACTION)
     with set_exploration_type(ExplorationType.RANDOM):

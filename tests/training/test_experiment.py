@@ -264,14 +264,14 @@ def test_a_run_survives_a_worker_that_dies(tmp_path, monkeypatch):
         nonlocal batches
         batches += 1
         if batches == 3:
-            os.kill(experiment._train_env.worker_pids[0], signal.SIGKILL)
-        store(data)
+            os.kill(experiment._collection.env.worker_pids[0], signal.SIGKILL)
+        return store(data)
 
     monkeypatch.setattr(experiment, "_store", kill_then_store)
     experiment.run()
     scalars = read_scalars(config.folder)
     assert scalars["train/faults"].values[-1] == 1
-    assert experiment._train_env.restarts == 1
+    assert experiment._collection.env.restarts == 1
     assert experiment.algorithm.replay.faults_dropped == 1
 
 

@@ -13,6 +13,7 @@ from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
+from ba_torchrl.training import collection
 from ba_torchrl.training import experiment as experiments
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
@@ -203,20 +204,20 @@ def test_without_the_positions_the_next_episodes_have_other_seeds(tmp_path, monk
     experiment = Experiment(config_for(tmp_path), progress=False)
 
     def fail():
-        experiment._train_env.close()
+        experiment._collection.env.close()
         raise RuntimeError("all workers were closed")
 
     at_call(experiment, experiment, "_store", 13, fail)
     with pytest.raises(RuntimeError, match="closed"):
         experiment.run()
     config = config_for(tmp_path, resume=True)
-    seeds, make_env = [], experiments.make_env
+    seeds, make_env = [], collection.make_env
 
     def recorded(config, seed, **changes):
         seeds.append(seed)
         return make_env(config, seed, **changes)
 
-    monkeypatch.setattr(experiments, "make_env", recorded)
+    monkeypatch.setattr(collection, "make_env", recorded)
     run(config)
     assert config.derived_seed(SeedUse.COLLECTION) not in seeds
     assert config.derived_seed(SeedUse.COLLECTION, resumed_updates(tmp_path)) in seeds

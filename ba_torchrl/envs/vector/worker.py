@@ -170,8 +170,12 @@ def _kill(process: BaseProcess) -> None:
     process.join()
 
 
-def _end_with(parent: int) -> None:
-    """Let the kernel kill this process when its parent ends, even if it hangs or is stopped."""
+def end_with(parent: int) -> None:
+    """Let the kernel kill this process when its parent ends, even if it hangs or is stopped.
+
+    Args:
+        parent: process id of the parent, whose main thread started this process.
+    """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:  # it ended before
@@ -181,7 +185,7 @@ def _end_with(parent: int) -> None:
 def _run_worker(loop: Callable[..., None], options: dict[str, Any], parent: int | None) -> None:
     """Run TorchRL's loop in a worker process, and send its exception to the parent."""
     if parent is not None:
-        _end_with(parent)
+        end_with(parent)
     # The parent handles the signals that a scheduler or a terminal sends to all processes, saves
     # its state with the workers' help and ends them.
     for number in (signal.SIGINT, signal.SIGTERM):

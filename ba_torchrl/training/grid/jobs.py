@@ -57,11 +57,7 @@ def run_all(
     Raises:
         ConfigError: a folder holds a run with other settings, in which case nothing was started.
     """
-    states = [(run, status(run)) for run in runs]
-    waiting = deque(run for run, found in states if found.state not in ("done", "running"))
-    for run, found in states:
-        if found.state == "running":
-            _report_skipped(run, found.detail)
+    waiting = deque(unfinished(runs))
     running: list[_Job] = []
     failures: dict[Path, str] = {}
     bar = tqdm(total=len(runs), initial=len(runs) - len(waiting), unit="run", disable=not progress)
@@ -90,6 +86,30 @@ def run_all(
             job.stop()
         bar.close()
     return failures
+
+
+def unfinished(runs: Sequence[ExperimentConfig]) -> list[ExperimentConfig]:
+    """Return the runs to start: those that are not finished and that no other process runs.
+
+    Raises:
+        ConfigError: a folder holds a run with other settings.
+    """
+    states = [(run, status(run)) for run in runs]
+    for run, found in states:
+        if found.state == "running":
+            _report_skipped(run, found.detail)
+    return [run for run, found in states if found.state not in ("done", "running")]
+
+
+def record_failure(run: ExperimentConfig, reason: str) -> None:
+    """Write the reason of a failure and the last lines of the output into the run's folder."""
+    failure = {"reason": reason, "when": now(), "log": _log_lines(run)[-LOG_LINES:]}
+    write_text(run.folder / FAILURE_FILE, json.dumps(failure, indent=2) + "\n")
+
+
+def _log_lines(run: ExperimentConfig) -> list[str]:
+    path = run.folder / LOG_FILE
+    return path.read_text(errors="replace").splitlines() if path.exists() else []
 
 
 def _report_skipped(run: ExperimentConfig, process: str) -> None:
@@ -152,12 +172,11 @@ class _Job:
             reason = "took longer than max_hours"
         elif code < 0:
             reason = f"killed by {signal.Signals(-code).name}"
-        lines = (self.run.folder / LOG_FILE).read_text(errors="replace").splitlines()
+        lines = _log_lines(self.run)
         last = next((line.strip() for line in reversed(lines) if line.strip()), "")
         if code > 0 and last:
             reason += f": {last}"
-        failure = {"reason": reason, "when": now(), "log": lines[-LOG_LINES:]}
-        write_text(self.run.folder / FAILURE_FILE, json.dumps(failure, indent=2) + "\n")
+        record_failure(self.run, reason)
         return reason
 
     def terminate(self) -> None:

@@ -1,4 +1,4 @@
-"""Benchmark: a grid of tasks, algorithms, networks and seeds, which `training.grid.jobs` runs."""
+"""Benchmark: a grid of tasks, algorithms, networks and seeds, which a launcher runs."""
 
 from __future__ import annotations
 
@@ -63,8 +63,10 @@ class BenchmarkConfig(StrictModel):
     """By algorithm; overrides `per_task`."""
     per_network: Overrides = Field(default_factory=dict)
     """By network; overrides `per_algorithm`."""
+    launcher: dict[str, Any] = Field(default_factory=lambda: {"name": "local"})
+    """``name`` of a registered launcher and its options: where the runs take place."""
     jobs: int = Field(default=1, ge=1)
-    """Runs at the same time."""
+    """Runs at the same time; on a Ray cluster, its resources decide."""
     max_hours: float | None = Field(default=None, gt=0)
     """Time limit of a run. A run that exceeds it is stopped and counts as failed; the next call
     resumes it."""

@@ -1,4 +1,4 @@
-"""One run of a benchmark: reads its configuration as JSON from the standard input.
+"""One run of a benchmark; the process reads its configuration as JSON from the standard input.
 
 Environments in processes of their own import this module again, so everything else is imported
 where it is needed.
@@ -11,9 +11,22 @@ def main() -> None:
     """Run the experiment."""
     tune_malloc()  # before torch allocates anything
 
+    import sys
+
+    run_experiment(sys.stdin.read())
+
+
+def run_experiment(values: str) -> None:
+    """Run an experiment in this process.
+
+    Args:
+        values: its configuration, as JSON.
+
+    Raises:
+        RunStopped: SIGINT or SIGTERM was received, and the state is saved.
+    """
     import json
     import logging
-    import sys
 
     from ba_torchrl.record.logging import limit_library_logs
     from ba_torchrl.training.config import ExperimentConfig
@@ -23,7 +36,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO)
     limit_library_logs()
     try:
-        Experiment(ExperimentConfig.parse(json.load(sys.stdin)), progress=False).run()
+        Experiment(ExperimentConfig.parse(json.loads(values)), progress=False).run()
     except RunStopped as stopped:
         logging.getLogger(__name__).warning("%s", stopped)
         raise

@@ -1,0 +1,1 @@
+"""Collectors: where the policy runs in the environments, in this process or in workers."""

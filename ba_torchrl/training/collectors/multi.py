@@ -1,0 +1,197 @@
+"""Collectors with worker processes on this machine, which TorchRL runs."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from queue import Empty
+
+import torch
+from tensordict import TensorDict
+from torch import multiprocessing as mp
+from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector, _runner
+from torchrl.weight_update import MultiProcessWeightSyncScheme
+
+from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.vector.worker import end_with
+from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
+from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig
+
+logger = logging.getLogger(__name__)
+
+_NO_TIMEOUT_S = 1e6
+_SHUTDOWN_S = 2.0
+_HEALTH_CHECK_S = 0.5
+_ANSWER_S = 120.0
+
+
+@COLLECTORS.register("multi_sync")
+class MultiSyncConfig(WorkersConfig):
+    """The workers step at the same time, all with the weights of the latest update."""
+
+    def start(
+        self, problem: CollectionProblem, positions: Sequence[Position] | None
+    ) -> MultiCollection:
+        """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
+        frames = self.steps_per_batch * problem.num_envs
+        return MultiCollection(problem, self, MultiSyncCollector, frames)
+
+
+@COLLECTORS.register("multi_async")
+class MultiAsyncConfig(WorkersConfig):
+    """The workers do not wait for each other, and step while the learner takes updates."""
+
+    def start(
+        self, problem: CollectionProblem, positions: Sequence[Position] | None
+    ) -> MultiCollection:
+        """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
+        frames = self.steps_per_batch * problem.num_envs // self.workers
+        return MultiCollection(problem, self, MultiAsyncCollector, frames)
+
+
+class MultiCollection(WorkerCollection):
+    """Batches of worker processes: of all workers if they are synchronous, else of one of them.
+
+    If a worker process ends, all are replaced, and their episodes in progress are lost.
+
+    Args:
+        problem: the run's environments and policy.
+        config: number of workers and size of batches.
+        collector_class: TorchRL's collector.
+        frames: number of transitions in a batch.
+    """
+
+    def __init__(
+        self,
+        problem: CollectionProblem,
+        config: WorkersConfig,
+        collector_class: type[MultiSyncCollector | MultiAsyncCollector],
+        frames: int,
+    ) -> None:
+        super().__init__(problem, config)
+        self._collector_class = collector_class
+        self._frames = frames
+        self._restarts = 0
+        self._failures_in_a_row = 0
+        self._collector = self._start()
+        self._batches = iter(self._collector)
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process ids of the workers."""
+        return [process.pid for process in self._collector.procs]
+
+    def collect(self) -> TensorDict:
+        """Send the weights and return a batch; see `WorkerCollection.collect`."""
+        while True:
+            try:
+                self._collector.update_policy_weights_(self.weights())
+                batch = next(self._batches)
+            except (RuntimeError, OSError, EOFError) as error:
+                self._replace(error)
+                continue
+            self._failures_in_a_row = 0
+            return batch
+
+    def close(self) -> None:
+        """End the worker processes."""
+        threads = torch.get_num_threads()
+        self._collector.shutdown(timeout=_SHUTDOWN_S, raise_on_error=False)
+        torch.set_num_threads(threads)  # TorchRL increases the number
+        for process in self._collector.procs:  # those that do not end in time
+            process.kill()
+            process.join()
+
+    def _start(self) -> MultiSyncCollector | MultiAsyncCollector:
+        problem = self.problem
+        # A worker is killed when the thread that started it ends, so only for the main thread.
+        is_main = threading.current_thread() is threading.main_thread()
+        with _start_method(problem.start_method):
+            return self._collector_class(
+                self.make_envs(problem.make_env, self._restarts),
+                # TorchRL sends its weights at first, and moves them to shared memory.
+                policy=copy.deepcopy(self.policy).to("cpu"),
+                policy_factory=self.make_policies(self._restarts),
+                frames_per_batch=self._frames,
+                total_frames=-1,
+                storing_device="cpu",
+                weight_sync_schemes={"policy": _WeightSync()},
+                num_threads=torch.get_num_threads(),
+                auto_register_policy_transforms=False,
+                init_fn=partial(_prepare_worker, os.getpid() if is_main else None),
+            )
+
+    def _replace(self, cause: Exception) -> None:
+        """Replace the workers after a failure.
+
+        Raises:
+            RuntimeError: there were too many in a row.
+        """
+        self.close()
+        self._failures_in_a_row += 1
+        if self._failures_in_a_row > self.problem.max_restarts:
+            raise RuntimeError(
+                f"the collector's workers failed {self._failures_in_a_row} times in a row; the "
+                f"last time: {cause}. Raise max_restarts, or use collector=single to see the error "
+                "where it happens"
+            ) from cause
+        self._restarts += 1
+        self.scalars["restarts"] = self._restarts
+        logger.warning("workers are replaced (restart %d): %s", self._restarts, cause)
+        self._collector = self._start()
+        self._batches = iter(self._collector)
+
+
+class _WeightSync(MultiProcessWeightSyncScheme):
+    """TorchRL's scheme, which notices that a worker ended instead of waiting for it forever."""
+
+    def _wait_for_ack(
+        self, worker_ids: int | list[int] | None = None, timeout: float | None = None
+    ) -> None:
+        """Wait until all workers have the weights.
+
+        Raises:
+            RuntimeError: a worker has ended, or does not answer.
+        """
+        deadline = time.monotonic() + _ANSWER_S
+        for queue in self._ack_queues.values():
+            is_waiting = True
+            while is_waiting:
+                try:
+                    queue.get(timeout=_HEALTH_CHECK_S)
+                    is_waiting = False
+                except Empty:
+                    if not all(process.is_alive() for process in self.context.procs):
+                        raise RuntimeError("a worker process has ended") from None
+                    if time.monotonic() > deadline:
+                        raise RuntimeError("a worker does not take the weights") from None
+
+
+def _prepare_worker(parent: int | None) -> None:
+    """Leave signals to the learner's process, and wait for it as long as it runs.
+
+    By default, TorchRL's workers discard a batch that the learner does not take within a second.
+    """
+    if parent is not None:
+        end_with(parent)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    _runner._TIMEOUT = _NO_TIMEOUT_S
+
+
+@contextlib.contextmanager
+def _start_method(method: str) -> Iterator[None]:
+    """Context in which processes start as ``method`` says, including those of TorchRL."""
+    before = mp.get_start_method(allow_none=True)
+    mp.set_start_method(method, force=True)
+    try:
+        yield
+    finally:
+        mp.set_start_method(before, force=True)

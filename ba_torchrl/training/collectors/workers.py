@@ -1,0 +1,158 @@
+"""Collection in workers, each with a part of the environments and a copy of the policy."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.training.collectors.base import Collection, CollectionProblem, CollectorConfig
+
+VERSION = "policy_version"
+"""Key of the updates after which the policy had the weights that chose an action, int64 [1]."""
+NO_WEIGHTS = -1
+"""Version of a policy that has not received the learner's weights."""
+
+
+class VersionedPolicy(TensorDictModuleBase):
+    """A policy whose version is one of its weights, and an entry of each transition.
+
+    Args:
+        policy: from the observation to ``action``.
+    """
+
+    version: Tensor
+
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        super().__init__()
+        self.policy = policy
+        self.register_buffer("version", torch.tensor(NO_WEIGHTS))
+        self.in_keys = list(policy.in_keys)
+        self.out_keys = [keys.ACTION, VERSION]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action and the version of a root TensorDict of any batch shape."""
+        version = self.version.clone()  # weights that arrive during the call do not count
+        out = self.policy(tensordict)
+        return out.set(VERSION, version.expand(*out.batch_size, 1).clone())
+
+    def receive(self, weights: TensorDictBase) -> None:
+        """Take over the weights of another policy and their version.
+
+        Args:
+            weights: of the same structure, from `TensorDict.from_module`.
+        """
+        TensorDict.from_module(self).data.update_(weights)
+
+
+class WorkersConfig(CollectorConfig):
+    """Options of every collector with workers."""
+
+    resources: ClassVar[frozenset[str]] = frozenset({"workers"})
+
+    workers: int = Field(default=2, ge=1)
+    """Number of workers; each runs an equal number of the environments."""
+    steps_per_batch: int = Field(default=1, ge=1)
+    """Steps of each environment between two deliveries of transitions and of weights."""
+
+    def check(self, num_envs: int) -> None:
+        """Check that the workers can share the environments equally.
+
+        Raises:
+            ConfigError: they cannot.
+        """
+        if num_envs % self.workers:
+            raise ConfigError(
+                f"collector.workers: {self.workers} workers cannot share num_envs={num_envs} "
+                "environments equally"
+            )
+
+
+class WorkerCollection(Collection):
+    """Batches of workers whose policies have the weights of the latest update, or earlier ones.
+
+    `scalars` holds ``restarts``, the number of times that workers were replaced, and ``lag``, the
+    mean number of updates between the weights that chose the actions of the last batch and the
+    batch's arrival.
+
+    Args:
+        problem: the run's environments and policy.
+        config: number of workers and size of batches.
+    """
+
+    def __init__(self, problem: CollectionProblem, config: WorkersConfig) -> None:
+        super().__init__()
+        self.problem = problem
+        self.config = config
+        self.policy = VersionedPolicy(problem.algorithm.policy)
+        self.scalars = {"lag": 0.0, "restarts": 0}
+
+    def __next__(self) -> TensorDict:
+        while True:
+            batch = self.collect().reshape(-1)
+            version = batch.pop(VERSION)
+            if (version == NO_WEIGHTS).any():  # of a worker that was replaced during the batch
+                self.scalars["restarts"] += 1
+                continue
+            self.scalars["lag"] = (self.problem.algorithm.updates - version).float().mean().item()
+            return batch
+
+    @abstractmethod
+    def collect(self) -> TensorDict:
+        """Send the weights of `policy`, and return the transitions of one batch.
+
+        Raises:
+            RuntimeError: workers failed too often in a row.
+        """
+
+    def weights(self) -> TensorDict:
+        """Return a copy of the weights and their version, on the CPU."""
+        self.policy.version.fill_(self.problem.algorithm.updates)
+        return TensorDict.from_module(self.policy).data.to("cpu").clone()
+
+    def make_envs(
+        self, make: Callable[[int, int], EnvBase], attempt: int = 0
+    ) -> list[Callable[[], EnvBase]]:
+        """Return the functions that make the environments of each worker.
+
+        Args:
+            make: from a number of environments and the seed of the first to the environments.
+            attempt: number of times that the workers were replaced; each has other seeds.
+        """
+        count = self.problem.num_envs // self.config.workers
+        seed = self._seed(attempt)
+        return [
+            partial(make, count, seed + worker * count) for worker in range(self.config.workers)
+        ]
+
+    def make_policies(self, attempt: int = 0) -> list[Callable[[], VersionedPolicy]]:
+        """Return the functions that make the policy of each worker; see `make_envs`.
+
+        The workers draw different random numbers. They receive the weights before the first step.
+        """
+        seed = derive_seed(self._seed(attempt), SeedUse.EXPLORATION)
+        return [
+            partial(
+                _make_policy, self.problem.make_policy, derive_seed(seed, SeedUse.EXPLORATION, i)
+            )
+            for i in range(self.config.workers)
+        ]
+
+    def _seed(self, attempt: int) -> int:
+        seed = self.problem.seed
+        return seed if attempt == 0 else derive_seed(seed, SeedUse.COLLECTION, attempt)
+
+
+def _make_policy(make: Callable[[int], TensorDictModuleBase], seed: int) -> VersionedPolicy:
+    return VersionedPolicy(make(seed))

@@ -1,0 +1,60 @@
+"""Interface of the launchers, and their registry."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ba_torchrl.config import StrictModel
+from ba_torchrl.registry import Registry
+from ba_torchrl.training.config import ExperimentConfig
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The runs of a benchmark and their limits."""
+
+    runs: Sequence[ExperimentConfig]
+    """All runs, from `plan`."""
+    folder: Path
+    """Of all runs."""
+    jobs: int
+    """Runs at the same time."""
+    max_hours: float | None
+    """Time limit of each run."""
+    command: Sequence[str]
+    """Command line of the benchmark: the interpreter, the script and its arguments."""
+
+
+class LauncherConfig(StrictModel, ABC):
+    """Options of a launcher."""
+
+    def check(self, runs: Sequence[ExperimentConfig]) -> None:
+        """Check that the launcher can be used, before anything starts.
+
+        Args:
+            runs: of the grid.
+
+        Raises:
+            ConfigError: it cannot; the message names the reason.
+        """
+        return
+
+    @abstractmethod
+    def run_all(self, grid: Grid) -> dict[Path, str]:
+        """Run the unfinished runs of a grid, resume the interrupted ones, and wait for their end.
+
+        Returns:
+            By run folder, the reason of its failure. Runs that another process runs are left to it.
+
+        Raises:
+            ConfigError: a folder holds a run with other settings, in which case nothing was
+                started.
+        """
+
+
+LAUNCHERS: Registry[type[LauncherConfig]] = Registry(
+    "launcher", "ba_torchrl.training.grid.launchers"
+)

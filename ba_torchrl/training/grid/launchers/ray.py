@@ -1,0 +1,141 @@
+"""The launcher on a Ray cluster: each run is a Ray task, which Ray repeats if its machine fails."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+from tqdm import tqdm
+
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.results import FAILURE_FILE
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.grid.jobs import LOG_FILE, SAVE_S, record_failure, unfinished
+from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid, LauncherConfig
+from ba_torchrl.training.grid.run_one import run_experiment
+from ba_torchrl.training.interruption import RunStopped
+from ba_torchrl.training.ray_cluster import (
+    check_installed,
+    check_resources,
+    connected_ray,
+    ray_module,
+)
+
+_FOREVER_S = 1e6
+
+
+@LAUNCHERS.register("ray")
+class RayConfig(LauncherConfig):
+    """One task of a Ray cluster for each run; as many run at a time as its resources allow.
+
+    All machines see the grid's folder under the same absolute path. A run whose machine or process
+    fails is resumed on another machine from its last saved state.
+    """
+
+    cpus: float = Field(default=1.0, ge=0)
+    """CPU cores that Ray reserves for each run."""
+    gpus: float = Field(default=0.0, ge=0)
+    """GPUs that Ray reserves for each run."""
+    max_retries: int = Field(default=3, ge=0)
+    """Largest number of times that a run is repeated because its machine or process failed."""
+    address: str | None = None
+    """Address of the cluster, such as "auto"; None for `ray.init`'s default, which starts a
+    cluster of this machine if it is not part of one."""
+
+    def check(self, runs: Sequence[ExperimentConfig]) -> None:
+        """Check that Ray is installed, and that no run starts workers of its own on the cluster.
+
+        Raises:
+            ConfigError: it is not, or one does.
+        """
+        check_installed("launcher")
+        if any(run.collector["name"] == "ray" for run in runs):
+            raise ConfigError(
+                "launcher=ray with collector=ray: runs that hold the cluster would wait for their "
+                "own workers; use one of the two"
+            )
+
+    def run_all(self, grid: Grid) -> dict[Path, str]:
+        """Run the unfinished runs; see `LauncherConfig.run_all`."""
+        waiting = unfinished(grid.runs)
+        ray = connected_ray(self.address)
+        check_resources("launcher", self.cpus, self.gpus)
+        task = ray.remote(
+            num_cpus=self.cpus,
+            num_gpus=self.gpus,
+            max_retries=self.max_retries,
+            max_calls=1,  # a process of its own for each run
+        )(_run_in_task)
+        pending = {}
+        for run in waiting:
+            (run.folder / FAILURE_FILE).unlink(missing_ok=True)
+            where = {"run_dir": str(run.folder.resolve())}
+            values = run.model_copy(update=where).model_dump_json()
+            pending[task.remote(values, grid.max_hours)] = run
+        failures: dict[Path, str] = {}
+        bar = tqdm(total=len(grid.runs), initial=len(grid.runs) - len(waiting), unit="run")
+        try:
+            while pending:
+                for reference in ray.wait(list(pending))[0]:
+                    reason = _reason(reference)
+                    run = pending.pop(reference)
+                    if reason is not None:
+                        failures[run.folder] = reason
+                        record_failure(run, reason)
+                        tqdm.write(f"failed: {run.folder}: {reason}")
+                    bar.update()
+        finally:
+            for reference in pending:  # they save their states
+                ray.cancel(reference)
+            if pending:
+                ray.wait(list(pending), num_returns=len(pending), timeout=SAVE_S)
+            bar.close()
+        return failures
+
+
+def _reason(reference: Any) -> str | None:
+    """Return why a task that has ended failed; None if it did not."""
+    exceptions = ray_module().exceptions
+    try:
+        ray_module().get(reference)
+    except exceptions.RayTaskError as error:
+        return f"{type(error.cause).__name__}: {error.cause}".splitlines()[0]
+    except exceptions.RayError as error:
+        return f"{type(error).__name__}: {str(error).splitlines()[0]}"
+    return None
+
+
+def _run_in_task(values: str, max_hours: float | None) -> None:
+    """Run an experiment in this process, with the run folder's log file.
+
+    Args:
+        values: the configuration of the run, as JSON.
+        max_hours: time limit of the run.
+
+    Raises:
+        TimeoutError: it took longer, or was cancelled. Its state is saved.
+    """
+    folder = Path(ExperimentConfig.model_validate_json(values).run_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    handler = logging.FileHandler(folder / LOG_FILE)
+    logging.getLogger().addHandler(handler)
+    seconds = _FOREVER_S if max_hours is None else 3600 * max_hours
+    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.daemon = True
+    timer.start()
+    try:
+        run_experiment(values)
+    except RunStopped as stopped:  # a task that raises SystemExit is repeated
+        raise TimeoutError(f"took longer than max_hours, or was cancelled: {stopped}") from None
+    except Exception:
+        logging.getLogger(__name__).exception("the run failed")
+        raise
+    finally:
+        timer.cancel()
+        logging.getLogger().removeHandler(handler)

@@ -1,0 +1,72 @@
+"""Small collections, and what a list of their batches must be."""
+
+import torch
+
+from ba_torchrl.envs import keys
+from ba_torchrl.training.checkpoint import build_algorithm
+from ba_torchrl.training.collection import start_collection
+from ba_torchrl.training.config import ExperimentConfig
+
+SEED = 7
+TINY = {
+    "task": "close_loop/block_reaching",
+    "env": {"obs_size": 64, "max_steps": 5},
+    "algorithm": {"name": "dagger", "batch_size": 8},
+    "network": {"name": "cnn", "width": 0.25},
+    "num_envs": 4,
+    "parallel": False,
+    "start_method": "fork",
+    "demonstrations": 3,
+    "min_replay": 5,
+    "total_updates": 12,
+    "eval_every": 6,
+    "eval_episodes": 2,
+    "final_eval_episodes": 2,
+    "log_every": 1,
+    "video_episodes": 0,
+}
+
+
+def config_for(tmp_path, collector, **changes):
+    values = {**TINY, "collector": collector, "run_dir": str(tmp_path / "run")}
+    return ExperimentConfig.parse({**values, **changes})
+
+
+def start(config):
+    """Return the collection of a run, and its algorithm."""
+    algorithm = build_algorithm(config)
+    return start_collection(config, algorithm, SEED, None), algorithm
+
+
+def change_weights(algorithm, updates):
+    """Give the policy other weights, as after so many updates; its actions are its means."""
+    torch.manual_seed(updates)
+    with torch.no_grad():
+        for name, parameter in algorithm.policy.named_parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+            if "log_std" in name:
+                parameter.fill_(-1e3 if "bias" in name else 0.0)
+    algorithm.policy.beta.fill_(0.0)
+    algorithm.updates = updates
+
+
+def own_actions(algorithm, batch):
+    """Return the actions of the learner's policy in the states of a batch."""
+    state = batch.select(*algorithm.policy.in_keys)
+    return algorithm.policy(state)[keys.ACTION]
+
+
+def assert_each_transition_once(batches):
+    """Check that every trajectory consists of all its steps in their order, each once."""
+    steps = {}
+    for batch in batches:
+        for step in batch.unbind(0):
+            trajectory = int(step["collector", "traj_ids"])
+            before = steps.setdefault(trajectory, [])
+            assert int(step["step_count"]) == len(before)
+            if before:
+                assert torch.equal(step[keys.PIXELS], before[-1][keys.NEXT, keys.PIXELS])
+                assert not before[-1][keys.NEXT, keys.DONE]
+            before.append(step)
+    assert len(steps) > 1
+    return steps

@@ -1,0 +1,164 @@
+"""Collection in worker processes of this machine."""
+
+import os
+import signal
+import time
+
+import pytest
+import torch
+
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.training.experiment import Experiment
+from tests.training.collectors.runs import (
+    assert_each_transition_once,
+    change_weights,
+    config_for,
+    own_actions,
+    start,
+)
+
+KINDS = ("multi_sync", "multi_async")
+
+
+@pytest.fixture
+def collecting(tmp_path):
+    """Start collections, which end with the test."""
+    started = []
+
+    def of(name, workers=2, **changes):
+        options = {} if name == "single" else {"workers": workers}
+        collection, algorithm = start(config_for(tmp_path, {"name": name, **options}, **changes))
+        started.append(collection)
+        return collection, algorithm
+
+    yield of
+    for collection in started:
+        collection.close()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_transition_is_returned_once_and_workers_get_the_weights(kind, collecting):
+    collection, algorithm = collecting(kind)
+    algorithm.policy.beta.fill_(1.0)
+    size = {"multi_sync": 4, "multi_async": 2}[kind]
+    batches = [next(collection) for _ in range(8)]
+    assert {len(batch) for batch in batches} == {size}
+    for batch in batches:  # beta is one of the weights
+        assert torch.allclose(batch[keys.ACTION], batch[keys.EXPERT_ACTION], atol=1e-6)
+
+    change_weights(algorithm, updates=3)
+    later = []
+    for _ in range(6):
+        later.append(next(collection))
+        if collection.scalars["lag"] == 0:
+            break
+    # a worker of an asynchronous collector is one batch ahead, which may wait in the queue
+    assert len(later) == 1 if kind == "multi_sync" else len(later) <= 4
+    assert torch.allclose(later[-1][keys.ACTION], own_actions(algorithm, later[-1]), atol=1e-6)
+    assert_each_transition_once([*batches, *later])
+    assert collection.scalars["restarts"] == 0
+
+
+def test_workers_start_the_episodes_of_the_default_collector(collecting):
+    single, _ = collecting("single")
+    sync, _ = collecting("multi_sync")
+    expected, found = next(single), next(sync)
+    assert len(found[keys.PIXELS].flatten(1).unique(dim=0)) == 4
+    assert torch.equal(found[keys.PIXELS], expected[keys.PIXELS])
+
+
+def test_several_steps_per_batch(tmp_path):
+    options = {"name": "multi_sync", "workers": 2, "steps_per_batch": 7}
+    collection, _ = start(config_for(tmp_path, options))
+    try:
+        batches = [next(collection) for _ in range(2)]
+    finally:
+        collection.close()
+    assert {len(batch) for batch in batches} == {28}
+    assert_each_transition_once(batches)
+
+
+def test_workers_draw_different_exploration(collecting):
+    collection, _ = collecting("multi_sync", num_envs=2, algorithm={"name": "sac"})
+    observed = next(collection)
+    assert not torch.equal(*observed[keys.ACTION])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ended_workers_are_replaced_with_the_present_weights(kind, collecting):
+    collection, algorithm = collecting(kind)
+    before = [next(collection) for _ in range(3)]
+    change_weights(algorithm, updates=5)
+    pids = collection.worker_pids
+    os.kill(pids[0], signal.SIGKILL)
+    after = []
+    deadline = time.monotonic() + 60
+    while not collection.scalars["restarts"] and time.monotonic() < deadline:
+        after.append(next(collection))
+    assert collection.scalars == {"restarts": 1, "lag": 0.0}
+    assert not set(pids) & set(collection.worker_pids)
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
+    new = [after[-1], *(next(collection) for _ in range(4))]
+    assert torch.allclose(new[0][keys.ACTION], own_actions(algorithm, new[0]), atol=1e-6)
+    assert_each_transition_once(new)
+    first = torch.cat([batch[keys.PIXELS] for batch in before])
+    assert not (new[0][keys.PIXELS][:, None] == first[None]).flatten(2).all(2).any()
+
+
+def test_too_many_failures_in_a_row_end_the_collection(collecting):
+    collection, _ = collecting("multi_sync", max_restarts=0)
+    next(collection)
+    os.kill(collection.worker_pids[1], signal.SIGKILL)
+    with pytest.raises(RuntimeError, match=r"failed 1 times in a row.*max_restarts"):
+        next(collection)
+
+
+def test_a_run_keeps_the_ratio_of_updates_to_steps_and_its_statistics(tmp_path):
+    options = {"name": "multi_async", "workers": 2}
+    experiment = Experiment(config_for(tmp_path, options), progress=False)
+    result = experiment.run()
+    assert result.updates == 12
+    steps = experiment._progress.env_steps
+    assert 4 * 12 <= steps <= 4 * 12 + 4  # one update for each step of all four environments
+    storage = experiment.algorithm.replay.storage
+    is_expert = storage.column("is_expert")
+    assert experiment.algorithm.replay_size == int(is_expert.sum()) + steps
+    assert len(experiment._progress.recent) >= 4  # episodes of at most five steps
+    scalars = read_scalars(tmp_path / "run")
+    assert scalars["collector/lag"].values[-1] <= 3
+    assert scalars["collector/restarts"].values[-1] == 0
+
+
+def test_a_stopped_run_continues_with_other_episodes(tmp_path):
+    class Stopped(Exception):
+        pass
+
+    options = {"name": "multi_sync", "workers": 2}
+    experiment = Experiment(config_for(tmp_path, options), progress=False)
+    update = experiment.algorithm.update
+
+    def stop():
+        if experiment.algorithm.updates == 4:
+            raise Stopped
+        return update()
+
+    experiment.algorithm.update = stop
+    with pytest.raises(Stopped):
+        experiment.run()
+    result = Experiment(config_for(tmp_path, options, resume=True), progress=False).run()
+    assert result.updates == 12
+    other = {"name": "multi_sync", "workers": 4}  # may change; the kind may not
+    resumed = config_for(tmp_path, other).resolved()
+    assert resumed == config_for(tmp_path, options).resolved()
+    assert resumed["collector"] == {"name": "multi_sync", "steps_per_batch": 1}
+
+
+def test_impossible_options_are_refused_before_anything_starts(tmp_path):
+    with pytest.raises(ConfigError, match="3 workers cannot share num_envs=4"):
+        config_for(tmp_path, {"name": "multi_sync", "workers": 3})
+    with pytest.raises(ConfigError, match="unknown collector 'multi'"):
+        config_for(tmp_path, {"name": "multi"})
+    with pytest.raises(ConfigError, match=r"(?s)collector .*unknown parameter 'steps'"):
+        config_for(tmp_path, {"name": "multi_sync", "steps": 3})

@@ -1,0 +1,81 @@
+"""Collection on a Ray cluster, one of whose nodes fails."""
+
+import time
+
+import pytest
+import torch
+
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.training.experiment import Experiment
+from tests.training.collectors.runs import (
+    change_weights,
+    config_for,
+    own_actions,
+    start,
+)
+from tests.training.ray_nodes import ray_nodes
+
+OPTIONS = {"name": "ray", "workers": 2}
+
+
+def test_without_ray_one_line_says_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("ba_torchrl.training.ray_cluster.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'ba-torchrl\[ray\]'") as raised:
+        config_for(tmp_path, OPTIONS)
+    assert "\n" not in str(raised.value)
+
+
+def nodes_of_workers(ray):
+    """Return the ids of the nodes that run the workers."""
+    from ray._private.state import actors
+
+    return {actor["Address"]["NodeID"] for actor in actors().values() if actor["State"] == "ALIVE"}
+
+
+@pytest.mark.slow
+def test_collection_goes_on_when_a_node_fails(tmp_path):
+    with ray_nodes(3) as (cluster, nodes, ray):
+        collection, algorithm = start(config_for(tmp_path, OPTIONS))
+        batches = [next(collection) for _ in range(6)]
+        change_weights(algorithm, updates=5)
+        batches += [next(collection) for _ in range(4)]  # two of each worker, or more of one
+        newest = batches[-1]
+        assert collection.scalars["lag"] == 0
+        assert torch.allclose(newest[keys.ACTION], own_actions(algorithm, newest), atol=1e-6)
+        data = torch.cat(batches)
+        rows = torch.cat([data[keys.PIXELS].flatten(1), data[keys.ACTION]], dim=1)
+        assert len(rows.unique(dim=0)) == len(rows) == 2 * len(batches)
+
+        worker = collection._collector.remote_collectors[0]
+        with pytest.raises(ray.exceptions.RayTaskError):  # not repeated, as failed nodes are
+            ray.get(worker.cascade_execute.remote("policy.receive"), timeout=60)
+
+        busy = nodes_of_workers(ray)
+        assert len(busy) == 2
+        failing = next(node for node in nodes if node.node_id in busy)
+        cluster.remove_node(failing, allow_graceful=False)
+        during, deadline = 0, time.monotonic() + 120
+        while not collection.scalars["restarts"] and time.monotonic() < deadline:
+            batch = next(collection)
+            during += 1
+            assert torch.allclose(batch[keys.ACTION], own_actions(algorithm, batch), atol=1e-6)
+        assert collection.scalars == {"restarts": 1, "lag": 0.0}
+        assert during > 1  # of the other worker
+        assert failing.node_id not in nodes_of_workers(ray)
+        assert len(nodes_of_workers(ray)) == 2
+        collection.close()
+
+
+@pytest.mark.slow
+def test_a_run_on_a_cluster_ends_like_every_run(tmp_path):
+    with ray_nodes(2):
+        experiment = Experiment(config_for(tmp_path, OPTIONS), progress=False)
+        result = experiment.run()
+        assert result.updates == 12
+        steps = experiment._progress.env_steps
+        assert 4 * 12 <= steps <= 4 * 12 + 4
+        is_expert = experiment.algorithm.replay.storage.column("is_expert")
+        assert experiment.algorithm.replay_size == int(is_expert.sum()) + steps
+        with pytest.raises(ConfigError, match="4 CPUs are needed, the Ray cluster has 2"):
+            start(config_for(tmp_path, {**OPTIONS, "workers": 4}))
