@@ -92,6 +92,11 @@ class Gripper:
         """Least height of the fingertips at any opening."""
         return min(z for _, z in self.tip_arc)
 
+    def finger_depth_below_m(self, height_m: float) -> float:
+        """Return the extent of an open finger along the closing axis below a height."""
+        reach_m = max((u for u, z in self.outline if z < height_m), default=0.0)
+        return max(reach_m - self.half_gap_m, self.finger_depth_m)
+
     def closed_reach_m(self, height_m: float) -> float:
         """Return the largest distance of the closed gripper below a height."""
         return max((u for u, z in self.closed_outline if z < height_m), default=0.0)
