@@ -56,6 +56,8 @@ TIP_OVER_M = 0.008
 """Distance beyond the pallet's edge at which an upended box is released, so that it tips over."""
 TIP_SITES = 2
 """Sites on each side of the centre of the edge that are compared for this."""
+BLOCKED_M = -5e-3
+"""Clearance of a grasp below which it is likely to fail."""
 MAX_SHIFT = 0.6
 RELEASE_MARGIN_M = 1e-3
 FREE_HALF_M = (0.056, 0.016)
@@ -182,7 +184,7 @@ class Palletizing:
             tilted = self._tilted_grasp(body)
             if tilted is not None:
                 tool, clearance_m = tilted
-        if clearance_m <= 0:
+        if clearance_m < BLOCKED_M:
             can_turn = self.action_limits.turn_rad > 0
             return perturbed_pick(self.world, body, tool, can_turn=can_turn)
         return pick_command(tool)
@@ -196,7 +198,7 @@ class Palletizing:
             self.terrain.support_ids,
             body,
             [other for other in (*self.pool.active, self.container) if other is not body],
-            below_centre_m=(GRASP_DEPTH_M - BOX_M[2] / 2) * self.unit,
+            above_centre_m=(BOX_M[2] / 2 - GRASP_DEPTH_M) * self.unit,
             offsets_m=[offset * self.unit for offset in self.grasp_offsets_m],
             opening=self.finger_opening,
             sufficient_m=SUFFICIENT_CLEARANCE_M,
