@@ -329,7 +329,7 @@ class Palletizing:
         """Gap between boxes side by side in which a finger opens at a release."""
         gripper = self.robot.gripper
         release_m = PickPlaceLimits().release_opening * gripper.half_gap_m
-        depth_m = gripper.finger_depth_below_m(GRASP_DEPTH_M * self.unit)
+        depth_m = gripper.finger_reach_below_m(GRASP_DEPTH_M * self.unit, 0.0)
         return depth_m + release_m + RELEASE_MARGIN_M
 
     def _tip_over(self, held: Body) -> PickPlaceCommand:
