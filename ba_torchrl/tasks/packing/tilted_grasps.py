@@ -34,7 +34,7 @@ ROLL_COST_M = 0.03
 box by one radian. Fingers on its edges rotate it, or lose it."""
 PITCH_COST_M = 0.003
 """The same for the approach direction. The place corrects it."""
-OFFSET_COST = 0.05
+OFFSET_COST = 0.2
 """The same for a grasp closer to the centre of the box, as a multiple of the distance."""
 
 
@@ -95,7 +95,7 @@ def tilted_grasp(
         down = perpendicular(tuple(-u for u in up), axis)
         position = tuple(frame.apply(np.array([0.0, offset, above_centre_m])).tolist())
         tool = Pose(position, axes_quaternion(axis, down))
-        clearance_m = tool_clearance_m(robot, tool, others, opening)
+        clearance_m = tool_clearance_m(robot, tool, others, opening, with_knuckles=True)
         score = min(clearance_m, sufficient_m) - cost
         if score > best_score and is_reachable(robot, support_ids, tool):
             best, best_score = TiltedGrasp(tool, clearance_m), score
