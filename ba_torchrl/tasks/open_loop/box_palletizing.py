@@ -51,7 +51,7 @@ SLOT_RAD = math.pi / 8
 GRASP_DEPTH_M = 0.008
 """Depth of a grasp below the top of a box, where the fingers fit between its neighbours."""
 SHIFTS = (0.0, 0.3, -0.3, 0.6, -0.6)
-"""Offsets at which a box is placed in a slot, as a multiple of `SLOT_M`."""
+"""Offsets in a slot that are compared, as a multiple of `SLOT_M`."""
 TIP_OVER_M = 0.008
 """Distance beyond the pallet's edge at which an upended box is released, so that it tips over."""
 TIP_SITES = 2
@@ -59,7 +59,9 @@ TIP_SITES = 2
 BLOCKED_M = -5e-3
 """Clearance of a grasp below which it is likely to fail."""
 MAX_SHIFT = 0.6
+"""Largest offset at which a box is placed in a slot, as a multiple of `SLOT_M`."""
 RELEASE_MARGIN_M = 1e-3
+"""Margin between a finger that opens at a release and the box beside it."""
 FREE_HALF_M = (0.056, 0.016)
 """Half the extents of the free area around a box at the start."""
 SETTLE_STEPS = 100
@@ -279,6 +281,8 @@ class Palletizing:
     def _site(self, slot: Rectangle, row: int, neighbors: Sequence[Rectangle]) -> Rectangle:
         """Return the site in a slot, off its centre if the fingers have no space there otherwise.
 
+        The outer boxes of a column are moved apart by what the gap between the slots lacks.
+
         Args:
             slot: the slot.
             row: -1, 0 or 1: the position of the slot along its x axis.
@@ -286,16 +290,14 @@ class Palletizing:
         """
         needed_m, limit_m = self._finger_gap_m, MAX_SHIFT * SLOT_M * self.unit
         spread_m = row * min(max(needed_m - (ROW_M - BOX_M[0]) * self.unit, 0.0), limit_m)
-        offsets_m = [shift * SLOT_M * self.unit for shift in SHIFTS]
+        offsets_m = [spread_m + shift * SLOT_M * self.unit for shift in SHIFTS]
         sites = [
-            slot._replace(x=x, y=y)
-            for x, y in (
-                slot.frame.to_world(min(max(spread_m + offset, -limit_m), limit_m), 0.0)
-                for offset in offsets_m
-            )
+            Rectangle(*slot.frame.to_world(min(max(offset_m, -limit_m), limit_m), 0.0), *slot[2:])
+            for offset_m in offsets_m
         ]
 
         def space(site: Rectangle) -> int:
+            """Return the gap to the nearest neighbour in millimetres, up to what is needed."""
             gap = min((gap_m(site, other) for other in neighbors), default=math.inf)
             return int(min(gap, needed_m) / RELEASE_MARGIN_M)
 

@@ -1,4 +1,4 @@
-"""Grasps of boxes on slopes beside a stack."""
+"""Grasps of boxes that lie on slopes beside a stack."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROLL_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 the fingers lie flat on them; 0 is horizontal."""
 PITCH_SHARES = (1.0, 0.5, 0.0, -0.5, -1.0)
 """Approach directions for each of them: 1 is along the normal of the box's top, 0 is as close to
-the vertical as the closing axis allows."""
+the vertical as the closing axis allows, and -1 is inclined to the other side."""
 ROLL_COST_M = 0.03
 """Clearance that a grasp gains to be preferred to one that is more parallel to the sides of the
 box by one radian. Fingers on its edges rotate it, or lose it."""
