@@ -95,6 +95,12 @@ def tips_below_tool_m(robot: Robot) -> float:
     return -robot.gripper.tip_height_m(robot.opening() * robot.gripper.half_gap_m)
 
 
+def knuckles_m(gripper: Gripper) -> tuple[float, float]:
+    """Return the reach of the open fingers above the grasp, and the height where it begins."""
+    wider = [(u, z) for u, z in gripper.outline if u > gripper.finger_reach_m]
+    return max((u for u, _ in wider), default=0.0), min((z for _, z in wider), default=math.inf)
+
+
 def passing_height_m(gripper: Gripper) -> float:
     """Return the height of the tool above a body that the gripper passes over."""
     return max(PASSING_HEIGHT_M, PASSING_GAP_M - gripper.lowest_tip_m)
@@ -182,7 +188,12 @@ def hand_clearance_m(
 
 
 def tool_clearance_m(
-    robot: Robot, tool: Pose, others: Sequence[Body], opening: float = 1.0
+    robot: Robot,
+    tool: Pose,
+    others: Sequence[Body],
+    opening: float = 1.0,
+    *,
+    with_knuckles: bool = False,
 ) -> float:
     """Return the clearance between the hand with open fingers at a pose, and other bodies.
 
@@ -193,6 +204,7 @@ def tool_clearance_m(
         tool: pose of the tool, which may be tilted.
         others: the other bodies.
         opening: opening of the gripper, 0 to 1.
+        with_knuckles: include the parts of the fingers that are wider than those beside an object.
     """
     # in a frame with the tool's position in which the tool points straight down at yaw zero
     to_view = rotation_array(tool.orientation) @ np.array(downward(0.0)).T
@@ -201,6 +213,11 @@ def tool_clearance_m(
     fingers = finger_rectangles(gripper, frame, half_gap_m(gripper, opening))
     parts = [(finger, gripper.lowest_tip_m) for finger in fingers]
     parts.append((hand_rectangle(robot, frame), gripper.palm_height_m))
+    if with_knuckles:
+        reach_m, height = knuckles_m(gripper)
+        reach_m -= (1 - opening) * gripper.half_gap_m
+        knuckles = Rectangle(x, y, 0.0, reach_m, gripper.half_width_m + SIDE_MARGIN_M)
+        parts.append((knuckles, height))
     extents = [(extents_m(part.corners), height) for part, height in parts]
     gap = math.inf
     for other in others:

@@ -19,6 +19,7 @@ from ba_torchrl.tasks.clearance import (
     grasp_clearance_m,
     hand_clearance_m,
     hand_rectangle,
+    knuckles_m,
     outline_clearance_m,
     passing_height_m,
     tips_below_tool_m,
@@ -50,6 +51,11 @@ def test_extents_of_the_gripper_follow_from_its_outline():
     assert GRIPPER.finger_reach_m == 0.06
     tips_only = replace(GRIPPER, outline=((0.0, math.inf), (0.04, -0.01)))
     assert tips_only.finger_reach_m == pytest.approx(0.054)
+    reach_m = [GRIPPER.finger_reach_below_m(z) for z in (-0.003, 0.003, 0.02, 0.05)]
+    assert reach_m == pytest.approx([0.054, 0.054, 0.06, 0.07])
+    assert GRIPPER.finger_reach_below_m(0.02, 0.5) == pytest.approx(0.04)
+    assert knuckles_m(GRIPPER) == (0.07, 0.045)
+    assert knuckles_m(tips_only) == (0.0, math.inf)
     assert GRIPPER.lowest_tip_m == -0.01
     assert [GRIPPER.closed_reach_m(z) for z in (-0.02, 0.0, 0.02, 0.1)] == [0, 0, 0.02, 0.035]
 

@@ -88,13 +88,24 @@ class Gripper:
     @property
     def finger_reach_m(self) -> float:
         """Distance of the outer side of the open fingers, up to `GRASP_HEIGHT_M`."""
-        tips_m = self.half_gap_m + self.finger_depth_m
-        return max([tips_m, *(u for u, z in self.outline if z < GRASP_HEIGHT_M)])
+        return self.finger_reach_below_m(GRASP_HEIGHT_M)
 
     @property
     def lowest_tip_m(self) -> float:
         """Least height of the fingertips at any opening."""
         return min(z for _, z in self.tip_arc)
+
+    def finger_reach_below_m(self, height_m: float, opening: float = 1.0) -> float:
+        """Return the distance of the fingers' outer sides below a height.
+
+        Args:
+            height_m: above the tool point.
+            opening: of the fingers, 0 to 1.
+        """
+        reach_m = self.half_gap_m + self.finger_depth_m
+        if height_m > self.tip_height_m(self.half_gap_m) + TIP_HEIGHT_M:
+            reach_m = max([reach_m, *(u for u, z in self.outline if z < height_m)])
+        return reach_m - (1 - opening) * self.half_gap_m
 
     def closed_reach_m(self, height_m: float) -> float:
         """Return the largest distance of the closed gripper below a height."""

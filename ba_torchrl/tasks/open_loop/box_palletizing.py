@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,25 +11,26 @@ import numpy as np
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, vertical_extent
-from ba_torchrl.sim.geometry import (
-    PlanarFrame,
-    Pose,
-    downward_quaternion,
-    quaternion_matrix,
-    surface_quaternion,
-)
+from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.geometry import Pose, Vector, tool_angles
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.clearance import tool_clearance_m
 from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
-from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.pick_place_commands import LEVEL_RAD, no_op, pick_command
+from ba_torchrl.tasks.packing.tilted_grasps import TiltedGrasp, tilted_grasp
+from ba_torchrl.tasks.perturbation import perturbed_pick
+from ba_torchrl.tasks.pick_place_commands import (
+    LEVEL_RAD,
+    carrying_pose,
+    no_op,
+    pick_command,
+    place_command,
+)
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 from ba_torchrl.tasks.structures.parts import CUBOID
-from ba_torchrl.tasks.structures.tilted_grasps import in_resting_frame, is_reachable
+from ba_torchrl.tasks.structures.tilted_grasps import is_reachable, release_pose
 
 PALLET_M = (0.232, 0.192, 0.03)
 """Extents of the pallet; all lengths are at the appendix's size."""
@@ -48,16 +50,18 @@ SLOT_RAD = math.pi / 8
 """Largest yaw error of a box in a slot."""
 GRASP_DEPTH_M = 0.008
 """Depth of a grasp below the top of a box, where the fingers fit between its neighbours."""
-NEIGHBOR_GAP_M = 0.019
-"""Gap between boxes side by side in which a finger can open."""
 SHIFTS = (0.0, 0.3, -0.3, 0.6, -0.6)
-"""Offsets at which a box is placed in a slot, as a multiple of `SLOT_M`."""
+"""Offsets in a slot that are compared, as a multiple of `SLOT_M`."""
 TIP_OVER_M = 0.008
 """Distance beyond the pallet's edge at which an upended box is released, so that it tips over."""
 TIP_SITES = 2
 """Sites on each side of the centre of the edge that are compared for this."""
-TILT_SHARES = (1.0, 0.75, 0.5, 0.25)
-"""Tilts of the tool that are compared, as a share of that of the box."""
+BLOCKED_M = -5e-3
+"""Clearance of a grasp below which it is likely to fail."""
+MAX_SHIFT = 0.6
+"""Largest offset at which a box is placed in a slot, as a multiple of `SLOT_M`."""
+RELEASE_MARGIN_M = 1e-3
+"""Margin between a finger that opens at a release and the box beside it."""
 FREE_HALF_M = (0.056, 0.016)
 """Half the extents of the free area around a box at the start."""
 SETTLE_STEPS = 100
@@ -177,32 +181,30 @@ class Palletizing:
             return level, grasps[body].clearance_m > 0, grasps[body].clearance_m
 
         body = max(unstacked, key=priority)
-        return pick_command(self._along_normal(grasps[body]))
+        tool, clearance_m = grasps[body].tool, grasps[body].clearance_m
+        if self.action_limits.can_tilt and CUBOID.tilt_rad(body) > LEVEL_RAD:
+            tilted = self._tilted_grasp(body)
+            if tilted is not None:
+                tool, clearance_m = tilted
+        if clearance_m < BLOCKED_M:
+            can_turn = self.action_limits.turn_rad > 0
+            return perturbed_pick(self.world, body, tool, can_turn=can_turn)
+        return pick_command(tool)
 
     # ----------------------------------------------------------------------------------------
 
-    def _along_normal(self, grasp: TopDownGrasp) -> Pose:
-        """Return the tool of a grasp, tilted like the box as far as arm and neighbours allow."""
-        body = grasp.body
-        if not self.action_limits.can_tilt or CUBOID.tilt_rad(body) < LEVEL_RAD:
-            return grasp.tool
-        normal = [row[2] for row in quaternion_matrix(CUBOID.resting_frame(body))]
-        rows = quaternion_matrix(in_resting_frame(CUBOID, body))
-        top_m = float((body.shape.vertices @ rows[2]).max())
-        x, y = PlanarFrame(*body.position[:2], grasp.yaw_rad).to_local(*grasp.position[:2])
-        offset = Pose((x, y, top_m - GRASP_DEPTH_M * self.unit), downward_quaternion(0.0))
-        others = [other for other in (*self.pool.active, self.container) if other is not body]
-        for share in TILT_SHARES:
-            axis = np.array([0.0, 0.0, 1.0 - share]) + share * np.array(normal)
-            axis = tuple((axis / np.linalg.norm(axis)).tolist())
-            surface = Pose(body.position, surface_quaternion(axis, grasp.yaw_rad))
-            tool = surface.compose(offset)
-            clearance_m = tool_clearance_m(self.robot, tool, others, self.finger_opening)
-            if clearance_m >= min(grasp.clearance_m, SUFFICIENT_CLEARANCE_M) and is_reachable(
-                self.robot, self.terrain.support_ids, tool
-            ):
-                return tool
-        return grasp.tool
+    def _tilted_grasp(self, body: Body) -> TiltedGrasp | None:
+        """Return the grasp of a box on a slope; None if the arm reaches none."""
+        return tilted_grasp(
+            self.robot,
+            self.terrain.support_ids,
+            body,
+            [other for other in (*self.pool.active, self.container) if other is not body],
+            above_centre_m=(BOX_M[2] / 2 - GRASP_DEPTH_M) * self.unit,
+            offsets_m=[offset * self.unit for offset in self.grasp_offsets_m],
+            opening=self.finger_opening,
+            sufficient_m=SUFFICIENT_CLEARANCE_M,
+        )
 
     def _activate_next_box(self) -> None:
         """Place the next box where it arrives."""
@@ -266,23 +268,71 @@ class Palletizing:
                 width,
                 length,
             )
-            sites = [
-                Rectangle(*center.frame.to_world(shift * SLOT_M * self.unit, 0.0), *center[2:])
-                for shift in SHIFTS
-            ]
-            # off the centre if a neighbour at the edge of its slot leaves no space for a finger
-            site = max(
-                sites,
-                key=lambda site: (
-                    min((gap_m(site, other) for other in neighbors), default=math.inf)
-                    > NEIGHBOR_GAP_M * self.unit
-                ),
-            )
+            row = round((x * math.cos(yaw) + y * math.sin(yaw)) / ROW_M)
+            site = self._site(center, row, neighbors)
             if all(gap_m(site, other) > 0 for other in obstacles):
-                return self.place(held, (site.x, site.y, z), site.yaw_rad - heading)
+                return self._level_place(held, (site.x, site.y, z), site.yaw_rad) or self.place(
+                    held, (site.x, site.y, z), site.yaw_rad - heading
+                )
         (x, y), yaw = max(self._arrivals, key=lambda arrival: self._gap_at_m(arrival, held))
         z = self.terrain.height_m((x, y)) + height + RELEASE_GAP_M
         return self.place(held, (x, y, z), yaw - heading)
+
+    def _site(self, slot: Rectangle, row: int, neighbors: Sequence[Rectangle]) -> Rectangle:
+        """Return the site in a slot, off its centre if the fingers have no space there otherwise.
+
+        The outer boxes of a column are moved apart by what the gap between the slots lacks.
+
+        Args:
+            slot: the slot.
+            row: -1, 0 or 1: the position of the slot along its x axis.
+            neighbors: outlines of the other boxes in the layer.
+        """
+        needed_m, limit_m = self._finger_gap_m, MAX_SHIFT * SLOT_M * self.unit
+        spread_m = row * min(max(needed_m - (ROW_M - BOX_M[0]) * self.unit, 0.0), limit_m)
+        offsets_m = [spread_m + shift * SLOT_M * self.unit for shift in SHIFTS]
+        sites = [
+            Rectangle(*slot.frame.to_world(min(max(offset_m, -limit_m), limit_m), 0.0), *slot[2:])
+            for offset_m in offsets_m
+        ]
+
+        def space(site: Rectangle) -> int:
+            """Return the gap to the nearest neighbour in millimetres, up to what is needed."""
+            gap = min((gap_m(site, other) for other in neighbors), default=math.inf)
+            return int(min(gap, needed_m) / RELEASE_MARGIN_M)
+
+        return max(sites, key=space)
+
+    def _level_place(self, held: Body, position: Vector, yaw_rad: float) -> PickPlaceCommand | None:
+        """Return the place at which a box that is tilted in the gripper is level, if there is one.
+
+        Args:
+            held: the box.
+            position: final position of its centre.
+            yaw_rad: its final yaw, up to half turns.
+        """
+        if not self.action_limits.can_tilt or CUBOID.tilt_rad(held) < LEVEL_RAD:
+            return None
+        tool, heading = self.robot.tool_frame(), CUBOID.yaw_rad(held)
+        turn = wrap_angle(yaw_rad - heading, math.pi)
+        for yaw in (heading + turn, heading + turn + math.pi):
+            target = release_pose(CUBOID, held, Pose(position), yaw)
+            pose = carrying_pose(tool, held.pose, target)
+            # a half turn of the tool would double the tilt of the box
+            is_allowed = tool_angles(pose.orientation)[0] % (2 * math.pi) <= math.pi
+            if is_allowed and is_reachable(
+                self.robot, self.terrain.support_ids, pose, PickPlaceLimits().pre_place_height_m
+            ):
+                return place_command(tool, held.pose, target)
+        return None
+
+    @property
+    def _finger_gap_m(self) -> float:
+        """Gap between boxes side by side in which a finger opens at a release."""
+        gripper = self.robot.gripper
+        release_m = PickPlaceLimits().release_opening * gripper.half_gap_m
+        depth_m = gripper.finger_reach_below_m(GRASP_DEPTH_M * self.unit, 0.0)
+        return depth_m + release_m + RELEASE_MARGIN_M
 
     def _tip_over(self, held: Body) -> PickPlaceCommand:
         """Return the place at the pallet's edge from which an upended box tips over."""

@@ -15,7 +15,7 @@ from ba_torchrl.sim.geometry import YawPose, downward_pose
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import deactivate_body
-from ba_torchrl.tasks.clearance import OUTER_MARGIN_M, finger_extent_m, grasp_clearance_m
+from ba_torchrl.tasks.clearance import grasp_clearance_m
 from ba_torchrl.tasks.covid_layout import (
     GAP_M,
     TEST_AREA,
@@ -325,11 +325,15 @@ class CovidTest(OpenLoopTask):
         bottom, top = body.shape.bounds_m
         if high - low > top[2] - bottom[2] + LEANING_M:
             return False
-        gripper, x, y = self.robot.gripper, *body.position[:2]
-        reach_m = finger_extent_m(gripper, self.finger_opening) - OUTER_MARGIN_M
-        hand = Rectangle(x, y, self._grasp_yaw(body), reach_m, gripper.half_width_m)
+        gripper, (x, y, _) = self.robot.gripper, body.position
         others = [other for other in self.objects if other is not body]
-        return all(gap_m(hand, outline(other)) > 0 for other in (*others, *self.layout.walls))
+        for other in (*others, *self.layout.walls):
+            height_m = vertical_extent(other)[1] - (low + self._grasp_m)
+            reach_m = gripper.finger_reach_below_m(height_m, self.finger_opening)
+            hand = Rectangle(x, y, self._grasp_yaw(body), reach_m, gripper.half_width_m)
+            if gap_m(hand, outline(other)) <= 0:
+                return False
+        return True
 
     @property
     def _grasp_m(self) -> float:

@@ -35,6 +35,15 @@ def test_the_expert_picks_objects_at_a_wall_last(make, seed):
     assert not state["truncated"]
 
 
+@pytest.mark.parametrize("robot", ["panda", "ur5"])
+def test_fingers_that_are_wide_above_the_walls_reach_all_new_objects(make, robot):
+    env = make(robot=robot)
+    for seed in range(5):
+        env.reset(seed=seed)
+        task = env.scene.task
+        assert all(map(task._can_grasp, task.objects))
+
+
 @pytest.mark.parametrize(
     "config",
     [{}, FIXED, {"action_sequence": "pxyzrrr"}],
