@@ -17,12 +17,15 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.training.config import ExperimentConfig
 
 
-def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
+def make_env(
+    config: ExperimentConfig, seed: int, *, wait_for_restarts: bool = True, **changes: bool
+) -> EnvBase:
     """Return the environments of a run, ready to be reset.
 
     Args:
         config: of the run.
         seed: of the first environment.
+        wait_for_restarts: as for `ba_torchrl.make_vector_env`.
         changes: fields of `EnvConfig` that differ from the run's.
     """
     return make_vector_env(
@@ -34,6 +37,7 @@ def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
         timeout_s=config.timeout_s,
         max_restarts=config.max_restarts,
         start_timeout_s=config.start_timeout_s,
+        wait_for_restarts=wait_for_restarts,
         **{**config.env, "seed": seed, **changes},
     )
 

@@ -171,7 +171,9 @@ class Experiment:
         part = progress.resumed_at[-1] if progress.env_steps and progress.resumed_at else 0
         seed = config.derived_seed(SeedUse.COLLECTION, part)
         generators = GlobalRNGState().state_dict()
-        self._train_env = make_env(config, seed, expert=self.algorithm.stores_expert_action)
+        self._train_env = make_env(
+            config, seed, wait_for_restarts=False, expert=self.algorithm.stores_expert_action
+        )
         if progress.positions is not None:
             self._train_env.continue_from(progress.positions)
         collector = make_collector(self._train_env, self.algorithm, config)
@@ -220,8 +222,9 @@ class Experiment:
     def _store(self, data: TensorDict) -> None:
         """Add collected transitions to the replay and count steps, faults and successes."""
         progress, following = self._progress, data[keys.NEXT]
-        progress.env_steps += data.numel()
-        progress.faults += int(following[keys.FAULT].sum())
+        is_present = ~data[keys.FAULT]  # not so while the worker of an environment starts
+        progress.env_steps += int(is_present.sum())
+        progress.faults += int((following[keys.FAULT] & is_present).sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
         self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
