@@ -73,8 +73,8 @@ def make_vector_env(
         max_restarts: largest number of failures in a row of a process, of attempts to start it or
             without a completed step.
         start_timeout_s: seconds after which a process that does not start is replaced.
-        wait_for_restarts: whether the environment of a failed process is reset before the next step.
-            Otherwise it reports faults until its new process is ready; see `VectorEnv`.
+        wait_for_restarts: whether the environment of a failed process is reset before the next
+            step. Otherwise it reports faults until its new process is ready; see `VectorEnv`.
         config: as for `make`.
 
     Raises:

@@ -18,6 +18,9 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.display import why_no_display
 from ba_torchrl.sim.shapes import Color, Shape
 
+SIMULATOR_ERRORS = (pybullet.error, SimulationError, ArithmeticError)
+"""Errors of PyBullet, among them a lost connection, and of computations with values from it."""
+
 
 @dataclass(frozen=True)
 class Physics:
