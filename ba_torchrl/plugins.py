@@ -68,6 +68,8 @@ def import_modules(names: Iterable[str]) -> None:
         ConfigError: a module does not exist; the message names possible fixes.
     """
     for name in names:
+        if not all(part.isidentifier() for part in name.split(".")):
+            raise ConfigError(f"plugins: {name!r} is not the name of a module, such as my.tasks")
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:

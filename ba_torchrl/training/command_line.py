@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.training import hydra_schema
 
 EXIT_CODE = 2
 _RESOURCES = {
@@ -24,6 +25,17 @@ _RESOURCES = {
     errno.EPERM,
     errno.EROFS,
 }
+
+
+def register_schemas() -> None:
+    """Make the schemas known to Hydra, with the plugins that the command line names.
+
+    An error is printed without traceback, as by `plain_errors`.
+    """
+    try:
+        hydra_schema.register(sys.argv[1:])
+    except ConfigError as error:
+        _end(error)
 
 
 def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
