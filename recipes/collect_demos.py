@@ -20,6 +20,7 @@ from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs, progress_bar
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_texts,
     check_writable,
     plain_errors,
     register_schemas,
@@ -34,6 +35,7 @@ def main(settings: DictConfig) -> None:
     """Play the expert's episodes and write them as a memory-mapped TensorDict."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_texts(settings, "task", "path", "source")
     check_counts(settings, "episodes", "num_envs")
     check_counts(settings, "replays", "seed", least=0)
     check_writable(settings.path)

@@ -20,6 +20,8 @@ from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_lists,
+    check_texts,
     check_writable,
     plain_errors,
     register_schemas,
@@ -34,6 +36,9 @@ def main(settings: DictConfig) -> None:
     """Play the experts' episodes and print their success and length."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_lists(settings, "robots")
+    check_lists(settings, "tasks", optional=True)
+    check_texts(settings, "path", optional=True)
     check_counts(settings, "episodes", "num_envs")
     check_counts(settings, "seed", least=0)
     if settings.path is not None:

@@ -16,6 +16,7 @@ from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.record.video import check_video, write_video
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_texts,
     check_writable,
     plain_errors,
     register_schemas,
@@ -33,6 +34,8 @@ def main(settings: DictConfig) -> None:
     """Play episodes and write a video of them."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_texts(settings, "task", "policy")
+    check_texts(settings, "video", optional=True)
     if settings.policy not in POLICIES:
         raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
     check_counts(settings, "episodes")

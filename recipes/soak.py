@@ -18,6 +18,8 @@ from ba_torchrl.profiling.soak import TABLE_FILE, SoakJob, run_soak
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_lists,
+    check_texts,
     check_writable,
     plain_errors,
     register_schemas,
@@ -32,6 +34,9 @@ def main(settings: DictConfig) -> None:
     """Run the tasks without figures, and print the table."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_lists(settings, "long_tasks")
+    check_lists(settings, "tasks", optional=True)
+    check_texts(settings, "folder")
     check_counts(settings, "steps", "long_steps", least=10)
     check_counts(settings, "seed", least=0)
     env = OmegaConf.to_container(settings.env, resolve=True)
