@@ -54,6 +54,7 @@ def make_vector_env(
     timeout_s: float = 60.0,
     max_restarts: int = 5,
     start_timeout_s: float = 120.0,
+    wait_for_restarts: bool = True,
     **config: Any,
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.
@@ -72,6 +73,8 @@ def make_vector_env(
         max_restarts: largest number of failures in a row of a process, of attempts to start it or
             without a completed step.
         start_timeout_s: seconds after which a process that does not start is replaced.
+        wait_for_restarts: whether the environment of a failed process is reset before the next
+            step. Otherwise it reports faults until its new process is ready; see `VectorEnv`.
         config: as for `make`.
 
     Raises:
@@ -88,5 +91,6 @@ def make_vector_env(
         timeout_s=timeout_s,
         max_restarts=max_restarts,
         start_timeout_s=start_timeout_s,
+        wait_for_restarts=wait_for_restarts,
         **config,
     )

@@ -68,6 +68,8 @@ def import_modules(names: Iterable[str]) -> None:
         ConfigError: a module does not exist; the message names possible fixes.
     """
     for name in names:
+        if not (isinstance(name, str) and all(map(str.isidentifier, name.split(".")))):
+            raise ConfigError(f"plugins: {name!r} is not the name of a module, such as my.tasks")
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:
@@ -88,6 +90,8 @@ def load_plugins(names: Iterable[str]) -> None:
     Raises:
         ConfigError: a module does not exist.
     """
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise ConfigError(f"plugins: must be a list of names of modules, got {names!r}")
     names = list(names)
     if names and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())

@@ -19,12 +19,12 @@ from omegaconf import DictConfig, OmegaConf
 from ba_torchrl.config import parse
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.command_line import plain_errors
+from ba_torchrl.training.command_line import plain_errors, register_schemas
 from ba_torchrl.training.config import choose
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 
-hydra_schema.register(sys.argv[1:])
+register_schemas()
 
 
 @hydra.main(config_path="../configs", config_name="benchmark", version_base="1.3")

@@ -5,7 +5,6 @@ python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstru
 python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction replays=200
 """
 
-import sys
 from pathlib import Path
 
 import hydra
@@ -19,10 +18,15 @@ from ba_torchrl.data.time_reversal import replay_scores
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs, progress_bar
-from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors
+from ba_torchrl.training.command_line import (
+    check_counts,
+    check_texts,
+    check_writable,
+    plain_errors,
+    register_schemas,
+)
 
-hydra_schema.register(sys.argv[1:])
+register_schemas()
 
 
 @hydra.main(config_path="../configs", config_name="collect_demos", version_base="1.3")
@@ -31,6 +35,7 @@ def main(settings: DictConfig) -> None:
     """Play the expert's episodes and write them as a memory-mapped TensorDict."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_texts(settings, "task", "path", "source")
     check_counts(settings, "episodes", "num_envs")
     check_counts(settings, "replays", "seed", least=0)
     check_writable(settings.path)

@@ -17,7 +17,12 @@ from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
 from ba_torchrl.record.video import check_video, write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
-from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors  # noqa: E402
+from ba_torchrl.training.command_line import (  # noqa: E402
+    check_counts,
+    check_texts,
+    check_writable,
+    plain_errors,
+)
 from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes  # noqa: E402
 
 FPS = 5
@@ -29,6 +34,8 @@ def main(settings: DictConfig) -> None:
     """Play greedy episodes with the policy of a checkpoint."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_texts(settings, "checkpoint")
+    check_texts(settings, "video", optional=True)
     check_counts(settings, "episodes", "num_envs", "video_episodes")
     if settings.video is not None:
         check_video(settings.video, FPS)

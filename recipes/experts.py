@@ -4,7 +4,6 @@ python recipes/experts.py                                 # every task, kuka, wi
 python recipes/experts.py robots=[panda,ur5] episodes=50 tasks=[close_loop/block_picking]
 """
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,16 @@ from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors
+from ba_torchrl.training.command_line import (
+    check_counts,
+    check_lists,
+    check_texts,
+    check_writable,
+    plain_errors,
+    register_schemas,
+)
 
-hydra_schema.register(sys.argv[1:])
+register_schemas()
 
 
 @hydra.main(config_path="../configs", config_name="experts", version_base="1.3")
@@ -31,6 +36,9 @@ def main(settings: DictConfig) -> None:
     """Play the experts' episodes and print their success and length."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_lists(settings, "robots")
+    check_lists(settings, "tasks", optional=True)
+    check_texts(settings, "path", optional=True)
     check_counts(settings, "episodes", "num_envs")
     check_counts(settings, "seed", least=0)
     if settings.path is not None:

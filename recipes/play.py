@@ -5,8 +5,6 @@ python recipes/play.py task=close_loop/block_pushing policy=random episodes=3
 python recipes/play.py task=close_loop/corner_picking video=null env.render=true   # needs a display
 """
 
-import sys
-
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -16,13 +14,18 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.record.video import check_video, write_video
-from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.command_line import check_counts, check_writable, plain_errors
+from ba_torchrl.training.command_line import (
+    check_counts,
+    check_texts,
+    check_writable,
+    plain_errors,
+    register_schemas,
+)
 from ba_torchrl.training.evaluation import record_episodes
 
 POLICIES = {"expert": expert_policy, "random": None}
 
-hydra_schema.register(sys.argv[1:])
+register_schemas()
 
 
 @hydra.main(config_path="../configs", config_name="play", version_base="1.3")
@@ -31,6 +34,8 @@ def main(settings: DictConfig) -> None:
     """Play episodes and write a video of them."""
     limit_library_logs()
     load_plugins(settings.plugins)
+    check_texts(settings, "task", "policy")
+    check_texts(settings, "video", optional=True)
     if settings.policy not in POLICIES:
         raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
     check_counts(settings, "episodes")

@@ -17,13 +17,12 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
 from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
-from ba_torchrl.training import hydra_schema  # noqa: E402
-from ba_torchrl.training.command_line import plain_errors  # noqa: E402
+from ba_torchrl.training.command_line import plain_errors, register_schemas  # noqa: E402
 from ba_torchrl.training.config import ExperimentConfig  # noqa: E402
 from ba_torchrl.training.experiment import Experiment  # noqa: E402
 from ba_torchrl.training.interruption import RunStopped  # noqa: E402
 
-hydra_schema.register(sys.argv[1:])
+register_schemas()
 
 
 @hydra.main(config_path="../configs", config_name="train", version_base="1.3")

@@ -25,6 +25,16 @@ from ba_torchrl.errors import ConfigError, DamagedFilesError
 CHECKSUMS_FILE = "checksums.json"
 _DATA_SUFFIXES = frozenset({".json", ".memmap"})
 _CHUNK = 1 << 20
+_LOAD_ERRORS = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What the readers of JSON, tensors and TensorDicts raise for files of another content."""
 _RESERVE = 10_000_000
 """Bytes for all files besides the tensors, and for tensors that take whole blocks."""
 
@@ -125,13 +135,22 @@ def read_state(folder: str | Path) -> dict[str, Any]:
 
     Raises:
         ConfigError: a file is neither a memory map nor JSON.
+        DamagedFilesError: the files are not a state.
     """
     folder = Path(folder)
     for _ in _files(folder):  # refuses what TensorDict would unpickle
         pass
     holder = _State({})
-    _ADAPTER.load(holder, folder, map_location="cpu", tensor_load_kwargs={}, args=(), kwargs={})
+    try:
+        _ADAPTER.load(holder, folder, map_location="cpu", tensor_load_kwargs={}, args=(), kwargs={})
+    except _LOAD_ERRORS as error:
+        raise _not_a_state(folder, error) from error
     return holder.state
+
+
+def _not_a_state(folder: Path, error: Exception) -> DamagedFilesError:
+    reason = (str(error).splitlines() or [""])[0]
+    return DamagedFilesError(f"{folder} does not hold a state: {type(error).__name__}: {reason}")
 
 
 def check_space(folder: str | Path, state: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -18,6 +17,7 @@ from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.checks import checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
+from ba_torchrl.envs.faults import FaultCounter, check_observation
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import enabled_observations, merge_entries
 from ba_torchrl.envs.rendering import RelativePoint, scene_viewpoint
@@ -27,15 +27,11 @@ from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
-from ba_torchrl.sim.world import Physics, World
+from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
-logger = logging.getLogger(__name__)
-
 CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torchrl.envs")
-
-MAX_CONSECUTIVE_FAULTS = 10
 
 
 class ManipulationEnv(EnvBase):
@@ -43,6 +39,9 @@ class ManipulationEnv(EnvBase):
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any
     other episodes. Exceptions are tasks that continue with the objects of the previous episode.
+
+    A simulator fault (see `ba_torchrl.envs.faults`) ends the episode truncated, with ``fault`` set
+    and the last valid observation; the next reset builds a new world.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
@@ -81,16 +80,13 @@ class ManipulationEnv(EnvBase):
         self._identity = object()
         self._observation: dict[str, torch.Tensor] = {}
         self._observations = enabled_observations(config, self.workspace)
-        self._memory: dict[str, Any] = {}
-        """Parts of observations from earlier steps; the dictionary is replaced, never modified."""
+        self._memory: dict[str, Any] = {}  # of observations; it is replaced, never modified
         self._ends: dict[str, bool] = {}
         """Flags of the last step, by key."""
         self._conditions: dict[str, bool] | None = None
         """The conditions of success after the last step, None before the first."""
         self._step_count = 0
-        self.faults = 0
-        """Number of simulator faults since construction."""
-        self._consecutive_faults = 0
+        self._fault_counter = FaultCounter(task_id)
         self.on_contact: Callable[[], None] | None = None
         """Called in an open-loop step at each grasp and before each release, for videos."""
         self._set_seed(config.seed)
@@ -172,6 +168,11 @@ class ManipulationEnv(EnvBase):
         if self._episodes.scene is None:
             raise SimulationError("reset the environment first")
         return self._episodes.scene
+
+    @property
+    def faults(self) -> int:
+        """Number of simulator faults since construction, in steps and in resets."""
+        return self._fault_counter.total
 
     @property
     def conditions(self) -> dict[str, bool]:
@@ -268,14 +269,12 @@ class ManipulationEnv(EnvBase):
     ) -> TensorDict:
         if seed is not None:
             self._set_seed(seed)
-        rng = np.random.default_rng([self.base_seed, self._episode])
         self._episode += 1
         self._step_count = 0
         is_first = self._episode == 1
         if is_first and self.task_class.needs_fresh_world:
             self._episodes.close()
-        scene = self._episodes.begin(rng, with_new_objects=is_first)
-        self._observation = self._observe(scene)
+        self._observation = self._begin_episode(with_new_objects=is_first)
         self._ends, self._conditions = {}, None
         return self._tensordict(self._observation)
 
@@ -283,8 +282,7 @@ class ManipulationEnv(EnvBase):
         action = checked_action(tensordict.get(keys.ACTION), self.task_id, self.action_sequence)
         scene = self.scene
         self._step_count += 1
-        success = valid = False
-        fault = False
+        success = valid = fault = False
         try:
             self._act(scene, action)
             scene.task.after_action()
@@ -295,7 +293,7 @@ class ManipulationEnv(EnvBase):
             fault, self._conditions = True, {}
             self._on_fault()
         else:
-            self._consecutive_faults = 0
+            self._fault_counter.count_step()
         terminated = not fault and (success or not valid)
         at_limit = self._step_count >= self.max_steps
         if at_limit and self.task_class.terminates_at_limit:
@@ -369,6 +367,7 @@ class ManipulationEnv(EnvBase):
             observation |= extra.observe(scene)
         if self.config.expert:
             observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
+        check_observation(observation)
         return observation
 
     def _tensordict(
@@ -386,14 +385,16 @@ class ManipulationEnv(EnvBase):
             out[key] = torch.tensor([ends.get(key, False)])
         return TensorDict(out, batch_size=[], device=self.device)
 
+    def _begin_episode(self, *, with_new_objects: bool) -> dict[str, torch.Tensor]:
+        """Start an episode, again in a new world after a fault, and return its observation."""
+        while True:
+            rng = np.random.default_rng([self.base_seed, self._episode - 1])
+            try:
+                return self._observe(self._episodes.begin(rng, with_new_objects=with_new_objects))
+            except SIMULATOR_ERRORS:
+                self._on_fault()
+
     def _on_fault(self) -> None:
-        """Count and log a simulator fault; the next reset builds a new world."""
-        self.faults += 1
-        self._consecutive_faults += 1
-        logger.exception("%s: simulator fault %d, episode dropped", self.task_id, self.faults)
+        """Close the worlds and count the fault; the next episode builds a new world."""
         self._episodes.close()
-        if self._consecutive_faults > MAX_CONSECUTIVE_FAULTS:
-            raise SimulationError(
-                f"{self.task_id} failed {self._consecutive_faults} times in a row; the log above "
-                "shows the cause"
-            )
+        self._fault_counter.count_fault()

@@ -56,6 +56,11 @@ def check_actions(
     same_layout = actions.shape == spec.shape and actions.dtype == spec.dtype
     if same_layout and bool(torch.isfinite(actions).all()):
         return
+    if actions.shape[:1] != spec.shape[:1]:
+        raise InvalidActionError(
+            f"the actions have shape {list(actions.shape)}, and there are {spec.shape[0]} "
+            f"environments; each needs {_describe(spec[0])}"
+        )
     for index, action in enumerate(actions.unbind(0)):
         if stepped is not None and not bool(stepped[index].any()):
             continue

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,8 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ba_torchrl.envs.faults import check_bodies
 from ba_torchrl.envs.scene import Scene, SceneState
-from ba_torchrl.errors import PlacementError, SimulationError
+from ba_torchrl.errors import PlacementError
 
 RESET_ATTEMPTS = 50
 SETTLE_STEPS = 100
@@ -84,6 +84,10 @@ class Episodes:
         for scene in self._scenes.values():
             scene.world.close()
         self._scenes.clear()
+        self.forget()
+
+    def forget(self) -> None:
+        """Let the next episode place new objects, also if the task continues."""
         self.scene = None
 
     def begin(self, rng: np.random.Generator, *, with_new_objects: bool) -> Scene:
@@ -136,12 +140,12 @@ def evaluate_at_rest(scene: Scene) -> tuple[dict[str, bool], bool]:
     The scene is settled only if all conditions hold before.
 
     Raises:
-        SimulationError: the position of a body is not finite.
+        SimulationError: the state of the scene is a fault; see `check_bodies`.
     """
-    if not math.isfinite(sum(map(sum, (body.position for body in scene.world.moving_bodies)))):
-        raise SimulationError("a body's position is not finite")
+    check_bodies(scene)
     conditions = scene.task.conditions()
     if all(conditions.values()):
         scene.world.settle(max_steps=SETTLE_STEPS)
+        check_bodies(scene)
         conditions = scene.task.conditions()
     return conditions, scene.task.is_valid()

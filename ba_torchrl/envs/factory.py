@@ -65,6 +65,7 @@ def make_vector(
     timeout_s: float = 60.0,
     max_restarts: int = 5,
     start_timeout_s: float = 120.0,
+    wait_for_restarts: bool = True,
     **config: Any,
 ) -> EnvBase:
     """Make environments that step together; see `ba_torchrl.make_vector_env`."""
@@ -82,6 +83,7 @@ def make_vector(
         timeout_s=timeout_s,
         max_restarts=max_restarts,
         start_timeout_s=start_timeout_s,
+        wait_for_restarts=wait_for_restarts,
     )
 
 

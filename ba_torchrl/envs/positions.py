@@ -57,6 +57,9 @@ class RecordedPosition:
         """
         self._set_seed(position["seed"])
         self._episode = position["episode"]
+        if self.task_class.needs_fresh_world:
+            self._episodes.close()
+        self._episodes.forget()
         for actions in position["actions"]:
             self._reset()
             for action in actions:
@@ -85,8 +88,9 @@ class RecordedPosition:
             return resumed
         scene = self._episodes.scene
         depends = self.task_class.needs_fresh_world or (scene is not None and scene.task.continues)
+        faults = self.faults
         result = super()._reset(tensordict, seed=seed, **options)
-        if not depends:
+        if not depends or self.faults > faults:  # a fault builds a new world
             self._first_episode, self._played = self._episode - 1, [[]]
         elif self._played is not None:
             self._played.append([])
@@ -94,7 +98,10 @@ class RecordedPosition:
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._resumed = None
+        faults = self.faults
         result = super()._step(tensordict)
-        if self._played is not None:
+        if self.faults > faults:  # the next episode is in a new world
+            self._first_episode, self._played = self._episode, []
+        elif self._played is not None:
             self._played[-1].append(tensordict.get(keys.ACTION).detach().clone())
         return result

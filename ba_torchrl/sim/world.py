@@ -18,6 +18,12 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.display import why_no_display
 from ba_torchrl.sim.shapes import Color, Shape
 
+MAX_CLIENTS = 1024
+"""Number of worlds that a process can have, a limit of PyBullet."""
+
+SIMULATOR_ERRORS = (pybullet.error, SimulationError, ArithmeticError)
+"""Errors of PyBullet, among them a lost connection, and of computations with values from it."""
+
 
 @dataclass(frozen=True)
 class Physics:
@@ -345,6 +351,11 @@ def _connect_window() -> int:
     if client >= 0:
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
     return client
+
+
+def count_clients() -> int:
+    """Return the number of open connections to PyBullet in this process."""
+    return sum(map(pybullet.isConnected, range(MAX_CLIENTS)))
 
 
 def _remove_state(state: int, client: int, connection: weakref.finalize) -> None:

@@ -23,12 +23,15 @@ from ba_torchrl.training.collectors.base import Collection, CollectionProblem
 from ba_torchrl.training.config import ExperimentConfig
 
 
-def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
+def make_env(
+    config: ExperimentConfig, seed: int, *, wait_for_restarts: bool = True, **changes: bool
+) -> EnvBase:
     """Return the environments of a run, ready to be reset.
 
     Args:
         config: of the run.
         seed: of the first environment.
+        wait_for_restarts: as for `ba_torchrl.make_vector_env`.
         changes: fields of `EnvConfig` that differ from the run's.
     """
     return make_vector_env(
@@ -40,6 +43,7 @@ def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
         timeout_s=config.timeout_s,
         max_restarts=config.max_restarts,
         start_timeout_s=config.start_timeout_s,
+        wait_for_restarts=wait_for_restarts,
         **{**config.env, "seed": seed, **changes},
     )
 
@@ -73,7 +77,8 @@ def start_collection(
 
 
 def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: int) -> EnvBase:
-    return make_env(_read(values, num_envs=num_envs), seed, expert=expert)
+    config = _read(values, num_envs=num_envs)
+    return make_env(config, seed, wait_for_restarts=False, expert=expert)
 
 
 def _make_policy(values: dict[str, Any], seed: int) -> TensorDictModuleBase:

@@ -10,9 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.training import hydra_schema
 
 EXIT_CODE = 2
 _RESOURCES = {
@@ -24,6 +25,17 @@ _RESOURCES = {
     errno.EPERM,
     errno.EROFS,
 }
+
+
+def register_schemas() -> None:
+    """Make the schemas known to Hydra, with the plugins that the command line names.
+
+    An error is printed without traceback, as by `plain_errors`.
+    """
+    try:
+        hydra_schema.register(sys.argv[1:])
+    except ConfigError as error:
+        _end(error)
 
 
 def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
@@ -61,6 +73,41 @@ def check_counts(settings: DictConfig, *names: str, least: int = 1) -> None:
         value: Any = settings[name]
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ConfigError(f"{name}: must be a whole number of at least {least}, got {value!r}")
+
+
+def check_texts(settings: DictConfig, *names: str, optional: bool = False) -> None:
+    """Check that settings are text, such as a path or the id of a task.
+
+    Args:
+        settings: of the recipe.
+        names: of the settings.
+        optional: allow None.
+
+    Raises:
+        ConfigError: one of them is not, or is empty.
+    """
+    for name in names:
+        value = settings[name]
+        if not (optional and value is None) and not (isinstance(value, str) and value):
+            raise ConfigError(f"{name}: must be text, got {value!r}")
+
+
+def check_lists(settings: DictConfig, *names: str, optional: bool = False) -> None:
+    """Check that settings are lists of text.
+
+    Args:
+        settings: of the recipe.
+        names: of the settings.
+        optional: allow None.
+
+    Raises:
+        ConfigError: one of them is not.
+    """
+    for name in names:
+        value = settings[name]
+        is_list = isinstance(value, ListConfig) and all(isinstance(item, str) for item in value)
+        if not (is_list or (optional and value is None)):
+            raise ConfigError(f"{name}: must be a list of names, got {value!r}")
 
 
 def check_writable(path: str | Path) -> None:

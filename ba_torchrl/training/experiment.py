@@ -214,8 +214,9 @@ class Experiment:
         """
         progress, following = self._progress, data[keys.NEXT]
         steps_before = progress.env_steps // self.config.num_envs
-        progress.env_steps += data.numel()
-        progress.faults += int(following[keys.FAULT].sum())
+        is_present = ~data[keys.FAULT]  # not so while the worker of an environment starts
+        progress.env_steps += int(is_present.sum())
+        progress.faults += int((following[keys.FAULT] & is_present).sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
         self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))

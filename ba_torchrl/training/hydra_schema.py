@@ -5,6 +5,7 @@ Any field can therefore be set on the command line, and no default is written tw
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,6 +14,7 @@ from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
@@ -131,6 +133,8 @@ def _plugins_in(arguments: Iterable[str]) -> list[str]:
     parser = OverridesParser.create()
     for argument in arguments:
         if argument.lstrip("+").startswith("plugins="):
-            value = parser.parse_override(argument).value()
-            found += [value] if isinstance(value, str) else [str(name) for name in value]
+            with contextlib.suppress(OverrideParseException):  # reported by Hydra itself
+                value = parser.parse_override(argument).value()
+                names = value if isinstance(value, list) else [value]
+                found += [str(name) for name in names]
     return found

@@ -23,7 +23,8 @@ class FakeEnv(EnvBase):
 
     A file named ``<pid>.<when>`` (when: step, reset) in ``folder`` makes that process raise,
     hang or die as the file says; it is removed first, unless the word starts with "always".
-    A file named ``build`` makes every constructor but the first raise.
+    A file named ``build`` makes every constructor raise, kill its process (``kill``), or wait until
+    the file is removed (``wait``).
     """
 
     def __init__(self, folder=None, horizon=1000, size=4, work_s=0.0):
@@ -45,7 +46,16 @@ class FakeEnv(EnvBase):
         self.generator = torch.Generator()
         self.count = None
         if self.folder is not None and (self.folder / "build").exists():
+            self._fail_to_build(self.folder / "build")
+
+    def _fail_to_build(self, path):
+        order = path.read_text()
+        if order == "kill":
+            os.kill(os.getpid(), 9)
+        if order != "wait":
             raise OSError("no simulator today")
+        while path.exists():
+            time.sleep(0.01)
 
     def _set_seed(self, seed):
         self.generator.manual_seed(seed)

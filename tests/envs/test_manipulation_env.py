@@ -6,8 +6,8 @@ import torch
 from torchrl.collectors import Collector
 
 import ba_torchrl
-from ba_torchrl.envs import base
-from ba_torchrl.errors import InvalidActionError
+from ba_torchrl.envs import faults
+from ba_torchrl.errors import InvalidActionError, SimulationError
 
 TASK = "close_loop/block_picking"
 
@@ -88,11 +88,11 @@ def test_a_simulator_fault_ends_the_episode_truncated(env, monkeypatch, caplog):
 
 
 def test_repeated_faults_are_an_error(env, monkeypatch):
-    monkeypatch.setattr(base, "MAX_CONSECUTIVE_FAULTS", 2)
+    monkeypatch.setattr(faults, "MAX_CONSECUTIVE_FAULTS", 2)
     monkeypatch.setattr("ba_torchrl.sim.control.close_loop.CloseLoopController.move_to", _fail)
     for _ in range(2):
         assert env.step(env.reset().set("action", torch.zeros(5)))["next", "fault"]
-    with pytest.raises(base.SimulationError, match="3 times in a row"):
+    with pytest.raises(SimulationError, match="3 times in a row"):
         env.step(env.reset().set("action", torch.zeros(5)))
 
 

@@ -56,6 +56,14 @@ COUNTS = [
     [
         *COUNTS,
         ("collect_demos", "replays=-1", "replays"),
+        ("collect_demos", "plugins=3", "plugins: must be a list of names of modules"),
+        ("collect_demos", "plugins=['']", "plugins: '' is not the name of a module"),
+        ("collect_demos", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
+        ("collect_demos", "path=null", "path: must be text"),
+        ("experts", "tasks=3", "tasks: must be a list of names"),
+        ("soak", "folder=null", "folder: must be text"),
+        ("soak", "steps=1", "steps: must be a whole number of at least 10"),
+        ("soak", "tasks=[mine/none]", "unknown task 'mine/none'"),
         ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
         ("experts", "path=/proc/nowhere/table.md", "cannot write to /proc/nowhere"),
         ("collect_demos", "path=/proc/nowhere/demos", "cannot write to /proc/nowhere"),
@@ -82,6 +90,17 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     assert words in error
     assert error.count("\n") == 1
     assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("name", ["train", "collect_demos", "benchmark"])
+def test_an_unknown_plugin_on_the_command_line_is_one_line(name, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", [name, "plugins=[no_such_module]"])
+    with pytest.raises(SystemExit) as end:
+        recipe(name)
+    error = capsys.readouterr().err
+    assert end.value.code == EXIT_CODE
+    assert error.startswith("error: cannot import the plugin 'no_such_module': there is no module")
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(

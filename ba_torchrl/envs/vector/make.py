@@ -38,6 +38,7 @@ def make_vector_env(
     timeout_s: float = 60.0,
     max_restarts: int = 5,
     start_timeout_s: float = 120.0,
+    wait_for_restarts: bool = True,
 ) -> SerialVectorEnv | VectorEnv:
     """Return ``num_envs`` environments as one, with batch size [num_envs], ready to be reset.
 
@@ -56,6 +57,8 @@ def make_vector_env(
         timeout_s: seconds after which a worker that does not answer is replaced.
         max_restarts: largest number of failures in a row of a worker; see `VectorEnv`.
         start_timeout_s: seconds after which a worker that does not start is replaced.
+        wait_for_restarts: whether the environment of a failed worker is reset before the next step;
+            see `VectorEnv`.
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.
@@ -77,6 +80,7 @@ def make_vector_env(
             timeout_s=timeout_s,
             max_restarts=max_restarts,
             start_timeout_s=start_timeout_s,
+            wait_for_restarts=wait_for_restarts,
             mp_start_method=start_method,
             num_threads=num_threads,
             use_buffers=True if use_buffers is None else use_buffers,

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import multiprocessing as mp
@@ -20,10 +18,9 @@ from ba_torchrl.envs import keys
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.answers import ask_all, collect_flags, collect_messages
 from ba_torchrl.envs.vector.batching import SeededVector
-from ba_torchrl.envs.vector.worker import Worker
+from ba_torchrl.envs.vector.replacement import Replacements, seed_worker
+from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker
 from ba_torchrl.errors import WorkerError
-
-logger = logging.getLogger(__name__)
 
 MakeEnv = Callable[[], EnvBase]
 
@@ -37,15 +34,21 @@ _LOST_STEP = {
     keys.SUCCESS: False,
     keys.FAULT: True,
 }
+_ABSENT = {**_LOST_STEP, keys.TRUNCATED: False, keys.DONE: False}
+_START_POLL_S = 1.0
 
 
 class VectorEnv(SeededVector, ParallelEnv):
     """Environments in worker processes; a worker that raises, ends or hangs is replaced.
 
-    The other workers keep their episodes. For the environment of the failed worker, the step
-    returns the last valid observation with ``fault``, ``truncated`` and ``done`` set and a reward
-    of zero; TorchRL then resets it like any environment that is done. Actions are validated in this
-    process before they are sent. ``restarts`` counts the replacements.
+    The other workers keep their episodes, and step while the new worker starts. For the environment
+    of the failed worker, the step returns the last valid observation with ``fault``, ``truncated``
+    and ``done`` set and a reward of zero; TorchRL then resets it like any environment that is done.
+    Actions are validated in this process before they are sent.
+
+    This reset waits for the new worker, unless ``wait_for_restarts`` is False. Then the environment
+    is absent until the worker is ready: the reset returns the last valid observation with ``fault``
+    set, and so does every step, which is truncated and done. A full reset always waits.
 
     Args:
         num_workers: number of environments.
@@ -54,6 +57,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         max_restarts: largest number of failures in a row of a worker: of attempts to start it, or
             of resets and steps without a completed step. The end of an idle worker does not count.
         start_timeout_s: seconds after which a worker that does not start is replaced.
+        wait_for_restarts: whether the environment of a failed worker is reset before the next step.
         parallel_options: further options of `torchrl.envs.ParallelEnv`.
 
     Raises:
@@ -68,6 +72,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         timeout_s: float = 60.0,
         max_restarts: int = 5,
         start_timeout_s: float = 120.0,
+        wait_for_restarts: bool = True,
         **parallel_options: Any,
     ) -> None:
         parallel_options.setdefault("shutdown_timeout", 5.0)
@@ -76,14 +81,24 @@ class VectorEnv(SeededVector, ParallelEnv):
         if missing:
             raise ValueError(f"environments in workers need the entries {sorted(missing)}")
         self.timeout_s = timeout_s
-        self.max_restarts = max_restarts
         self.start_timeout_s = start_timeout_s
-        self.restarts = 0
-        self._failures_in_a_row = [0] * num_workers
-        self._replacements = [0] * num_workers  # since the last seed
-        self._lost: set[int] = set()  # replaced between two steps, fault not reported yet
+        self.wait_for_restarts = wait_for_restarts
+        self._lost: set[int] = set()  # without an episode, and the next step reports a fault
         self._threads_before = torch.get_num_threads()
         self.parent_channels: list[Worker] = []
+        self._replacements = Replacements(
+            self.parent_channels, self._launch, self._close_all, max_restarts, num_workers
+        )
+
+    @property
+    def max_restarts(self) -> int:
+        """Largest number of failures in a row of a worker."""
+        return self._replacements.max_restarts
+
+    @property
+    def restarts(self) -> int:
+        """Number of workers that were replaced."""
+        return self._replacements.restarts
 
     @property
     def worker_pids(self) -> list[int]:
@@ -92,6 +107,8 @@ class VectorEnv(SeededVector, ParallelEnv):
 
     def get_positions(self) -> list[Position]:
         """Return the position of each environment; see `SeededVector.get_positions`."""
+        if self._lost:
+            raise WorkerError(f"the episodes of environments {sorted(self._lost)} are lost")
         arguments = [()] * self.num_workers
         return ask_all(self.parent_channels, "get_position", arguments, self.timeout_s)
 
@@ -99,6 +116,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         """Continue episodes; see `SeededVector.continue_from`."""
         steps = max(sum(map(len, position["actions"])) for position in positions)
         arguments = [(position,) for position in positions]
+        self._replacements.finish(wait_for_all=True)
         timeout_s = self.timeout_s + steps * _STEP_S
         ask_all(self.parent_channels, "continue_from", arguments, timeout_s)
 
@@ -133,19 +151,31 @@ class VectorEnv(SeededVector, ParallelEnv):
             self.start()
         self._replace_dead()
         mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or kwargs:
+            with self._waiting():
+                self._replacements.finish(wait_for_all=True)
+                return super()._reset(tensordict, **kwargs)
+        self._replacements.finish(wait_for_all=self.wait_for_restarts)
         if self._use_buffers and mask is not None and not mask.any():  # TorchRL would fail
             return self.shared_tensordict_parent.select(*self._selected_reset_keys_filt).clone()
-        return super()._reset(tensordict, **kwargs)
+        with self._muted(self._replacements.starting):
+            return super()._reset(tensordict, **kwargs)
 
     def _seed_env(self, index: int, seed: int) -> None:
-        self._replacements[index] = 0
+        self._replacements.on_seed(index)
+        self._replacements.finish(wait_for_all=True)
         worker = self.parent_channels[index]
         try:
             worker.check()
-            _seed(worker, seed)
+            seed_worker(worker, seed)
         except WorkerError as error:
-            self._replace({index: error}, seed)
+            self._replacements.begin({index: error}, seed)
+            self._replacements.finish(wait_for_all=True)
             self._lost.add(index)
+
+    def _set_base_seed(self, seed: int | None) -> None:
+        super()._set_base_seed(seed)
+        self._replacements.base_seed = self._base_seed
 
     def _start_workers(self) -> None:
         if self._use_buffers and self._non_tensor_keys:
@@ -159,15 +189,20 @@ class VectorEnv(SeededVector, ParallelEnv):
         try:
             for index in range(self.num_workers):
                 self.parent_channels.append(self._launch(index))
+            failures = {}
             for index, worker in enumerate(self.parent_channels):
                 try:
                     worker.wait_until_ready()
-                except WorkerError as error:
+                except EnvironmentRaisedError as error:
                     raise RuntimeError(f"worker {index} could not be started: {error}") from None
+                except WorkerError as error:
+                    failures[index] = error
+            self._replacements.begin(failures, failures=1)
+            self._replacements.finish(wait_for_all=True)
         except BaseException:
             for worker in self.parent_channels:
                 worker.kill()
-            self.parent_channels = []
+            self._forget_workers()
             raise
         self._threads_before = torch.get_num_threads()
         if self.num_threads is not None:
@@ -207,16 +242,27 @@ class VectorEnv(SeededVector, ParallelEnv):
         return [worker.event for worker in self.parent_channels]
 
     def _shutdown_workers(self) -> None:
-        for worker in self.parent_channels:
+        for index, worker in enumerate(self.parent_channels):
+            if index in self._replacements.starting:
+                worker.abort()
+                continue
             worker.muted = False
             worker.send(("close", None))
         deadline = time.monotonic() + self.shutdown_timeout
         for worker in self.parent_channels:
             worker.join(deadline - time.monotonic())
-        self.parent_channels = []
+        self._forget_workers()
         if self._use_buffers:
             del self.shared_tensordicts, self.shared_tensordict_parent
             del self._shared_tensordict_parent_next, self._shared_tensordict_parent_root
+
+    def _forget_workers(self) -> None:
+        self.parent_channels.clear()
+        self._replacements.forget_starts()
+
+    def _close_all(self) -> None:
+        if not self.is_closed:  # else `_start_workers` ends them
+            self.close()
 
     @contextlib.contextmanager
     def _stepping(self) -> Iterator[None]:
@@ -224,7 +270,13 @@ class VectorEnv(SeededVector, ParallelEnv):
         if self.is_closed:
             self.start()
         self._replace_dead()
-        for index in self._lost:
+        with self._muted(self._lost):
+            yield
+
+    @contextlib.contextmanager
+    def _muted(self, indices: Iterable[int]) -> Iterator[None]:
+        """Context in which some workers get no commands."""
+        for index in indices:
             self.parent_channels[index].muted = True
         try:
             yield
@@ -232,87 +284,51 @@ class VectorEnv(SeededVector, ParallelEnv):
             for worker in self.parent_channels:
                 worker.muted = False
 
+    @contextlib.contextmanager
+    def _waiting(self) -> Iterator[None]:
+        """Context in which resets wait for workers that start."""
+        waits, self.wait_for_restarts = self.wait_for_restarts, True
+        try:
+            yield
+        finally:
+            self.wait_for_restarts = waits
+
     def _replace_dead(self) -> None:
         """Replace the workers that have ended since their last answer."""
         dead = {}
         for index, worker in enumerate(self.parent_channels):
+            if not worker.is_ready:
+                continue
             try:
                 worker.check()
             except WorkerError as error:
                 dead[index] = error
-        self._replace(dead)
+        self._replacements.begin(dead)
         self._lost |= dead.keys()
 
-    def _count_failure(self, index: int, cause: WorkerError) -> None:
-        """Count a failure in a reset or a step.
-
-        Raises:
-            RuntimeError: there were too many without a completed step.
-        """
-        self._failures_in_a_row[index] += 1
-        self._check_limit(index, self._failures_in_a_row[index], "completing a step", cause)
-
-    def _check_limit(self, index: int, failures: int, success: str, cause: WorkerError) -> None:
-        if failures <= self.max_restarts:
-            return
-        self.close()
-        raise RuntimeError(
-            f"worker {index} failed {failures} times without {success}; the last time {cause}. All "
-            "workers were closed. Use parallel=False to see the error where it happens, or raise "
-            "timeout_s, start_timeout_s or max_restarts"
-        )
-
-    def _replace(self, causes: Mapping[int, WorkerError], seed: int | None = None) -> None:
-        """Start and seed new processes, all at once; they must be reset before a step.
-
-        Args:
-            causes: why each worker is replaced, by index.
-            seed: None for unused ones.
-
-        Raises:
-            RuntimeError: a worker cannot be started.
-        """
-        attempts = 0
-        while causes:
-            for index, cause in causes.items():
-                self._check_limit(index, attempts, "starting", cause)
-                self.restarts += 1
-                self._replacements[index] += 1
-                # As text: the traceback in a stored log record would keep the ended worker alive.
-                logger.warning(
-                    "worker %d is replaced (restart %d): %s", index, self.restarts, str(cause)
-                )
-                self.parent_channels[index].kill()
-                self.parent_channels[index] = self._launch(index)
-            attempts += 1
-            failed = {}
-            for index in causes:
-                worker = self.parent_channels[index]
-                try:
-                    worker.wait_until_ready()
-                    _seed(worker, self._new_seed(index) if seed is None else seed)
-                except WorkerError as error:
-                    failed[index] = error
-            causes = failed
-
-    def _new_seed(self, index: int) -> int:
-        """Return an unused seed, which is the same in every repetition of the run."""
-        known = self._base_seed is not None
-        entropy = [self._base_seed, index, self._replacements[index]] if known else None
-        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
-
     def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
-        workers = {index: self.parent_channels[index] for index in workers_range}
-        failures = self._collect([index for index in workers if not workers[index].muted])
-        for index, cause in failures.items():
-            self._count_failure(index, cause)
-        self._replace(failures)
-        for index, worker in workers.items():
-            if index not in failures and not worker.muted and worker.command != "reset":
-                self._failures_in_a_row[index] = 0
-            if index in failures or worker.muted:
-                self._recover(index, worker.message)
+        messages = {index: self.parent_channels[index].message for index in workers_range}
+        absent = {index for index in messages if self.parent_channels[index].muted}
+        for index in absent:
+            self.parent_channels[index].muted = False
+        failures = self._collect([index for index in messages if index not in absent])
+        answered = messages.keys() - absent - failures.keys()
+        for index in answered:
             self._lost.discard(index)
+            if messages[index][0] != "reset":
+                self._replacements.count_step(index)
+        self._replace_failed(failures)
+        if len(self._replacements.starting) == self.num_workers:
+            self._replacements.wait_for_any(_START_POLL_S)
+            self._replacements.finish(wait_for_all=False)
+        for index in sorted(messages.keys() - answered):
+            self._recover(index, messages[index])
+
+    def _replace_failed(self, failures: dict[int, WorkerError]) -> None:
+        for index, cause in failures.items():
+            self._replacements.count_failure(index, cause)
+        self._replacements.begin(failures)
+        self._replacements.finish(wait_for_all=self.wait_for_restarts)
 
     def _collect(self, indices: list[int]) -> dict[int, WorkerError]:
         """Wait for the answers of workers; return the errors of failed workers by index."""
@@ -341,39 +357,44 @@ class VectorEnv(SeededVector, ParallelEnv):
     def _recover(self, index: int, message: tuple[Any, Any]) -> None:
         """Answer the command in ``message`` for an environment that lost its episode."""
         command = message[0]
+        self._lost.add(index)
         if command != "reset":
-            self._write_lost_step(index)
+            self._write(index, _LOST_STEP, to_next=True)
             message = ("reset", (False, {}))
-        self.parent_channels[index].muted = False
         if command == "step":  # the environment is done, so the caller resets it
+            if index not in self._replacements.starting:
+                self._lost.discard(index)
             return
-        while True:
+        while index not in self._replacements.starting:
             # The message contains the seed, if the caller gave one.
             self.parent_channels[index].send(message)
             failures = self._collect([index])
             if not failures:
+                self._lost.discard(index)
                 return
-            self._count_failure(index, failures[index])
-            self._replace(failures)
+            self._replace_failed(failures)
+        self._write(index, _ABSENT, to_next=False)
 
-    def _write_lost_step(self, index: int) -> None:
-        """Write the answer to a step that was lost."""
+    def _write(self, index: int, values: dict[str, Any], *, to_next: bool) -> None:
+        """Write the answer of an environment without a worker: its last observation, and flags.
+
+        Args:
+            index: of the environment.
+            values: of the flags and the reward.
+            to_next: answer a step, otherwise a reset.
+        """
         if self._use_buffers:
             root = self.shared_tensordicts[index]
-            answer = root.get("next")
+            answer = root.get("next") if to_next else root
         else:
             root = self._last_worker_outputs[index]
             answer = TensorDict(device=self.device)
-            for spec in (self.full_observation_spec, self.full_reward_spec, self.full_done_spec):
+            specs = [self.full_observation_spec, self.full_done_spec]
+            for spec in specs + [self.full_reward_spec] * to_next:
                 answer.update(spec[index].zero())
             self.parent_channels[index].inbox.append(answer)
-        if root is not None:
+        if root is not None and answer is not root:
             for key in self.observation_keys:
                 answer.get(key).copy_(root.get(key))
-        for key in _LOST_STEP.keys() & set(answer.keys()):
-            answer.get(key).fill_(_LOST_STEP[key])
-
-
-def _seed(worker: Worker, seed: int) -> None:
-    worker.send(("seed", (seed, True)))
-    worker.recv()
+        for key in values.keys() & set(answer.keys()):
+            answer.get(key).fill_(values[key])

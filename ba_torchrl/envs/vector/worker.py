@@ -9,7 +9,6 @@ import os
 import pickle
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections import deque
@@ -22,6 +21,7 @@ from typing import Any
 import torchrl
 from torch import multiprocessing as mp
 
+from ba_torchrl.envs.vector.launcher import start_process
 from ba_torchrl.errors import WorkerError
 
 logger = logging.getLogger(__name__)
@@ -31,6 +31,10 @@ _IDLE_TIMEOUT_S = 1e6  # by default TorchRL's workers end after 10,000 s without
 _PR_SET_PDEATHSIG = 1
 _BUSY_WAIT_S = 100e-6
 _POLL_INTERVAL_S = 30e-6
+
+
+class EnvironmentRaisedError(WorkerError):
+    """The environment of a worker raised an exception, in contrast to a process that ended."""
 
 
 class Worker:
@@ -68,13 +72,13 @@ class Worker:
             "child_pipe": child_pipe,
             "mp_event": self.event,
         }
-        # The worker is killed when the thread that started it ends, so only for the main thread.
-        is_main = threading.current_thread() is threading.main_thread()
-        parent = os.getpid() if is_main else None
+        self.is_ready = False
+        """Whether the environment is built, and the worker takes commands."""
         self.process = context.Process(
-            target=_run_worker, args=(loop, options, parent), daemon=True
+            target=_run_worker, args=(loop, options, os.getpid()), daemon=True
         )
-        self.process.start()
+        start_process(self.process)
+        self._start_deadline = time.monotonic() + start_timeout_s
         # At the end of this process, before multiprocessing sends SIGTERM, which workers ignore.
         self._at_exit = util.Finalize(self, _kill, (self.process,), exitpriority=10)
         child_pipe.close()  # else the pipe stays open when the worker ends
@@ -84,20 +88,35 @@ class Worker:
         """The name of the last command."""
         return self.message[0]
 
+    def has_started_or_failed(self) -> bool:
+        """Whether `wait_until_ready` returns or raises at once."""
+        is_late = time.monotonic() > self._start_deadline
+        return is_late or self.process.exitcode is not None or self.pipe.poll()
+
     def wait_until_ready(self) -> None:
         """Wait until the environment is built.
 
         Raises:
-            WorkerError: the environment could not be built.
+            WorkerError: the environment is not built within ``start_timeout_s`` seconds after the
+                start, or the process has ended.
+            EnvironmentRaisedError: its constructor raised.
         """
-        self.read(self._start_timeout_s)
+        left_s = max(self._start_deadline - time.monotonic(), 0.0)
+        self.read(left_s, limit_s=self._start_timeout_s)
+        self.is_ready = True
         self.send(("init", None))
 
     def send(self, message: tuple[Any, Any]) -> None:
-        """Send a command and its argument; if the worker has ended, reading the answer raises."""
+        """Send a command and its argument; if the worker has ended, reading the answer raises.
+
+        Raises:
+            WorkerError: the environment is not built yet.
+        """
         self.message = message
         if self.muted:
             return
+        if not self.is_ready:
+            raise WorkerError(f"it cannot take {self.command!r} while it starts")
         try:
             # Not `send`, which passes tensors as file descriptors that an ended worker never opens.
             self.pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
@@ -112,20 +131,26 @@ class Worker:
         """
         return self.inbox.popleft() if self.inbox else self.read(self._timeout_s)
 
-    def read(self, timeout_s: float) -> Any:
+    def read(self, timeout_s: float, *, limit_s: float | None = None) -> Any:
         """Return the next message of the pipe.
+
+        Args:
+            timeout_s: seconds to wait.
+            limit_s: the limit that the error names; by default ``timeout_s``.
 
         Raises:
             WorkerError: the worker has ended, or sends nothing for ``timeout_s`` seconds.
+            EnvironmentRaisedError: the environment raised.
         """
         try:
             if not self.pipe.poll(timeout_s):
-                raise WorkerError(f"it did not answer {self.command!r} within {timeout_s:g} s")
+                limit_s = timeout_s if limit_s is None else limit_s
+                raise WorkerError(f"it did not answer {self.command!r} within {limit_s:g} s")
             message = self.pipe.recv()
         except (EOFError, OSError):
             raise WorkerError(self._exit_reason()) from None
         if isinstance(message, tuple) and message[0] == _FAILED:
-            raise WorkerError(f"it raised\n{message[1]}")
+            raise EnvironmentRaisedError(f"it raised\n{message[1]}")
         return message
 
     def check(self) -> None:
@@ -182,10 +207,9 @@ def end_with(parent: int) -> None:
             os._exit(1)
 
 
-def _run_worker(loop: Callable[..., None], options: dict[str, Any], parent: int | None) -> None:
+def _run_worker(loop: Callable[..., None], options: dict[str, Any], parent: int) -> None:
     """Run TorchRL's loop in a worker process, and send its exception to the parent."""
-    if parent is not None:
-        end_with(parent)
+    end_with(parent)
     # The parent handles the signals that a scheduler or a terminal sends to all processes, saves
     # its state with the workers' help and ends them.
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -27,6 +27,27 @@ if __name__ == "__main__":
     print(*env.worker_pids, flush=True)
     {end}
 """
+THREAD = """
+import os, signal, sys, threading, time
+sys.path.insert(0, {tests!r})
+from fake_env import FakeEnv, act
+from ba_torchrl.envs.vector.make import make_vector_env
+
+made = []
+thread = threading.Thread(
+    target=lambda: made.append(make_vector_env(FakeEnv, 3, start_method="fork"))
+)
+thread.start()
+thread.join()
+(env,) = made
+print(*env.worker_pids, flush=True)
+time.sleep(0.2)
+step = env.step(act(env, env.reset()))
+assert not step["next", "fault"].any() and env.restarts == 0
+print("stepped after the end of the thread", flush=True)
+os.kill(env.worker_pids[0], signal.SIGSTOP)
+time.sleep(100)
+"""
 FAKES = Path(fake_env.__file__).parent
 
 
@@ -50,16 +71,31 @@ def wait_until_gone(pids, seconds=10.0):
     ("how", "method"), [("killed", "fork"), ("killed", "spawn"), ("ended", "fork")]
 )
 def test_no_worker_survives_its_parent(tmp_path, how, method):
-    script = tmp_path / "parent.py"
     end = "time.sleep(100)" if how == "killed" else "sys.exit(0)"
-    script.write_text(PARENT.format(tests=str(FAKES), method=method, end=end))
-    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
-    pids = [int(pid) for pid in parent.stdout.readline().split()]
-    assert len(pids) == 3
+    script = PARENT.format(tests=str(FAKES), method=method, end=end)
+    parent, pids = start_parent(tmp_path, script)
     if how == "killed":
         parent.kill()
     assert parent.wait(10) == (-signal.SIGKILL if how == "killed" else 0)
     assert wait_until_gone(pids)
+
+
+def test_workers_of_a_thread_survive_the_thread_but_not_the_process(tmp_path):
+    parent, pids = start_parent(tmp_path, THREAD.format(tests=str(FAKES)))
+    assert parent.stdout.readline() == "stepped after the end of the thread\n"
+    parent.kill()
+    parent.wait(10)
+    assert wait_until_gone(pids)
+
+
+def start_parent(folder, source):
+    """Start a script that prints the ids of its three workers; return its process and the ids."""
+    script = folder / "parent.py"
+    script.write_text(source)
+    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
+    pids = [int(pid) for pid in parent.stdout.readline().split()]
+    assert len(pids) == 3
+    return parent, pids
 
 
 @BUFFERS
@@ -80,7 +116,7 @@ def test_a_trickle_of_deaths_does_not_end_the_environments(make_fakes, use_buffe
 def test_workers_that_ended_together_start_together(make_fakes, monkeypatch):
     env = make_fakes(3)
     state = env.reset()
-    order, launch = [], env._launch
+    order, launch = [], env._replacements._launch
 
     def recorded(index):
         worker = launch(index)
@@ -89,7 +125,7 @@ def test_workers_that_ended_together_start_together(make_fakes, monkeypatch):
         order.append(f"launch {index}")
         return worker
 
-    monkeypatch.setattr(env, "_launch", recorded)
+    monkeypatch.setattr(env._replacements, "_launch", recorded)
     for worker in env.parent_channels[:2]:
         os.kill(worker.process.pid, signal.SIGKILL)
         worker.process.join()

@@ -1,0 +1,88 @@
+"""Simulator faults: how they are detected and counted.
+
+A fault is an error of PyBullet or of its connection, a pose or an observation that is not finite,
+or a body that passed through the floor or was thrown away. In a step, it ends the episode
+truncated, and the next reset builds a new world. In a reset, the episode starts again in a new
+world.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+
+import torch
+
+from ba_torchrl.envs.scene import Scene
+from ba_torchrl.errors import SimulationError
+
+logger = logging.getLogger(__name__)
+
+MAX_CONSECUTIVE_FAULTS = 10
+LOWEST_M = -0.1
+"""Height below which a body has passed through the floor."""
+FARTHEST_M = 10.0
+"""Distance from the robot's base that only a diverging solver gives a body within one step."""
+
+
+def check_bodies(scene: Scene) -> None:
+    """Check that the state of a scene is one that the physics engine can continue from.
+
+    Raises:
+        SimulationError: a pose or a joint angle is not finite, or a visible body is below the floor
+            or far away.
+    """
+    if not math.isfinite(sum(scene.robot.measured_joints())):
+        raise SimulationError("a joint of the robot is not finite")
+    for body in scene.world.moving_bodies:
+        position, orientation = body.pose
+        if not math.isfinite(sum(position) + sum(orientation)):
+            raise SimulationError(f"the pose of {body.name!r} is not finite")
+        is_lost = position[2] < LOWEST_M or math.hypot(*position) > FARTHEST_M
+        if is_lost and not body.is_hidden:
+            place = ", ".join(f"{x:.3g}" for x in position)
+            raise SimulationError(f"{body.name!r} is lost at ({place}) m")
+
+
+def check_observation(observation: Mapping[str, torch.Tensor]) -> None:
+    """Check that the entries of an observation are finite.
+
+    Raises:
+        SimulationError: one is not.
+    """
+    for key, value in observation.items():
+        if value.is_floating_point() and not math.isfinite(value.sum()):
+            raise SimulationError(f"the observation {key!r} is not finite")
+
+
+class FaultCounter:
+    """Counts the faults of an environment, and ends it after too many in a row.
+
+    Args:
+        task_id: for messages.
+    """
+
+    def __init__(self, task_id: str) -> None:
+        self._task_id = task_id
+        self.total = 0
+        self._in_a_row = 0
+
+    def count_step(self) -> None:
+        """Note a step without a fault."""
+        self._in_a_row = 0
+
+    def count_fault(self) -> None:
+        """Count and log the exception that is handled.
+
+        Raises:
+            SimulationError: there were more than `MAX_CONSECUTIVE_FAULTS` without a step.
+        """
+        self.total += 1
+        self._in_a_row += 1
+        logger.exception("%s: simulator fault %d, episode dropped", self._task_id, self.total)
+        if self._in_a_row > MAX_CONSECUTIVE_FAULTS:
+            raise SimulationError(
+                f"{self._task_id} failed {self._in_a_row} times in a row; the log above shows the "
+                "cause"
+            )

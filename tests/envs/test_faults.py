@@ -1,0 +1,184 @@
+"""A simulator fault ends the episode truncated, and the next one is in a new world."""
+
+import math
+
+import pybullet
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.envs import faults
+from ba_torchrl.errors import SimulationError
+
+TASKS = {
+    "close_loop/block_picking": {"obs_size": 16},
+    "open_loop/block_stacking": {"obs_size": 32},
+    "open_loop/bin_packing": {"obs_size": 32, "num_objects": 2},
+}
+TASK = "close_loop/block_picking"
+
+
+def make(task=TASK, **changes):
+    return ba_torchrl.make(task, **{"seed": 0, **TASKS[task], **changes})
+
+
+def action(env):
+    return env.action_spec.zero()
+
+
+def step(env, state):
+    return env.step(state.clone().set("action", action(env)))["next"]
+
+
+def give_nan(env):
+    body = env.scene.task.objects[0]
+    body.set_pose((math.nan, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0))
+
+
+def turn_nan(env):
+    body = env.scene.task.objects[0]
+    body.set_pose(body.position, (math.nan, 0.0, 0.0, 1.0))
+
+
+def lose_below(env):
+    body = env.scene.task.objects[0]
+    body.set_pose((*body.position[:2], -3.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def throw(env):
+    env.scene.task.objects[0].set_pose((90.0, 0.0, 40.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def remove(env):
+    pybullet.removeBody(env.scene.task.objects[0].id, physicsClientId=env.scene.world.client)
+
+
+def disconnect(env):
+    pybullet.disconnect(physicsClientId=env.scene.world.client)
+
+
+def break_joint(env):
+    robot = env.scene.robot
+    pybullet.resetJointState(robot.id, robot.arm_joints[0], math.nan, physicsClientId=robot.client)
+
+
+FAULTS = [give_nan, turn_nan, lose_below, throw, remove, disconnect, break_joint]
+
+
+@pytest.fixture(autouse=True)
+def _no_client_is_left():
+    def clients():
+        return sum(map(pybullet.isConnected, range(32)))
+
+    before = clients()
+    yield
+    assert clients() == before
+
+
+@pytest.mark.parametrize(
+    ("task", "fault"),
+    # in open loop, the arm is moved to each pose at once, which repairs its joints
+    [(task, fault) for task in TASKS for fault in FAULTS if task == TASK or fault != break_joint],
+)
+def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt(task, fault):
+    env = make(task)
+    state = env.reset()
+    fault(env)
+    following = step(env, state)
+    assert following["fault"]
+    assert following["truncated"]
+    assert not following["terminated"]
+    assert following["reward"] == 0
+    for key, value in following.items():
+        assert torch.isfinite(value.float()).all(), key
+    assert torch.equal(following["pixels"], state["pixels"])  # the last valid observation
+    assert env.faults == 1
+    with pytest.raises(SimulationError, match="reset the environment first"):
+        _ = env.scene
+    state = env.reset()
+    assert not state["fault"]
+    assert not step(env, state)["fault"]
+    env.close()
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_episodes_after_a_fault_are_those_of_the_seed(fault):
+    undisturbed, env = make(), make()
+    expected = [undisturbed.reset(), undisturbed.reset(), undisturbed.reset()]
+    state = env.reset()
+    fault(env)
+    step(env, state)
+    for other in expected[1:]:
+        assert torch.equal(env.reset()["pixels"], other["pixels"])
+    undisturbed.close()
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("fault", [disconnect, remove])
+def test_a_fault_between_two_episodes_starts_the_reset_again(task, fault):
+    undisturbed, env = make(task), make(task)
+    for each in (undisturbed, env):
+        each.reset()
+    expected = undisturbed.reset()
+    fault(env)
+    state = env.reset()
+    assert torch.equal(state["pixels"], expected["pixels"])
+    assert not step(env, state)["fault"]
+    undisturbed.close()
+    env.close()
+
+
+def test_a_reset_that_always_fails_is_an_error(monkeypatch):
+    env = make()
+
+    def fail(*_):
+        raise pybullet.error("no server")
+
+    monkeypatch.setattr(faults, "MAX_CONSECUTIVE_FAULTS", 2)
+    monkeypatch.setattr(env.task_class, "initialize_episode", fail)
+    with pytest.raises(SimulationError, match="3 times in a row"):
+        env.reset()
+    env.close()
+
+
+def test_an_image_that_is_not_finite_is_a_fault(monkeypatch):
+    env = make()
+    state = env.reset()
+    height_map = env._images
+
+    def spoilt(scene):
+        images = height_map(scene)
+        images["pixels"] = images["pixels"].copy()
+        images["pixels"][0, 3, 3] = math.nan
+        return images
+
+    with monkeypatch.context() as patch:
+        patch.setattr(env, "_images", spoilt)
+        following = step(env, state)
+    assert following["fault"]
+    assert torch.isfinite(following["pixels"]).all()
+    env.close()
+
+
+@pytest.mark.parametrize("task", ["close_loop/block_picking", "open_loop/bin_packing"])
+def test_an_episode_after_a_fault_continues_in_another_environment(task):
+    first = make(task)
+    state = first.reset()
+    step(first, state)
+    give_nan(first)
+    step(first, state)
+    with pytest.raises(SimulationError, match="do not determine"):
+        first.get_position()
+    step(first, first.reset())
+    position = first.get_position()
+    expected = step(first, state)
+
+    second = make(task, seed=9)
+    second.reset()
+    second.continue_from(position)
+    following = step(second, second.reset())
+    for key, value in expected.items():
+        assert torch.equal(following[key], value), key
+    first.close()
+    second.close()

@@ -1,0 +1,84 @@
+"""Command lines of recipes: an error is one line, before work starts."""
+
+import contextlib
+import importlib.util
+import io
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.command_line import EXIT_CODE
+from tests.fuzz.values import check, examples
+
+ROOT = Path(__file__).parents[2]
+WORK = {
+    "collect_demos": "make_vector_env",
+    "experts": "expert_scores",
+    "play": "record_episodes",
+    "soak": "run_soak",
+    "evaluate": None,  # there is no checkpoint
+}
+"""The first call that works, by recipe."""
+TEXTS = ("null", "true", "0", "-1", "1", "3", "1.5", ".nan", "1e30", "text", "''", "[]", "[a]")
+TEXTS += ("{a: 1}", "close_loop/block_reaching", "open_loop/nothing", "ur5", "/proc/no/x.mp4")
+VALUES = st.one_of(st.sampled_from(TEXTS), st.text(max_size=5), st.integers().map(str))
+
+
+class StartedError(Exception):
+    """The recipe began to work."""
+
+
+def started(*_, **__):
+    raise StartedError
+
+
+@pytest.fixture
+def recipe(request, monkeypatch, tmp_path):
+    """The function of a recipe whose work is replaced, and its settings by overrides."""
+    name = request.param
+    monkeypatch.chdir(tmp_path)
+    spec = importlib.util.spec_from_file_location(f"fuzzed_{name}", ROOT / f"recipes/{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setattr("sys.argv", [name])
+    spec.loader.exec_module(module)
+    if WORK[name] is not None:
+        monkeypatch.setattr(module, WORK[name], started)
+    hydra_schema.register()
+    with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
+        yield name, module.main.__wrapped__
+
+
+@pytest.mark.parametrize("recipe", WORK, indirect=True)
+@examples(12)
+def test_command_lines(recipe, count):
+    name, main = recipe
+    required = ["checkpoint=run"] if name == "evaluate" else []
+    known = OmegaConf.to_container(compose(name, overrides=required))
+
+    def prop(overrides):
+        changes = [f"{key}={value}" for key, value in overrides.items()]
+        try:
+            settings = compose(name, overrides=required + changes)
+        except (HydraException, OmegaConfBaseException, ValueError):
+            return  # Hydra reports it
+        error = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(error), contextlib.redirect_stdout(io.StringIO()):
+                main(settings)
+            return
+        except StartedError:
+            return
+        except SystemExit as end:
+            code = end.code
+        assert code == EXIT_CODE
+        assert error.getvalue().startswith("error: ")
+        assert "Traceback" not in error.getvalue()
+
+    keys = st.one_of(st.sampled_from(sorted(known)), st.sampled_from(["env.robot", "env.obs_size"]))
+    check(count, st.dictionaries(keys, VALUES, min_size=1, max_size=2), prop, shrinks=False)
