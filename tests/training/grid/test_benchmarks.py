@@ -45,7 +45,7 @@ def shipped(name, *overrides):
         HydraConfig.instance().set_config(settings)
         own = OmegaConf.masked_copy(settings, [key for key in settings if key != "hydra"])
         values = OmegaConf.to_container(own, resolve=True)
-        assert values.pop("dry_run") is False
+        assert (values.pop("dry_run"), values.pop("only")) == (False, None)
         known = [name for name in BenchmarkConfig.model_fields if name in values]
         config = parse(BenchmarkConfig, {name: values.pop(name) for name in known}, "benchmark")
         return config, values, plan(config, values, hydra_schema.preset)
