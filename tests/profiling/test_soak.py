@@ -5,16 +5,17 @@ import sys
 
 import pytest
 
-from ba_torchrl.profiling import soak
+from ba_torchrl.profiling import soak, soak_one
 from ba_torchrl.profiling.soak import TABLE_FILE, SoakFigures, SoakJob, run_soak
-from ba_torchrl.profiling.soak_one import soak as soak_one
 
 JOB = SoakJob(task="close_loop/block_reaching", steps=60, env={"obs_size": 16, "max_steps": 10})
 
 
 @pytest.fixture(scope="module")
 def figures():
-    return soak_one(JOB)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(soak_one, "SAMPLES", 8)  # each collects the garbage of the whole test session
+        return soak_one.soak(JOB)
 
 
 def worker(folder, figures, code=""):
