@@ -38,13 +38,9 @@ class ManipulationEnv(EnvBase):
     """A manipulation task as an unbatched TorchRL environment on the CPU.
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any
-    other episodes. Exceptions are tasks that continue with the objects of the previous episode, and
-    those with hollow bodies (`open_loop/covid_test`, `open_loop/bottle_arrangement`): the engine
-    solves the contacts of two such bodies in an order that may depend on earlier episodes, so that
-    trajectories from the same start can differ.
-
-    A simulator fault (see `ba_torchrl.envs.faults`) ends the episode truncated, with ``fault`` set
-    and the last valid observation; the next reset builds a new world.
+    other episodes. Exceptions are tasks that continue with the objects of the previous episode. In
+    `open_loop/covid_test` and `open_loop/bottle_arrangement` the last bits of contacts of hollow
+    bodies can depend on earlier episodes.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
