@@ -39,8 +39,8 @@ class ManipulationEnv(EnvBase):
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any
     other episodes. Exceptions are tasks that continue with the objects of the previous episode. In
-    `open_loop/covid_test` and `open_loop/bottle_arrangement` the last bits of contacts of hollow
-    bodies can depend on earlier episodes.
+    `open_loop/covid_test` and `open_loop/bottle_arrangement` the contacts of hollow bodies, and so
+    the trajectories, can depend on earlier episodes.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.

@@ -39,7 +39,7 @@ def start(config):
 
 
 def change_weights(algorithm, updates):
-    """Give the policy other weights, as after so many updates; its actions are its means."""
+    """Set the weights that the policy has after a number of updates; it acts with its means."""
     torch.manual_seed(updates)
     with torch.no_grad():
         for name, parameter in algorithm.policy.named_parameters():
