@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.data.demo_files import save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations, source_config
+from ba_torchrl.data.demos import check_noise, collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.data.time_reversal import replay_scores
 from ba_torchrl.errors import ConfigError
@@ -38,6 +38,7 @@ def main(settings: DictConfig) -> None:
     check_texts(settings, "task", "path", "source")
     check_counts(settings, "episodes", "num_envs")
     check_counts(settings, "replays", "seed", least=0)
+    check_noise(settings.noise, settings.source, "noise")
     check_writable(settings.path)
     if Path(settings.path).exists():
         raise ConfigError(f"{settings.path} exists already; choose another path")
@@ -57,6 +58,7 @@ def main(settings: DictConfig) -> None:
                 seed=settings.seed,
                 source=settings.source,
                 only_successful=settings.only_successful,
+                noise=settings.noise,
                 on_episode=lambda _: bar.update(),
             )
     finally:

@@ -137,9 +137,11 @@ class ImitationLearning:
         return self.imitator.nearest_action(action)
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store demonstrations with actions that the policy can choose.
+        """Store the expert's steps of demonstrations, with actions that the policy can choose.
 
         Args:
             episodes: TensorDicts [T].
         """
-        super().on_demonstrations([self.imitator.as_demonstration(each) for each in episodes])
+        for episode in episodes:
+            data = self.to_transitions(self.imitator.as_demonstration(episode), is_expert=True)
+            self.extend(data[data[keys.IS_EXPERT].squeeze(-1)])

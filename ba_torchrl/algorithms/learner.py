@@ -261,14 +261,16 @@ class Learner(Algorithm):
         return scalars
 
     def pretrain_update(self) -> TensorDict:
-        """Take one update before the first collection, of behaviour cloning with ``init="bc"``.
+        """Take one update before the first collection; with ``init="bc"``, of behaviour cloning of
+        the expert's transitions in a batch.
 
         Raises:
             FloatingPointError: a loss is not finite.
         """
         if self.init_loss is None:
             return self.update()
-        return self.minimize(self.init_loss(self.sample()))
+        batch = self.sample()
+        return self.minimize(self.init_loss(batch[batch[keys.IS_EXPERT].squeeze(-1)]))
 
     def minimize(self, scalars: TensorDictBase) -> TensorDict:
         """Take one gradient step on a sum of losses, update target and average, and count it.

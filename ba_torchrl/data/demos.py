@@ -7,6 +7,7 @@ import statistics
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, get_args
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -34,6 +35,7 @@ def collect_demonstrations(
     seed: int | None = None,
     source: Source = "expert",
     only_successful: bool = False,
+    noise: float = 0.0,
     nearest_action: Callable[[Tensor], Tensor] | None = None,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
@@ -47,6 +49,10 @@ def collect_demonstrations(
         source: "expert", or "deconstruction" for episodes reversed in time. Episodes that cannot be
             reversed are dropped; all others succeed.
         only_successful: drop episodes that did not reach the goal.
+        noise: probability of executing a random action in place of the expert's, for the source
+            "expert". The expert then acts from states that it does not reach by itself (DART:
+            Laskey et al., 2017). If it is positive, the entry ``is_expert`` [T, 1] tells which
+            actions are the expert's.
         nearest_action: maps the expert's action to the action that is executed and recorded. A
             policy with discrete actions needs it; None for the expert's own action.
         on_episode: called with each episode when it ends, for progress bars.
@@ -55,13 +61,17 @@ def collect_demonstrations(
         Episodes as TensorDicts [T], with the entries of an environment without ``expert``.
 
     Raises:
-        ConfigError: the source is unknown.
+        ConfigError: the source is unknown or cannot have noise, or ``noise`` is no probability.
     """
     if source not in SOURCES:
         raise ConfigError(f"source: {source!r} is not one of {', '.join(SOURCES)}")
+    check_noise(noise, source, "noise")
+    add_noise = RandomActions(env, noise, 0 if seed is None else seed) if noise else None
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         out = expert_policy(tensordict)
+        if add_noise is not None:
+            out = add_noise(out)
         if nearest_action is not None:
             out.set(keys.ACTION, nearest_action(out[keys.ACTION]))
         return out
@@ -74,6 +84,51 @@ def collect_demonstrations(
         for episode in played
         if is_success(episode) or not only_successful
     ]
+
+
+class RandomActions:
+    """Replaces the action by a random one in some steps, and flags the others as the expert's.
+
+    Args:
+        env: whose actions are drawn, uniformly within the bounds.
+        probability: of a random action.
+        seed: of the draws.
+    """
+
+    def __init__(self, env: EnvBase, probability: float, seed: int) -> None:
+        self._space = env.action_spec.space
+        self._probability = probability
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action and ``is_expert`` of every environment.
+
+        Args:
+            tensordict: with the expert's actions [N, A].
+        """
+        action = tensordict[keys.ACTION]
+        low, high = self._space.low, self._space.high
+        drawn = low + (high - low) * torch.rand(action.shape, generator=self._generator)
+        is_expert = torch.rand(len(action), 1, generator=self._generator) >= self._probability
+        tensordict.set(keys.ACTION, torch.where(is_expert, action, drawn))
+        return tensordict.set(keys.IS_EXPERT, is_expert)
+
+
+def check_noise(noise: float, source: Source, name: str) -> None:
+    """Check the probability of random actions in demonstrations.
+
+    Args:
+        noise: the probability.
+        source: of the demonstrations.
+        name: of the setting, for error messages.
+
+    Raises:
+        ConfigError: it is not in [0, 1), or the source has no noise.
+    """
+    if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0 <= noise < 1:
+        raise ConfigError(f"{name}: must be at least 0 and less than 1, got {noise!r}")
+    if noise and source != "expert":
+        raise ConfigError(f"{name}: demonstrations of the source {source!r} have no random actions")
 
 
 def source_config(source: Source) -> dict[str, bool]:

@@ -123,6 +123,7 @@ def gather_demonstrations(
             seed=seed,
             source=config.demonstrations_source,
             only_successful=config.only_successful_demonstrations,
+            noise=config.demonstrations_noise,
             nearest_action=algorithm.nearest_action,
             on_episode=on_episode,
         )

@@ -13,7 +13,7 @@ from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, Ne
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import EnvConfig, StrictModel, parse
 from ba_torchrl.data.demo_files import check_demonstrations
-from ba_torchrl.data.demos import Source, source_config
+from ba_torchrl.data.demos import Source, check_noise, source_config
 from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
@@ -72,6 +72,10 @@ class ExperimentConfig(StrictModel):
     """Their source: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
     """Leave out failed episodes; fewer remain where the expert fails."""
+    demonstrations_noise: float = Field(default=0.0, ge=0, lt=1)
+    """Probability of a random action in place of the expert's in each step of a demonstration that
+    is played for the run (Laskey et al., 2017). The expert recovers. Steps with random actions are
+    stored as if the policy had collected them. None in the appendix."""
     demonstrations_path: str | None = None
     """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
     pretrain_updates: int = Field(default=0, ge=0)
@@ -238,6 +242,7 @@ class ExperimentConfig(StrictModel):
 
     def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)
+        check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
         if self.demonstrations:
             check_task_parameters(
                 self.task, parse_env_config(self.task, {**self.env, **source}, "env")

@@ -115,6 +115,29 @@ def test_any_actor_is_initialised_and_nothing_else(name):
     assert learner.updates == 2
 
 
+@pytest.mark.parametrize(
+    ("network", "algorithm", "changes"),
+    [
+        ("cnn", {"name": "bc"}, {}),
+        ("asr", {"name": "bc"}, OPEN),
+        ("cnn", {"name": "sac", "init": "bc"}, {"pretrain_updates": 1}),
+    ],
+    ids=["close_loop", "open_loop", "initialisation"],
+)
+def test_random_actions_of_demonstrations_are_not_imitated(tmp_path, network, algorithm, changes):
+    settings = {"total_updates": 2, "eval_every": 2, **changes, "demonstrations_noise": 0.5}
+    made = make_experiment(tmp_path, network, algorithm, **settings)
+    learner, imitated, episodes = made.algorithm, [], []
+    loss = learner.init_loss or learner.loss
+    loss.register_forward_pre_hook(lambda _, args: imitated.append(args[0][keys.IS_EXPERT].clone()))
+    store = learner.on_demonstrations
+    learner.on_demonstrations = lambda each: (episodes.extend(each), store(each))
+    made.run()
+    assert not all(episode[keys.IS_EXPERT].all() for episode in episodes)
+    assert imitated
+    assert all(len(flags) and flags.all() for flags in imitated)
+
+
 def demonstration_error(learner):
     """Return the greedy policy's mean squared error on the demonstrations."""
     data = learner.replay.storage[:]

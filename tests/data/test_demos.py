@@ -7,6 +7,8 @@ import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.state_files import seal
+from ba_torchrl.data.transitions import as_transitions
+from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 
 TASK = "open_loop/block_stacking"
@@ -96,3 +98,68 @@ def test_demonstrations_are_not_overwritten(collected, tmp_path):
     save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=0)
     with pytest.raises(FileExistsError, match="choose another folder"):
         save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=1)
+
+
+NOISY_TASK = "close_loop/block_reaching"
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """Episodes with random actions: what was returned, and the steps with the expert's actions."""
+    env = ba_torchrl.make_vector_env(
+        NOISY_TASK, 2, parallel=False, seed=0, obs_size=32, expert=True
+    )
+    played = []
+    episodes = collect_demonstrations(env, 30, seed=0, noise=0.3, on_episode=played.append)
+    again = collect_demonstrations(env, 30, seed=0, noise=0.3)
+    env.close()
+    return episodes, played, again
+
+
+def test_random_actions_of_a_demonstration_are_flagged(noisy):
+    episodes, played, _ = noisy
+    steps = torch.cat(played)
+    is_expert = steps[keys.IS_EXPERT].squeeze(-1)
+    same = (steps[keys.ACTION] == steps[keys.EXPERT_ACTION]).all(dim=-1)
+    assert torch.equal(same, is_expert)
+    assert is_expert.float().mean() == pytest.approx(0.7, abs=0.1)
+    drawn = steps[keys.ACTION][~is_expert]
+    assert drawn.min() < -0.8
+    assert drawn.max() > 0.8
+    assert drawn.abs().max() <= 1
+    assert sum(map(len, episodes)) == len(steps)
+
+
+def test_the_expert_recovers_from_random_actions(noisy):
+    episodes, _, _ = noisy
+    assert all(episode[keys.NEXT, keys.SUCCESS][-1] for episode in episodes)
+
+
+def test_random_actions_are_those_of_the_seed(noisy):
+    episodes, _, again = noisy
+    for one, other in zip(episodes, again, strict=True):
+        assert torch.equal(one[keys.ACTION], other[keys.ACTION])
+
+
+def test_flags_are_those_of_the_transitions_and_of_a_file(noisy, tmp_path):
+    episodes, _, _ = noisy
+    env = {"obs_size": 32}
+    save_demonstrations(tmp_path / "demos", episodes, task=NOISY_TASK, env=env, seed=0)
+    loaded = load_demonstrations(tmp_path / "demos", task=NOISY_TASK, env=env)
+    for episode, other in zip(episodes, loaded, strict=True):
+        for each in (episode, other):
+            stored = as_transitions(each, [keys.PIXELS], is_expert=True)
+            assert torch.equal(stored[keys.IS_EXPERT], episode[keys.IS_EXPERT])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"noise": 0.1, "source": "deconstruction"}, "noise"),
+        ({"noise": -0.1}, "noise: .* -0.1"),
+        ({"noise": 1.5}, "noise: .* 1.5"),
+    ],
+)
+def test_noise_that_cannot_be_added_is_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        collect_demonstrations(None, 1, **settings)
