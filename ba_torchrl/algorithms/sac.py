@@ -29,7 +29,7 @@ from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.contrastive import BilinearInfoNCE
-from ba_torchrl.objectives.sacfd import ImitatedAction, SACfDLoss
+from ba_torchrl.objectives.sacfd import SACfDLoss
 from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
 
 
@@ -57,9 +57,6 @@ class SACConfig(LearnerConfig):
     """Whether targets have the entropy term."""
     demonstration_weight: float = Field(default=1.0, ge=0)
     """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
-    imitated_action: ImitatedAction = "sample"
-    """Action of the policy in the behaviour term: a "sample", or the "mode" of its distribution,
-    whose standard deviation the term then does not lower. Not in the appendix."""
     augmentation: Literal["none", "so2"] = "none"
     """Rotation of transitions about the z axis; none in the appendix."""
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
@@ -159,7 +156,6 @@ class SAC(Learner):
             target_entropy=config.target_entropy,
             entropy_backup=config.entropy_backup,
             demonstration_weight=config.demonstration_weight,
-            imitated_action=config.imitated_action,
             weighted_terms=config.importance_weighted,
             weight_norm=config.importance_norm,
             views=config.views,

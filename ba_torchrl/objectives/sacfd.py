@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.base import (
@@ -24,9 +22,6 @@ from ba_torchrl.objectives.base import (
     weighted,
 )
 from ba_torchrl.objectives.shared_encoder import SharedEncoderCritics
-
-ImitatedAction = Literal["sample", "mode"]
-"""Action of the policy that the behaviour term compares with the demonstrated one."""
 
 
 class SACfDLoss(SharedEncoderCritics, TransitionLoss):
@@ -41,9 +36,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                       * mean over experts of w_i mean over components (a - a_i)^2
         loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
-    Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023). With
-    ``imitated_action="mode"``, the behaviour term takes the policy's deterministic action instead
-    of a, so that it does not lower the policy's standard deviation.
+    Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
 
     u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
     "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are
@@ -71,7 +64,6 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         entropy_backup: whether y has the entropy term; without it, y is the return alone.
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
             flag in the batch.
-        imitated_action: action of the policy in the behaviour term.
         reduction: of the samples' losses; the formulas above are "mean".
         weighted_terms: terms that the importance weights multiply.
         weight_norm: statistic by which a batch's weights are divided.
@@ -83,8 +75,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         contrastive_weight: weight of the contrastive term.
 
     Raises:
-        ValueError: ``alpha_init`` is not positive, ``imitated_action`` is unknown, or the encoder
-            has several outputs.
+        ValueError: ``alpha_init`` is not positive, or the encoder has several outputs.
     """
 
     @dataclass
@@ -135,7 +126,6 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         target_entropy: float = -5.0,
         entropy_backup: bool = True,
         demonstration_weight: float = 1.0,
-        imitated_action: ImitatedAction = "sample",
         reduction: Reduction | None = None,
         weighted_terms: WeightedTerms = "critic_and_policy",
         weight_norm: WeightNorm = "max",
@@ -146,9 +136,6 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
-        known = get_args(ImitatedAction)
-        if imitated_action not in known:
-            raise ValueError(f"imitated_action must be one of {known}, got {imitated_action!r}")
         if len(encoder_network.out_keys) != 1:
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
@@ -165,7 +152,6 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
         self._needs_expert_flag = demonstration_weight != 0
         self.entropy_backup = entropy_backup
-        self.imitated_action = imitated_action
         self.views = views
         self.target_views = target_views
         self.contrastive = None if contrastive is None else contrastive.to(device)
@@ -221,15 +207,13 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         priority = self._over_views(error.detach().abs().mean(dim=-1))
         tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
 
-        policy = self._policy_distribution(state)
-        sample, log_prob = compute_rsample_log_prob(policy)
+        sample, log_prob = self._sample_action(state)
         # Detached features and heads: the gradient reaches the actor's parameters only, through the
         # action.
         q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
         policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
         is_expert = self._expert_flag(tensordict)
-        imitated = policy.deterministic_sample if self.imitated_action == "mode" else sample
-        error = self._over_views((imitated - action).square().mean(dim=-1))
+        error = self._over_views((sample - action).square().mean(dim=-1))
         demonstration = reduce_over(weighted(error, weights.of("all")), is_expert, self.reduction)
         policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
         loss_actor = policy_term + self.demonstration_weight * demonstration

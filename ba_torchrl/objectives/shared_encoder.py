@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch.distributions import Distribution
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 
 class SharedEncoderCritics:
     """Mixin of a loss module with an actor, an encoder and K critics that see its features."""
 
-    def _policy_distribution(self, tensordict: TensorDictBase) -> Distribution:
-        """Return the policy's distribution of actions, of batch shape [...]."""
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            return self.actor_network.get_dist(tensordict.select(*self.actor_network.in_keys))
-
     def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return an action [..., A] drawn with gradient and its log-probability [...]."""
-        return compute_rsample_log_prob(self._policy_distribution(tensordict))
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            observation = tensordict.select(*self.actor_network.in_keys)
+            return compute_rsample_log_prob(self.actor_network.get_dist(observation))
 
     def _features(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
         with params.to_module(self.encoder_network, preserve_module_state=False):

@@ -32,7 +32,6 @@ SAC = {
     "target_entropy": -2.5,
     "entropy_backup": False,
     "demonstration_weight": 3.0,
-    "imitated_action": "mode",
     "batch_size": 6,
     "buffer_size": 77,
     "replay": "prioritized",
@@ -153,7 +152,6 @@ def test_the_terms_of_sac_have_their_values():
     assert float(loss.alpha) == pytest.approx(0.25)
     assert float(loss.target_entropy) == -2.5
     assert not loss.entropy_backup
-    assert loss.imitated_action == "mode"
     assert float(loss.demonstration_weight) == 3.0
 
 

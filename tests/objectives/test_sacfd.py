@@ -1,6 +1,7 @@
 """The SACfD loss against plain arithmetic, and against TorchRL's contract."""
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -12,8 +13,99 @@ from torchrl.objectives import SoftUpdate, ValueEstimators
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.sacfd import SACfDLoss
-from tests.linear_sac import NoiselessTanhNormal, batch, make
-from tests.sacfd_by_hand import by_hand
+from tests.linear_sac import (
+    batch,
+    make,
+)
+
+
+def affine(row_weights, bias, x):
+    return [
+        sum(w * v for w, v in zip(row, x, strict=True)) + b
+        for row, b in zip(row_weights, bias, strict=True)
+    ]
+
+
+def importance(data, terms, norm):
+    """Weights of the critic's, the policy's and the other terms of each sample."""
+    ones = [1.0] * len(data)
+    weights = data["priority_weight"].tolist() if "priority_weight" in data else ones
+    divisor = max(weights) if norm == "max" else sum(weights) / len(weights)
+    weights = [w / divisor for w in weights]
+    number = ["none", "critic", "critic_and_policy", "all"].index(terms)
+    return [weights if number >= least else ones for least in (1, 2, 3)]
+
+
+def by_hand(
+    loss,
+    data,
+    gamma,
+    alpha,
+    target_entropy,
+    demonstration_weight,
+    terms="critic_and_policy",
+    norm="max",
+    entropy_backup=True,
+):
+    """The terms of the loss, computed with Python floats and loops."""
+
+    def parameters(name):
+        tree = getattr(loss, name)
+        return tree["module", "net", "weight"].tolist(), tree["module", "net", "bias"].tolist()
+
+    actor_tree = loss.actor_network_params["module", "0", "module"]
+    actor = actor_tree["net", "weight"].tolist(), actor_tree["net", "bias"].tolist()
+    log_std = actor_tree["log_std"].tolist()
+
+    def policy(x):
+        action = [math.tanh(v) for v in affine(*actor, x)]
+        return action, (sum(action) + sum(log_std)) / 2
+
+    def q(x, action, prefix):
+        encoder = parameters(f"{prefix}encoder_network_params")
+        features = [math.tanh(v) for v in affine(*encoder, x)]
+        return affine(*parameters(f"{prefix}qvalue_network_params"), features + action)
+
+    def observation(tree, i):
+        return [*tree[keys.PIXELS][i].tolist(), float(tree[keys.HOLDING][i])]
+
+    n = len(data)
+    critic, policy_weights, others = importance(data, terms, norm)
+    qvalue = actor_term = alpha_term = entropy = value = behaviour = weighted_behaviour = 0.0
+    experts, priorities = 0, []
+    for i in range(n):
+        x, following = observation(data, i), observation(data[keys.NEXT], i)
+        stored = data[keys.ACTION][i].tolist()
+        next_action, next_log_prob = policy(following)
+        bootstrap = min(q(following, next_action, "target_"))
+        bootstrap -= alpha * next_log_prob * entropy_backup
+        y = float(data[keys.NEXT, keys.REWARD][i])
+        if not data[keys.NEXT, keys.TERMINATED][i]:
+            y += gamma * bootstrap
+        errors = [v - y for v in q(x, stored, "")]
+        qvalue += critic[i] * sum(e * e for e in errors) / n
+        value += sum(q(x, stored, "")) / 2 / n
+        priorities.append([sum(abs(e) for e in errors) / 2])
+        action, log_prob = policy(x)
+        actor_term += policy_weights[i] * (alpha * log_prob - min(q(x, action, ""))) / n
+        alpha_term -= others[i] * math.log(alpha) * (log_prob + target_entropy) / n
+        entropy -= log_prob / n
+        if keys.IS_EXPERT in data and data[keys.IS_EXPERT][i]:
+            experts += 1
+            error = sum((a - e) ** 2 for a, e in zip(action, stored, strict=True)) / 2
+            behaviour += error
+            weighted_behaviour += others[i] * error
+    behaviour /= max(experts, 1)
+    weighted_behaviour /= max(experts, 1)
+    return {
+        "loss_qvalue": qvalue,
+        "loss_actor": actor_term + demonstration_weight * weighted_behaviour,
+        "loss_alpha": alpha_term,
+        "alpha": alpha,
+        "entropy": entropy,
+        "demonstration_error": behaviour,
+        "q_value": value,
+    }, priorities
 
 
 @pytest.mark.parametrize("weights", [(0.2, 0.8, 0.4, 0.1), None], ids=["weights", "uniform"])
@@ -58,45 +150,11 @@ def test_without_entropy_backup_the_target_is_the_return_alone():
     assert losses[True] != pytest.approx(losses[False], rel=1e-3)
 
 
-class HalvedMode(NoiselessTanhNormal):
-    """A distribution whose mode is half its draw."""
-
-    @property
-    def deterministic_sample(self):
-        return self.loc.tanh() / 2
-
-
-@pytest.mark.parametrize(("imitated_action", "scale"), [("sample", 1.0), ("mode", 0.5)])
-def test_the_behaviour_term_takes_the_chosen_action(imitated_action, scale):
-    loss = make(HalvedMode, alpha_init=0.2, imitated_action=imitated_action)
-    data = batch()
-    expected, _ = by_hand(loss, data, 0.99, 0.2, -5, 1.0, imitated_scale=scale)
-    out = loss(data)
-    for name, value in expected.items():
-        assert out[name].item() == pytest.approx(value, rel=1e-6), name
-
-
-@pytest.mark.parametrize("imitated_action", ["sample", "mode"])
-def test_imitation_of_the_mode_leaves_the_standard_deviation_alone(imitated_action):
-    gradients = []
-    for weight in (1.0, 9.0):
-        loss = make(TanhNormal, demonstration_weight=weight, imitated_action=imitated_action)
-        torch.manual_seed(1)
-        loss(batch())["loss_actor"].backward()
-        gradients.append(loss.actor_network_params["module", "0", "module", "log_std"].grad)
-    assert torch.equal(*gradients) == (imitated_action == "mode")
-
-
 def test_unknown_importance_weights_are_refused():
     with pytest.raises(ValueError, match=r"weighted_terms .* 'actor'"):
         make(weighted_terms="actor")
     with pytest.raises(ValueError, match=r"weight_norm .* 'median'"):
         make(weight_norm="median")
-
-
-def test_an_unknown_imitated_action_is_refused():
-    with pytest.raises(ValueError, match=r"imitated_action .* 'mean'"):
-        make(imitated_action="mean")
 
 
 def test_defaults_are_those_of_the_paper():
