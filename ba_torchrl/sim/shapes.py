@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -143,21 +145,26 @@ class Solid(Shape):
                 physicsClientId=client,
             )
         # PyBullet creates several hulls only from a file
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "parts.obj"
-            write_obj(path, self.parts)
+        with _obj_file(self.parts) as path:
             return pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client
+                pybullet.GEOM_MESH, fileName=path, physicsClientId=client
             )
 
     def create_visual(self, client: int) -> int:
         """Create the visual surface."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "surface.obj"
-            write_obj(path, [self.mesh()])
+        # from a file, since PyBullet does not free visual shapes that are made from arrays
+        with _obj_file([self.mesh()]) as path:
             return pybullet.createVisualShape(
                 pybullet.GEOM_MESH,
-                fileName=str(path),
+                fileName=path,
                 rgbaColor=self.color,
                 physicsClientId=client,
             )
+
+
+@contextmanager
+def _obj_file(parts: Sequence[Mesh]) -> Iterator[str]:
+    """Write a temporary OBJ file and yield its path."""
+    with tempfile.NamedTemporaryFile(suffix=".obj") as file:
+        write_obj(Path(file.name), parts)
+        yield file.name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import cache
 from typing import ClassVar, overload
 
 import numpy as np
@@ -96,4 +97,10 @@ def load_object_set(name: str, asset_root: str | None = None) -> ObjectSet:
     Raises:
         ConfigError: the name is unknown, or the folder is missing or not readable.
     """
-    return OBJECT_SETS[name](asset_root)
+    return _packaged_set(name) if asset_root is None else OBJECT_SETS[name](asset_root)
+
+
+@cache
+def _packaged_set(name: str) -> ObjectSet:
+    """Return an object set of the package; its shapes are the same in all worlds of a process."""
+    return OBJECT_SETS[name](None)

@@ -25,7 +25,7 @@ def test_sets_hold_named_shapes_of_one_material(name, least):
 
 
 def test_shapes_are_loaded_on_access(monkeypatch):
-    shapes = load_object_set("random")
+    shapes = OBJECT_SETS["random"](None)
     loaded = []
     parts = type(shapes).parts
     monkeypatch.setattr(type(shapes), "parts", lambda self, i: loaded.append(i) or parts(self, i))
@@ -34,6 +34,10 @@ def test_shapes_are_loaded_on_access(monkeypatch):
     assert loaded == [85]
     with pytest.raises(IndexError):
         shapes[86]
+
+
+def test_worlds_share_the_shapes_of_a_packaged_set():
+    assert load_object_set("random") is load_object_set("random")
 
 
 def test_an_unknown_set_and_an_unused_folder_are_refused(tmp_path):
