@@ -105,8 +105,12 @@ class ViewInput:
 
     @property
     def finger_offset_m(self) -> float:
-        """Distance between the square of each finger and the tool point."""
-        return self.setup.finger_span_m * self.opening / 2
+        """Distance between the square of each finger and the tool point.
+
+        The squares of closed fingers touch and do not overlap, so that they show the yaw of the
+        tool.
+        """
+        return max(self.setup.finger_span_m * self.opening / 2, FINGER_SQUARE_HALF_M)
 
 
 class View(ABC):

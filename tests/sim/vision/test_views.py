@@ -91,7 +91,7 @@ def test_default_view_equals_explicit_arithmetic(world):
                 z + 0.12 - HeightCamera(bodies).heightmap((x, y), 0.45, pixels), 0.0, 0.39
             )
             pixel = 0.45 / pixels
-            apart = 0.105 * opening / 2 / pixel
+            apart = max(0.105 * opening / 2, 5 * 0.3 / 128) / pixel
             for side in (-apart, apart):
                 center = (pixels / 2 + side * math.cos(yaw), pixels / 2 + side * math.sin(yaw))
                 paint_square(expected, center, 5 * 0.3 / 128 / pixel, yaw, 0.0)
@@ -192,7 +192,7 @@ def test_rotating_views_follow_the_yaw_of_the_tool(name, world):
 
 
 @pytest.mark.parametrize("name", [*TOP_DOWN, "render_center"])
-@pytest.mark.parametrize("opening", [0.4, 1.0])
+@pytest.mark.parametrize("opening", [0.0, 0.4, 1.0])
 def test_position_and_size_of_finger_squares(name, opening, world):
     (x, y, _), yaw = TOOL
     values = image(name, world, [], opening=opening)
@@ -211,7 +211,7 @@ def test_position_and_size_of_finger_squares(name, opening, world):
     )
     along = (points - [x, y]) @ [math.cos(yaw), math.sin(yaw)]
     across = (points - [x, y]) @ [-math.sin(yaw), math.cos(yaw)]
-    offset = 0.105 * opening / 2
+    offset = max(0.105 * opening / 2, FINGER_SQUARE_HALF_M)  # closed fingers touch
     assert np.abs(np.abs(along) - offset).max() <= FINGER_SQUARE_HALF_M + 1e-6
     assert np.abs(across).max() <= FINGER_SQUARE_HALF_M + 1e-6
     assert along[along > 0].mean() == pytest.approx(offset, abs=2e-3)
