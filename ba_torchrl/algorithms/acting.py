@@ -19,12 +19,20 @@ class ActingPolicy(TensorDictModuleBase):
     Args:
         policy: from the observation to ``action``.
         transforms: transform of each image, by key.
+        exploration: changes the action under TorchRL's exploration type RANDOM, such as by noise;
+            None for the policy's own action.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, transforms: Mapping[str, nn.Module]) -> None:
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        transforms: Mapping[str, nn.Module],
+        exploration: TensorDictModuleBase | None = None,
+    ) -> None:
         super().__init__()
         self.policy = policy
         self.transforms = nn.ModuleDict(transforms)
+        self.exploration = exploration
         self.in_keys = list(policy.in_keys)
         self.out_keys = [keys.ACTION]
 
@@ -33,4 +41,7 @@ class ActingPolicy(TensorDictModuleBase):
         seen = tensordict.select(*self.in_keys)
         for key, transform in self.transforms.items():
             seen.set(key, transform(seen[key]))
-        return tensordict.set(keys.ACTION, self.policy(seen)[keys.ACTION])
+        out = self.policy(seen)
+        if self.exploration is not None:
+            out = self.exploration(out)
+        return tensordict.set(keys.ACTION, out[keys.ACTION])

@@ -118,7 +118,9 @@ class Learner(Algorithm):
         self.averaged_policy = self.make_averaged_policy()
         averaged = self.averaged_policy
         acting = self.trained_policy if averaged is None else averaged.module
-        self.policy = ActingPolicy(acting, self.make_acting_transforms()).to(problem.device)
+        self.policy = ActingPolicy(
+            acting, self.make_acting_transforms(), self.make_exploration()
+        ).to(problem.device)
         self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
@@ -164,6 +166,11 @@ class Learner(Algorithm):
     def make_acting_transforms(self) -> Mapping[str, nn.Module]:
         """Return the transform of each image that the acting policy sees; by default its codec."""
         return self.codecs
+
+    def make_exploration(self) -> TensorDictModuleBase | None:
+        """Return what changes the actions of the acting policy when it explores; by default None,
+        which leaves exploration to the policy's distribution."""
+        return None
 
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""

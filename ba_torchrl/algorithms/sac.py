@@ -10,7 +10,8 @@ from pydantic import Field, model_validator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import ProbabilisticActor
+from torchrl.data import Bounded
+from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
@@ -57,6 +58,9 @@ class SACConfig(LearnerConfig):
     """Whether targets have the entropy term."""
     demonstration_weight: float = Field(default=1.0, ge=0)
     """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
+    exploration_noise: float = Field(default=0.0, ge=0)
+    """Standard deviation of Gaussian noise that is added to collected actions, which are then
+    clipped to [-1, 1]. None in the appendix."""
     augmentation: Literal["none", "so2"] = "none"
     """Rotation of transitions about the z axis; none in the appendix."""
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
@@ -138,6 +142,14 @@ class SAC(Learner):
             return self.codecs
         crop = CenterCrop(self.config.crop_size)
         return {key: nn.Sequential(codec, crop) for key, codec in self.codecs.items()}
+
+    def make_exploration(self) -> AdditiveGaussianModule | None:
+        """Return the noise of collected actions, if configured."""
+        sigma = self.config.exploration_noise
+        if not sigma:
+            return None
+        actions = Bounded(-1.0, 1.0, (len(self.problem.actions.sequence),))
+        return AdditiveGaussianModule(actions, sigma_init=sigma, sigma_end=sigma)
 
     def make_loss(self, networks: ActorCritic) -> SACfDLoss:
         """Return the loss of actor, critics, temperature and, if configured, encoder."""

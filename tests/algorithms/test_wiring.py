@@ -32,6 +32,7 @@ SAC = {
     "target_entropy": -2.5,
     "entropy_backup": False,
     "demonstration_weight": 3.0,
+    "exploration_noise": 0.15,
     "batch_size": 6,
     "buffer_size": 77,
     "replay": "prioritized",
