@@ -15,6 +15,8 @@ CONFIDENCE = 0.95
 RESAMPLES = 2000
 LEAST_VALUES = 6
 """Smallest sample whose range contains the median with that confidence (1 - 2 / 2^6 = 0.97)."""
+BLOCKS = 20
+"""Least number of blocks of consecutive values, which are resampled together."""
 _BATCH = 200
 
 
@@ -45,25 +47,29 @@ def ratio_of_medians(
 ) -> Ratio:
     """Return a ratio of products of medians.
 
-    The samples are resampled independently of each other (B. Efron and R. Tibshirani, An
-    Introduction to the Bootstrap, 1993).
+    The samples are resampled independently of each other, long ones in at least `BLOCKS` blocks,
+    since consecutive durations depend on each other (E. Carlstein, The Use of Subseries
+    Values for Estimating the Variance of a General Statistic, 1986).
 
     Args:
-        numerators: samples whose medians are multiplied.
+        numerators: samples whose medians are multiplied, in the order of measurement.
         denominators: samples by whose medians the product is divided.
     """
     count = len(numerators)
-
-    def statistic(*samples: np.ndarray, axis: int) -> np.ndarray:
-        medians = [np.median(sample, axis=axis) for sample in samples]
-        return np.prod(medians[:count], axis=0) / np.prod(medians[count:], axis=0)
-
     samples = [np.asarray(sample) for sample in (*numerators, *denominators)]
-    value = float(statistic(*samples, axis=-1))
+    value = _ratio([np.median(sample) for sample in samples], count)
     if min(map(len, samples)) < LEAST_VALUES:
-        return Ratio(value, None)
+        return Ratio(float(value), None)
+    blocks = [_blocks(sample) for sample in samples]
+
+    def statistic(*chosen: np.ndarray, axis: int) -> np.ndarray:
+        resampled = (
+            each[i].reshape(*i.shape[:-1], -1) for each, i in zip(blocks, chosen, strict=True)
+        )
+        return _ratio([np.median(sample, axis=axis) for sample in resampled], count)
+
     interval = bootstrap(
-        samples,
+        [np.arange(len(each)) for each in blocks],
         statistic,
         n_resamples=RESAMPLES,
         batch=_BATCH,
@@ -72,7 +78,17 @@ def ratio_of_medians(
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return Ratio(value, (float(interval.low), float(interval.high)))
+    return Ratio(float(value), (float(interval.low), float(interval.high)))
+
+
+def _ratio(medians: Sequence[np.ndarray], count: int) -> np.ndarray:
+    return np.prod(medians[:count], axis=0) / np.prod(medians[count:], axis=0)
+
+
+def _blocks(sample: np.ndarray) -> np.ndarray:
+    """Return consecutive values [blocks, length], without the first ones that fill no block."""
+    length = max(len(sample) // BLOCKS, 1)
+    return sample[len(sample) % length :].reshape(-1, length)
 
 
 @dataclass(frozen=True)

@@ -194,10 +194,20 @@ def test_equal_samples_are_within_the_noise_and_different_ones_above_it():
     assert np.median([ratio.value for ratio in ratios]) == pytest.approx(1.2, rel=0.02)
 
 
+def test_values_that_depend_on_the_one_before_have_a_wider_interval():
+    rng = np.random.default_rng(0)
+    drawn = [np.repeat(samples(1.0, 20, rng), 10).tolist() for _ in range(200)]
+    ratios = [
+        ratio_of_medians([new], [old]) for new, old in zip(drawn[::2], drawn[1::2], strict=True)
+    ]
+    assert sum(ratio.is_above_noise for ratio in ratios) <= 9
+
+
 def test_few_values_have_no_interval():
     ratio = ratio_of_medians([[1.0] * 5], [[2.0] * 20])
     assert (ratio.value, ratio.interval, ratio.is_above_noise) == (0.5, None, None)
     assert ratio_of_medians([[1.0] * 6], [[2.0] * 6]).interval == (0.5, 0.5)
+    assert ratio_of_medians([[1.0] * 6], [[2.0] * 47]).interval == (0.5, 0.5)
 
 
 def test_units_cancel_the_speed_of_the_machine():
