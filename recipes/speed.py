@@ -1,8 +1,10 @@
-"""Print times of steps, images and updates and the replay's memory, as a table in Markdown.
+"""Print times of steps, images and updates, frames per second, and the replay's memory, as a table.
 
 python recipes/speed.py
-python recipes/speed.py which=simulation repeats=50
+python recipes/speed.py which=simulation repeats=50 output=before.json
+python recipes/speed.py which=simulation repeats=50 compare=before.json
 python recipes/speed.py which=learning/equi_sdqfd_update profile=true
+python recipes/speed.py which=learning device=cuda
 """
 
 from ba_torchrl._malloc import tune_malloc
@@ -13,24 +15,51 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
 from ba_torchrl.plugins import load_plugins  # noqa: E402
-from ba_torchrl.profiling.table import as_markdown, machine, measure  # noqa: E402
+from ba_torchrl.profiling.comparison import columns_of_changes  # noqa: E402
+from ba_torchrl.profiling.speed_file import (  # noqa: E402
+    Machine,
+    SpeedFile,
+    check_output,
+    read_speed_file,
+    write_speed_file,
+)
+from ba_torchrl.profiling.table import COLUMNS, as_markdown, measure  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
-from ba_torchrl.training.command_line import plain_errors  # noqa: E402
+from ba_torchrl.training.command_line import (  # noqa: E402
+    check_counts,
+    check_texts,
+    check_writable,
+    plain_errors,
+)
+from ba_torchrl.training.config import usable_device  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="speed", version_base="1.3")
 @plain_errors
 def main(settings: DictConfig) -> None:
-    """Measure, and print a table with the budgets."""
+    """Measure, print a table, and write or compare it."""
     limit_library_logs()
     load_plugins(settings.plugins)
-    where = machine()  # includes the load before the measurement
+    check_texts(settings, "which", "device")
+    check_texts(settings, "output", "compare", optional=True)
+    check_counts(settings, "repeats")
+    device = usable_device(settings.device)
+    old = None if settings.compare is None else read_speed_file(settings.compare)
+    if settings.output is not None:
+        check_output(settings.output)
+        check_writable(settings.output)
+    where = Machine.here(device)  # includes the load before the measurement
     profiles: dict[str, str] | None = {} if settings.profile else None
-    rows = measure(settings.which, settings.repeats, profiles=profiles)
+    rows = measure(settings.which, settings.repeats, profiles=profiles, device=device)
+    if settings.output is not None:
+        write_speed_file(settings.output, SpeedFile(machine=where, rows=rows))
     for work, operations in (profiles or {}).items():
         print(f"{work}\n{operations}")
-    print(as_markdown(rows))
+    changes = {} if old is None else columns_of_changes(old.rows, rows)
+    print(as_markdown(rows, {**COLUMNS, **changes}))
     print(f"\n{where}")
+    if old is not None:
+        print(f"old: {old.machine}")
 
 
 if __name__ == "__main__":

@@ -10,13 +10,14 @@ from tensordict import TensorDict
 from torch import nn
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.algorithms.precision import network_dtype
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.buffer import FrameStorage
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
-from ba_torchrl.profiling.table import Bench, Budget, Row, measurement, timed_row
+from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
+from ba_torchrl.profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 
@@ -25,11 +26,15 @@ CAPACITY = 100_000
 
 
 class LearningUnit:
-    """A float32 3 x 3 convolution, 64 to 128 channels, 64 images of 64 x 64, and its gradient."""
+    """A float32 3 x 3 convolution, 64 to 128 channels, 64 images of 64 x 64, and its gradient.
 
-    def __init__(self) -> None:
-        self.convolution = nn.Conv2d(64, 128, 3, padding=1)
-        self.images = torch.randn(64, 64, 64, 64, requires_grad=True)
+    Args:
+        device: where it is computed.
+    """
+
+    def __init__(self, device: torch.device = CPU) -> None:
+        self.convolution = nn.Conv2d(64, 128, 3, padding=1, device=device)
+        self.images = torch.randn(64, 64, 64, 64, device=device, requires_grad=True)
 
     def __call__(self) -> None:
         """Compute the forward and the backward pass."""
@@ -53,21 +58,20 @@ OPEN_LOOP = {
 SIX_DOF = {**OPEN_LOOP, "env": {"action_sequence": "pxyzrrr", "in_hand_mode": "proj"}}
 
 
-def _learner(experiment: dict[str, Any], network: dict[str, Any], obs_size: int) -> Algorithm:
-    """Return a learner with the expert's transitions in its replay."""
+def _config(
+    experiment: dict[str, Any], network: dict[str, Any], obs_size: int, device: torch.device
+) -> ExperimentConfig:
+    """Return the configuration of a learner."""
     env = {**experiment.get("env", {}), "obs_size": obs_size}
-    config = ExperimentConfig.parse(
+    return ExperimentConfig.parse(
         {
             **experiment,
             "env": env,
             "network": network,
             "seed": SEED,
-            "device": "cpu",
+            "device": str(device),
         }
     )
-    algorithm = build_algorithm(config)
-    algorithm.on_demonstrations(_expert_episodes(config.task, 20, env)[1])
-    return algorithm
 
 
 def _expert_episodes(
@@ -81,18 +85,38 @@ def _expert_episodes(
     return high, played
 
 
-def _update(bench: Bench, work: str, learner: Algorithm, budget: Budget) -> list[Row]:
-    units, times = bench.time_against(LearningUnit(), {work: learner.update})
-    return [timed_row(work, "s", times[work], units, budget)]
+def measure_update(
+    bench: Bench,
+    work: str,
+    experiment: dict[str, Any],
+    network: dict[str, Any],
+    obs_size: int,
+    budget: Budget,
+) -> list[Row]:
+    """Return the row of a learner's updates, with the expert's transitions in its replay."""
+    config = _config(experiment, network, obs_size, bench.device)
+    learner = build_algorithm(config)
+    learner.on_demonstrations(_expert_episodes(config.task, 20, config.env)[1])
+    product = MatrixProduct(network_dtype(config.network_config, bench.device), bench.device)
+    multiply_adds = count_multiply_adds(learner.update)
+    times = bench.time_against(
+        {"unit": LearningUnit(bench.device), "product": product}, {work: learner.update}
+    )
+    limits = [multiply_adds / product.multiply_adds * value for value in times["product"]]
+    notes = f"{multiply_adds / 1e9:.3g} G multiply-adds, {product.describe(times['product'])}"
+    shown = budget if bench.device.type == "cpu" else None
+    return [timed_row(work, "s", times[work], times["unit"], shown, notes, limits)]
 
 
 @measurement("learning/equi_sacfd_update")
 def equivariant_update(bench: Bench) -> list[Row]:
     """Update of the paper's largest close-loop learner."""
-    return _update(
+    return measure_update(
         bench,
         "Equi SACfD update, batch 64, 128 px, C8, 64 fields",
-        _learner(CLOSE_LOOP, {"name": "equi", "group_order": 8, "n_hidden": 64}, 128),
+        CLOSE_LOOP,
+        {"name": "equi", "group_order": 8, "n_hidden": 64},
+        128,
         Budget("13.5", 2.0, 1.3),
     )
 
@@ -100,10 +124,12 @@ def equivariant_update(bench: Bench) -> list[Row]:
 @measurement("learning/equi_sacfd_update_small")
 def quickstart_update(bench: Bench) -> list[Row]:
     """Update of the learner of `make train`."""
-    return _update(
+    return measure_update(
         bench,
         "Equi SACfD update, batch 64, 64 px, C8, 16 fields",
-        _learner(CLOSE_LOOP, {"name": "equi", "group_order": 8, "n_hidden": 16}, 64),
+        CLOSE_LOOP,
+        {"name": "equi", "group_order": 8, "n_hidden": 16},
+        64,
         Budget("", None, 0.15),
     )
 
@@ -111,10 +137,12 @@ def quickstart_update(bench: Bench) -> list[Row]:
 @measurement("learning/cnn_sacfd_update")
 def plain_update(bench: Bench) -> list[Row]:
     """Update of the paper's plain close-loop learner."""
-    return _update(
+    return measure_update(
         bench,
         "CNN SACfD update, batch 64, 128 px",
-        _learner(CLOSE_LOOP, {"name": "cnn"}, 128),
+        CLOSE_LOOP,
+        {"name": "cnn"},
+        128,
         Budget("1.57", 0.35, 0.2),
     )
 
@@ -122,10 +150,12 @@ def plain_update(bench: Bench) -> list[Row]:
 @measurement("learning/equi_sdqfd_update")
 def equivariant_spatial_update(bench: Bench) -> list[Row]:
     """Update of the paper's equivariant open-loop learner."""
-    return _update(
+    return measure_update(
         bench,
         "SDQfD Equi ASR update, batch 16, 128 px, 16 rotations",
-        _learner(OPEN_LOOP, {"name": "equi_asr"}, 128),
+        OPEN_LOOP,
+        {"name": "equi_asr"},
+        128,
         Budget("40.6", 7.0, 4.0),
     )
 
@@ -133,10 +163,12 @@ def equivariant_spatial_update(bench: Bench) -> list[Row]:
 @measurement("learning/cnn_sdqfd_update")
 def plain_spatial_update(bench: Bench) -> list[Row]:
     """Update of the paper's plain open-loop learner."""
-    return _update(
+    return measure_update(
         bench,
         "SDQfD CNN ASR update, batch 16, 128 px, 16 rotations",
-        _learner(OPEN_LOOP, {"name": "asr"}, 128),
+        OPEN_LOOP,
+        {"name": "asr"},
+        128,
         Budget("3.9", 1.0, 0.5),
     )
 
@@ -144,10 +176,12 @@ def plain_spatial_update(bench: Bench) -> list[Row]:
 @measurement("learning/equi_deictic_sdqfd_update")
 def equivariant_pose_update(bench: Bench) -> list[Row]:
     """Update of the paper's equivariant learner in six degrees of freedom, ramps' image sizes."""
-    return _update(
+    return measure_update(
         bench,
         "SDQfD Equi Deictic ASR update, batch 16, 128 px, 24 px in hand",
-        _learner(SIX_DOF, {"name": "equi_deictic_asr"}, 128),
+        SIX_DOF,
+        {"name": "equi_deictic_asr"},
+        128,
         Budget("", None, None),
     )
 
@@ -155,10 +189,12 @@ def equivariant_pose_update(bench: Bench) -> list[Row]:
 @measurement("learning/cnn_pose_sdqfd_update")
 def plain_pose_update(bench: Bench) -> list[Row]:
     """Update of the paper's plain learner in six degrees of freedom, ramps' image sizes."""
-    return _update(
+    return measure_update(
         bench,
         "SDQfD CNN ASR update in six degrees of freedom, batch 16, 128 px, 24 px in hand",
-        _learner(SIX_DOF, {"name": "asr"}, 128),
+        SIX_DOF,
+        {"name": "asr"},
+        128,
         Budget("", None, None),
     )
 
@@ -177,7 +213,7 @@ def _replay_memory(
     megabytes = storage.nbytes / stored * CAPACITY / 1e6
     notes = f"counted over {stored} transitions, {storage.nbytes / stored:.0f} bytes each"
     work = f"100,000 transitions of 128 px, {task}"
-    return [Row(work, "MB", [megabytes], budget, None, notes)]
+    return [Row(work, "MB", [megabytes], budget, notes=notes)]
 
 
 @measurement("memory/close_loop_replay")

@@ -72,7 +72,7 @@ def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
     return played
 
 
-@measurement("simulation/step", over=list_tasks)
+@measurement("simulation/step", over=lambda: zip(list_tasks()))
 def step_and_reset(bench: Bench, task: str) -> list[Row]:
     """Times of steps and resets of a task under the expert's actions.
 
@@ -129,8 +129,8 @@ def depth_image(bench: Bench) -> list[Row]:
 
     heights = camera.heightmap(center, side_m, pixels)
     np.testing.assert_allclose(plain.heightmap(center, side_m, pixels), heights, atol=1e-12)
-    units, times = bench.time_against(
-        unit,
+    times = bench.time_against(
+        {"unit": unit},
         {
             "compiled": lambda: camera.heightmap(next(centers), side_m, pixels),
             "NumPy": lambda: plain.heightmap(center, side_m, pixels),
@@ -138,6 +138,7 @@ def depth_image(bench: Bench) -> list[Row]:
         },
         repeats=10,
     )
+    units = times.pop("unit")
     cubes = [body.id for body in unit.bodies]
     pybullet.removeBody(unit.robot.id, physicsClientId=unit.world.client)  # the arm occludes cubes
     drawn = np.isin(np.reshape(tiny_renderer()[4], (pixels, pixels)), cubes)

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import version
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass as validated
 from tqdm import tqdm
 
+from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.record.results import processor
 from ba_torchrl.registry import Registry
 
-GROUPS = ("simulation", "learning", "memory")
+GROUPS = ("simulation", "learning", "throughput", "memory")
 
 MEASUREMENTS: Registry[Measurement] = Registry("measurement", "ba_torchrl.profiling")
 
@@ -27,42 +26,78 @@ WARM_UP = 3
 
 PROFILE_ROWS = 40
 
+CPU = torch.device("cpu")
 
-@dataclass(frozen=True)
+
+Unit = Literal["ms", "s", "MB", "frames/s"]
+SECONDS = {"ms": 1e-3, "s": 1.0}
+"""Units of duration."""
+
+Positive = Annotated[float, Field(gt=0)]
+Values = Annotated[tuple[Positive, ...], Field(strict=False)]  # lists become tuples
+
+
+@validated(config=StrictModel.model_config)
 class Budget:
     """Values for comparison with a row, in the row's unit."""
 
     reference: str
     """The reference implementation's figure, on two cores of a Xeon with AMX."""
-    must: float | None
-    aim: float | None
+    must: Positive | None
+    aim: Positive | None
 
 
-@dataclass(frozen=True)
+@validated(config=StrictModel.model_config)
 class Row:
     """A row of the table."""
 
     work: str
-    unit: Literal["ms", "s", "MB"]
-    values: Sequence[float]
+    unit: Unit
+    values: Annotated[Values, Field(min_length=1)]
     """All measurements, in `unit`."""
     budget: Budget | None = None
-    multiple: float | None = None
-    """Median as a multiple of the unit of work."""
+    unit_s: Values = ()
+    """Seconds of the unit of work, timed alternately with the values."""
+    limit_s: Values = ()
+    """Seconds that the row's multiply-adds take in a matrix product, timed alternately."""
     notes: str = ""
+
+    @property
+    def multiple(self) -> float | None:
+        """Median duration in units of work, or frames during a unit; None without a unit."""
+        if not self.unit_s:
+            return None
+        value, unit_s = statistics.median(self.values), statistics.median(self.unit_s)
+        return value * SECONDS[self.unit] / unit_s if self.unit in SECONDS else value * unit_s
+
+    @property
+    def share_of_limit(self) -> float | None:
+        """Median duration of the matrix product as a fraction of the row's; None without."""
+        if not self.limit_s:
+            return None
+        median_s = statistics.median(self.values) * SECONDS[self.unit]
+        return statistics.median(self.limit_s) / median_s
 
 
 class Bench:
-    """Repeats a measurement, and alternates timed calls with a unit of work.
+    """Repeats a measurement, and alternates timed calls with units of work.
 
     Args:
         repeats: rounds of each measurement.
         bar: progress bar of the rounds.
         profiles: receives a profile of each timed call, by name; None for no profiles.
+        device: of the learners.
     """
 
-    def __init__(self, repeats: int, bar: tqdm, profiles: dict[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        repeats: int,
+        bar: tqdm,
+        profiles: dict[str, str] | None = None,
+        device: torch.device = CPU,
+    ) -> None:
         self.repeats = repeats
+        self.device = device
         self._bar = bar
         self._profiles = profiles
 
@@ -73,35 +108,49 @@ class Bench:
             self._bar.update()
 
     def time_against(
-        self, unit: Callable[[], Any], calls: dict[str, Callable[[], Any]], repeats: int = 1
-    ) -> tuple[list[float], dict[str, list[float]]]:
-        """Time calls and a unit of work alternately; return the seconds of each.
+        self,
+        units: Mapping[str, Callable[[], Any]],
+        calls: Mapping[str, Callable[[], Any]],
+        repeats: int = 1,
+    ) -> dict[str, list[float]]:
+        """Time calls and units of work alternately; return the seconds of each, by name.
 
         Args:
-            unit: the unit of work.
+            units: the units of work, by name; they are not profiled.
             calls: the measured calls, by name.
             repeats: number of timed calls in a round.
         """
-        for call in (unit, *calls.values()):
+        timed = {**units, **calls}
+        for call in timed.values():
             for _ in range(WARM_UP):
                 call()
-        units: list[float] = []
-        times: dict[str, list[float]] = {name: [] for name in calls}
+        times: dict[str, list[float]] = {name: [] for name in timed}
         for _ in self.rounds():
             for _ in range(repeats):
-                units.append(seconds(unit))
-                for name, call in calls.items():
-                    times[name].append(seconds(call))
+                for name, call in timed.items():
+                    times[name].append(seconds(call, self.device))
         if self._profiles is not None:
             self._profiles.update({name: operations(call) for name, call in calls.items()})
-        return units, times
+        return times
 
 
-def seconds(call: Callable[[], Any]) -> float:
-    """Return the duration of a call, seconds."""
+def seconds(call: Callable[[], Any], device: torch.device = CPU) -> float:
+    """Return the duration of a call, seconds.
+
+    Args:
+        call: the timed function.
+        device: where it computes; its work ends within the measured time.
+    """
+    _synchronize(device)
     start = time.perf_counter()
     call()
+    _synchronize(device)
     return time.perf_counter() - start
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 def operations(call: Callable[[], Any]) -> str:
@@ -119,20 +168,21 @@ def operations(call: Callable[[], Any]) -> str:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A function that measures rows of the table, and the names for which it is called."""
+    """A function that measures rows of the table, and the arguments for which it is called."""
 
     function: Callable[..., list[Row]]
-    names: Callable[[], Iterable[str]] | None
+    over: Callable[[], Iterable[tuple[Any, ...]]] | None
 
 
 def measurement(
-    name: str, over: Callable[[], Iterable[str]] | None = None
+    name: str, over: Callable[[], Iterable[tuple[Any, ...]]] | None = None
 ) -> Callable[[Callable[..., list[Row]]], Callable[..., list[Row]]]:
     """Return a decorator that adds a function's rows to the table.
 
     Args:
         name: one of `GROUPS`, a slash, and the name of the measurement.
-        over: returns names; the function is called once per name, as its second argument.
+        over: returns tuples; the function is called once per tuple, which holds its arguments after
+            the first.
     """
 
     def decorate(function: Callable[..., list[Row]]) -> Callable[..., list[Row]]:
@@ -143,7 +193,11 @@ def measurement(
 
 
 def measure(
-    which: str, repeats: int, progress: bool = True, profiles: dict[str, str] | None = None
+    which: str,
+    repeats: int,
+    progress: bool = True,
+    profiles: dict[str, str] | None = None,
+    device: torch.device = CPU,
 ) -> list[Row]:
     """Measure one group of the table, a single measurement, or "all".
 
@@ -152,6 +206,7 @@ def measure(
         repeats: rounds of each measurement.
         progress: show a progress bar.
         profiles: receives a profile of each timed call, by name; None for no profiles.
+        device: of the learners.
 
     Raises:
         ConfigError: ``which`` is unknown, or ``repeats`` is below 1.
@@ -171,12 +226,12 @@ def measure(
     rows: list[Row] = []
     with tqdm(total=len(jobs) * repeats, disable=not progress, unit="round") as bar:
         for function, arguments in jobs:
-            rows += function(Bench(repeats, bar, profiles), *arguments)
+            rows += function(Bench(repeats, bar, profiles, device), *arguments)
     return rows
 
 
-def _arguments(entry: Measurement) -> list[tuple[str, ...]]:
-    return [()] if entry.names is None else [(name,) for name in entry.names()]
+def _arguments(entry: Measurement) -> list[tuple[Any, ...]]:
+    return [()] if entry.over is None else list(entry.over())
 
 
 def timed_row(
@@ -186,6 +241,7 @@ def timed_row(
     units: Sequence[float],
     budget: Budget | None = None,
     notes: str = "",
+    limits: Sequence[float] = (),
 ) -> Row:
     """Return a row of measured times.
 
@@ -196,47 +252,50 @@ def timed_row(
         units: seconds of the unit of work, timed alternately.
         budget: reference and limits.
         notes: remarks.
+        limits: seconds of the work's multiply-adds in a matrix product, timed alternately.
     """
-    scale = {"ms": 1e3, "s": 1.0}[unit]
-    multiple = statistics.median(times) / statistics.median(units)
-    return Row(work, unit, [scale * value for value in times], budget, multiple, notes)
+    values = [value / SECONDS[unit] for value in times]
+    return Row(work, unit, values, budget, units, limits, notes)
 
 
-def as_markdown(rows: Sequence[Row]) -> str:
-    """Return the rows as a table in Markdown."""
-    lines = [
-        "| work | median | mean | least | units | reference | must | aim | notes |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+def as_markdown(rows: Sequence[Row], columns: Mapping[str, Callable[[Row], str]]) -> str:
+    """Return a table in Markdown.
+
+    Args:
+        rows: of the table.
+        columns: by heading, the function that returns the cell of a row.
+    """
+    lines = [f"| {' | '.join(columns)} |", f"|{'---|' * len(columns)}"]
     for row in rows:
-        budget = row.budget or Budget("", None, None)
-        cells = [
-            row.work,
-            f"{_digits(statistics.median(row.values))} {row.unit}",
-            _digits(statistics.fmean(row.values)),
-            _digits(min(row.values)),
-            _digits(row.multiple),
-            budget.reference,
-            _digits(budget.must),
-            _digits(budget.aim),
-            row.notes,
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
+        lines.append(f"| {' | '.join(cell(row) for cell in columns.values())} |")
     return "\n".join(lines)
 
 
-def _digits(value: float | None) -> str:
+def digits(value: float | None) -> str:
     """Return a number with three significant digits."""
     if value is None:
         return ""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def machine() -> str:
-    """Return processor, package versions, date and load of the machine."""
-    packages = ", ".join(f"{name} {version(name)}" for name in ("torch", "torchrl", "pybullet"))
-    load = f", load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-    return (
-        f"{processor()}, {os.cpu_count()} cores, {torch.get_num_threads()} torch threads; "
-        f"{packages}; {datetime.now(UTC):%Y-%m-%d}{load}"
-    )
+def _share(row: Row) -> str:
+    return "" if row.share_of_limit is None else f"{row.share_of_limit:.0%}"
+
+
+def _budget(row: Row) -> Budget:
+    return row.budget or Budget("", None, None)
+
+
+COLUMNS: dict[str, Callable[[Row], str]] = {
+    "work": lambda row: row.work,
+    "median": lambda row: f"{digits(statistics.median(row.values))} {row.unit}",
+    "mean": lambda row: digits(statistics.fmean(row.values)),
+    "least": lambda row: digits(min(row.values)),
+    "units": lambda row: digits(row.multiple),
+    "share of the limit": _share,
+    "reference": lambda row: _budget(row).reference,
+    "must": lambda row: digits(_budget(row).must),
+    "aim": lambda row: digits(_budget(row).aim),
+    "notes": lambda row: row.notes,
+}
+"""Columns of the table; docs/performance.md describes them."""

@@ -169,9 +169,7 @@ class ExperimentConfig(StrictModel):
     @property
     def torch_device(self) -> torch.device:
         """The learner's device."""
-        if self.device == "auto":
-            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        return torch.device(self.device)
+        return _as_device(self.device)
 
     @property
     def folder(self) -> Path:
@@ -219,11 +217,7 @@ class ExperimentConfig(StrictModel):
                 f"logger: {config.logger!r} needs a package that is not installed: "
                 f"pip install 'ba-torchrl[{config.logger}]'"
             )
-        try:
-            torch.zeros(1, device=config.torch_device).item()
-        except (RuntimeError, AssertionError, NotImplementedError) as error:
-            reason = str(error).splitlines()[0]
-            raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
+        usable_device(config.device)
         return config.model_copy(update={"plugins": config._all_plugins()})
 
     def _all_plugins(self) -> list[str]:
@@ -249,6 +243,30 @@ class ExperimentConfig(StrictModel):
             )
         if self.demonstrations_path is not None:
             check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
+
+
+def usable_device(name: str) -> torch.device:
+    """Return a device that can compute.
+
+    Args:
+        name: as of `torch.device`; "auto" for a GPU if there is one, else the CPU.
+
+    Raises:
+        ConfigError: there is no such device.
+    """
+    try:
+        device = _as_device(name)
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
+    return device
+
+
+def _as_device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(name)
 
 
 def choose(registry: Any, values: dict[str, Any], kind: str) -> Any:

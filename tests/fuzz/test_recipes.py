@@ -22,6 +22,7 @@ WORK = {
     "experts": "expert_scores",
     "play": "record_episodes",
     "soak": "run_soak",
+    "speed": "measure",
     "evaluate": None,  # there is no checkpoint
 }
 """The first call that works, by recipe."""

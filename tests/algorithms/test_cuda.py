@@ -1,0 +1,83 @@
+"""Learners on a GPU."""
+
+import dataclasses
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tqdm import tqdm
+
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+from ba_torchrl.config import parse
+from ba_torchrl.profiling import learning
+from ba_torchrl.profiling.table import Bench, Budget
+from tests.algorithms.tiny import OPEN, SIZES, make_experiment, problem, run, transitions
+
+pytestmark = pytest.mark.cuda
+
+SACFD = {"name": "sac", "demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
+
+
+def build(network, device):
+    """A learner that computes in float32."""
+    torch.manual_seed(0)
+    config = parse(NETWORKS[network], {**SIZES[network], "precision": "float32"}, network)
+    return ALGORITHMS["sac"]().build(config, dataclasses.replace(problem(), device=device))
+
+
+def parameters(learner):
+    return dict(learner.loss.named_parameters())
+
+
+@pytest.mark.parametrize(
+    ("network", "algorithm", "changes"),
+    [
+        ("cnn", SACFD, {}),
+        ("equi", SACFD, {}),
+        ("cnn", {"name": "rlpd", "replay": "symmetric"}, {}),
+        ("cnn", {"name": "iql"}, {"pretrain_updates": 1}),
+        ("cnn", {"name": "bc"}, {}),
+        ("cnn", {"name": "dagger"}, {}),
+        ("asr", {"name": "spatial_q", "demonstrations": "sdqfd"}, OPEN),
+    ],
+    ids=["sacfd cnn", "sacfd equi", "rlpd", "iql", "bc", "dagger", "sdqfd asr"],
+)
+def test_a_run_learns_on_the_device_and_its_state_loads_on_the_cpu(
+    network, algorithm, changes, tmp_path, cuda
+):
+    learner = run(tmp_path, network, algorithm, **changes, device=str(cuda))
+    found = parameters(learner)
+    assert {value.device.type for value in found.values()} == {cuda.type}
+    assert all(value.isfinite().all() for value in found.values())
+    other = make_experiment(tmp_path / "cpu", network, algorithm, **changes, device="cpu").algorithm
+    assert any(not torch.equal(value.cpu(), parameters(other)[key]) for key, value in found.items())
+    other.load_state_dict(learner.state_dict())
+    for key, value in parameters(other).items():
+        torch.testing.assert_close(value, found[key].cpu(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("network", ["cnn", "equi"])
+def test_actions_are_those_of_the_cpu(network, cuda):
+    here, there = (build(network, device) for device in (torch.device("cpu"), cuda))
+    there.load_state_dict(here.state_dict())
+    states = transitions(here).select(*here.observation_keys)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        actions = here.policy(states.clone())["action"]
+        found = there.policy(states.to(cuda))["action"]
+    assert actions.std(dim=0).max() > 0
+    torch.testing.assert_close(found.cpu(), actions, rtol=1e-3, atol=1e-4)
+
+
+def test_speed_of_an_update(cuda):
+    experiment = {"task": "close_loop/block_reaching", "algorithm": {"name": "sac"}}
+    with tqdm(disable=True) as bar:
+        (row,) = learning.measure_update(
+            Bench(3, bar, device=cuda),
+            "update",
+            experiment,
+            {"name": "cnn"},
+            64,
+            Budget("1", 1.0, 1.0),
+        )
+    assert row.budget is None  # the budgets are those of a CPU
+    assert 0 < row.share_of_limit < 1

@@ -1,0 +1,115 @@
+"""Values that measurements add to the table: share of the limit and frames per second."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from tqdm import tqdm
+
+from ba_torchrl.profiling import learning, limits, throughput
+from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
+from ba_torchrl.profiling.table import COLUMNS, Bench, Budget, Row, as_markdown
+
+
+def test_multiply_adds_of_forward_and_backward():
+    left, right = torch.randn(3, 4), torch.randn(4, 5, requires_grad=True)
+    assert count_multiply_adds(lambda: left @ right) == 3 * 4 * 5
+    assert count_multiply_adds(lambda: (left @ right).sum().backward()) == 2 * 3 * 4 * 5
+
+
+@pytest.mark.parametrize("groups", [1, 2, 4])
+def test_multiply_adds_of_a_grouped_convolution(groups):
+    images = torch.randn(2, 8, 9, 9, requires_grad=True)
+    filters = torch.randn(12, 8 // groups, 3, 3, requires_grad=True)
+    forward = 2 * 12 * 9 * 9 * (8 // groups) * 3 * 3
+
+    def call():
+        F.conv2d(images, filters, padding=1, groups=groups).sum().backward()
+
+    assert count_multiply_adds(call) == 3 * forward
+
+
+def test_share_of_the_limit():
+    row = Row("update", "ms", [40.0, 50.0, 90.0], limit_s=[0.01, 0.02, 0.1])
+    assert row.share_of_limit == pytest.approx(0.4)
+    assert as_markdown([row], COLUMNS).splitlines()[-1].split("|")[6] == " 40% "
+    assert Row("step", "ms", [1.0]).share_of_limit is None
+
+
+def test_an_update_has_a_limit(monkeypatch):
+    monkeypatch.setitem(limits.SIZE, "cpu", 64)
+    monkeypatch.setattr(learning, "LearningUnit", lambda _: lambda: None)
+    experiment = {
+        "task": "close_loop/block_reaching",
+        "algorithm": {"name": "sac", "batch_size": 2},
+    }
+    with tqdm(disable=True) as bar:
+        (row,) = learning.measure_update(
+            Bench(2, bar),
+            "update",
+            experiment,
+            {"name": "cnn", "width": 0.125, "precision": "float32"},
+            64,
+            Budget("", None, None),
+        )
+    assert len(row.values) == len(row.unit_s) == len(row.limit_s) == 2
+    assert 0 < row.share_of_limit < 1
+    assert "multiply-adds, float32 matrix product" in row.notes
+
+
+def test_the_matrix_product_has_the_format_of_the_network():
+    product = MatrixProduct(torch.bfloat16, torch.device("cpu"))
+    assert product.multiply_adds == limits.SIZE["cpu"] ** 3
+    assert product.describe([1.0, 2.0, 4.0]) == "bfloat16 matrix product 4.29 G/s"
+
+
+def test_frames_per_second(monkeypatch):
+    # Forking is fast; it needs a process without an open simulator, so workers come first.
+    options = {"parallel": True, "start_method": "fork"}
+    vectors = {
+        "workers, shared memory": {**options, "use_buffers": True},
+        "workers, pipes": {**options, "use_buffers": False},
+        "one process": {"parallel": False},
+    }
+    monkeypatch.setattr(throughput, "VECTORS", vectors)
+    monkeypatch.setattr(throughput, "STEPS", 3)
+    with tqdm(disable=True) as bar:
+        rows = throughput.collection(Bench(2, bar), "close_loop/block_reaching", 2)
+    assert [row.work for row in rows] == [
+        f"close_loop/block_reaching, collection, 2 environments, {name}" for name in vectors
+    ]
+    for row in rows:
+        assert row.unit == "frames/s"
+        assert len(row.values) == 2
+        assert all(1 < value < 20_000 for value in row.values)
+        assert row.multiple == pytest.approx(
+            sum(row.values) / 2 * sum(row.unit_s) / 2
+        )  # frames during a unit
+
+
+def test_frames_per_second_count_all_environments(monkeypatch):
+    monkeypatch.setattr(throughput, "VECTORS", {"one process": {"parallel": False}})
+    monkeypatch.setattr(throughput, "STEPS", 4)
+    monkeypatch.setattr(throughput, "make_vector_env", lambda *_, **__: None)
+    taken = []
+
+    class Collector:
+        def __init__(self, env, policy, *, frames_per_batch, **_):
+            assert policy is None
+            taken.append(frames_per_batch)
+
+        def __iter__(self):
+            return iter(range(100))
+
+        def shutdown(self):
+            taken.append("closed")
+
+    monkeypatch.setattr(throughput, "Collector", Collector)
+
+    class Halves(Bench):
+        def time_against(self, units, calls, repeats=1):
+            return {name: [0.5, 0.5] for name in {**units, **calls}}
+
+    with tqdm(disable=True) as bar:
+        (row,) = throughput.collection(Halves(2, bar), "close_loop/block_reaching", 5)
+    assert taken == [20, "closed"]
+    assert list(row.values) == [40.0, 40.0]

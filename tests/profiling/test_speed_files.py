@@ -1,0 +1,238 @@
+"""Files of measured rows: written, read, compared; only documented errors."""
+
+import importlib.util
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hypothesis import strategies as st
+
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.profiling import speed_file
+from ba_torchrl.profiling.comparison import Change, columns_of_changes, ratio_of_medians
+from ba_torchrl.profiling.speed_file import (
+    Machine,
+    SpeedFile,
+    check_output,
+    read_speed_file,
+    write_speed_file,
+)
+from ba_torchrl.profiling.table import COLUMNS, Budget, Row, as_markdown
+from tests.fuzz.values import JSON, check, examples
+
+ROOT = Path(__file__).parents[2]
+ROWS = [
+    Row("update", "s", [1.5, 1.25, 2.0], Budget("13.5", 2.0, None), [0.5, 0.25], [0.125], "a note"),
+    Row("replay", "MB", [38.8]),
+]
+
+
+@pytest.fixture
+def content():
+    return SpeedFile(machine=Machine.here(torch.device("cpu")), rows=ROWS)
+
+
+def test_a_file_holds_all_values_machine_versions_date_and_commit(tmp_path, content):
+    path = write_speed_file(tmp_path / "speed.json", content)
+    assert read_speed_file(path) == content
+    values = json.loads(path.read_text())
+    assert values["rows"][0]["values"] == [1.5, 1.25, 2.0]
+    assert values["rows"][0]["unit_s"] == [0.5, 0.25]
+    assert values["machine"]["versions"]["torch"] == torch.__version__
+    assert values["machine"]["threads"] == torch.get_num_threads()
+    assert values["machine"]["date"] > "2026"
+
+
+def test_the_commit_is_that_of_the_repository(tmp_path, monkeypatch):
+    monkeypatch.setattr(speed_file, "_REPOSITORY", tmp_path)
+    assert Machine.here(torch.device("cpu")).commit is None
+    git = ["git", "-c", "user.name=a", "-c", "user.email=b", "-C", tmp_path]
+    for command in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "first"]):
+        subprocess.run([*git, *command], check=True)
+    head = subprocess.run(
+        [*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True
+    ).stdout
+    commit = Machine.here(torch.device("cpu")).commit
+    assert len(commit) >= 7
+    assert head.startswith(commit)
+
+
+def test_the_limit_of_instruction_sets_is_shown(monkeypatch):
+    monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", "AVX512_CORE")
+    machine = Machine.here(torch.device("cpu"))
+    assert machine.onednn_max_cpu_isa == "AVX512_CORE"
+    assert "ONEDNN_MAX_CPU_ISA=AVX512_CORE" in str(machine)
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda values: [1], "content: "),
+        (lambda values: {**values, "format": 2}, "format: "),
+        (lambda values: {**values, "machine": {}}, "machine.cpu: "),
+        (lambda values: {**values, "rows": [{**values["rows"][0], "values": []}]}, "rows.0.values"),
+        (lambda values: {**values, "rows": [{**values["rows"][0], "values": [0.0]}]}, "greater"),
+        (lambda values: {**values, "rows": [{**values["rows"][0], "unit": "h"}]}, "rows.0.unit"),
+        (lambda values: {**values, "rows": [{**values["rows"][0], "new": 1}]}, "rows.0.new"),
+    ],
+)
+def test_a_foreign_file_is_refused_in_one_line(damage, reason, tmp_path, content):
+    path = write_speed_file(tmp_path / "speed.json", content)
+    path.write_text(json.dumps(damage(json.loads(path.read_text()))))
+    with pytest.raises(ConfigError, match=reason) as raised:
+        read_speed_file(path)
+    assert str(raised.value).startswith(f"{path} is not a file that recipes/speed.py wrote (")
+    assert "\n" not in str(raised.value)
+
+
+@examples(100)
+def test_damaged_files_are_refused(tmp_path, count):
+    def prop(data):
+        path = tmp_path / "speed.json"
+        path.write_bytes(data if isinstance(data, bytes) else json.dumps(data).encode())
+        with pytest.raises(ConfigError):
+            read_speed_file(path)
+
+    check(count, st.one_of(st.binary(max_size=40), JSON), prop)
+
+
+@pytest.fixture
+def recipe(monkeypatch, tmp_path):
+    """A function that runs the recipe in a folder of its own, with arguments."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["speed.py"])
+    spec = importlib.util.spec_from_file_location("speed", ROOT / "recipes" / "speed.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def run(*arguments):
+        with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
+            module.main.__wrapped__(compose("speed", overrides=list(arguments)))
+
+    return run
+
+
+def test_the_recipe_writes_a_file_and_compares_with_it(recipe, tmp_path, content, capsys):
+    old = Row("depth image, 128 px, compiled", "ms", [1e3] * 20, unit_s=[1.0] * 20)
+    write_speed_file(tmp_path / "old.json", SpeedFile(machine=content.machine, rows=[old]))
+    recipe(
+        "which=simulation/depth_image",
+        "repeats=1",
+        "compare=old.json",
+        "output=new/speed.json",
+    )
+    header, _, *rows, empty, where, other = capsys.readouterr().out.strip().split("\n")
+    assert (empty, other) == ("", f"old: {content.machine}")
+    cells = [
+        dict(
+            zip(
+                *([cell.strip() for cell in line.split("|")[1:-1]] for line in (header, row)),
+                strict=True,
+            )
+        )
+        for row in rows
+    ]
+    assert cells[0]["work"] == old.work
+    assert cells[0]["old median"] == "1000"
+    assert cells[0]["difference"] == "above noise"
+    assert float(cells[0]["new / old"].split()[0]) < 0.1
+    assert cells[1]["old median"] == cells[1]["difference"] == ""
+    new = read_speed_file(tmp_path / "new" / "speed.json")
+    assert str(new.machine) == where
+    assert [row.work for row in new.rows] == [row["work"] for row in cells]
+    assert len(new.rows[0].values) == len(new.rows[0].unit_s) == 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["compare=none.json"], "error: cannot read none.json: No such file or directory"),
+        (["compare=."], "error: cannot read .: Is a directory"),
+        (["output=speed.csv"], "error: output: the file ends in .json, not 'speed.csv'"),
+        (["repeats=few"], "error: repeats: must be a whole number of at least 1, got 'few'"),
+        (["device=nothing"], "error: device: use device=cpu or device=auto"),
+    ],
+)
+def test_mistakes_are_reported_in_one_line_before_the_measurement(
+    arguments, message, recipe, capsys
+):
+    with pytest.raises(SystemExit) as ended:
+        recipe(*arguments)
+    assert ended.value.code == 2
+    out, error = capsys.readouterr()
+    assert error.startswith(message)
+    assert error.count("\n") == 1
+    assert out == ""
+
+
+def test_other_suffixes_are_refused():
+    check_output("a/b.json")
+    with pytest.raises(ConfigError, match=r"ends in \.json"):
+        check_output("a/json")
+
+
+# -- noise -----------------------------------------------------------------------------------------
+
+
+def samples(median, count, rng):
+    """Times with a long upper tail, as a busy machine has."""
+    return (median * (1 + rng.exponential(0.1, count))).tolist()
+
+
+def test_equal_samples_are_within_the_noise_and_different_ones_above_it():
+    rng = np.random.default_rng(0)
+    ratios = [
+        ratio_of_medians([samples(1.0, 20, rng)], [samples(1.0, 20, rng)]) for _ in range(100)
+    ]
+    assert sum(ratio.is_above_noise for ratio in ratios) <= 9  # 95 % interval
+    ratios = [ratio_of_medians([samples(1.2, 20, rng)], [samples(1.0, 20, rng)]) for _ in range(50)]
+    assert sum(ratio.is_above_noise for ratio in ratios) >= 45
+    assert np.median([ratio.value for ratio in ratios]) == pytest.approx(1.2, rel=0.02)
+
+
+def test_values_that_depend_on_the_one_before_have_a_wider_interval():
+    rng = np.random.default_rng(0)
+    drawn = [np.repeat(samples(1.0, 20, rng), 10).tolist() for _ in range(200)]
+    ratios = [
+        ratio_of_medians([new], [old]) for new, old in zip(drawn[::2], drawn[1::2], strict=True)
+    ]
+    assert sum(ratio.is_above_noise for ratio in ratios) <= 9
+
+
+def test_few_values_have_no_interval():
+    ratio = ratio_of_medians([[1.0] * 5], [[2.0] * 20])
+    assert (ratio.value, ratio.interval, ratio.is_above_noise) == (0.5, None, None)
+    assert ratio_of_medians([[1.0] * 6], [[2.0] * 6]).interval == (0.5, 0.5)
+    assert ratio_of_medians([[1.0] * 6], [[2.0] * 47]).interval == (0.5, 0.5)
+
+
+def test_units_cancel_the_speed_of_the_machine():
+    """The new machine takes twice the time for everything; the work itself is unchanged."""
+    old = Row("work", "ms", [10.0] * 8, unit_s=[1.0] * 8)
+    change = Change.between(old, Row("work", "ms", [20.0] * 8, unit_s=[2.0] * 8))
+    assert (change.of_values.value, change.of_units.value) == (2.0, 1.0)
+    assert change.of_values.is_above_noise
+    assert change.difference == "within noise"
+    old = Row("work", "frames/s", [10.0] * 8, unit_s=[1.0] * 8)
+    change = Change.between(old, Row("work", "frames/s", [5.0] * 8, unit_s=[2.0] * 8))
+    assert (change.of_values.value, change.of_units.value) == (0.5, 1.0)
+    assert change.of_units.value == 5.0 * 2.0 / (10.0 * 1.0)
+
+
+def test_rows_without_a_unit_of_work_compare_by_value():
+    change = Change.between(Row("memory", "MB", [50.0]), Row("memory", "MB", [40.0]))
+    assert (change.of_values.value, change.of_units, change.difference) == (0.8, None, "")
+
+
+def test_rows_are_compared_with_those_of_the_same_work_and_unit():
+    old = [Row("a", "ms", [1.0] * 8), Row("b", "ms", [1.0] * 8), Row("c", "s", [1.0] * 8)]
+    new = [Row("a", "ms", [3.0] * 8), Row("b", "s", [1.0] * 8), Row("d", "s", [1.0] * 8)]
+    columns = {"work": COLUMNS["work"], **columns_of_changes(old, new)}
+    lines = as_markdown(new, columns).splitlines()
+    assert lines[0] == "| work | old median | new / old | new / old, units | difference |"
+    assert lines[2] == "| a | 1 | 3 (3 to 3) |  | above noise |"
+    assert lines[3:] == ["| b |  |  |  |  |", "| d |  |  |  |  |"]
