@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.geometry import Pose, tool_angles
 from ba_torchrl.tasks.workspace import Workspace
@@ -39,6 +41,19 @@ def carrying_pose(tool: Pose, held: Pose, target: Pose) -> Pose:
         target: target pose of the held body.
     """
     return target.compose(held.inverse().compose(tool))
+
+
+def swaps_fingers(tool: Pose) -> bool:
+    """Whether an action with yaws in [0, pi] turns the tool by half a turn about its own axis.
+
+    Such an action brings the fingers to the pose, but reverses a held body in it: the error of the
+    place is twice the body's tilt and distance from the centre of the tool.
+
+    Args:
+        tool: pose of the tool.
+    """
+    rz, _, _ = tool_angles(tool.orientation)
+    return abs(rz) >= ROUNDING_RAD and rz % (2 * math.pi) > math.pi
 
 
 def no_op(workspace: Workspace, is_holding: bool) -> PickPlaceCommand:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ba_torchrl.actions import PICK, PLACE
+from ba_torchrl.actions import PICK, PLACE, OpenLoopActions
 from ba_torchrl.sim.geometry import Pose, downward_pose
 from ba_torchrl.tasks.pick_place_commands import (
     LEVEL_RAD,
@@ -14,6 +14,7 @@ from ba_torchrl.tasks.pick_place_commands import (
     no_op,
     pick_command,
     place_command,
+    swaps_fingers,
 )
 from ba_torchrl.tasks.workspace import Workspace
 
@@ -85,3 +86,11 @@ def test_a_no_op_is_in_the_corner_of_the_workspace():
     workspace = Workspace(x=(0.2, 0.6), y=(-0.3, 0.1), z=(0.0, 0.4))
     assert no_op(workspace, is_holding=False)[:3] == (PICK, 0.2, -0.3)
     assert no_op(workspace, is_holding=True)[:3] == (PLACE, 0.2, -0.3)
+
+
+@pytest.mark.parametrize("rz", [-3.0, -0.4, -1e-12, 0.0, 0.4, 3.0])
+def test_yaws_outside_of_half_a_turn_swap_the_fingers(rz):
+    pose = pose_of((0.4, 0.1, 0.05), rz, 0.2, -0.1, flip=True)
+    actions = OpenLoopActions("xyrrr", ((0.2, 0.6), (-0.2, 0.2), (0.0, 0.4)))
+    executed = actions.decode(actions.encode(pick_command(pose)))
+    assert swaps_fingers(pose) == (executed.ry_rad < 0)

@@ -12,7 +12,7 @@ from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.control.limits import PickPlaceLimits
-from ba_torchrl.sim.geometry import Pose, Vector, tool_angles
+from ba_torchrl.sim.geometry import Pose, Vector
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
@@ -27,6 +27,7 @@ from ba_torchrl.tasks.pick_place_commands import (
     no_op,
     pick_command,
     place_command,
+    swaps_fingers,
 )
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 from ba_torchrl.tasks.structures.parts import CUBOID
@@ -318,9 +319,7 @@ class Palletizing:
         for yaw in (heading + turn, heading + turn + math.pi):
             target = release_pose(CUBOID, held, Pose(position), yaw)
             pose = carrying_pose(tool, held.pose, target)
-            # a half turn of the tool would double the tilt of the box
-            is_allowed = tool_angles(pose.orientation)[0] % (2 * math.pi) <= math.pi
-            if is_allowed and is_reachable(
+            if not swaps_fingers(pose) and is_reachable(
                 self.robot, self.terrain.support_ids, pose, PickPlaceLimits().pre_place_height_m
             ):
                 return place_command(tool, held.pose, target)

@@ -78,6 +78,8 @@ class GraspCandidate(NamedTuple):
     """Range that the far finger sweeps as it closes, for a grasp with a shift."""
     near_finger_range_m: tuple[float, float] = (0.0, 0.0)
     """Range in which the near finger descends beside the piece, for a grasp with a shift."""
+    middle_m: float = 0.0
+    """Middle of the piece, at which a centred grasp has the same space for both fingers."""
     along_m: float = 0.0
     """Position of the tool perpendicular to the closing axis, along the length of the piece."""
     tool: Quaternion | None = None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, footprint_radius_m
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, world_vertices
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
     Pose,
@@ -94,6 +94,10 @@ class GraspSelector:
         if self.limits.can_tilt and piece.tilt_rad(body) >= LEVEL_RAD:
             tools = tilted_tools(piece, body)
             candidates = [GraspCandidate(quaternion_yaw(tool), tool=tool) for tool in tools]
+        if self.limits.can_tilt:
+            candidates = [
+                candidate._replace(middle_m=_middle_m(body, candidate)) for candidate in candidates
+            ]
         centered = tuple(candidates)
         if self.limits.can_tilt and len(piece.grasp_yaws_rad) == 1:
             yaw = piece.grasp_yaws_rad[0]
@@ -114,7 +118,9 @@ class GraspSelector:
                     if candidate.tool is None:
                         candidates.append(edge)
                     else:
-                        candidates.append(candidate._replace(shift_m=side * edge.shift_m))
+                        candidates.append(
+                            candidate._replace(shift_m=side * edge.shift_m, middle_m=0.0)
+                        )
         return candidates
 
     def is_free(self, body: Body) -> bool:
@@ -213,7 +219,9 @@ class GraspSelector:
         gripper, yaw = self.robot.gripper, candidate.yaw_rad
         if candidate.tool is not None:
             tool = Pose(grasp, candidate.tool)
-            return tool_clearance_m(self.robot, tool, others, self.finger_opening)
+            return tool_clearance_m(
+                self.robot, tool, others, self.finger_opening, with_knuckles=True
+            )
         if candidate.shift_m:
             far = (candidate.far_finger_range_m,)
             fingers = path_clearance_m(gripper, body, yaw, far, others, at)
@@ -229,8 +237,19 @@ class GraspSelector:
 def _tool_position(position: Vector, candidate: GraspCandidate) -> Vector:
     """Return the position of the tool for a grasp of a body at a position."""
     x, y, z = position
+    across_m = candidate.shift_m + candidate.middle_m
     if candidate.tool is None:
         frame = PlanarFrame(x, y, candidate.yaw_rad)
-        return *frame.to_world(candidate.shift_m, candidate.along_m), z
-    offset = (candidate.shift_m, -candidate.along_m, 0.0)  # the y axis of a tool is reversed
+        return *frame.to_world(across_m, candidate.along_m), z
+    offset = (across_m, -candidate.along_m, 0.0)  # the y axis of a tool is reversed
     return Pose(position, candidate.tool).compose(Pose(offset)).position
+
+
+def _middle_m(body: Body, candidate: GraspCandidate) -> float:
+    """Return the middle of a body along the closing axis, relative to its origin."""
+    yaw = candidate.yaw_rad
+    axis = (math.cos(yaw), math.sin(yaw), 0.0)
+    if candidate.tool is not None:
+        axis = tuple(row[0] for row in quaternion_matrix(candidate.tool))
+    distances = (world_vertices(body) - body.position) @ axis
+    return float(distances.min() + distances.max()) / 2

@@ -24,6 +24,7 @@ from ba_torchrl.tasks.pick_place_commands import (
     no_op,
     pick_command,
     place_command,
+    swaps_fingers,
 )
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, GraspQueries
 from ba_torchrl.tasks.structures.free_space import PlacementArea
@@ -244,13 +245,18 @@ class PickPlaceExpert(GraspQueries):
         return [release_pose(move.piece, move.body, origin, yaw) for yaw in yaws]
 
     def _best_release(self, move: Move) -> Pose:
-        """Return the pose of the held body at its release, the best of those within reach."""
+        """Return the pose of the held body at its release, the best of those within reach.
+
+        Poses that the tool reaches without a half turn come first: the held body may be tilted or
+        off the centre of the fingers.
+        """
         tool, held = self.robot.tool_frame(), move.body.pose
-        ranked = sorted(
-            self._release_poses(move),
-            key=lambda pose: self._release_clearance_m(move, pose),
-            reverse=True,
-        )
+
+        def quality(pose: Pose) -> tuple[bool, float]:
+            is_exact = not swaps_fingers(carrying_pose(tool, held, pose))
+            return is_exact, self._release_clearance_m(move, pose)
+
+        ranked = sorted(self._release_poses(move), key=quality, reverse=True)
         supports, clearance_m = self.terrain.support_ids, PickPlaceLimits().pre_place_height_m
         reachable = (
             pose

@@ -1,0 +1,91 @@
+"""Grasps and releases of the expert for structures, with six degrees of freedom."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
+from ba_torchrl.envs import keys
+from ba_torchrl.sim.bodies import world_vertices
+from ba_torchrl.sim.geometry import (
+    Pose,
+    matrix_quaternion,
+    quaternion_product,
+    rotation_array,
+    surface_quaternion,
+    tool_rotation,
+    yaw_quaternion,
+)
+from ba_torchrl.tasks.structures.parts import CUBOID
+
+OFF_CENTRE_M = 0.025
+IMPROVISED = "ramp/improvise_house_building_3"
+
+
+def hold_off_centre(env, seed):
+    """Hold the cuboid beside its centre, rolled about its length; return the state and cuboid."""
+    state = env.reset(seed=seed)
+    task = env.scene.task
+    body = next(body for body in task.objects if body.name.startswith("cuboid"))
+    x, y, z = body.position
+    yaw = CUBOID.yaw_rad(body) % math.pi
+    about_length = (0.0, math.sin(0.05), 0.0, math.cos(0.05))
+    body.set_pose((x, y, z + 0.02), quaternion_product(yaw_quaternion(yaw), about_length))
+    at = Pose((x, y, z), yaw_quaternion(yaw)).compose(Pose((0.0, OFF_CENTRE_M, 0.0))).position
+    pick = env.actions.encode(PickPlaceCommand(PICK, *at[:2], z + 0.02, yaw))
+    state = env.step(state.set(keys.ACTION, env.action_spec.zero() + pick))[keys.NEXT]
+    assert env.scene.robot.held_body() is body
+    in_tool = env.scene.robot.tool_frame().inverse().compose(body.pose)
+    assert abs(in_tool.position[1]) > OFF_CENTRE_M / 2
+    return body
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_piece_that_is_held_off_its_centre_is_released_at_its_position(make_env, seed):
+    env = make_env("ramp/house_building_3", robot="panda")
+    body = hold_off_centre(env, seed)
+    task, robot = env.scene.task, env.scene.robot
+    expert = task.expert
+    move = expert.structure.planner.next_move(expert._placement_area(), body, expert)
+    command = env.actions.decode(env.actions.encode(task.expert_command()))
+    assert command.primitive == PLACE
+    tool = Pose(command[1:4], matrix_quaternion(tool_rotation(*command.angles_rad)))
+    released = tool.compose(robot.tool_frame().inverse().compose(body.pose))
+    assert math.dist(released.position, move.position) < 2e-3
+
+
+@pytest.mark.parametrize("robot", ["kuka", "ur5"])
+@pytest.mark.parametrize("seed", range(3))
+def test_centred_grasps_have_the_same_space_on_both_sides_of_a_shape(make_env, robot, seed):
+    env = make_env(IMPROVISED, robot=robot)
+    env.reset(seed=seed)
+    grasps = env.scene.task.expert.grasps
+    for body in env.scene.task.objects:
+        centred = [c for c in grasps.candidates(body) if not c.shift_m and not c.along_m]
+        assert centred
+        for candidate in centred:
+            tool = grasps.tool_pose(body, candidate)
+            position = np.subtract(tool.position, (0.0, 0.0, grasps._raise_m(body, candidate)))
+            extents = (world_vertices(body) - position) @ rotation_array(tool.orientation)[:, 0]
+            assert extents.min() == pytest.approx(-extents.max(), abs=1e-6)
+
+
+def test_a_tilted_grasp_has_no_clearance_where_the_knuckles_touch_a_piece(make_env):
+    env = make_env(IMPROVISED, robot="ur5_robotiq")
+    env.reset(seed=0)
+    grasps = env.scene.task.expert.grasps
+    roof, cuboid = (
+        next(body for body in env.scene.task.objects if body.name.startswith(name))
+        for name in ("roof", "cuboid")
+    )
+    normal = (math.sin(0.3), 0.0, math.cos(0.3))
+    roof.set_pose((0.45, 0.0, 0.1), surface_quaternion(normal, math.pi / 2))
+    candidate = next(c for c in grasps.candidates(roof) if c.tool is not None)
+    tool = grasps.tool_pose(roof, candidate)
+    half_m = np.ptp(cuboid.shape.vertices[:, 0]) / 2
+    # its side is beyond the fingers and below the palm
+    at = tool.compose(Pose((0.066 + half_m, 0.0, -0.05))).position
+    cuboid.set_pose(at, tool.orientation)
+    clearance_m = grasps.candidate_clearance_m(roof, candidate, [cuboid], None)
+    assert clearance_m < 0
