@@ -56,6 +56,9 @@ class SACConfig(LearnerConfig):
     """Entropy that the temperature is tuned for, nats."""
     entropy_backup: bool = True
     """Whether targets have the entropy term."""
+    bootstrap_truncated: bool = True
+    """Whether targets bootstrap on steps that the time limit truncates; the reference
+    implementation does not."""
     demonstration_weight: float = Field(default=1.0, ge=0)
     """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
     exploration_noise: float = Field(default=0.0, ge=0)
@@ -175,6 +178,8 @@ class SAC(Learner):
             contrastive=self._make_contrastive(networks.encoder),
             contrastive_weight=config.contrastive_weight,
         )
+        if not config.bootstrap_truncated:
+            loss.set_keys(terminated=loss.tensor_keys.done)
         return loss.make_value_estimator(gamma=config.gamma)
 
     def _make_contrastive(self, encoder: nn.Module) -> BilinearInfoNCE | None:

@@ -148,6 +148,20 @@ def test_a_target_is_the_reward_plus_the_discounted_value():
     torch.testing.assert_close(target - reward, 0.7 * (undiscounted - reward))
 
 
+@pytest.mark.parametrize("bootstraps", [True, False])
+def test_targets_of_truncated_steps_bootstrap_if_configured(bootstraps):
+    sac = build("sac", bootstrap_truncated=bootstraps, alpha_init=1e-8)
+    batch = transitions(sac)
+    for key in (keys.TRUNCATED, keys.DONE):
+        batch[keys.NEXT, key] |= True
+    with torch.no_grad():
+        target = sac.loss._target(batch)
+    assert torch.equal(target, batch[keys.NEXT, keys.REWARD]) != bootstraps
+    batch[keys.NEXT, keys.TERMINATED] |= True
+    with torch.no_grad():
+        assert torch.equal(sac.loss._target(batch), batch[keys.NEXT, keys.REWARD])
+
+
 def test_the_terms_of_sac_have_their_values():
     loss = build("sac").loss
     assert float(loss.alpha) == pytest.approx(0.25)
