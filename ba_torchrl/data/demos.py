@@ -89,6 +89,8 @@ def collect_demonstrations(
 class RandomActions:
     """Replaces the action by a random one in some steps, and flags the others as the expert's.
 
+    TorchRL's ``EGreedyModule`` draws from the global generator and has no such flag.
+
     Args:
         env: whose actions are drawn, uniformly within the bounds.
         probability: of a random action.

@@ -152,7 +152,7 @@ class Solid(Shape):
 
     def create_visual(self, client: int) -> int:
         """Create the visual surface."""
-        # from a file, since PyBullet does not free visual shapes that are made from arrays
+        # PyBullet keeps more memory of a visual shape that is made from arrays
         with _obj_file([self.mesh()]) as path:
             return pybullet.createVisualShape(
                 pybullet.GEOM_MESH,
@@ -165,6 +165,7 @@ class Solid(Shape):
 @contextmanager
 def _obj_file(parts: Sequence[Mesh]) -> Iterator[str]:
     """Write a temporary OBJ file and yield its path."""
-    with tempfile.NamedTemporaryFile(suffix=".obj") as file:
-        write_obj(Path(file.name), parts)
-        yield file.name
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.obj"
+        write_obj(path, parts)
+        yield str(path)

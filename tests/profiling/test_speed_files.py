@@ -211,7 +211,7 @@ def test_few_values_have_no_interval():
 
 
 def test_units_cancel_the_speed_of_the_machine():
-    """The new machine takes twice the time for everything; the work itself is unchanged."""
+    """All durations on the new machine are twice as long, also that of the unit of work."""
     old = Row("work", "ms", [10.0] * 8, unit_s=[1.0] * 8)
     change = Change.between(old, Row("work", "ms", [20.0] * 8, unit_s=[2.0] * 8))
     assert (change.of_values.value, change.of_units.value) == (2.0, 1.0)

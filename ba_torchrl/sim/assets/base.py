@@ -102,5 +102,5 @@ def load_object_set(name: str, asset_root: str | None = None) -> ObjectSet:
 
 @cache
 def _packaged_set(name: str) -> ObjectSet:
-    """Return an object set of the package; its shapes are the same in all worlds of a process."""
+    """Return an object set that reads no folder; all worlds of a process share its shapes."""
     return OBJECT_SETS[name](None)
