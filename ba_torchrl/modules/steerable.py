@@ -1,8 +1,9 @@
 """Steerable convolutions on escnn's kernel bases, with plain tensors in and out.
 
-escnn builds the bases; the layers here hold the coefficients and expand them in every forward pass.
-No filter is cached, so none is outdated when weights are copied in place, and ``state_dict``,
-``deepcopy`` and functional calls see ordinary parameters only.
+escnn builds the bases; the layers here hold the coefficients and expand them in every forward
+pass, or once inside `reuse_filters`. Outside of it no filter is kept, so none is outdated when
+weights are copied in place, and ``state_dict``, ``deepcopy`` and functional calls see ordinary
+parameters only.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import io
 import math
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +36,26 @@ ESCNN_FIX = (
     "`pip install --no-deps escnn==1.0.11 && pip install lie_learn joblib pymanopt autograd`, "
     "or run `make setup`"
 )
+
+
+_expanded: ContextVar[dict[tuple[Any, ...], tuple[Any, ...]] | None] = ContextVar(
+    "expanded", default=None
+)
+"""Inside `reuse_filters`: filters with their weights, by layer, dtype and ids of the weights."""
+
+
+@contextlib.contextmanager
+def reuse_filters() -> Iterator[None]:
+    """Expand each filter once inside the context, in which no weight may change.
+
+    For evaluation, where most of a small batch's time would go into expanding the same filters.
+    Forward passes with gradients expand theirs as usual.
+    """
+    token = _expanded.set({})
+    try:
+        yield
+    finally:
+        _expanded.reset(token)
 
 
 def _gspaces() -> ModuleType:
@@ -320,9 +342,24 @@ class SteerableConv2d(nn.Module):
         kernels = kernels.view(out_count, in_count, out_size, k, k, in_size)
         return kernels.permute(0, 2, 3, 4, 1, 5).reshape(out_count * out_size, k, k, -1)
 
+    def filters(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None]:
+        """As `expand`, but from `reuse_filters` where it applies."""
+        if torch.is_grad_enabled() or torch.compiler.is_compiling():
+            return self.expand(dtype)
+        kept = _expanded.get()
+        if kept is None:
+            return self.expand(dtype)
+        # The tensors that a functional call puts in place of the parameters have other ids; they
+        # are kept with the result, so that no id is used again.
+        weights = tuple(self.parameters())
+        key = (self, dtype, *map(id, weights))
+        if key not in kept:
+            kept[key] = (self.expand(dtype), weights)
+        return kept[key][0]
+
     def forward(self, x: Tensor) -> Tensor:
         """Return the convolution of x [B, C, H, W], computed in x's dtype."""
-        weight, bias = self.expand(x.dtype)
+        weight, bias = self.filters(x.dtype)
         return F.conv2d(x, weight, bias, padding=self.padding)
 
     def extra_repr(self) -> str:
@@ -347,5 +384,5 @@ class SteerableLinear(SteerableConv2d):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [..., out] of x [..., in]."""
-        weight, bias = self.expand(x.dtype)
+        weight, bias = self.filters(x.dtype)
         return F.linear(x, weight[:, :, 0, 0], bias)

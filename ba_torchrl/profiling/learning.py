@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextvars import copy_context
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.precision import network_dtype
@@ -16,10 +18,12 @@ from ba_torchrl.data.replay.buffer import FrameStorage
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
+from ba_torchrl.modules.steerable import reuse_filters
 from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
 from ba_torchrl.profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.evaluation import acting_on
 
 SEED = 0
 CAPACITY = 100_000
@@ -197,6 +201,49 @@ def plain_pose_update(bench: Bench) -> list[Row]:
         128,
         Budget("", None, None),
     )
+
+
+ACTING = {
+    "Equi SACfD, 128 px, C8, 64 fields": (
+        CLOSE_LOOP,
+        {"name": "equi", "group_order": 8, "n_hidden": 64},
+        128,
+    ),
+    "Equi SACfD, 64 px, C8, 16 fields": (
+        CLOSE_LOOP,
+        {"name": "equi", "group_order": 8, "n_hidden": 16},
+        64,
+    ),
+    "SDQfD Equi ASR, 128 px, 16 rotations": (OPEN_LOOP, {"name": "equi_asr"}, 128),
+    "SDQfD Equi Deictic ASR, 128 px": (SIX_DOF, {"name": "equi_deictic_asr"}, 128),
+}
+"""Networks that act, with their experiment, parameters and size of images."""
+
+
+@measurement("learning/acting", over=lambda: [(work,) for work in ACTING])
+def measure_acting(bench: Bench, work: str) -> list[Row]:
+    """Greedy actions of five environments, with filters expanded in every pass and once."""
+    experiment, network, obs_size = ACTING[work]
+    config = _config(experiment, network, obs_size, bench.device)
+    env = make_vector_env(config.task, 5, parallel=False, seed=SEED, **config.env)
+    state = env.reset()
+    env.close()
+    act = acting_on(build_algorithm(config).policy, bench.device)
+
+    @torch.no_grad()
+    @set_exploration_type(ExplorationType.DETERMINISTIC)
+    def every_pass() -> None:
+        act(state.clone())
+
+    with reuse_filters():
+        every_pass()
+        kept = copy_context()
+    calls = {
+        f"{work}, actions of 5 environments": every_pass,
+        f"{work}, actions of 5 environments, filters reused": lambda: kept.run(every_pass),
+    }
+    times = bench.time_against({"unit": LearningUnit(bench.device)}, calls)
+    return [timed_row(call, "ms", times[call], times["unit"]) for call in calls]
 
 
 def _replay_memory(

@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl import make
 from ba_torchrl.data.episodes import Policy, collect_episodes, mean_length, success_rate
 from ba_torchrl.envs import keys
+from ba_torchrl.modules.steerable import reuse_filters
 from ba_torchrl.record.video import FrameRecorder
 
 
@@ -60,7 +61,7 @@ def evaluate(
     seed: int,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> Evaluation:
-    """Play greedy episodes from a seed, a fixed number per environment.
+    """Play greedy episodes from a seed, a fixed number per environment; the weights stay constant.
 
     Args:
         env: a vector of environments.
@@ -69,7 +70,7 @@ def evaluate(
         seed: of the first episodes.
         on_episode: called with each episode, for progress bars.
     """
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with set_exploration_type(ExplorationType.DETERMINISTIC), reuse_filters():
         played = collect_episodes(
             env,
             policy,
@@ -109,7 +110,7 @@ def record_episodes(
     recorder = FrameRecorder(env)
     act = env.rand_action if policy is None else policy
     try:
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
+        with set_exploration_type(ExplorationType.DETERMINISTIC), reuse_filters():
             for _ in range(episodes):
                 state = env.reset()
                 recorder.record()

@@ -18,6 +18,7 @@ from ba_torchrl.modules.steerable import (
     kernel_block,
     planar_rotations,
     planar_rotations_and_flips,
+    reuse_filters,
 )
 
 
@@ -203,3 +204,79 @@ def test_bad_field_types_are_refused():
         SteerableConv2d(gspace, [(regular, 0)], [(regular, 1)], 3)
     with pytest.raises(ValueError, match="no steerable kernel"):
         SteerableConv2d(gspace, [(trivial, 1)], [(vector, 1)], 1)
+
+
+@pytest.fixture
+def layer():
+    gspace = planar_rotations(4)
+    types = field_types(gspace, [("regular", 2)])
+    return SteerableConv2d(gspace, types, types, 3, padding=1)
+
+
+@pytest.fixture
+def expansions(layer, monkeypatch):
+    """The dtypes of the filters that the layer has expanded."""
+    expand, made = layer.expand, []
+
+    def counted(dtype):
+        made.append(dtype)
+        return expand(dtype)
+
+    monkeypatch.setattr(layer, "expand", counted)
+    return made
+
+
+@torch.no_grad()
+def test_reused_filters_are_expanded_once_per_dtype(layer, expansions):
+    x = torch.randn(2, 8, 5, 5)
+    expected = layer(x)
+    with reuse_filters():
+        for _ in range(3):
+            torch.testing.assert_close(layer(x), expected, rtol=0, atol=0)
+            layer(x.bfloat16())
+    assert expansions == [torch.float32, torch.float32, torch.bfloat16]
+
+
+@torch.no_grad()
+def test_filters_are_expanded_anew_after_reuse(layer):
+    x = torch.randn(2, 8, 5, 5)
+    with reuse_filters():
+        before = layer(x)
+    for weight in layer.parameters():
+        weight.data.mul_(2)
+    torch.testing.assert_close(layer(x), 2 * before)
+    with reuse_filters():
+        torch.testing.assert_close(layer(x), 2 * before)
+
+
+def test_reused_filters_belong_to_the_weights_of_a_functional_call(layer):
+    x = torch.randn(2, 8, 5, 5)
+    others = [
+        {name: scale * weight.detach() for name, weight in layer.named_parameters()}
+        for scale in (2, 3)
+    ]
+    with torch.no_grad(), reuse_filters():
+        plain = layer(x)
+        for _ in range(2):
+            for scale, weights in zip((2, 3), others, strict=True):
+                changed = torch.func.functional_call(layer, weights, (x,))
+                torch.testing.assert_close(changed, scale * plain)
+        torch.testing.assert_close(layer(x), plain, rtol=0, atol=0)
+
+
+def test_forward_passes_with_gradients_do_not_reuse_filters(layer, expansions):
+    x = torch.randn(2, 8, 5, 5)
+    with reuse_filters():
+        for _ in range(2):
+            layer.zero_grad()
+            layer(x).sum().backward()
+            assert all(weight.grad is not None for weight in layer.parameters())
+    assert len(expansions) == 2
+
+
+@torch.no_grad()
+def test_a_layer_is_traced_as_one_graph(layer):
+    x = torch.randn(2, 8, 5, 5)
+    traced = torch.compile(layer, backend="eager", fullgraph=True)
+    with reuse_filters():
+        torch.testing.assert_close(traced(x), layer(x))
