@@ -30,6 +30,7 @@ from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.contrastive import BilinearInfoNCE
+from ba_torchrl.objectives.imitation import ActionDistance
 from ba_torchrl.objectives.sacfd import SACfDLoss
 from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
 
@@ -61,6 +62,9 @@ class SACConfig(LearnerConfig):
     implementation does not."""
     demonstration_weight: float = Field(default=1.0, ge=0)
     """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
+    demonstration_distance: ActionDistance = "mse"
+    """Distance of the policy's action from the demonstrated one in the behaviour term: the squared
+    error of the appendix, or "kl", whose gradient does not vanish at the ends of the range."""
     exploration_noise: float = Field(default=0.0, ge=0)
     """Standard deviation of Gaussian noise that is added to collected actions, which are then
     clipped to [-1, 1]. None in the appendix."""
@@ -171,6 +175,7 @@ class SAC(Learner):
             target_entropy=config.target_entropy,
             entropy_backup=config.entropy_backup,
             demonstration_weight=config.demonstration_weight,
+            demonstration_distance=config.demonstration_distance,
             weighted_terms=config.importance_weighted,
             weight_norm=config.importance_norm,
             views=config.views,

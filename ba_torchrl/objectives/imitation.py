@@ -2,15 +2,45 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.dqn import LevelValues
+
+ActionDistance = Literal["mse", "kl"]
+"""Distance of a policy's action from the expert's: see `action_distance`."""
+
+
+def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance) -> Tensor:
+    """Return the distance of actions from the expert's, the mean over components, [...].
+
+    With a = tanh(u), "mse" is (a - a_e)^2. Its derivative with respect to u, 2 (a - a_e)(1 - a^2),
+    vanishes at both ends of the range, so a policy that is driven to the wrong end stays there.
+    "kl" is twice the Kullback-Leibler divergence of Bernoulli distributions with the probabilities
+    (1 + a_e) / 2 and (1 + a) / 2. It is convex in u with the derivative 2 (a - a_e), and equals the
+    squared error for small actions.
+
+    Args:
+        action: [..., A] in (-1, 1).
+        expert_action: [..., A] in [-1, 1].
+        kind: "mse" or "kl".
+    """
+    if kind == "mse":
+        return (action - expert_action).square().mean(dim=-1)
+    smallest = torch.finfo(action.dtype).tiny
+    divergence = torch.zeros_like(action)
+    for sign in (1, -1):
+        expert = (1 + sign * expert_action.clamp(-1, 1)) / 2
+        policy = ((1 + sign * action) / 2).clamp_min(smallest)
+        divergence = divergence + torch.xlogy(expert, expert) - expert * policy.log()
+    return 2 * divergence.mean(dim=-1)
 
 
 class BehaviourCloningLoss(LossModule):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -21,6 +22,7 @@ from ba_torchrl.objectives.base import (
     reduce_over,
     weighted,
 )
+from ba_torchrl.objectives.imitation import ActionDistance, action_distance
 from ba_torchrl.objectives.shared_encoder import SharedEncoderCritics
 
 
@@ -33,10 +35,11 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         y_i         = r_i + gamma (1 - terminated_i) (min_k q'_k(s'_i, a') - alpha log pi(a'|s'_i))
         loss_qvalue = sum_k mean_i u_i (q_k(s_i, a_i) - y_i)^2
         loss_actor  = mean_i v_i (alpha log pi(a | s_i) - min_k q_k(s_i, a)) + demonstration_weight
-                      * mean over experts of w_i mean over components (a - a_i)^2
+                      * mean over experts of w_i d(a, a_i)
         loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
-    Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
+    d(a, a_i) is the mean over components of (a - a_i)^2, or another `action_distance`. Without
+    ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
 
     u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
     "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are
@@ -64,6 +67,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         entropy_backup: whether y has the entropy term; without it, y is the return alone.
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
             flag in the batch.
+        demonstration_distance: of the behaviour term.
         reduction: of the samples' losses; the formulas above are "mean".
         weighted_terms: terms that the importance weights multiply.
         weight_norm: statistic by which a batch's weights are divided.
@@ -75,7 +79,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         contrastive_weight: weight of the contrastive term.
 
     Raises:
-        ValueError: ``alpha_init`` is not positive, or the encoder has several outputs.
+        ValueError: ``alpha_init`` is not positive, ``demonstration_distance`` is unknown, or the
+            encoder has several outputs.
     """
 
     @dataclass
@@ -126,6 +131,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         target_entropy: float = -5.0,
         entropy_backup: bool = True,
         demonstration_weight: float = 1.0,
+        demonstration_distance: ActionDistance = "mse",
         reduction: Reduction | None = None,
         weighted_terms: WeightedTerms = "critic_and_policy",
         weight_norm: WeightNorm = "max",
@@ -136,6 +142,11 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
+        if demonstration_distance not in get_args(ActionDistance):
+            raise ValueError(
+                f"demonstration_distance is one of {get_args(ActionDistance)}, got "
+                f"{demonstration_distance!r}"
+            )
         if len(encoder_network.out_keys) != 1:
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
@@ -151,6 +162,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         )
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
         self._needs_expert_flag = demonstration_weight != 0
+        self.demonstration_distance: ActionDistance = demonstration_distance
         self.entropy_backup = entropy_backup
         self.views = views
         self.target_views = target_views
@@ -213,7 +225,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
         policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
         is_expert = self._expert_flag(tensordict)
-        error = self._over_views((sample - action).square().mean(dim=-1))
+        distance = action_distance(sample, action, self.demonstration_distance)
+        error = self._over_views(distance)
         demonstration = reduce_over(weighted(error, weights.of("all")), is_expert, self.reduction)
         policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
         loss_actor = policy_term + self.demonstration_weight * demonstration

@@ -4,10 +4,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.distributions import Bernoulli, kl_divergence
+from torchrl.modules import TanhNormal
 
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
-from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
+from ba_torchrl.objectives.imitation import (
+    BehaviourCloningLoss,
+    LevelCrossEntropyLoss,
+    action_distance,
+)
 from tests.linear_sac import batch
 
 
@@ -104,3 +110,37 @@ def test_cross_entropies_are_averaged_over_the_batch_and_summed_over_levels():
     assert found["loss_bc"].item() == pytest.approx(first + second, rel=1e-6)
     assert float(found["accuracy"]) == 0.5  # right at one level of two in either sample
     assert not found["accuracy"].requires_grad
+
+
+def test_the_divergence_is_that_of_bernoulli_distributions():
+    action = torch.tensor([[0.3, -0.7, 0.9], [0.0, 0.5, -0.99]], dtype=torch.float64)
+    expert = torch.tensor([[-1.0, -0.7, 0.2], [1.0, 0.0, -1.0]], dtype=torch.float64)
+    expected = 2 * kl_divergence(Bernoulli((1 + expert) / 2), Bernoulli((1 + action) / 2))
+    found = action_distance(action, expert, "kl")
+    torch.testing.assert_close(found, expected.mean(dim=-1), rtol=1e-6, atol=1e-9)
+    assert (action_distance(action, action, "kl").abs() < 1e-12).all()
+
+
+@pytest.mark.parametrize("expert", [-1.0, -0.3, 0.0, 1.0])
+def test_the_gradient_of_the_divergence_before_the_tanh(expert):
+    u = torch.linspace(-4, 4, 9, dtype=torch.float64, requires_grad=True)
+    action_distance(u.tanh()[:, None], torch.full((9, 1), expert), "kl").sum().backward()
+    torch.testing.assert_close(u.grad, 2 * (u.detach().tanh() - expert))
+
+
+def test_small_actions_have_the_same_distances():
+    action = torch.tensor([[0.01, -0.02]], dtype=torch.float64)
+    expert = torch.tensor([[-0.01, 0.03]], dtype=torch.float64)
+    both = [action_distance(action, expert, kind) for kind in ("mse", "kl")]
+    torch.testing.assert_close(*both, rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize(("kind", "is_free"), [("mse", False), ("kl", True)])
+def test_the_divergence_leaves_the_wrong_end_of_the_range(kind, is_free):
+    loc = torch.full((4, 1), 12.0, requires_grad=True)  # tanh is 1 in float32
+    sample = TanhNormal(loc, torch.full((4, 1), 0.1), low=-1.0, high=1.0).rsample()
+    distance = action_distance(sample, torch.full((4, 1), -1.0), kind)
+    assert distance.isfinite().all()
+    distance.sum().backward()
+    assert bool((loc.grad > 1).all()) is is_free
+    assert bool((loc.grad.abs() < 1e-4).all()) is not is_free
