@@ -14,9 +14,9 @@ from ba_torchrl.modules.base import NetworkConfig
 class BCConfig(LearnerConfig):
     """Hyper-parameters of behaviour cloning.
 
-    The loss is the mean squared error of sampled actions in close-loop tasks, and the cross-entropy
-    of the Q network's choices in open-loop tasks; see `ba_torchrl.objectives.imitation`. All
-    updates of the run are on the demonstrations.
+    The loss is the divergence of sampled actions from the expert's in close-loop tasks, and the
+    cross-entropy of the Q network's choices in open-loop tasks; see
+    `ba_torchrl.objectives.imitation`. All updates of the run are on the demonstrations.
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop", "open_loop"})

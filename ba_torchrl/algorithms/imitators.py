@@ -57,8 +57,8 @@ class GaussianImitator:
         self.policy = squashed_gaussian_policy(actor, [*images, keys.HOLDING])
 
     def make_loss(self) -> LossModule:
-        """Return the mean squared error of sampled actions."""
-        return BehaviourCloningLoss(self.policy)
+        """Return the distance of sampled actions, with gradients at the ends of the range."""
+        return BehaviourCloningLoss(self.policy, "kl")
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the action: the policy can choose every action."""

@@ -161,7 +161,7 @@ class Learner(Algorithm):
             raise ConfigError(
                 f"init: {type(self).__name__} has no actor that behaviour cloning could initialise"
             )
-        return BehaviourCloningLoss(policy)
+        return BehaviourCloningLoss(policy, "kl")
 
     def make_acting_transforms(self) -> Mapping[str, nn.Module]:
         """Return the transform of each image that the acting policy sees; by default its codec."""

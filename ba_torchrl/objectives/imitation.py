@@ -44,16 +44,18 @@ def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance)
 
 
 class BehaviourCloningLoss(LossModule):
-    """Behaviour cloning of a stochastic policy: the mean squared error of an action drawn from it.
+    """Behaviour cloning of a stochastic policy: the distance of an action drawn from it.
 
-    The mean over batch and components of (a - a_e)^2, with the expert's action a_e and a ~ pi drawn
-    with gradient. Its expectation is the squared error of the mean plus the variance, so it trains
-    the standard deviation as well. This is the behaviour term of SACfD (appendix G.2). TorchRL's
-    ``BCLoss`` has the likelihood instead, which a squashed Gaussian does not bound at the ends of
-    the action's range, where the experts' gripper commands are, or the error of the mode.
+    The mean over the batch of the `action_distance` of a ~ pi, drawn with gradient, from the
+    expert's action a_e. With "mse", which is the behaviour term of SACfD (appendix G.2), its
+    expectation is the squared error of the mean plus the variance, so it trains the standard
+    deviation as well. TorchRL's ``BCLoss`` has the likelihood instead, which a squashed Gaussian
+    does not bound at the ends of the action's range, where the experts' gripper commands are, or
+    the error of the mode.
 
     Args:
         actor_network: policy; from the observation to a distribution with ``rsample``.
+        distance: of actions.
     """
 
     actor_network: ProbabilisticTensorDictSequential
@@ -62,9 +64,12 @@ class BehaviourCloningLoss(LossModule):
 
     out_keys = ("loss_bc",)
 
-    def __init__(self, actor_network: ProbabilisticTensorDictSequential) -> None:
+    def __init__(
+        self, actor_network: ProbabilisticTensorDictSequential, distance: ActionDistance = "mse"
+    ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
+        self.distance: ActionDistance = distance
         self.in_keys = [*actor_network.in_keys, keys.ACTION]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -80,7 +85,7 @@ class BehaviourCloningLoss(LossModule):
         action = tensordict[keys.ACTION]
         if sample.ndim > action.ndim:
             action = action.unsqueeze(-2).expand_as(sample)
-        return TensorDict({"loss_bc": F.mse_loss(sample, action)})
+        return TensorDict({"loss_bc": action_distance(sample, action, self.distance).mean()})
 
 
 class LevelCrossEntropyLoss(LossModule):

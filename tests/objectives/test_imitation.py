@@ -32,16 +32,23 @@ class Constant(nn.Module):
 OBSERVATION = [keys.PIXELS, keys.HOLDING]
 
 
-def test_the_error_is_that_of_the_drawn_action():
+@pytest.mark.parametrize("distance", ["mse", "kl"])
+def test_the_error_is_that_of_the_drawn_action(distance):
     actor = Constant([0.3, -0.4], [0.5, 0.2])
-    loss = BehaviourCloningLoss(squashed_gaussian_policy(actor, OBSERVATION))
+    loss = BehaviourCloningLoss(squashed_gaussian_policy(actor, OBSERVATION), distance)
     data = batch()
     torch.manual_seed(5)
     found = loss(data)["loss_bc"]
     torch.manual_seed(5)
     noise = torch.randn(4, 2, dtype=torch.float64)
     drawn = torch.tanh(actor.loc + actor.log_scale.exp() * noise)
-    torch.testing.assert_close(found, (drawn - data[keys.ACTION]).square().mean())
+    expert = data[keys.ACTION]
+    if distance == "mse":
+        expected = (drawn - expert).square().mean()
+    else:
+        expert, policy = (Bernoulli((1 + action) / 2) for action in (expert, drawn))
+        expected = 2 * kl_divergence(expert, policy).mean()
+    torch.testing.assert_close(found, expected)
     found.backward()
     assert (actor.loc.grad != 0).all()
     assert (actor.log_scale.grad != 0).all()
