@@ -1,6 +1,5 @@
 """The SACfD loss against plain arithmetic, and against TorchRL's contract."""
 
-import itertools
 import math
 
 import pytest
@@ -36,16 +35,6 @@ def importance(data, terms, norm):
     return [weights if number >= least else ones for least in (1, 2, 3)]
 
 
-def squared_error(action, expert):
-    return (action - expert) ** 2
-
-
-def divergence(action, expert):
-    """Twice the Kullback-Leibler divergence of the expert's Bernoulli distribution."""
-    p, q = (1 + expert) / 2, (1 + action) / 2
-    return 2 * sum(a * math.log(a / b) for a, b in ((p, q), (1 - p, 1 - q)) if a > 0)
-
-
 def by_hand(
     loss,
     data,
@@ -56,7 +45,6 @@ def by_hand(
     terms="critic_and_policy",
     norm="max",
     entropy_backup=True,
-    distance=squared_error,
 ):
     """The terms of the loss, computed with Python floats and loops."""
 
@@ -103,7 +91,7 @@ def by_hand(
         entropy -= log_prob / n
         if keys.IS_EXPERT in data and data[keys.IS_EXPERT][i]:
             experts += 1
-            error = sum(distance(a, e) for a, e in zip(action, stored, strict=True)) / 2
+            error = sum((a - e) ** 2 for a, e in zip(action, stored, strict=True)) / 2
             behaviour += error
             weighted_behaviour += others[i] * error
     behaviour /= max(experts, 1)
@@ -135,22 +123,6 @@ def test_losses_equal_a_calculation_in_python(experts, weights, demonstration_we
     assert data[keys.TD_ERROR].shape == (4, 1)
     expected_priorities = torch.tensor(priorities, dtype=torch.float64)
     torch.testing.assert_close(data[keys.TD_ERROR], expected_priorities, rtol=1e-6, atol=0)
-
-
-def test_the_behaviour_term_with_the_divergence():
-    loss = make(
-        alpha_init=0.2,
-        target_entropy=-1.5,
-        demonstration_weight=0.3,
-        demonstration_distance="kl",
-        weighted_terms="all",
-    )
-    data = batch((True, True, False, True), (0.2, 0.8, 0.4, 0.1))
-    data[keys.ACTION][0, 0] = 1.0  # at the end of the range, as the gripper's commands are
-    found = loss(data)
-    expected, _ = by_hand(loss, data, 0.99, 0.2, -1.5, 0.3, terms="all", distance=divergence)
-    for name in ("loss_actor", "demonstration_error"):
-        assert found[name].item() == pytest.approx(expected[name], rel=1e-6), name
 
 
 @pytest.mark.parametrize("norm", ["max", "mean"])
@@ -247,22 +219,6 @@ def test_each_term_reaches_its_own_parameters_only():
     out = loss(data)
     for name in ("alpha", "entropy", "demonstration_error", "q_value"):
         assert not out[name].requires_grad
-
-
-def test_behaviour_term_pulls_the_sample_to_the_expert():
-    loss = make(alpha_init=1e-9, demonstration_weight=1.0)
-    data = batch()
-    with torch.no_grad():  # critics that do not care
-        loss.qvalue_network_params["module", "net", "weight"].zero_()
-    optimizer = torch.optim.SGD(loss.actor_network_params.parameters(), 0.1)
-    errors = []
-    for _ in range(20):
-        out = loss(data.clone())
-        errors.append(float(out["demonstration_error"]))
-        optimizer.zero_grad()
-        out["loss_actor"].backward()
-        optimizer.step()
-    assert all(later < earlier for earlier, later in itertools.pairwise(errors))
 
 
 def test_soft_update_moves_the_targets():
