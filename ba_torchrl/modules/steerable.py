@@ -48,8 +48,8 @@ _expanded: ContextVar[dict[tuple[Any, ...], tuple[Any, ...]] | None] = ContextVa
 def reuse_filters() -> Iterator[None]:
     """Expand each filter once inside the context, in which no weight may change.
 
-    For evaluation, where most of a small batch's time would go into expanding the same filters.
-    Forward passes with gradients expand theirs as usual.
+    For evaluation, where the weights are constant and batches small. Forward passes with gradients
+    expand their filters as usual.
     """
     token = _expanded.set({})
     try:
