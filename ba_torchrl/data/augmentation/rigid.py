@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Literal, NamedTuple
 
 import torch
@@ -88,8 +88,9 @@ class RigidAugmentation(nn.Module):
     """Applies a random rigid transform to images, next images and action of each transition.
 
     Images with the gripper's axes do not change, with two exceptions: a reflection reverses the
-    gripper's y axis, and a yaw that is wrapped into half a turn reverses both axes. A transition is
-    unchanged if no drawn transform keeps its action within the workspace.
+    gripper's y axis, and a yaw that is wrapped into half a turn, or rounded to the other end of it,
+    reverses both axes. A transition is unchanged if no drawn transform keeps its action within the
+    workspace.
 
     Args:
         transforms: set of transforms, see `RigidTransforms`.
@@ -98,6 +99,8 @@ class RigidAugmentation(nn.Module):
         seed: of the module's own draws.
         probability: of transforming a transition.
         order: n of C_n.
+        nearest_action: returns the actions of a grid that are nearest to actions [B, A]; None to
+            keep transformed actions as they are.
 
     Raises:
         ValueError: the probability is outside [0, 1], the order is not positive, an image cannot be
@@ -114,6 +117,7 @@ class RigidAugmentation(nn.Module):
         seed: int,
         probability: float = 1.0,
         order: int = 16,
+        nearest_action: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= probability <= 1 or order < 1:
@@ -134,6 +138,7 @@ class RigidAugmentation(nn.Module):
         self.actions = actions
         self.probability = probability
         self.order = order
+        self._nearest_action = nearest_action
         self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
         self._gripper_images = {
             key: image.axes for key, image in images.items() if image.frame == "gripper"
@@ -234,7 +239,12 @@ class RigidAugmentation(nn.Module):
                 tilt = self.actions.components.index(name)
                 moved[:, tilt] = torch.where(is_turned_over, -moved[:, tilt], moved[:, tilt])
         moved[:, rz] = yaw
-        return moved.to(action), is_turned_over
+        moved = moved.to(action)
+        if self._nearest_action is not None:
+            exact, moved = moved, self._nearest_action(moved)
+            if self.actions.half_rotation:  # a yaw that is rounded up to pi is 0, fingers swapped
+                is_turned_over ^= (moved[:, rz] - exact[:, rz]).abs() > math.pi / 2
+        return moved, is_turned_over
 
     def _reverse_axes(self, out: TensorDictBase, rows: Tensor, axes: str) -> None:
         """Reverse axes of the images with the gripper's axes, in some rows of a batch."""

@@ -10,6 +10,8 @@ from tensordict import TensorDict
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
+from ba_torchrl.modules.spatial import Level
+from ba_torchrl.modules.spatial_policy import SpatialActions
 from ba_torchrl.sim.geometry import euler_matrix
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from tests.specs import open_loop_images
@@ -118,3 +120,40 @@ def test_the_projections_equal_those_of_a_pick_in_the_transformed_scene(tilts):
             assert moved[5:].tolist() == pytest.approx([-tilt for tilt in tilts])
         seen.add(turn)
     assert seen == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize(("transforms", "order"), [("cn", 16), ("cn", 7), ("se2", 1)])
+def test_images_are_reversed_where_the_grid_swaps_the_fingers(transforms, order):
+    """On the grid, as in the scene: the pose of the tool and the image in its axes agree."""
+    levels = (Level(("x", "y"), (SIZE, SIZE)), Level(("rz",), (8,)))
+    levels += (Level(("z",), (9,)), Level(("ry",), (7,)), Level(("rx",), (7,)))
+    limits = {"ry": (-0.6, 0.6), "rx": (-0.6, 0.6)}
+    grid = SpatialActions(OpenLoopActions("pxyzrrr", BOUNDS), levels, limits)
+    rng = np.random.default_rng(1)
+    poses = rng.uniform((0.0, -0.4, -0.4), (math.pi, 0.4, 0.4), (600, 3))
+    action = np.concatenate([np.zeros((600, 1)), np.tile([[0.47, 0.0, 0.07]], (600, 1)), poses], 1)
+    action = grid.nearest(torch.from_numpy(action).float())
+    in_hand = np.arange(3 * 24 * 24, dtype=np.float64).reshape(3, 24, 24)
+    data = transitions(spot(), action, in_hand)
+    module = augmentation(transforms, order=order, nearest_action=grid.nearest)
+    angles = []
+    draw = module._draw_inside
+
+    def recorded(moved):
+        is_found, transform = draw(moved)
+        angles.append(torch.where(is_found, transform.angle_rad, 0.0))
+        return is_found, transform
+
+    module._draw_inside = recorded
+    out = module(data)
+    after = out["action"]
+    assert torch.equal(grid.nearest(after), after)
+    kept = (out["in_hand"] == data["in_hand"]).flatten(1).all(1)
+    assert 0.3 < kept.float().mean() < 0.7
+    for i in range(600):
+        turned = np.array(euler_matrix(float(angles[0][i]), 0, 0)) @ euler_matrix(
+            *action[i, 4:].double().tolist()
+        )
+        wanted = turned if kept[i] else turned @ SWAP
+        found = np.array(euler_matrix(*after[i, 4:].double().tolist()))
+        assert np.abs(found - wanted).max() < 0.22, i  # half a step of the yaw is 0.196
