@@ -21,7 +21,8 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
     Pixels and yaws are chosen by the equivariant networks of 'equi_asr'. Each z, ry and rx is
     evaluated on the projections of the scene at the pose with that value, by shared weights; the
     features of the scene are invariant, so these values do not change when scene and yaw rotate
-    together.
+    together. With yaws of half a turn this does not hold for rotations that wrap the yaw: they swap
+    the fingers, so the projections are seen from the other side.
 
     Args:
         group_order: number of rotations of the dihedral group of the pixel values.
