@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from ba_torchrl.envs import keys
+from ba_torchrl.modules.steerable import reuse_filters
+
+
+@contextlib.contextmanager
+def constant_weights() -> Iterator[None]:
+    """Context in which no network's weights change: what depends on them alone is computed once."""
+    with reuse_filters():
+        yield
 
 
 class ActingPolicy(TensorDictModuleBase):

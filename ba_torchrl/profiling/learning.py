@@ -12,13 +12,13 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make_vector_env
+from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.precision import network_dtype
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.buffer import FrameStorage
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.steerable import reuse_filters
 from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
 from ba_torchrl.profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 from ba_torchrl.training.checkpoint import build_algorithm
@@ -235,7 +235,7 @@ def measure_acting(bench: Bench, work: str) -> list[Row]:
     def every_pass() -> None:
         act(state.clone())
 
-    with reuse_filters():
+    with constant_weights():
         every_pass()
         kept = copy_context()
     calls = {

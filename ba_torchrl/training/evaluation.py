@@ -15,9 +15,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make
+from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.data.episodes import Policy, collect_episodes, mean_length, success_rate
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.steerable import reuse_filters
 from ba_torchrl.record.video import FrameRecorder
 
 
@@ -70,7 +70,7 @@ def evaluate(
         seed: of the first episodes.
         on_episode: called with each episode, for progress bars.
     """
-    with set_exploration_type(ExplorationType.DETERMINISTIC), reuse_filters():
+    with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
         played = collect_episodes(
             env,
             policy,
@@ -110,7 +110,7 @@ def record_episodes(
     recorder = FrameRecorder(env)
     act = env.rand_action if policy is None else policy
     try:
-        with set_exploration_type(ExplorationType.DETERMINISTIC), reuse_filters():
+        with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
             for _ in range(episodes):
                 state = env.reset()
                 recorder.record()
