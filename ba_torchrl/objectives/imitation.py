@@ -34,13 +34,10 @@ def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance)
     """
     if kind == "mse":
         return (action - expert_action).square().mean(dim=-1)
-    smallest = torch.finfo(action.dtype).tiny
-    divergence = torch.zeros_like(action)
-    for sign in (1, -1):
-        expert = (1 + sign * expert_action.clamp(-1, 1)) / 2
-        policy = ((1 + sign * action) / 2).clamp_min(smallest)
-        divergence = divergence + torch.xlogy(expert, expert) - expert * policy.log()
-    return 2 * divergence.mean(dim=-1)
+    expert, policy = (1 + expert_action.to(action).clamp(-1, 1)) / 2, (1 + action) / 2
+    cross_entropy = F.binary_cross_entropy(policy, expert, reduction="none")
+    entropy = F.binary_cross_entropy(expert, expert, reduction="none")
+    return 2 * (cross_entropy - entropy).mean(dim=-1)
 
 
 class BehaviourCloningLoss(LossModule):
