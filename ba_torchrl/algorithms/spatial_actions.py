@@ -10,7 +10,6 @@ from tensordict import TensorDictBase
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import Problem
-from ba_torchrl.data.augmentation.rigid import reverse_gripper_axes
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import NetworkConfig
@@ -71,7 +70,7 @@ def demonstration_on_grid(
     for key, image in images.items():
         if image.frame == "gripper":
             for nested, over in ((key, is_over[:-1]), ((keys.NEXT, key), is_over[1:])):
-                reversed_images = reverse_gripper_axes(episode[nested], image.axes, "xy")
+                reversed_images = image.reverse_axes(episode[nested], "xy")
                 over = over.reshape(-1, 1, 1, 1)
                 out.set(nested, torch.where(over, reversed_images, episode[nested]))
     return out

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from torch import Tensor
 from torchrl.data import Bounded
 
 Storage = Literal["uint8", "float16", "exact"]
@@ -57,3 +58,19 @@ class ImageSpec:
     def to_tensor_spec(self) -> Bounded:
         """Return the image's TorchRL specification."""
         return Bounded(self.low, self.high, shape=self.shape, dtype=self.dtype)
+
+    def reverse_axes(self, images: Tensor, axes: str) -> Tensor:
+        """Return images in the gripper's axes with some of these axes reversed.
+
+        Exact for heights. Projections are accurate to one voxel, because their smoothing is not
+        symmetric.
+
+        Args:
+            images: [B, C, h, w].
+            axes: "x", along which the fingers close, "y", perpendicular to it, or both.
+        """
+        channels = [
+            channel.flip([dim for dim in (-2, -1) if names[dim] in axes])
+            for channel, names in zip(images.unbind(1), self.axes, strict=True)
+        ]
+        return torch.stack(channels, dim=1)

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from ba_torchrl.envs import keys
 from ba_torchrl.modules.asr_base import ASR, ASRNetworkConfig, PatchView
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.equi_asr import EquivariantYawValues, InvariantSceneVector
 from ba_torchrl.modules.equi_unet import EquivariantPixelValues
-from ba_torchrl.modules.pose_values import PoseValues
-from ba_torchrl.modules.pose_views import PoseGridConfig, TiltedView, UprightView, is_six_dof
+from ba_torchrl.modules.pose_values import FingerSymmetricValues, PoseValues
+from ba_torchrl.modules.pose_views import (
+    BothFingerOrders,
+    PoseGridConfig,
+    TiltedView,
+    UprightView,
+    is_six_dof,
+)
 from ba_torchrl.modules.spatial import SpatialSpec
 from ba_torchrl.modules.steerable import planar_rotations_and_flips, planar_yaws
 
@@ -21,14 +28,19 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
     Pixels and yaws are chosen by the equivariant networks of 'equi_asr'. Each z, ry and rx is
     evaluated on the projections of the scene at the pose with that value, by shared weights; the
     features of the scene are invariant, so these values do not change when scene and yaw rotate
-    together. With yaws of half a turn this does not hold for rotations that wrap the yaw: they swap
-    the fingers, so the projections are seen from the other side.
+    together. With yaws of half a turn, a rotation that wraps the yaw swaps the fingers: the same
+    pose has the opposite tilts, and the other end of what is held points forward. The values are
+    therefore the mean over both orders of the fingers, each with its projections and the in-hand
+    image turned by half a turn; this doubles the cost of these levels.
 
     Args:
         group_order: number of rotations of the dihedral group of the pixel values.
+        swap_fingers: take the mean over both orders of the fingers where yaws span half a turn; the
+            paper describes one order.
     """
 
     group_order: int = Field(default=4, ge=2)
+    swap_fingers: bool = True
 
     def build(self, spec: SpatialSpec) -> ASR:
         """Return a freshly initialised network.
@@ -64,5 +76,9 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
         later = [(PatchView(patch_size), yaws)]
         for view in views:
             scene = InvariantSceneVector(positions.scene_channels, self.width)
-            later.append((view, PoseValues(spec, in_voxels, view.channels, 1, patch_size, scene)))
+            values = PoseValues(spec, in_voxels, view.channels, 1, patch_size, scene)
+            if self.swap_fingers and spec.half_rotation:
+                view = BothFingerOrders(view)
+                values = FingerSymmetricValues(values, spec.images[keys.IN_HAND])
+            later.append((view, values))
         return ASR(positions, later, levels, self.limits)

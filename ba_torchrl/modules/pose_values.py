@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.cnn import CastConv2d, initialise_plain
 from ba_torchrl.modules.patches import centre_fit
 from ba_torchrl.modules.spatial import SpatialSpec
@@ -125,3 +126,33 @@ class PoseValues(nn.Module):
             x = conv(F.relu(F.max_pool2d(x, 2), inplace=True))
         x = F.relu(x, inplace=True).flatten(1).float()
         return F.relu(self.narrow(F.relu(self.wide(x))))
+
+
+class FingerSymmetricValues(nn.Module):
+    """Q values that do not change when the fingers are swapped: the mean over both orders.
+
+    Half a turn of the tool about its own axis turns the views and what is held by half a turn.
+
+    Args:
+        values: of one order of the fingers.
+        in_hand: declaration of the in-hand image.
+    """
+
+    def __init__(self, values: PoseValues, in_hand: ImageSpec) -> None:
+        super().__init__()
+        self.values = values
+        self.in_hand = in_hand
+
+    def forward(self, views: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
+        """Return values [B, K * values_per_view].
+
+        Args:
+            views: projections [B, 2 K, C, p, p], see `BothFingerOrders`.
+            in_hand: [B, C', h, w].
+            scene: feature map [B, C'', h', w'].
+            holding: [B, 1], which selects the primitive.
+        """
+        views = torch.cat(views.chunk(2, dim=1))
+        in_hand = torch.cat([in_hand, self.in_hand.reverse_axes(in_hand, "xy")])
+        values = self.values(views, in_hand, scene.repeat(2, 1, 1, 1), holding.repeat(2, 1))
+        return torch.stack(values.chunk(2)).mean(dim=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -26,6 +26,14 @@ class PoseGrid(NamedTuple):
     rz_rad: tuple[float, ...]
     ry_rad: tuple[float, ...]
     rx_rad: tuple[float, ...]
+
+    def with_swapped_fingers(self) -> PoseGrid:
+        """Return the poses after half a turn of the tool about its own axis, by the same index."""
+        return PoseGrid(
+            self.z_m,
+            tuple(yaw + math.pi for yaw in self.rz_rad),
+            *(tuple(-tilt for tilt in tilts) for tilts in (self.ry_rad, self.rx_rad)),
+        )
 
 
 def is_six_dof(spec: SpatialSpec) -> bool:
@@ -155,3 +163,24 @@ class TiltedView:
         heights = torch.tensor(self.grid.z_m, dtype=torch.float64, device=pixels.device)
         z = heights[chosen[:, 3:4]].expand(-1, cells.shape[1])
         return project(patch, self.pixel_m, z, cells)
+
+
+@dataclass(frozen=True)
+class BothFingerOrders:
+    """Projections at the candidate poses, then at the same poses with swapped fingers.
+
+    Args:
+        view: of the poses.
+    """
+
+    view: UprightView | TiltedView
+
+    @property
+    def channels(self) -> int:
+        """Channels of a projection."""
+        return self.view.channels
+
+    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+        """Return projections [B, 2 K, 3, p, p], voxels."""
+        swapped = replace(self.view, grid=self.view.grid.with_swapped_fingers())
+        return torch.cat([self.view(pixels, chosen), swapped(pixels, chosen)], dim=1)

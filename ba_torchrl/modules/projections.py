@@ -58,7 +58,7 @@ def _nearest_cell(offset: Tensor, size: int) -> Tensor:
     return (offset + (size - 1) / 2 + 0.5 + TIE_TOLERANCE).floor_().int()
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def cell_table(
     yaws_rad: tuple[float, ...],
     ry_rad: tuple[float, ...],

@@ -21,9 +21,11 @@ FIELDS = {
 }
 
 
-def build(name="equi_deictic_asr", half_rotation=False):
+def build(name="equi_deictic_asr", half_rotation=False, **fields):
     torch.manual_seed(0)
-    return NETWORKS[name](**FIELDS).build(spatial_spec(SIZE, 24, 3, COMPONENTS, half_rotation))
+    return NETWORKS[name](**FIELDS, **fields).build(
+        spatial_spec(SIZE, 24, 3, COMPONENTS, half_rotation)
+    )
 
 
 def batch(n=4, seed=0, yaws=8):
@@ -105,19 +107,69 @@ def test_rotating_the_scene_turns_pixels_shifts_yaws_and_keeps_the_other_values(
             assert_different(actual, expected)
 
 
+def wrapped(observation, chosen):
+    """The same poses with the fingers swapped where the yaw has left half a turn."""
+    pixels, in_hand, holding = observation
+    is_swapped = chosen[:, 2] >= 8
+    # half a turn of the gripper: rows and columns of the axes y z, x z and x y
+    reversed_hand = torch.stack(
+        [in_hand[:, 0].flip(-2), in_hand[:, 1].flip(-2), in_hand[:, 2].flip(-2, -1)], dim=1
+    )
+    in_hand = torch.where(is_swapped[:, None, None, None], reversed_hand, in_hand)
+    tilts = torch.where(is_swapped[:, None], 2 - chosen[:, 4:], chosen[:, 4:])
+    chosen = torch.cat([chosen[:, :2], chosen[:, 2:3] % 8, chosen[:, 3:4], tilts], dim=1)
+    return (pixels, in_hand, holding), chosen, is_swapped
+
+
 @pytest.mark.parametrize("trained", [False, True])
-def test_a_quarter_turn_without_the_wrap_of_half_a_turn(trained):
-    """Yaws of less than a quarter turn keep the fingers in place."""
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_yaws_of_half_a_turn(quarters, trained):
+    """A yaw that leaves half a turn swaps the fingers: tilts and what is held turn over."""
     network = build(half_rotation=True)
     if trained:
         train(network)
-    *observation, chosen = batch(yaws=4)
+    *observation, chosen = batch(n=6)
+    scene, moved = turned(observation, chosen, quarters, 0)
+    moved[:, 2] = chosen[:, 2] + 4 * quarters
+    moved[:, 2] %= 16  # a full turn is the same pose
+    swapped_scene, moved, is_swapped = wrapped(scene, moved)
+    assert is_swapped.any()
     with torch.no_grad():
-        _, yaws, *others = values_of(network, observation, chosen)
-        found = values_of(network, *turned(observation, chosen, 1, 4))
-    assert_equal(found[1], yaws.roll(4, dims=1))
-    for actual, expected in zip(found[2:], others, strict=True):
-        assert_equal(actual, expected)
+        pixels, yaws, *others = values_of(network, observation, chosen)
+        found = values_of(network, scene, moved)[:2] + values_of(network, swapped_scene, moved)[2:]
+        assert_equal(found[0], torch.rot90(pixels, quarters, (-2, -1)))
+        assert_equal(found[1], yaws.roll(4 * quarters, dims=1))
+        for actual, expected in zip(found[2:], others, strict=True):
+            is_tilt = expected.shape[1] == 3
+            turned_over = is_swapped[:, None] & torch.tensor(is_tilt)
+            assert_equal(actual, torch.where(turned_over, expected.flip(1), expected))
+
+
+def test_one_order_of_the_fingers_alone_is_not_symmetric():
+    network = build(half_rotation=True, swap_fingers=False)
+    *observation, chosen = batch()
+    scene, moved = turned(observation, chosen, 2, 0)
+    moved[:, 2] = chosen[:, 2] + 8
+    scene, moved, _ = wrapped(scene, moved)
+    with torch.no_grad():
+        heights = values_of(network, observation, chosen)[2]
+        assert_different(values_of(network, scene, moved)[2], heights)
+
+
+def test_tilts_and_what_is_held_turn_over_with_the_fingers():
+    """The symmetry does not hide either: each alone changes the values."""
+    network = build(half_rotation=True)
+    train(network)
+    *observation, chosen = batch()
+    chosen[:, 4] = 0
+    tilted = chosen.clone()
+    tilted[:, 4] = 2
+    pixels, in_hand, holding = observation
+    with torch.no_grad():
+        expected = values_of(network, observation, chosen)[4]
+        assert_different(values_of(network, observation, tilted)[4], expected)
+        other = (pixels, in_hand.flip(-2), holding)
+        assert_different(values_of(network, other, chosen)[4], expected)
 
 
 def test_the_plain_network_is_not_equivariant():

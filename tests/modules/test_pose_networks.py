@@ -95,13 +95,15 @@ def grid(component, index, half):
     return first + index * (last - first) / (COUNTS[component] - 1)
 
 
+def pose_of(chosen, half):
+    """Return the values of chosen indices besides the pixel, by component."""
+    pairs = zip(COUNTS, chosen[2:].tolist(), strict=True)
+    return {name: grid(name, index, half) for name, index in pairs}
+
+
 def projection(heightmap, chosen, half, **pose):
     """Return the in-hand image of a pick at chosen indices; components in ``pose`` override."""
-    values = {
-        name: grid(name, index, half)
-        for name, index in zip(COUNTS, chosen[2:].tolist(), strict=True)
-    }
-    values |= pose
+    values = pose_of(chosen, half) | pose
     center = (int(chosen[0]) + 0.5, int(chosen[1]) + 0.5)
     z, angles = values.pop("z"), [values[name] for name in ("rz", "ry", "rx")]
     view = PickView(heightmap, heightmap, center, 0.4 / SIZE, z, *angles)
@@ -115,18 +117,24 @@ def assert_close(views, expected):
     assert expected.std() > 0.1
 
 
+def swapped(pose):
+    """Return the pose after half a turn of the tool about its own axis."""
+    return pose | {"rz": pose["rz"] + math.pi, "ry": -pose["ry"], "rx": -pose["rx"]}
+
+
 @pytest.mark.parametrize("half", [True, False])
 def test_every_candidate_pose_sees_the_scene_from_itself(half):
+    """With yaws of half a turn, first with one order of the fingers, then with the other."""
     views = build("equi_deictic_asr", half=half).views
     pixels, *_, chosen = batch()
     for number, name in ((1, "z"), (2, "ry"), (3, "rx")):
         found = views[number](pixels, chosen[:, : number + 2])
-        later = dict.fromkeys(("ry", "rx")[number - 1 :], 0.0)
         for i in range(3):
-            expected = [
-                projection(pixels[i, 0].numpy(), chosen[i], half, **later, **{name: value})
-                for value in (grid(name, index, half) for index in range(COUNTS[name]))
-            ]
+            pose = pose_of(chosen[i], half) | dict.fromkeys(("ry", "rx")[number - 1 :], 0.0)
+            poses = [pose | {name: grid(name, index, half)} for index in range(COUNTS[name])]
+            poses += [swapped(pose) for pose in poses] if half else []
+            heights = pixels[i, 0].numpy()
+            expected = [projection(heights, chosen[i], half, **pose) for pose in poses]
             assert_close(found[i], np.stack(expected))
 
 

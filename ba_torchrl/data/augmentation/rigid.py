@@ -67,23 +67,6 @@ def transform_images(images: Tensor, transform: RigidTransform) -> Tensor:
     return transformed
 
 
-def reverse_gripper_axes(images: Tensor, channel_axes: tuple[str, ...], axes: str) -> Tensor:
-    """Return images in the gripper's axes with some of these axes reversed.
-
-    Exact for heights. Projections are accurate to one voxel, because their smoothing is not
-    symmetric.
-
-    Args:
-        images: [B, C, h, w].
-        channel_axes: the gripper's axes along rows and columns of each channel.
-        axes: "x", along which the fingers close, "y", perpendicular to it, or both.
-    """
-    channels = []
-    for channel, names in zip(images.unbind(1), channel_axes, strict=True):
-        channels.append(channel.flip([dim for dim in (-2, -1) if names[dim] in axes]))
-    return torch.stack(channels, dim=1)
-
-
 class RigidAugmentation(nn.Module):
     """Applies a random rigid transform to images, next images and action of each transition.
 
@@ -141,7 +124,7 @@ class RigidAugmentation(nn.Module):
         self._nearest_action = nearest_action
         self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
         self._gripper_images = {
-            key: image.axes for key, image in images.items() if image.frame == "gripper"
+            key: image for key, image in images.items() if image.frame == "gripper"
         }
         # On the CPU for any device of the batch, so that the draws of a seed are the same on all
         # devices.
@@ -248,10 +231,10 @@ class RigidAugmentation(nn.Module):
 
     def _reverse_axes(self, out: TensorDictBase, rows: Tensor, axes: str) -> None:
         """Reverse axes of the images with the gripper's axes, in some rows of a batch."""
-        for key, channel_axes in self._gripper_images.items():
+        for key, spec in self._gripper_images.items():
             for nested in (key, (keys.NEXT, key)):
                 image = out[nested].clone()
-                image[rows] = reverse_gripper_axes(image[rows], channel_axes, axes)
+                image[rows] = spec.reverse_axes(image[rows], axes)
                 out.set(nested, image)
 
     def get_extra_state(self) -> Tensor:

@@ -9,7 +9,6 @@ from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.rigid import (
     RigidAugmentation,
     RigidTransform,
-    reverse_gripper_axes,
     transform_images,
 )
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
@@ -31,8 +30,7 @@ def augmentation(transforms, actions, channels=1, seed=0, **settings):
 
 
 def reverse_in_hand(image, axes):
-    axes_of_channels = open_loop_images(channels=image.shape[1])["in_hand"].axes
-    return reverse_gripper_axes(image, axes_of_channels, axes)
+    return open_loop_images(channels=image.shape[1])["in_hand"].reverse_axes(image, axes)
 
 
 def spot(x, y):
