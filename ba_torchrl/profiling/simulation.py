@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import itertools
+import math
+import statistics
 import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pybullet
+import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from ba_torchrl import list_tasks, make
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
 from ba_torchrl.profiling.table import Bench, Budget, Row, measurement, seconds, timed_row
 from ba_torchrl.sim.geometry import downward
@@ -22,6 +29,7 @@ from ba_torchrl.tasks.base import TASKS
 
 SEED = 0
 CAMERA_M = 1.0
+SLIP_TASKS = ("open_loop/block_stacking", "open_loop/bin_packing", "ramp/house_building_1")
 
 
 class SimulationUnit:
@@ -104,6 +112,93 @@ def step_and_reset(bench: Bench, task: str) -> list[Row]:
     return [
         timed_row(f"{task}, step, {size} px", "ms", steps, units, of_step, notes),
         timed_row(f"{task}, reset", "ms", resets, units, of_reset),
+    ]
+
+
+def _timed_steps(
+    bench: Bench, tasks: Sequence[str], on_reset: Callable[[Sequence[ManipulationEnv]], None]
+) -> Iterator[tuple[list[float], list[TensorDictBase], float]]:
+    """Step one environment of each task in turns under the experts' actions.
+
+    Args:
+        bench: counts the episodes.
+        tasks: of the environments; the shortest episode ends a round.
+        on_reset: called with the environments after each reset.
+
+    Yields:
+        The seconds of a step of each environment, their states, and the seconds of a unit of work.
+    """
+    unit = SimulationUnit()
+    envs = [make(task, seed=SEED) for task in tasks]
+    episodes = [_expert_actions(task, bench.repeats) for task in tasks]
+    for number in bench.rounds():
+        states = [env.reset() for env in envs]
+        on_reset(envs)
+        for actions in zip(*(played[number] for played in episodes), strict=False):
+            times = []
+            for i, (env, action) in enumerate(zip(envs, actions, strict=True)):
+                states[i][keys.ACTION] = action
+                start = time.perf_counter()
+                result = env.step(states[i])
+                times.append(time.perf_counter() - start)
+                states[i] = result[keys.NEXT]
+            yield times, states, seconds(unit)
+    for world in (*envs, unit.world):
+        world.close()
+
+
+def _on_level_ground(task: str) -> str:
+    return f"open_loop/{task.split('/')[1]}"
+
+
+def _tasks_on_slopes() -> list[str]:
+    """Return the open-loop tasks of which there is another one on level ground."""
+    tasks = list_tasks()
+    return [
+        task
+        for task in tasks
+        if TASKS[task].control == "open_loop" and _on_level_ground(task) in {*tasks} - {task}
+    ]
+
+
+@measurement("simulation/terrain", over=lambda: zip(_tasks_on_slopes()))
+def step_on_slopes(bench: Bench, task: str) -> list[Row]:
+    """Times of steps on ramps or bumps, and in turns those of the same task on level ground."""
+    tasks = (task, _on_level_ground(task))
+    found = [(times, unit_s) for times, _, unit_s in _timed_steps(bench, tasks, lambda _: None)]
+    (on_slopes, level), units = (
+        zip(*(times for times, _ in found), strict=True),
+        [unit for _, unit in found],
+    )
+    notes = (
+        f"{statistics.median(on_slopes) / statistics.median(level):.2f} times that on level ground"
+    )
+    return [
+        timed_row(f"{task}, step", "ms", on_slopes, units, notes=notes),
+        timed_row(f"{task}, on level ground", "ms", level, units),
+    ]
+
+
+@measurement("simulation/slip_test", over=lambda: zip(SLIP_TASKS))
+def slip_test(bench: Bench, task: str) -> list[Row]:
+    """Times of steps with and without the test whether a held body slips, in turns.
+
+    The measurement ends when a body slips, since the states then differ.
+    """
+
+    def leave_out_second(envs: Sequence[ManipulationEnv]) -> None:
+        controller = envs[1].scene.controller
+        controller.limits = replace(controller.limits, max_slip_m=math.inf)
+
+    steps, units = [], []
+    for times, states, unit_s in _timed_steps(bench, (task, task), leave_out_second):
+        steps.append(times)
+        units.append(unit_s)
+        if not torch.equal(*(state[keys.PIXELS] for state in states)):
+            break
+    return [
+        timed_row(f"{task}, step {name} the slip test", "ms", values, units)
+        for name, values in zip(("with", "without"), zip(*steps, strict=True), strict=True)
     ]
 
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import ClassVar
 
+import numba
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, world_vertices
@@ -40,7 +40,10 @@ FOOTPRINT_POINTS = 17
 RESTING_ITERATIONS = 3
 """Linearisations in the computation of a body's pose at rest."""
 DEPTH_M = 1.0
-"""Distance below the surface of the point that closes its convex hull."""
+"""Distance below the surface of the points from which the search for the lowest plane starts."""
+SUPPORT_TOLERANCE_M = 1e-12
+"""Height of a point above the lowest plane by rounding."""
+SHARE_TOLERANCE = 1e-12
 
 _BEARINGS = 2 * math.pi * np.arange(16) / 16
 _RING = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS)], axis=1)
@@ -276,14 +279,52 @@ def lowest_plane(
     Returns:
         Slopes [2] of the plane along both axes, and its height at the origin.
     """
-    vertices = np.empty((len(points) + 1, 3))
-    vertices[:-1, :2], vertices[:-1, 2] = points, heights
-    vertices[-1] = (*points.sum(axis=0) / len(points), heights.min() - DEPTH_M)
-    planes = ConvexHull(vertices).equations
-    upper = planes[planes[:, 2] > 1e-9]  # the other faces contain the deep point
-    slopes, offsets = -upper[:, :2] / upper[:, 2:3], -upper[:, 3] / upper[:, 2]
-    lowest = int((slopes @ center + offsets).argmin())
-    return slopes[lowest], float(offsets[lowest])
+    # three deep points around the others are the first triangle below the centre
+    reach = np.ptp(points, axis=0).max()
+    corners = 4.0 * reach * np.array([[-1.0, -1.0], [1.0, -1.0], [0.0, 1.0]]) + center
+    rows = np.empty((len(points) + 3, 3))
+    rows[:-3, :2], rows[:-3, 2] = points, heights
+    rows[-3:, :2], rows[-3:, 2] = corners, heights.min() - DEPTH_M
+    a, b, c = rows[_supporting_triangle(rows, np.asarray(center, dtype=np.float64))]
+    normal = np.cross(b - a, c - a)
+    slopes = -normal[:2] / normal[2]
+    return slopes, float(a[2] - slopes @ a[:2])
+
+
+@numba.njit(cache=True)
+def _supporting_triangle(rows, center):  # noqa: ANN001, ANN202
+    """Return the three of the points [N, 3] on the lowest plane above all of them at the centre.
+
+    The dual simplex method: the last three points are the first triangle, which contains the
+    centre as seen from above. The point highest above the plane of the triangle replaces the corner
+    that leaves the centre in the triangle.
+    """
+    count = len(rows)
+    chosen = np.array([count - 3, count - 2, count - 1])
+    for _ in range(count):
+        ax, ay, az = rows[chosen[0]]
+        bx, by, bz = rows[chosen[1]] - rows[chosen[0]]
+        cx, cy, cz = rows[chosen[2]] - rows[chosen[0]]
+        area = bx * cy - by * cx
+        slope_x, slope_y = (bz * cy - by * cz) / area, (bx * cz - bz * cx) / area
+        farthest, largest = -1, SUPPORT_TOLERANCE_M
+        for k in range(count):
+            above = rows[k, 2] - az - slope_x * (rows[k, 0] - ax) - slope_y * (rows[k, 1] - ay)
+            if above > largest:
+                farthest, largest = k, above
+        if farthest < 0:
+            break
+        # shares of the corners in the centre and in the new point, which sum to one
+        px, py = center[0] - ax, center[1] - ay
+        qx, qy = rows[farthest, 0] - ax, rows[farthest, 1] - ay
+        p1, p2 = (px * cy - py * cx) / area, (bx * py - by * px) / area
+        q1, q2 = (qx * cy - qy * cx) / area, (bx * qy - by * qx) / area
+        leaving, least = 0, np.inf
+        for k, p, q in ((0, 1.0 - p1 - p2, 1.0 - q1 - q2), (1, p1, q1), (2, p2, q2)):
+            if q > SHARE_TOLERANCE and p / q < least:
+                leaving, least = k, p / q
+        chosen[leaving] = farthest
+    return chosen
 
 
 @lru_cache(maxsize=8)

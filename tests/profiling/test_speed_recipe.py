@@ -1,5 +1,6 @@
 """The rows of the table of measurements; the times are not tested."""
 
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from tqdm import tqdm
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
+from ba_torchrl.profiling.simulation import SLIP_TASKS
 from ba_torchrl.profiling.table import (
     COLUMNS,
     GROUPS,
@@ -88,6 +90,24 @@ def test_each_timed_image_is_drawn(monkeypatch):
     compiled = measure("simulation/depth_image", repeats=2, progress=False)[0]
     assert "compiled" in compiled.work
     assert len(drawn) > len(compiled.values) == 20
+
+
+def test_steps_with_and_without_the_slip_test_are_taken_in_turns():
+    rows = measure("simulation/slip_test", repeats=1, progress=False)
+    assert len(rows) == 2 * len(SLIP_TASKS)
+    for with_test, without in zip(rows[::2], rows[1::2], strict=True):
+        assert len(with_test.values) == len(without.values) == len(with_test.unit_s) >= 6
+
+
+def test_steps_on_slopes_are_compared_with_those_on_level_ground():
+    rows = measure("simulation/terrain", repeats=1, progress=False)
+    on_slopes, level = rows[::2], rows[1::2]
+    assert [row.work for row in on_slopes] == [
+        f"{task}, step" for task in ba_torchrl.list_tasks() if task.startswith(("ramp/", "bump/"))
+    ]
+    for row, other in zip(on_slopes, level, strict=True):
+        ratio = statistics.median(row.values) / statistics.median(other.values)
+        assert row.notes == f"{ratio:.2f} times that on level ground"
 
 
 def test_every_measurement_belongs_to_a_group():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -59,7 +60,8 @@ class PickPlaceLimits:
     """Height by which a grasp is lifted before it is checked."""
     max_slip_m: float = 0.002
     """Displacement of a held body in the tool frame, in a simulated motion, above which it slips. A
-    body that is accelerated by `held_acceleration_m_s2` alone lags by 3 mm behind the lift."""
+    body that is accelerated by `held_acceleration_m_s2` alone lags by 3 mm behind the lift.
+    Infinity: slipping is not tested."""
     min_motion_steps: int = 4
     """Least number of physics steps of a simulated straight motion."""
     transit_height_m: float = 0.3
@@ -79,3 +81,8 @@ class PickPlaceLimits:
     """Physics steps after which a body that is not grasped is no longer held."""
     max_vertical_force_n: float = 40.0
     """Sum of vertical contact forces at which a simulated downward motion stops."""
+
+    @property
+    def tests_slip(self) -> bool:
+        """Whether a held body that slips is carried by simulation instead of teleports."""
+        return math.isfinite(self.max_slip_m)

@@ -173,7 +173,10 @@ class PickPlace:
         return bullet_compose(bullet_inverse(self.robot.tool_frame()), body.pose)
 
     def _touched_poses(self) -> dict[Body, Pose]:
-        """Return the poses in the tool frame of the bodies that the hand touches."""
+        """Return the poses in the tool frame of the bodies that the hand touches; none if slipping
+        is not tested."""
+        if not self.limits.tests_slip:
+            return {}
         touched = {contact.other_id for contact in contacts(self.world.client, self.robot.id)}
         return {
             body: self._pose_in_tool_frame(body) for body in self.world.bodies if body.id in touched
@@ -185,6 +188,8 @@ class PickPlace:
         Args:
             before: its pose in the tool frame before a motion; None if the hand did not touch it.
         """
+        if not self.limits.tests_slip:
+            return False
         if before is None:
             return True
         return math.dist(before.position, self.grasp.position) > self.limits.max_slip_m

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -57,18 +58,25 @@ def test_a_block_that_lies_on_a_slope_needs_friction(teleport, friction, is_held
         assert scene.is_held == is_held
 
 
+def steps_of_a_pick(friction, **limits):
+    scene = RampScene(friction=friction)
+    with scene.world:
+        scene.hand.limits = replace(scene.hand.limits, **limits)
+        before = scene.world.steps
+        scene.pick()
+        return scene.world.steps - before
+
+
 def test_only_a_body_that_slips_is_carried_by_simulation():
-    steps = {}
-    for friction in (0.2, 1.0):
-        scene = RampScene(friction=friction)
-        with scene.world:
-            before = scene.world.steps
-            scene.pick()
-            steps[friction] = scene.world.steps - before
+    slipping, held = steps_of_a_pick(0.2), steps_of_a_pick(1.0)
     limits = PickPlaceLimits()
-    assert steps[1.0] < 30
+    assert held < 30
     retreat_steps = math.sqrt(limits.approach_distance_m / limits.held_acceleration_m_s2) * 240
-    assert steps[0.2] > steps[1.0] + retreat_steps
+    assert slipping > held + retreat_steps
+
+
+def test_an_infinite_limit_leaves_the_slip_test_out():
+    assert steps_of_a_pick(0.2, max_slip_m=math.inf) < 30 < steps_of_a_pick(0.2)
 
 
 FRICTIONS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 1.0)
