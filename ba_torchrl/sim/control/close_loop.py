@@ -77,7 +77,8 @@ class CloseLoopController:
         """Move the tool along a straight line to a pose.
 
         The motion ends early where the pose is out of reach or the contact forces exceed their
-        limits.
+        limits. Where the vertical force exceeds its limit, the tool rises and continues
+        sideways: it slides along surfaces.
 
         Args:
             position: target of the tool point, metres.
@@ -161,6 +162,8 @@ class CloseLoopController:
             fraction = min(fraction + stride, 1.0)
             if not self._simulate_path(path, [fraction], None):
                 return 1.0
+            if not path.goes_down:
+                break
         return fraction
 
     def _is_in_contact_below(self, held: Body | None) -> bool:
@@ -204,7 +207,8 @@ class CloseLoopController:
         """Simulate a motion along the path.
 
         The motion ends where the path is out of reach. If a force limit is exceeded, the last
-        displacement is reverted.
+        displacement is reverted. After too large a vertical force, the rest of the path is raised;
+        after too large a lateral force, or if the path is vertical, the motion ends.
 
         Args:
             path: the path.
@@ -227,29 +231,20 @@ class CloseLoopController:
             before = robot.joints
             robot.command(joints)
             self.world.step()
-            if self._is_overloaded(held, vertical_n):
+            points = self._outer_contacts(held)
+            is_blocked = lateral_force_n(points) > limits.max_lateral_force_n
+            if is_blocked or vertical_force_n(points) > vertical_n:
                 # without this, repeated actions would move the stiff arm deeper into the body
                 robot.command(before)
                 self.world.step()
-                has_arrived = False
-                break
+                if is_blocked or not path.goes_sideways:
+                    has_arrived = False
+                    break
+                path.rise(fraction, robot.tool_pose()[0][2] + limits.rise_m)
         measured = robot.measured_joints()
         if max(abs(a - b) for a, b in zip(measured, robot.joints, strict=True)) > 5e-3:
             robot.command(measured)  # ends the force against the body that stopped the arm
         return has_arrived
-
-    def _is_overloaded(self, held: Body | None, vertical_n: float) -> bool:
-        """Whether the contact forces of the hand and the held body exceed a limit.
-
-        Args:
-            held: the held body.
-            vertical_n: limit of the vertical force.
-        """
-        points = self._outer_contacts(held)
-        return (
-            vertical_force_n(points) > vertical_n
-            or lateral_force_n(points) > self.limits.max_lateral_force_n
-        )
 
     def _outer_contacts(self, held: Body | None) -> list[Contact]:
         """Return the contacts of the hand and the held body with other bodies."""
@@ -274,7 +269,16 @@ class _Path:
         self.length_m = math.hypot(*self._delta)
         self.goes_down = self._delta[2] < -1e-4
         self.goes_up = self._delta[2] > 1e-4
+        self.goes_sideways = math.hypot(*self._delta[:2]) > 1e-3
         self.angle_rad = abs(self._rotation_rad)
+
+    def rise(self, fraction: float, height_m: float) -> None:
+        """Continue at or above a height of the tool point, from a fraction of the path on."""
+        climb_m = max(self._delta[2], 0.0)
+        self._start = (*self._start[:2], height_m - fraction * climb_m)
+        self._delta = (*self._delta[:2], climb_m)
+        self.length_m = math.hypot(*self._delta)
+        self.goes_down = False
 
     def joints_at(self, fraction: float) -> list[float] | None:
         """Return the arm joints at a fraction of the path, 0 to 1; None if out of reach."""
