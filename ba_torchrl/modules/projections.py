@@ -77,7 +77,7 @@ def cell_table(
 
     Returns:
         int32 [yaws, ry, rx, size, size, size]: 43 MB for 16 x 7 x 7 rotations of 24 voxels, 200 MB
-        for 40 voxels.
+        for 40 voxels. With both orders of the fingers, a process holds twice this.
     """
     angles = (torch.tensor(values, dtype=torch.float64) for values in (yaws_rad, ry_rad, rx_rad))
     rotations = tool_rotations(*torch.meshgrid(*angles, indexing="ij"))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pybullet
@@ -26,6 +28,7 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.sloped_terrain import OnSlopes
 
 SEED = 0
 CAMERA_M = 1.0
@@ -115,67 +118,80 @@ def step_and_reset(bench: Bench, task: str) -> list[Row]:
     ]
 
 
-def _timed_steps(
+class _Turn(NamedTuple):
+    """One step of each environment."""
+
+    times_s: tuple[float, ...]
+    physics: tuple[int, ...]
+    """Numbers of physics steps."""
+    states: tuple[TensorDictBase, ...]
+    unit_s: float
+    """Duration of a unit of work."""
+
+
+def _turns(
     bench: Bench, tasks: Sequence[str], on_reset: Callable[[Sequence[ManipulationEnv]], None]
-) -> Iterator[tuple[list[float], list[TensorDictBase], float]]:
+) -> Iterator[_Turn]:
     """Step one environment of each task in turns under the experts' actions.
+
+    The order of the environments is reversed after each turn.
 
     Args:
         bench: counts the episodes.
         tasks: of the environments; the shortest episode ends a round.
         on_reset: called with the environments after each reset.
-
-    Yields:
-        The seconds of a step of each environment, their states, and the seconds of a unit of work.
     """
-    unit = SimulationUnit()
-    envs = [make(task, seed=SEED) for task in tasks]
-    episodes = [_expert_actions(task, bench.repeats) for task in tasks]
-    for number in bench.rounds():
-        states = [env.reset() for env in envs]
-        on_reset(envs)
-        for actions in zip(*(played[number] for played in episodes), strict=False):
-            times = []
-            for i, (env, action) in enumerate(zip(envs, actions, strict=True)):
-                states[i][keys.ACTION] = action
-                start = time.perf_counter()
-                result = env.step(states[i])
-                times.append(time.perf_counter() - start)
-                states[i] = result[keys.NEXT]
-            yield times, states, seconds(unit)
-    for world in (*envs, unit.world):
-        world.close()
+    with contextlib.ExitStack() as stack:
+        unit = SimulationUnit()
+        stack.callback(unit.world.close)
+        envs = [make(task, seed=SEED) for task in tasks]
+        for env in envs:
+            stack.callback(env.close)
+        episodes = [_expert_actions(task, bench.repeats) for task in tasks]
+        order = list(range(len(envs)))
+        for number in bench.rounds():
+            states = [env.reset() for env in envs]
+            on_reset(envs)
+            for actions in zip(*(played[number] for played in episodes), strict=False):
+                times, physics = [0.0] * len(envs), [0] * len(envs)
+                for i in order:
+                    states[i][keys.ACTION] = actions[i]
+                    before = envs[i].scene.world.steps
+                    start = time.perf_counter()
+                    result = envs[i].step(states[i])
+                    times[i] = time.perf_counter() - start
+                    physics[i] = envs[i].scene.world.steps - before
+                    states[i] = result[keys.NEXT]
+                order.reverse()
+                yield _Turn(tuple(times), tuple(physics), tuple(states), seconds(unit))
 
 
 def _on_level_ground(task: str) -> str:
-    return f"open_loop/{task.split('/')[1]}"
+    return f"open_loop/{task.rpartition('/')[2]}"
 
 
 def _tasks_on_slopes() -> list[str]:
-    """Return the open-loop tasks of which there is another one on level ground."""
-    tasks = list_tasks()
+    """Return the tasks on slopes of which there is another one on level ground."""
     return [
         task
-        for task in tasks
-        if TASKS[task].control == "open_loop" and _on_level_ground(task) in {*tasks} - {task}
+        for task in list_tasks()
+        if issubclass(TASKS[task], OnSlopes) and _on_level_ground(task) in TASKS
     ]
 
 
 @measurement("simulation/terrain", over=lambda: zip(_tasks_on_slopes()))
 def step_on_slopes(bench: Bench, task: str) -> list[Row]:
     """Times of steps on ramps or bumps, and in turns those of the same task on level ground."""
-    tasks = (task, _on_level_ground(task))
-    found = [(times, unit_s) for times, _, unit_s in _timed_steps(bench, tasks, lambda _: None)]
-    (on_slopes, level), units = (
-        zip(*(times for times, _ in found), strict=True),
-        [unit for _, unit in found],
-    )
-    notes = (
-        f"{statistics.median(on_slopes) / statistics.median(level):.2f} times that on level ground"
-    )
+    turns = list(_turns(bench, (task, _on_level_ground(task)), lambda _: None))
+    units = [turn.unit_s for turn in turns]
+    on_slopes, level = zip(*(turn.times_s for turn in turns), strict=True)
+    steps, level_steps = np.mean([turn.physics for turn in turns], axis=0)
+    ratio = statistics.median(on_slopes) / statistics.median(level)
+    notes = f"{ratio:.2f} times that on level ground, {steps:.1f} physics steps per action"
+    level_notes = f"{level_steps:.1f} physics steps per action"
     return [
         timed_row(f"{task}, step", "ms", on_slopes, units, notes=notes),
-        timed_row(f"{task}, on level ground", "ms", level, units),
+        timed_row(f"{task}, on level ground", "ms", level, units, notes=level_notes),
     ]
 
 
@@ -190,15 +206,15 @@ def slip_test(bench: Bench, task: str) -> list[Row]:
         controller = envs[1].scene.controller
         controller.limits = replace(controller.limits, max_slip_m=math.inf)
 
-    steps, units = [], []
-    for times, states, unit_s in _timed_steps(bench, (task, task), leave_out_second):
-        steps.append(times)
-        units.append(unit_s)
-        if not torch.equal(*(state[keys.PIXELS] for state in states)):
+    times, units = [], []
+    for turn in _turns(bench, (task, task), leave_out_second):
+        times.append(turn.times_s)
+        units.append(turn.unit_s)
+        if not torch.equal(*(state[keys.PIXELS] for state in turn.states)):
             break
     return [
         timed_row(f"{task}, step {name} the slip test", "ms", values, units)
-        for name, values in zip(("with", "without"), zip(*steps, strict=True), strict=True)
+        for name, values in zip(("with", "without"), zip(*times, strict=True), strict=True)
     ]
 
 

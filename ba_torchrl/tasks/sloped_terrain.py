@@ -39,8 +39,9 @@ FOOTPRINT_POINTS = 17
 """Points along each side of the grid that represents the lower face of a body."""
 RESTING_ITERATIONS = 3
 """Linearisations in the computation of a body's pose at rest."""
-DEPTH_M = 1.0
-"""Distance below the surface of the points from which the search for the lowest plane starts."""
+DEPTH_SLOPE = 1e3
+"""Depth of the points from which the search for the lowest plane starts, as a multiple of the
+extent of the surface. Planes up to a quarter of this slope are found."""
 SUPPORT_TOLERANCE_M = 1e-12
 """Height of a point above the lowest plane by rounding."""
 SHARE_TOLERANCE = 1e-12
@@ -196,8 +197,10 @@ class SlopedTerrain(Terrain):
             rotation = np.array(quaternion_matrix(surface_quaternion(_normal(slopes), yaw_rad)))
             points = local @ rotation[:, :2].T + (*xy, height)
             rises = self.heights_m(points[:, :2]) - points[:, 2]
-            # the point of the lower face below the centre of mass
+            # the point of the lower face below the centre of mass; a body whose centre of mass is
+            # beside its lower face gets the tilt of the surface, and topples
             below = center[:2] - center[2] * rotation[2, :2] / rotation[2, 2]
+            below = np.clip(below, 0.99 * local.min(axis=0), 0.99 * local.max(axis=0))
             gradient, offset = lowest_plane(local, rises, below)
             slopes = slopes + np.linalg.solve(rotation[:2, :2].T, gradient)
             height += offset
@@ -284,7 +287,7 @@ def lowest_plane(
     corners = 4.0 * reach * np.array([[-1.0, -1.0], [1.0, -1.0], [0.0, 1.0]]) + center
     rows = np.empty((len(points) + 3, 3))
     rows[:-3, :2], rows[:-3, 2] = points, heights
-    rows[-3:, :2], rows[-3:, 2] = corners, heights.min() - DEPTH_M
+    rows[-3:, :2], rows[-3:, 2] = corners, heights.min() - DEPTH_SLOPE * reach
     a, b, c = rows[_supporting_triangle(rows, np.asarray(center, dtype=np.float64))]
     normal = np.cross(b - a, c - a)
     slopes = -normal[:2] / normal[2]

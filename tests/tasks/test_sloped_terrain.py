@@ -248,6 +248,22 @@ def test_the_lowest_plane_is_the_solution_of_the_linear_program(seed):
     assert (rows @ (*slopes, height) - heights).min() == pytest.approx(0.0, abs=1e-9)
 
 
+def test_the_lowest_plane_of_three_points_is_theirs():
+    points, heights = np.array([[0.0, 0.0], [0.05, 0.0], [0.0, 0.05]]), np.array([0.0, 0.3, 1.0])
+    slopes, height = lowest_plane(points, heights, points.mean(axis=0))
+    assert (*slopes, height) == pytest.approx((6.0, 20.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("height_m", [0.03, 0.06, 0.1, 0.2])
+def test_a_body_stands_with_the_tilt_of_the_surface_even_if_it_topples(world, height_m):
+    ramps = Ramps(world, WORKSPACE)
+    box = world.add(Box(size_m=(0.03, 0.03, height_m)), "box")
+    world.seal()
+    ramps.heights_m = lambda points: 0.5 * points[:, 0]
+    ramps.stand(box, (0.4, 0.0), 0.7)
+    assert box.tilt_rad == pytest.approx(math.atan(0.5), abs=1e-6)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_boxes_stand_on_bumps_where_physics_leaves_them(world, seed):
     bumps = Bumps(world, WORKSPACE, (0.13, 0.1), random_orientation=True)

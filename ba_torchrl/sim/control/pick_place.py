@@ -173,8 +173,10 @@ class PickPlace:
         return bullet_compose(bullet_inverse(self.robot.tool_frame()), body.pose)
 
     def _touched_poses(self) -> dict[Body, Pose]:
-        """Return the poses in the tool frame of the bodies that the hand touches; none if slipping
-        is not tested."""
+        """Return the poses in the tool frame of the bodies that the hand touches.
+
+        There are none if slipping is not tested.
+        """
         if not self.limits.tests_slip:
             return {}
         touched = {contact.other_id for contact in contacts(self.world.client, self.robot.id)}
