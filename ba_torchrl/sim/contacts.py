@@ -20,6 +20,10 @@ VERTICAL_COSINE = 0.6
 """A contact is vertical if its normal is within 53 degrees of the vertical."""
 
 
+CANCELLED = 0.1
+"""Share of a sum of forces below which they cancel out."""
+
+
 class Contact(NamedTuple):
     """A contact point, or a pair of closest points, of two bodies.
 
@@ -128,3 +132,15 @@ def vertical_force_n(contacts: Iterable[Contact]) -> float:
 def lateral_force_n(contacts: Iterable[Contact]) -> float:
     """Return the sum of the normal forces of the contacts that are not vertical."""
     return sum(contact.force_n for contact in contacts if not contact.is_vertical)
+
+
+def lateral_direction(contacts: Iterable[Contact]) -> tuple[float, float]:
+    """Return the horizontal direction of the lateral forces on the bodies, a unit vector.
+
+    It is (0, 0) if the forces cancel out.
+    """
+    lateral = [contact for contact in contacts if not contact.is_vertical]
+    x, y = (sum(c.force_n * c.normal[axis] for c in lateral) for axis in (0, 1))
+    norm = math.hypot(x, y)
+    total = sum(contact.force_n for contact in lateral)
+    return (x / norm, y / norm) if norm > CANCELLED * total else (0.0, 0.0)

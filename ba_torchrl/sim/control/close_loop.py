@@ -17,7 +17,13 @@ import math
 
 from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import Contact, lateral_force_n, outer_contacts, vertical_force_n
+from ba_torchrl.sim.contacts import (
+    Contact,
+    lateral_direction,
+    lateral_force_n,
+    outer_contacts,
+    vertical_force_n,
+)
 from ba_torchrl.sim.control.limits import MotionLimits
 from ba_torchrl.sim.geometry import Vector, YawPose, downward
 from ba_torchrl.sim.robots.base import Robot
@@ -77,8 +83,8 @@ class CloseLoopController:
         """Move the tool along a straight line to a pose.
 
         The motion ends early where the pose is out of reach or the contact forces exceed their
-        limits. Where the vertical force exceeds its limit, the tool rises and continues
-        sideways: it slides along surfaces.
+        limits. Where a force exceeds its limit, the tool yields by a small distance and
+        continues without the motion against the force: it slides along surfaces.
 
         Args:
             position: target of the tool point, metres.
@@ -207,8 +213,8 @@ class CloseLoopController:
         """Simulate a motion along the path.
 
         The motion ends where the path is out of reach. If a force limit is exceeded, the last
-        displacement is reverted. After too large a vertical force, the rest of the path is raised;
-        after too large a lateral force, or if the path is vertical, the motion ends.
+        displacement is reverted, and the rest of the path yields to the force: its component
+        against the force is removed. If nothing remains of it, the motion ends.
 
         Args:
             path: the path.
@@ -232,15 +238,17 @@ class CloseLoopController:
             robot.command(joints)
             self.world.step()
             points = self._outer_contacts(held)
-            is_blocked = lateral_force_n(points) > limits.max_lateral_force_n
-            if is_blocked or vertical_force_n(points) > vertical_n:
+            is_raised = vertical_force_n(points) > vertical_n
+            is_pushed = lateral_force_n(points) > limits.max_lateral_force_n
+            if is_raised or is_pushed:
                 # without this, repeated actions would move the stiff arm deeper into the body
                 robot.command(before)
                 self.world.step()
-                if is_blocked or not path.goes_sideways:
+                away = lateral_direction(points) if is_pushed else (0.0, 0.0)
+                path.yield_to((*away, float(is_raised)), fraction, limits.yield_m)
+                if path.remaining_m(fraction) < limits.yield_m:
                     has_arrived = False
                     break
-                path.rise(fraction, robot.tool_pose()[0][2] + limits.rise_m)
         measured = robot.measured_joints()
         if max(abs(a - b) for a, b in zip(measured, robot.joints, strict=True)) > 5e-3:
             robot.command(measured)  # ends the force against the body that stopped the arm
@@ -264,21 +272,36 @@ class _Path:
     def __init__(self, robot: Robot, start: YawPose, end: YawPose) -> None:
         self._robot = robot
         self._start, self._start_yaw = start
-        self._delta = tuple(e - s for s, e in zip(self._start, end[0], strict=True))
         self._rotation_rad = wrap_angle(end[1] - start[1])
-        self.length_m = math.hypot(*self._delta)
-        self.goes_down = self._delta[2] < -1e-4
-        self.goes_up = self._delta[2] > 1e-4
-        self.goes_sideways = math.hypot(*self._delta[:2]) > 1e-3
         self.angle_rad = abs(self._rotation_rad)
+        self._set_delta(tuple(e - s for s, e in zip(self._start, end[0], strict=True)))
 
-    def rise(self, fraction: float, height_m: float) -> None:
-        """Continue at or above a height of the tool point, from a fraction of the path on."""
-        climb_m = max(self._delta[2], 0.0)
-        self._start = (*self._start[:2], height_m - fraction * climb_m)
-        self._delta = (*self._delta[:2], climb_m)
-        self.length_m = math.hypot(*self._delta)
-        self.goes_down = False
+    def _set_delta(self, delta: Vector) -> None:
+        self._delta = delta
+        self.length_m = math.hypot(*delta)
+        self.goes_down = delta[2] < -1e-4
+        self.goes_up = delta[2] > 1e-4
+
+    def yield_to(self, direction: Vector, fraction: float, distance_m: float) -> None:
+        """Displace the rest of the path, and remove its motion against the displacement.
+
+        Args:
+            direction: of the displacement: horizontal and vertical unit vectors, or zeros.
+            fraction: of the path that has been covered.
+            distance_m: length of the displacement.
+        """
+        x, y, z = self._robot.tool_pose()[0]
+        dx, dy, dz = self._delta
+        away_x, away_y, up = direction
+        against = min(dx * away_x + dy * away_y, 0.0)
+        delta = dx - against * away_x, dy - against * away_y, max(dz, 0.0) if up else dz
+        tool = x + distance_m * away_x, y + distance_m * away_y, z + distance_m * up
+        self._start = tuple(t - fraction * d for t, d in zip(tool, delta, strict=True))
+        self._set_delta(delta)
+
+    def remaining_m(self, fraction: float) -> float:
+        """Return the length of the rest of the path, metres."""
+        return (1 - fraction) * self.length_m
 
     def joints_at(self, fraction: float) -> list[float] | None:
         """Return the arm joints at a fraction of the path, 0 to 1; None if out of reach."""

@@ -19,12 +19,12 @@ class MotionLimits:
     """Duration of a displacement of 5 cm with a held body; it is proportional to the square root of
     the displacement."""
     max_vertical_force_n: float = 40.0
-    """The tool rises when the sum of the vertical contact forces of the hand and the held body
-    exceeds this; a vertical motion stops."""
-    rise_m: float = 1e-3
-    """Distance by which it rises."""
+    """The tool yields when the sum of the vertical contact forces of the hand and the held body
+    exceeds this."""
     max_lateral_force_n: float = 150.0
-    """A motion stops when the sum of the lateral contact forces exceeds this."""
+    """The same for the lateral contact forces."""
+    yield_m: float = 1e-3
+    """Displacement of a tool that yields."""
     press_stride_m: float = 5e-4
     """Displacement per step of a downward motion that starts in contact."""
     max_press_steps: int = 8

@@ -1,8 +1,16 @@
 """Close-loop motions in contact: the tool slides along surfaces within its force limits."""
 
+import math
+
 import pytest
 
-from ba_torchrl.sim.contacts import lateral_force_n, outer_contacts, vertical_force_n
+from ba_torchrl.sim.contacts import (
+    Contact,
+    lateral_direction,
+    lateral_force_n,
+    outer_contacts,
+    vertical_force_n,
+)
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
@@ -60,6 +68,32 @@ def test_a_wall_stops_fingers_that_slide_along_the_floor(robot):
             scene.move(0.45, scene.tool[1] + 0.05, -0.02)
         assert -0.06 < scene.tool[1] < 0.0
         assert scene.tool[2] < 0.03
+
+
+@pytest.mark.parametrize("heading", [-0.5, 0.5])
+def test_fingers_that_are_pushed_against_a_wall_slide_along_it(heading):
+    with Scene("kuka", 0.0, Box(size_m=(0.4, 0.02, 0.2), mass_kg=0.0)) as scene:
+        wall = scene.bodies[0]
+        wall.place((0.45, 0.0, 0.1), heading)
+        for _ in range(4):
+            scene.move(scene.tool[0], scene.tool[1] + 0.05, 0.1)
+            assert scene.forces()[1] < 2 * scene.controller.limits.max_lateral_force_n
+        along_m = (scene.tool[0] - 0.45) * math.cos(heading) + scene.tool[1] * math.sin(heading)
+        across_m = scene.tool[1] * math.cos(heading) - (scene.tool[0] - 0.45) * math.sin(heading)
+        assert math.copysign(along_m, heading * along_m) > 0.04
+        assert -0.06 < across_m < -0.01  # on the same side
+
+
+def test_the_direction_of_lateral_forces_is_their_weighted_mean():
+    def contact(normal, force_n):
+        return Contact(0, 1, 2, 0, 0, *[(0.0, 0.0, 0.0)] * 2, normal, 0.0, force_n, *[0.0] * 4)
+
+    points = [contact((1.0, 0.0, 0.0), 30.0), contact((0.0, 1.0, 0.0), 40.0)]
+    vertical = contact((0.0, 0.0, 1.0), 500.0)
+    assert lateral_direction([*points, vertical]) == pytest.approx((0.6, 0.8))
+    opposed = [contact((1.0, 0.0, 0.0), 30.0), contact((-1.0, 0.0, 0.0), 30.0)]
+    assert lateral_direction(opposed) == (0.0, 0.0)
+    assert lateral_direction([vertical]) == (0.0, 0.0)
 
 
 def test_fingers_climb_a_slope_that_they_are_pushed_against():
