@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.profiling import throughput
 from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
 from ba_torchrl.profiling.simulation import SLIP_TASKS
 from ba_torchrl.profiling.table import (
@@ -48,7 +49,9 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
     assert all(row.count("|") == columns for row in rows)
     work = [row.split("|")[1].strip() for row in rows]
     tasks = ba_torchrl.list_tasks()
-    assert len(work) == len(set(work)) == 2 * len(tasks) + 3
+    on_slopes = sum(task.startswith(("ramp/", "bump/")) for task in tasks)
+    others = 3 + 2 * len(SLIP_TASKS)  # depth images and the slip test
+    assert len(work) == len(set(work)) == 2 * len(tasks) + 2 * on_slopes + others
     for task in tasks:
         (step,) = (row for row in rows if f"| {task}, step, 128 px |" in row)
         assert "physics steps per action" in step
@@ -108,6 +111,16 @@ def test_steps_on_slopes_are_compared_with_those_on_level_ground():
     for row, other in zip(on_slopes, level, strict=True):
         ratio = statistics.median(row.values) / statistics.median(other.values)
         assert row.notes.startswith(f"{ratio:.2f} times that on level ground, ")
+
+
+@pytest.mark.parametrize(("collector", "workers"), [("single", 1), ("multi_sync", 2)])
+def test_the_frames_of_a_runs_collector_are_counted(collector, workers, monkeypatch):
+    monkeypatch.setattr(throughput, "ROUND_S", 0.2)
+    with tqdm(disable=True) as bar:
+        (row,) = throughput.run_collection(Bench(2, bar), collector, workers)
+    assert f"collector={collector}, {workers} worker" in row.work
+    assert len(row.values) == len(row.unit_s) == 2
+    assert min(row.values) > 1
 
 
 def test_every_measurement_belongs_to_a_group():

@@ -103,6 +103,9 @@ class _Worker(Collector):
     def __bool__(self) -> bool:
         return True  # else Ray asks for the length, which an endless collector does not have
 
+    def __repr__(self) -> str:
+        return type(self).__name__  # Ray prints it with each line of output, so it has one line
+
 
 class _RestartingCollector(RayCollector):
     """TorchRL's collector, with workers that Ray restarts and that receive weights as objects.
