@@ -8,7 +8,7 @@ python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstru
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.data.demo_files import save_demonstrations
@@ -22,6 +22,7 @@ from ba_torchrl.training.command_line import (
     check_counts,
     check_texts,
     check_writable,
+    mapping_of,
     plain_errors,
     register_schemas,
 )
@@ -42,7 +43,7 @@ def main(settings: DictConfig) -> None:
     check_writable(settings.path)
     if Path(settings.path).exists():
         raise ConfigError(f"{settings.path} exists already; choose another path")
-    env_settings = OmegaConf.to_container(settings.env, resolve=True)
+    env_settings = mapping_of(settings, "env")
     env = make_vector_env(
         settings.task,
         settings.num_envs,

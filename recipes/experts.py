@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
@@ -23,6 +23,7 @@ from ba_torchrl.training.command_line import (
     check_lists,
     check_texts,
     check_writable,
+    mapping_of,
     plain_errors,
     register_schemas,
 )
@@ -45,7 +46,7 @@ def main(settings: DictConfig) -> None:
         check_writable(settings.path)
     for robot in settings.robots:
         _ = ROBOTS[robot]  # raises with the known names
-    variants = OmegaConf.to_container(settings.variants, resolve=True)
+    variants = mapping_of(settings, "variants")
     tables = []
     for table, columns in variants.items():
         tasks = [

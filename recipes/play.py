@@ -7,7 +7,7 @@ python recipes/play.py task=close_loop/corner_picking video=null env.render=true
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from ba_torchrl.data.demos import expert_policy
 from ba_torchrl.errors import ConfigError
@@ -18,6 +18,7 @@ from ba_torchrl.training.command_line import (
     check_counts,
     check_texts,
     check_writable,
+    mapping_of,
     plain_errors,
     register_schemas,
 )
@@ -44,7 +45,7 @@ def main(settings: DictConfig) -> None:
         check_video(settings.video, settings.fps)
         check_writable(settings.video)
     torch.manual_seed(settings.seed)
-    env = OmegaConf.to_container(settings.env, resolve=True)
+    env = mapping_of(settings, "env")
     frames = record_episodes(
         settings.task,
         {**env, "expert": settings.policy == "expert"},

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from ba_torchrl import list_tasks
 from ba_torchrl.envs.factory import resolve
@@ -21,6 +21,7 @@ from ba_torchrl.training.command_line import (
     check_lists,
     check_texts,
     check_writable,
+    mapping_of,
     plain_errors,
     register_schemas,
 )
@@ -39,7 +40,7 @@ def main(settings: DictConfig) -> None:
     check_texts(settings, "folder")
     check_counts(settings, "steps", "long_steps", least=10)
     check_counts(settings, "seed", least=0)
-    env = OmegaConf.to_container(settings.env, resolve=True)
+    env = mapping_of(settings, "env")
     tasks = list(settings.tasks or list_tasks())
     for task in tasks:
         resolve(task, **env)  # raises with the known names

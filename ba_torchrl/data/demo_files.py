@@ -95,9 +95,9 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
     try:
         data = TensorDict.load_memmap(path, allow_pickle=False)
         numbers = data[_EPISODE].squeeze(-1)
+        return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} does not hold episodes: {error}") from error
-    return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
 
 
 def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> None:

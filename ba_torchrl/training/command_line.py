@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import hydra_schema
@@ -108,6 +108,22 @@ def check_lists(settings: DictConfig, *names: str, optional: bool = False) -> No
         is_list = isinstance(value, ListConfig) and all(isinstance(item, str) for item in value)
         if not (is_list or (optional and value is None)):
             raise ConfigError(f"{name}: must be a list of names, got {value!r}")
+
+
+def mapping_of(settings: DictConfig, name: str) -> dict[str, Any]:
+    """Return a group of settings as a dictionary.
+
+    Args:
+        settings: of the recipe.
+        name: of the group, such as "env".
+
+    Raises:
+        ConfigError: it is not a group.
+    """
+    value = settings[name]
+    if not isinstance(value, DictConfig):
+        raise ConfigError(f"{name}: must be a group of settings, got {value!r}")
+    return OmegaConf.to_container(value, resolve=True)
 
 
 def check_writable(path: str | Path) -> None:
