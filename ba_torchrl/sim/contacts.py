@@ -18,8 +18,6 @@ CONTACT_DISTANCE_M = 5e-4
 """Bodies closer than this are in contact; PyBullet also lists pairs that are millimetres apart."""
 VERTICAL_COSINE = 0.6
 """A contact is vertical if its normal is within 53 degrees of the vertical."""
-
-
 CANCELLED = 0.1
 """Share of a sum of forces below which they cancel out."""
 
@@ -144,3 +142,9 @@ def lateral_direction(contacts: Iterable[Contact]) -> tuple[float, float]:
     norm = math.hypot(x, y)
     total = sum(contact.force_n for contact in lateral)
     return (x / norm, y / norm) if norm > CANCELLED * total else (0.0, 0.0)
+
+
+def vertical_direction(contacts: Iterable[Contact]) -> float:
+    """Return the sign of the sum of the vertical forces on the bodies: 1 upwards, -1 downwards."""
+    force = sum(c.force_n * c.normal[2] for c in contacts if c.is_vertical)
+    return math.copysign(1.0, force)

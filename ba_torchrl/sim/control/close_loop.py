@@ -22,6 +22,7 @@ from ba_torchrl.sim.contacts import (
     lateral_direction,
     lateral_force_n,
     outer_contacts,
+    vertical_direction,
     vertical_force_n,
 )
 from ba_torchrl.sim.control.limits import MotionLimits
@@ -82,9 +83,9 @@ class CloseLoopController:
     def move_to(self, position: Vector, yaw_rad: float) -> None:
         """Move the tool along a straight line to a pose.
 
-        The motion ends early where the pose is out of reach or the contact forces exceed their
-        limits. Where a force exceeds its limit, the tool yields by a small distance and
-        continues without the motion against the force: it slides along surfaces.
+        The motion ends early where the pose is out of reach. Where a contact force exceeds its
+        limit, the tool yields by a small distance and continues without the motion against the
+        force: it slides along surfaces.
 
         Args:
             position: target of the tool point, metres.
@@ -238,14 +239,15 @@ class CloseLoopController:
             robot.command(joints)
             self.world.step()
             points = self._outer_contacts(held)
-            is_raised = vertical_force_n(points) > vertical_n
-            is_pushed = lateral_force_n(points) > limits.max_lateral_force_n
-            if is_raised or is_pushed:
+            yields_vertically = vertical_force_n(points) > vertical_n
+            yields_laterally = lateral_force_n(points) > limits.max_lateral_force_n
+            if yields_vertically or yields_laterally:
                 # without this, repeated actions would move the stiff arm deeper into the body
                 robot.command(before)
                 self.world.step()
-                away = lateral_direction(points) if is_pushed else (0.0, 0.0)
-                path.yield_to((*away, float(is_raised)), fraction, limits.yield_m)
+                away = lateral_direction(points) if yields_laterally else (0.0, 0.0)
+                up = vertical_direction(points) if yields_vertically else 0.0
+                path.yield_to((*away, up), fraction, limits.yield_m)
                 if path.remaining_m(fraction) < limits.yield_m:
                     has_arrived = False
                     break
@@ -293,8 +295,8 @@ class _Path:
         x, y, z = self._robot.tool_pose()[0]
         dx, dy, dz = self._delta
         away_x, away_y, up = direction
-        against = min(dx * away_x + dy * away_y, 0.0)
-        delta = dx - against * away_x, dy - against * away_y, max(dz, 0.0) if up else dz
+        against, down = min(dx * away_x + dy * away_y, 0.0), min(dz * up, 0.0)
+        delta = dx - against * away_x, dy - against * away_y, dz - down * up
         tool = x + distance_m * away_x, y + distance_m * away_y, z + distance_m * up
         self._start = tuple(t - fraction * d for t, d in zip(tool, delta, strict=True))
         self._set_delta(delta)

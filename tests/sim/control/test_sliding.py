@@ -9,9 +9,10 @@ from ba_torchrl.sim.contacts import (
     lateral_direction,
     lateral_force_n,
     outer_contacts,
+    vertical_direction,
     vertical_force_n,
 )
-from ba_torchrl.sim.control.close_loop import CloseLoopController
+from ba_torchrl.sim.control.close_loop import CloseLoopController, _Path
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
@@ -94,6 +95,39 @@ def test_the_direction_of_lateral_forces_is_their_weighted_mean():
     opposed = [contact((1.0, 0.0, 0.0), 30.0), contact((-1.0, 0.0, 0.0), 30.0)]
     assert lateral_direction(opposed) == (0.0, 0.0)
     assert lateral_direction([vertical]) == (0.0, 0.0)
+    assert vertical_direction([*points, vertical]) == 1.0
+    assert (
+        vertical_direction([contact((0.0, 0.0, -1.0), 500.0), vertical._replace(force_n=1.0)]) == -1
+    )
+
+
+@pytest.mark.parametrize(
+    ("direction", "end"),
+    [
+        ((0.0, 0.0, 1.0), (0.47, 0.02, 0.221)),  # a force from below does not stop a rise
+        ((0.0, 0.0, -1.0), (0.47, 0.02, 0.199)),
+        ((-1.0, 0.0, 0.0), (0.449, 0.02, 0.22)),
+        ((0.0, 1.0, 0.0), (0.47, 0.021, 0.22)),
+        ((-0.6, -0.8, 0.0), (0.4526, -0.0032, 0.22)),
+    ],
+)
+def test_a_path_yields_by_a_distance_and_loses_its_motion_against_it(direction, end):
+    class Robot:
+        joints = None
+
+        def tool_pose(self):
+            return (0.45, 0.0, 0.2), 0.0
+
+        def inverse_kinematics(self, position, *_):
+            return position
+
+    path = _Path(Robot(), ((0.43, -0.02, 0.18), 0.0), ((0.47, 0.02, 0.22), 0.0))
+    path.yield_to(direction, 0.5, 1e-3)
+    assert path.joints_at(1.0) == pytest.approx(end, abs=1e-9)
+    tool = path.joints_at(0.5)
+    moved = tuple(0.001 * d for d in direction)
+    assert tool == pytest.approx((0.45 + moved[0], moved[1], 0.2 + moved[2]), abs=1e-9)
+    assert path.remaining_m(0.5) == pytest.approx(math.dist(tool, end), abs=1e-9)
 
 
 def test_fingers_climb_a_slope_that_they_are_pushed_against():
