@@ -45,6 +45,7 @@ extent of the surface. Planes up to a quarter of this slope are found."""
 SUPPORT_TOLERANCE_M = 1e-12
 """Height of a point above the lowest plane by rounding."""
 SHARE_TOLERANCE = 1e-12
+"""Share of a corner in a point that is zero up to rounding."""
 
 _BEARINGS = 2 * math.pi * np.arange(16) / 16
 _RING = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS)], axis=1)

@@ -123,6 +123,15 @@ def altered(folder, sealed, read):
     return prop
 
 
+def test_demonstrations_whose_shape_is_altered_are_refused(demos, tmp_path):
+    copy = shutil.copytree(demos, tmp_path / "copy")
+    description = copy / "meta.json"
+    description.write_text(json.dumps(json.loads(description.read_text()) | {"shape": []}))
+    seal(copy)
+    with pytest.raises(ConfigError, match="does not hold episodes"):
+        load_demonstrations(copy, task=TASK, env=ENV)
+
+
 @examples(60)
 def test_demonstrations(demos, count):
     def read(path):

@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 import ba_torchrl
 from ba_torchrl.data.state_files import write_state
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.command_line import EXIT_CODE, check_writable, plain_errors
+from ba_torchrl.training.command_line import EXIT_CODE, check_writable, mapping_of, plain_errors
 from ba_torchrl.training.config import ExperimentConfig
 
 ROOT = Path(__file__).parents[2]
@@ -187,3 +188,10 @@ def test_a_folder_without_permission_is_refused(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(ConfigError, match="Permission denied"):
         check_writable(tmp_path / "file")
+
+
+@pytest.mark.parametrize("value", [None, 1, "text", ["a"]])
+def test_a_group_of_settings_must_be_one(value):
+    assert mapping_of(OmegaConf.create({"env": {"robot": "ur5"}}), "env") == {"robot": "ur5"}
+    with pytest.raises(ConfigError, match="env: must be a group of settings, got"):
+        mapping_of(OmegaConf.create({"env": value}), "env")
