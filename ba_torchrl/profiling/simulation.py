@@ -9,7 +9,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pybullet
@@ -130,7 +130,10 @@ class _Turn(NamedTuple):
 
 
 def _turns(
-    bench: Bench, tasks: Sequence[str], on_reset: Callable[[Sequence[ManipulationEnv]], None]
+    bench: Bench,
+    tasks: Sequence[str],
+    on_reset: Callable[[Sequence[ManipulationEnv]], None] = lambda _: None,
+    settings: Sequence[dict[str, Any]] = ({}, {}),
 ) -> Iterator[_Turn]:
     """Step one environment of each task in turns under the experts' actions.
 
@@ -140,11 +143,14 @@ def _turns(
         bench: counts the episodes.
         tasks: of the environments; the shortest episode ends a round.
         on_reset: called with the environments after each reset.
+        settings: of each environment.
     """
     with contextlib.ExitStack() as stack:
         unit = SimulationUnit()
         stack.callback(unit.world.close)
-        envs = [make(task, seed=SEED) for task in tasks]
+        envs = [
+            make(task, seed=SEED, **values) for task, values in zip(tasks, settings, strict=True)
+        ]
         for env in envs:
             stack.callback(env.close)
         episodes = [_expert_actions(task, bench.repeats) for task in tasks]
@@ -182,7 +188,7 @@ def _tasks_on_slopes() -> list[str]:
 @measurement("simulation/terrain", over=lambda: zip(_tasks_on_slopes()))
 def step_on_slopes(bench: Bench, task: str) -> list[Row]:
     """Times of steps on ramps or bumps, and in turns those of the same task on level ground."""
-    turns = list(_turns(bench, (task, _on_level_ground(task)), lambda _: None))
+    turns = list(_turns(bench, (task, _on_level_ground(task))))
     units = [turn.unit_s for turn in turns]
     on_slopes, level = zip(*(turn.times_s for turn in turns), strict=True)
     steps, level_steps = np.mean([turn.physics for turn in turns], axis=0)
@@ -215,6 +221,19 @@ def slip_test(bench: Bench, task: str) -> list[Row]:
     return [
         timed_row(f"{task}, step {name} the slip test", "ms", values, units)
         for name, values in zip(("with", "without"), zip(*times, strict=True), strict=True)
+    ]
+
+
+@measurement("simulation/expert", over=lambda: zip(list_tasks()))
+def expert_action(bench: Bench, task: str) -> list[Row]:
+    """Times of steps with and without the expert's next action, in turns."""
+    turns = list(_turns(bench, (task, task), settings=({"expert": True}, {})))
+    units = [turn.unit_s for turn in turns]
+    steps, plain = zip(*(turn.times_s for turn in turns), strict=True)
+    notes = f"the action takes {1e3 * (statistics.mean(steps) - statistics.mean(plain)):.2f} ms"
+    return [
+        timed_row(f"{task}, step with the expert's action", "ms", steps, units, notes=notes),
+        timed_row(f"{task}, step without it", "ms", plain, units),
     ]
 
 

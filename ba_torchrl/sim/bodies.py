@@ -28,6 +28,9 @@ class Body:
         name: used in error messages.
     """
 
+    _vertices: tuple[Pose, np.ndarray] | None = None
+    """Pose and result of the last call of `world_vertices`."""
+
     def __init__(self, client: int, shape: Shape, name: str) -> None:
         self.client = client
         self.shape = shape
@@ -144,7 +147,12 @@ class Body:
 
 def world_vertices(body: Body) -> np.ndarray:
     """Return the vertices of a body's visual surface in the world frame, [V, 3] metres."""
-    return body.pose.apply(body.shape.vertices)
+    pose = body.pose
+    if body._vertices is None or body._vertices[0] != pose:
+        vertices = pose.apply(body.shape.vertices)
+        vertices.flags.writeable = False
+        body._vertices = pose, vertices
+    return body._vertices[1]
 
 
 def vertical_extent(body: Body) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ba_torchrl.sim.bodies import Body, world_vertices
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, Vector, downward, rotation_array
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
-from ba_torchrl.tasks.footprints import Rectangle, extents_m, gap_m, separation_m
+from ba_torchrl.tasks.footprints import Rectangle, extents_m, gaps_m, separation_m
 
 Range = tuple[float, float]
 """Ends of an interval along the direction in which the fingers close."""
@@ -187,58 +188,88 @@ def hand_clearance_m(
     return gap
 
 
-def tool_clearance_m(
+def tool_clearances_m(
     robot: Robot,
-    tool: Pose,
-    others: Sequence[Body],
+    tools: Sequence[Pose],
+    others: Iterable[Body],
     opening: float = 1.0,
     *,
     with_knuckles: bool = False,
-) -> float:
-    """Return the clearance between the hand with open fingers at a pose, and other bodies.
+) -> np.ndarray:
+    """Return the clearances between the hand with open fingers at some poses, and other bodies.
 
-    It is a lower bound, the largest gap between parallel lines that separate the two.
+    Each is a lower bound, the largest gap between parallel lines that separate the two.
 
     Args:
         robot: the robot.
-        tool: pose of the tool, which may be tilted.
+        tools: K poses of the tool, which may be tilted.
         others: the other bodies.
         opening: opening of the gripper, 0 to 1.
         with_knuckles: include the parts of the fingers that are wider than those beside an object.
+
+    Returns:
+        [K] metres.
     """
-    # in a frame with the tool's position in which the tool points straight down at yaw zero
-    to_view = rotation_array(tool.orientation) @ np.array(downward(0.0)).T
-    x, y, z = tool.position
-    frame, gripper = PlanarFrame(x, y, 0.0), robot.gripper
-    fingers = finger_rectangles(gripper, frame, half_gap_m(gripper, opening))
-    parts = [(finger, gripper.lowest_tip_m) for finger in fingers]
-    parts.append((hand_rectangle(robot, frame), gripper.palm_height_m))
-    if with_knuckles:
-        reach_m, height = knuckles_m(gripper)
-        reach_m -= (1 - opening) * gripper.half_gap_m
-        knuckles = Rectangle(x, y, 0.0, reach_m, gripper.half_width_m + SIDE_MARGIN_M)
-        parts.append((knuckles, height))
-    extents = [(extents_m(part.corners), height) for part, height in parts]
-    gap = math.inf
+    # in frames at the tools' positions in which the tools point straight down at yaw zero
+    upright = np.array(downward(0.0)).T
+    to_views = np.stack([rotation_array(tool.orientation) @ upright for tool in tools])
+    origins = np.array([tool.position for tool in tools])[:, None]
+    parts, heights = _hand_extents(robot.gripper, robot.hand_half_extents_m, opening, with_knuckles)
+    gaps = np.full(len(tools), math.inf)
     for other in others:
-        corners = (world_vertices(other) - tool.position) @ to_view + tool.position
-        around = extents_m(corners[:, :2])
-        for part, height in extents:
-            if corners[:, 2].max() > z + height:
-                gap = min(gap, separation_m(part, around))
-    return gap
+        corners = (world_vertices(other) - origins) @ to_views
+        separations = separation_m(parts[:, None], extents_m(corners[..., :2]))  # [parts, K]
+        is_higher = corners[..., 2].max(axis=1) > heights[:, None]
+        gaps = np.minimum(gaps, np.where(is_higher, separations, math.inf).min(axis=0))
+    return gaps
 
 
-def outline_clearance_m(
-    gripper: Gripper, tool: PlanarFrame, half_opening_m: float, others: Iterable[Rectangle]
-) -> float:
-    """Return the clearance between the fingers and outlines.
+@lru_cache(maxsize=64)
+def _hand_extents(
+    gripper: Gripper, hand_half_extents_m: tuple[float, float], opening: float, with_knuckles: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return outlines and heights of the parts of an open hand at the origin.
 
     Args:
         gripper: the gripper.
-        tool: frame of the tool.
+        hand_half_extents_m: half the extents of the hand above the palm.
+        opening: opening of the gripper, 0 to 1.
+        with_knuckles: include the parts of the fingers that are wider than those beside an object.
+
+    Returns:
+        Extremes [parts, 2, BEARINGS] of each part's outline, and its height [parts] above the tool
+        point: only bodies that are higher can touch it.
+    """
+    origin = PlanarFrame(0.0, 0.0, 0.0)
+    fingers = finger_rectangles(gripper, origin, half_gap_m(gripper, opening))
+    parts = [(finger, gripper.lowest_tip_m) for finger in fingers]
+    parts.append((Rectangle(*origin, *hand_half_extents_m), gripper.palm_height_m))
+    if with_knuckles:
+        reach_m, height = knuckles_m(gripper)
+        reach_m -= (1 - opening) * gripper.half_gap_m
+        half_width_m = gripper.half_width_m + SIDE_MARGIN_M
+        parts.append((Rectangle(*origin, reach_m, half_width_m), height))
+    outlines, heights = zip(*parts, strict=True)
+    return np.stack([extents_m(part.corners) for part in outlines]), np.array(heights)
+
+
+def outline_clearances_m(
+    gripper: Gripper,
+    tools: Sequence[PlanarFrame],
+    half_opening_m: float,
+    others: Sequence[Rectangle],
+) -> np.ndarray:
+    """Return the clearances between the fingers and outlines.
+
+    Args:
+        gripper: the gripper.
+        tools: K frames of the tool.
         half_opening_m: distance between the tool point and the inner side of a finger.
         others: outlines of bodies that are higher than the fingertips.
+
+    Returns:
+        [K] metres.
     """
-    fingers = finger_rectangles(gripper, tool, half_opening_m)
-    return min((gap_m(finger, other) for other in others for finger in fingers), default=math.inf)
+    fingers = [f for tool in tools for f in finger_rectangles(gripper, tool, half_opening_m)]
+    gaps = gaps_m(fingers, others).reshape(len(tools), 2 * len(others))
+    return gaps.min(axis=1, initial=math.inf)

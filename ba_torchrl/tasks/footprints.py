@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -85,6 +86,26 @@ def gap_m(first: Rectangle, second: Rectangle) -> float:
     return gap
 
 
+def gaps_m(first: Sequence[Rectangle], second: Sequence[Rectangle]) -> np.ndarray:
+    """Return `gap_m` of every rectangle of one list [N] and every one of another [M], [N, M]."""
+    one, other = (
+        np.array(rectangles, dtype=float).reshape(-1, 5) for rectangles in (first, second)
+    )
+
+    def along_sides(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return the largest gap along a side of the rectangles of ``a``."""
+        x, y, yaw, half_x, half_y = np.moveaxis(b, -1, 0) - np.moveaxis(a * (1, 1, 1, 0, 0), -1, 0)
+        cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+        turn_cos, turn_sin = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
+        along = np.abs(cos * x + sin * y) - a[..., 3] - (turn_cos * half_x + turn_sin * half_y)
+        across = np.abs(cos * y - sin * x) - a[..., 4] - (turn_sin * half_x + turn_cos * half_y)
+        return np.maximum(along, across)
+
+    return np.maximum(
+        along_sides(one[:, None], other[None]), along_sides(other[None], one[:, None])
+    )
+
+
 def outline(body: Body, yaw_rad: float | None = None) -> Rectangle:
     """Return the bounding rectangle of a body's footprint.
 
@@ -127,11 +148,20 @@ def _bounding_rectangle(corners: np.ndarray, yaw_rad: float) -> Rectangle:
 
 
 def extents_m(points: np.ndarray) -> np.ndarray:
-    """Return the extremes [2, BEARINGS] of points [V, 2] along each bearing."""
+    """Return the extremes [..., 2, BEARINGS] of points [..., V, 2] along each bearing."""
     along = points @ _DIRECTIONS
-    return np.stack([along.min(axis=0), along.max(axis=0)])
+    return np.stack([along.min(axis=-2), along.max(axis=-2)], axis=-2)
 
 
-def separation_m(one: np.ndarray, other: np.ndarray) -> float:
-    """Return a lower bound of the distance between two outlines from their extents."""
-    return float(np.maximum(one[0] - other[1], other[0] - one[1]).max())
+def separation_m(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return lower bounds of the distances between outlines.
+
+    Args:
+        one: [..., 2, BEARINGS] extremes, as `extents_m` returns.
+        other: the same; leading dimensions are broadcast.
+
+    Returns:
+        [...] metres.
+    """
+    gaps = np.maximum(one[..., 0, :] - other[..., 1, :], other[..., 0, :] - one[..., 1, :])
+    return gaps.max(axis=-1)

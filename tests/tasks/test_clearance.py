@@ -4,9 +4,17 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from ba_torchrl.sim.geometry import PlanarFrame
+from ba_torchrl.sim.bodies import world_vertices
+from ba_torchrl.sim.geometry import (
+    PlanarFrame,
+    Pose,
+    matrix_quaternion,
+    rotation_array,
+    tool_rotation,
+)
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
@@ -20,9 +28,10 @@ from ba_torchrl.tasks.clearance import (
     hand_clearance_m,
     hand_rectangle,
     knuckles_m,
-    outline_clearance_m,
+    outline_clearances_m,
     passing_height_m,
     tips_below_tool_m,
+    tool_clearances_m,
 )
 from ba_torchrl.tasks.footprints import Rectangle
 
@@ -101,15 +110,63 @@ def test_only_bodies_higher_than_the_palm_are_obstacles_of_the_hand(cubes):
     assert hand_rectangle(robot, tool) == Rectangle(0.45, 0.0, math.pi / 2, 0.07, 0.03)
 
 
+@pytest.mark.parametrize("with_knuckles", [False, True])
+def test_clearances_of_tilted_tools_are_gaps_in_the_frame_of_each_tool(cubes, with_knuckles):
+    """Compared with the gaps between projections of vertices onto 16 lines, one at a time."""
+    _, other = cubes
+    robot = SimpleNamespace(gripper=GRIPPER, hand_half_extents_m=(0.07, 0.03))
+    inner, outer, half_width = 0.04 - INNER_MARGIN_M, 0.06 - INNER_MARGIN_M, 0.01 + SIDE_MARGIN_M
+    parts = [  # extents along the closing axis and across it, and height above the tool point
+        ((inner, outer), (-half_width, half_width), -0.01),
+        ((-outer, -inner), (-half_width, half_width), -0.01),
+        ((-0.07, 0.07), (-0.03, 0.03), 0.05),
+    ]
+    if with_knuckles:
+        parts.append(((-0.07, 0.07), (-half_width, half_width), 0.045))
+    rng = np.random.default_rng(1)
+    tools = [
+        Pose((0.45, 0.0, 0.02), matrix_quaternion(tool_rotation(*angles)))
+        for angles in rng.uniform((-3.0, -0.4, -0.4), (3.0, 0.4, 0.4), (6, 3))
+    ]
+    found = []
+    for _ in range(8):
+        other.set_pose(
+            tuple(rng.uniform((0.38, -0.07, 0.0), (0.52, 0.07, 0.08))),
+            matrix_quaternion(tool_rotation(*rng.uniform(-1.0, 1.0, 3))),
+        )
+        gaps = tool_clearances_m(robot, tools, [other], with_knuckles=with_knuckles)
+        for tool, gap in zip(tools, gaps, strict=True):
+            x_axis, y_axis, z_axis = rotation_array(tool.orientation).T
+            points = [
+                (offset @ x_axis, -(offset @ y_axis), -(offset @ z_axis))
+                for offset in world_vertices(other) - tool.position
+            ]
+            least = math.inf
+            for (x0, x1), (y0, y1), height in parts:
+                if max(z for _, _, z in points) <= height:
+                    continue
+                widest = -math.inf
+                for i in range(16):
+                    cos, sin = math.cos(i * math.pi / 16), math.sin(i * math.pi / 16)
+                    ours = [cos * x + sin * y for x in (x0, x1) for y in (y0, y1)]
+                    theirs = [cos * x + sin * y for x, y, _ in points]
+                    widest = max(widest, min(theirs) - max(ours), min(ours) - max(theirs))
+                least = min(least, widest)
+            found.append(least)
+            assert gap == (least if least == math.inf else pytest.approx(least, abs=1e-9))
+    assert min(found) < 0 < max(found)
+
+
 def test_footprints_of_the_fingers_and_their_clearance_from_an_outline():
     tool = PlanarFrame(0.4, 0.1, math.pi / 2)
     left, right = finger_rectangles(GRIPPER, tool, 0.03)
     assert left[:2] == pytest.approx((0.4, 0.1 - 0.04))
     assert right == pytest.approx((0.4, 0.1 + 0.04, math.pi / 2, 0.01, 0.01 + SIDE_MARGIN_M))
     wall = Rectangle(0.4, 0.2, 0.0, 0.1, 0.01)
-    gap = outline_clearance_m(GRIPPER, tool, 0.03, [wall])
-    assert gap == pytest.approx(0.2 - 0.01 - (0.1 + 0.05))
-    assert outline_clearance_m(GRIPPER, tool, 0.03, []) == math.inf
+    lower = tool._replace(y=0.05)
+    gaps = outline_clearances_m(GRIPPER, [tool, lower], 0.03, [wall])
+    assert gaps == pytest.approx([0.2 - 0.01 - (0.1 + 0.05), 0.2 - 0.01 - (0.05 + 0.05)])
+    assert list(outline_clearances_m(GRIPPER, [tool, lower], 0.03, [])) == [math.inf, math.inf]
 
 
 def test_heights_follow_from_the_depth_of_the_fingertips():

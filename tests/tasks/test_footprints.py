@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest
+from ba_torchrl.tasks.footprints import Rectangle, gap_m, gaps_m, narrowest
 from ba_torchrl.tasks.workspace import Workspace
 from tests.tasks.packing.scenes import BIN
 
@@ -31,6 +31,19 @@ def test_gaps_between_rectangles(second, gap):
             assert gap_m(a, b) < 0
         else:
             assert gap_m(a, b) == pytest.approx(gap)
+
+
+def test_gaps_between_all_rectangles_of_two_lists_are_those_of_each_pair():
+    rng = np.random.default_rng(0)
+    rectangles = [
+        Rectangle(*rng.uniform((-0.2, -0.2, -4.0, 0.01, 0.01), (0.2, 0.2, 4.0, 0.1, 0.1)))
+        for _ in range(12)
+    ]
+    first, second = rectangles[:5], rectangles[5:]
+    expected = [[gap_m(a, b) for b in second] for a in first]
+    assert np.min(expected) < 0 < np.max(expected)
+    assert gaps_m(first, second) == pytest.approx(np.array(expected), abs=1e-12)
+    assert gaps_m(first, []).shape == (5, 0)
 
 
 def test_rotated_rectangles_overlap_by_their_corners():

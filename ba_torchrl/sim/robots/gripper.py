@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Protocol
 
 import numpy as np
@@ -85,12 +85,12 @@ class Gripper:
         """Extent of a fingertip along the closing axis."""
         return self.closed_half_m - self.tip_arc[0][0]
 
-    @property
+    @cached_property
     def finger_reach_m(self) -> float:
         """Distance of the outer side of the open fingers, up to `GRASP_HEIGHT_M`."""
         return self.finger_reach_below_m(GRASP_HEIGHT_M)
 
-    @property
+    @cached_property
     def lowest_tip_m(self) -> float:
         """Least height of the fingertips at any opening."""
         return min(z for _, z in self.tip_arc)

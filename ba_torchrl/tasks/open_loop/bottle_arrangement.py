@@ -15,7 +15,7 @@ from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.clearance import half_gap_m, outline_clearance_m
+from ba_torchrl.tasks.clearance import half_gap_m, outline_clearances_m
 from ba_torchrl.tasks.footprints import Rectangle
 from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
@@ -174,13 +174,7 @@ class BottleArrangement(PackingTask):
             yaw = self.robot.tool_pose()[1]
             if self.action_limits.turn_rad:
                 obstacles = self.obstacles(held, floor + self.depth_m(held) + self.tips_m)
-                half = self.release_half_m(held)
-                yaw = max(
-                    self._yaws(),
-                    key=lambda yaw: round(
-                        self._finger_clearance_m((x, y), yaw, half, obstacles), 4
-                    ),
-                )
+                yaw, _ = self._best_yaw((x, y), self.release_half_m(held), obstacles)
             turn = yaw - self.robot.tool_pose()[1]
             return self.place(held, (x, y, floor + RELEASE_GAP_M), turn)
         outside = [body for body in self.objects if not self.stands_in_tray(body)]
@@ -203,29 +197,22 @@ class BottleArrangement(PackingTask):
         obstacles = self.obstacles(body, height + self.tips_m)
         x, y, _ = body.position
         half = half_gap_m(self.robot.gripper, self.finger_opening)
-        choices = [
-            TopDownGrasp(
-                body,
-                (x, y, height),
-                yaw,
-                self._finger_clearance_m((x, y), yaw, half, obstacles),
-            )
-            for yaw in self._yaws()
-        ]
-        return max(choices, key=lambda choice: round(choice.clearance_m, 4))
+        yaw, clearance_m = self._best_yaw((x, y), half, obstacles)
+        return TopDownGrasp(body, (x, y, height), yaw, clearance_m)
 
     # ----------------------------------------------------------------------------------------
 
-    def _finger_clearance_m(
-        self,
-        xy: tuple[float, float],
-        yaw_rad: float,
-        half_opening_m: float,
-        obstacles: Sequence[Rectangle],
-    ) -> float:
-        """Return the clearance between the fingers at a tool position and obstacles."""
-        tool = PlanarFrame(*xy, yaw_rad)
-        return outline_clearance_m(self.robot.gripper, tool, half_opening_m, obstacles)
+    def _best_yaw(
+        self, xy: tuple[float, float], half_opening_m: float, obstacles: Sequence[Rectangle]
+    ) -> tuple[float, float]:
+        """Return the yaw at which fingers at a position have the largest clearance, and this."""
+        yaws = self._yaws()
+        tools = [PlanarFrame(*xy, yaw) for yaw in yaws]
+        gripper = self.robot.gripper
+        clearances_m = outline_clearances_m(gripper, tools, half_opening_m, obstacles).tolist()
+        rounded = [round(clearance_m, 4) for clearance_m in clearances_m]
+        best = rounded.index(max(rounded))
+        return yaws[best], clearances_m[best]
 
     def _yaws(self) -> list[float]:
         """Return the yaws to grasp or release a bottle at, a diagonal of the tray first."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import pybullet
 
 from ba_torchrl.actions import PickPlaceCommand
@@ -16,8 +17,8 @@ from ba_torchrl.sim.meshes import box_mesh, frame_parts, merge_meshes, transform
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.clearance import half_gap_m, hand_rectangle, outline_clearance_m
-from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
+from ba_torchrl.tasks.clearance import half_gap_m, hand_rectangle, outline_clearances_m
+from ba_torchrl.tasks.footprints import Rectangle, gaps_m, narrowest, outline
 from ba_torchrl.tasks.grasps import TopDownGrasp
 from ba_torchrl.tasks.open_loop_task import OpenLoopControl
 from ba_torchrl.tasks.pick_place_commands import place_command
@@ -146,18 +147,20 @@ class PackingTask(OpenLoopControl, Task):
         obstacles = self.obstacles(body, height + self.tips_m)
         hand_obstacles = self.obstacles(body, height + gripper.palm_height_m)
         half_open = half_gap_m(gripper, self.finger_opening)
-        choices = []
-        for side in narrowest(body, None if self.action_limits.turn_rad else 0.0):
-            for offset in self.grasp_offsets_m:
-                if abs(offset * self.unit) > max(side.half_y - 0.012, 0.0):
-                    continue
-                xy = side.frame.to_world(0.0, offset * self.unit)
-                tool = PlanarFrame(*xy, side.yaw_rad)
-                clearance = outline_clearance_m(gripper, tool, half_open, obstacles)
-                hand = hand_rectangle(self.robot, tool)
-                clearance = min([clearance, *(gap_m(hand, other) for other in hand_obstacles)])
-                choices.append(TopDownGrasp(body, (*xy, height), side.yaw_rad, clearance))
-        return max(choices, key=lambda choice: min(choice.clearance_m, SUFFICIENT_CLEARANCE_M))
+        tools = [
+            PlanarFrame(*side.frame.to_world(0.0, offset * self.unit), side.yaw_rad)
+            for side in narrowest(body, None if self.action_limits.turn_rad else 0.0)
+            for offset in self.grasp_offsets_m
+            if abs(offset * self.unit) <= max(side.half_y - 0.012, 0.0)
+        ]
+        hands = [hand_rectangle(self.robot, tool) for tool in tools]
+        clearances_m = np.minimum(
+            outline_clearances_m(gripper, tools, half_open, obstacles),
+            gaps_m(hands, hand_obstacles).min(axis=1, initial=math.inf),
+        )
+        best = int(np.minimum(clearances_m, SUFFICIENT_CLEARANCE_M).argmax())
+        x, y, yaw = tools[best]
+        return TopDownGrasp(body, (x, y, height), yaw, float(clearances_m[best]))
 
     def place(self, held: Body, position: Vector, turn_rad: float) -> PickPlaceCommand:
         """Return the place of the held body at a position and a yaw up to half turns.

@@ -19,7 +19,7 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import tool_clearance_m
+from ba_torchrl.tasks.clearance import tool_clearances_m
 from ba_torchrl.tasks.structures.parts import CUBOID
 from ba_torchrl.tasks.structures.tilted_grasps import is_reachable
 
@@ -95,7 +95,9 @@ def tilted_grasp(
         down = perpendicular(tuple(-u for u in up), axis)
         position = tuple(frame.apply(np.array([0.0, offset, above_centre_m])).tolist())
         tool = Pose(position, axes_quaternion(axis, down))
-        clearance_m = tool_clearance_m(robot, tool, others, opening, with_knuckles=True)
+        (clearance_m,) = tool_clearances_m(
+            robot, [tool], others, opening, with_knuckles=True
+        ).tolist()
         score = min(clearance_m, sufficient_m) - cost
         if score > best_score and is_reachable(robot, support_ids, tool):
             best, best_score = TiltedGrasp(tool, clearance_m), score

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from ba_torchrl.tasks.clearance import (
     grasp_clearance_m,
     hand_clearance_m,
     path_clearance_m,
-    tool_clearance_m,
+    tool_clearances_m,
 )
 from ba_torchrl.tasks.pick_place_commands import LEVEL_RAD
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps
@@ -36,6 +37,17 @@ LENGTH_SHARES = (-0.1, 0.1, -0.2, 0.2, -0.3, 0.3)
 """Positions of grasps off the centre of a long piece, as a multiple of its length."""
 SUFFICIENT_CLEARANCE_M = 0.02
 """Clearances above this are equally good."""
+
+
+class Quality(NamedTuple):
+    """Quality of a grasp; a larger one is better."""
+
+    deficit_m: float
+    """The clearance if it is negative, else 0."""
+    centering_m: float
+    """How close the grasp is to the centre, at most 0."""
+    clearance_m: float
+    """The clearance including that of the near finger."""
 
 
 class GraspSelector:
@@ -62,6 +74,12 @@ class GraspSelector:
         self.terrain = terrain
         self.limits = limits
         self.finger_opening = finger_opening
+        self._candidates: dict[Body, tuple[Pose, list[GraspCandidate]]] = {}
+        """Pose of each body and its grasps at this pose."""
+
+    def on_new_decision(self) -> None:
+        """Prepare for a scene whose ground may have changed since the last call."""
+        self._candidates.clear()
 
     def yaws(self, body: Body) -> list[float]:
         """Return the yaws of the gripper at which it can grasp a body."""
@@ -80,15 +98,21 @@ class GraspSelector:
         Returns:
             Metres; exact up to `SUFFICIENT_CLEARANCE_M`, infinite if no piece is near.
         """
-        return self.candidate_clearance_m(
-            body, GraspCandidate(yaw_rad), self.others(body), position
-        )
+        candidates = [GraspCandidate(yaw_rad)]
+        return self.clearances_m(body, candidates, self.others(body), position)[0]
 
     def candidates(self, body: Body) -> list[GraspCandidate]:
         """Return the grasps of a body, the centred ones first.
 
         A body on a slope is grasped along the normal of its side, as far as the arm can reach.
         """
+        pose, candidates = self._candidates.get(body, (None, []))
+        if pose != body.pose:
+            candidates = self._new_candidates(body)
+            self._candidates[body] = body.pose, candidates
+        return candidates
+
+    def _new_candidates(self, body: Body) -> list[GraspCandidate]:
         piece = self.structure.planner.pieces[body]
         candidates = [GraspCandidate(yaw) for yaw in self.yaws(body)]
         if self.limits.can_tilt and piece.tilt_rad(body) >= LEVEL_RAD:
@@ -139,11 +163,10 @@ class GraspSelector:
 
         If it reaches none of them, it pushes a tilted body with fingers that point straight down.
         """
-        ranked = sorted(
-            self.candidates(body),
-            key=lambda candidate: self.quality(body, candidate),
-            reverse=True,
-        )
+        candidates = self.candidates(body)
+        qualities = self._qualities(body, candidates)
+        order = sorted(range(len(candidates)), key=qualities.__getitem__, reverse=True)
+        ranked = [candidates[i] for i in order]
         if not self.limits.can_tilt:
             return ranked[0]
         supports = self.terrain.support_ids
@@ -160,28 +183,35 @@ class GraspSelector:
     def _is_on_ground(self, body: Body) -> bool:
         return self.terrain.gap_below_m(body) < self.structure.block_m / 4
 
-    def quality(self, body: Body, candidate: GraspCandidate) -> tuple[float, float, float]:
-        """Return the quality of a grasp, by which grasps are compared.
+    def quality(self, body: Body, candidate: GraspCandidate) -> Quality:
+        """Return the quality of a grasp, by which grasps are compared."""
+        return self._qualities(body, [candidate])[0]
 
-        Returns:
-            The clearance if it is negative, else 0; how close the grasp is to the centre, at most
-            0; and the clearance including that of the near finger.
-        """
-        if (
-            self.limits.can_tilt
-            and self._raise_m(body, candidate) > RAISE_BLOCKS * self.structure.block_m
-        ):
-            return -1.0, 0.0, -1.0
+    def _qualities(self, body: Body, candidates: Sequence[GraspCandidate]) -> list[Quality]:
+        """Return the quality of each grasp of a body."""
         others = self.others(body)
-        clearance_m = least_m = self.candidate_clearance_m(body, candidate, others, None)
-        if candidate.shift_m:
-            gripper, yaw = self.robot.gripper, candidate.yaw_rad
-            near = (candidate.near_finger_range_m,)
-            least_m = min(clearance_m, path_clearance_m(gripper, body, yaw, near, others))
-        if candidate.tool is not None:  # the largest tilt with enough clearance comes first
-            least_m = min(least_m, SUFFICIENT_CLEARANCE_M)
-        centering = -abs(candidate.along_m) - bool(candidate.shift_m)
-        return min(clearance_m, 0.0), centering, least_m
+        limit_m = RAISE_BLOCKS * self.structure.block_m
+        is_raised = [
+            self.limits.can_tilt and self._raise_m(body, candidate) > limit_m
+            for candidate in candidates
+        ]
+        lower = [c for c, raised in zip(candidates, is_raised, strict=True) if not raised]
+        clearances_m = iter(self.clearances_m(body, lower, others, None))
+        qualities = []
+        for candidate, raised in zip(candidates, is_raised, strict=True):
+            if raised:
+                qualities.append(Quality(-1.0, 0.0, -1.0))
+                continue
+            clearance_m = least_m = next(clearances_m)
+            if candidate.shift_m:
+                gripper, yaw = self.robot.gripper, candidate.yaw_rad
+                near = (candidate.near_finger_range_m,)
+                least_m = min(clearance_m, path_clearance_m(gripper, body, yaw, near, others))
+            if candidate.tool is not None:  # the largest tilt with enough clearance comes first
+                least_m = min(least_m, SUFFICIENT_CLEARANCE_M)
+            centering_m = -abs(candidate.along_m) - bool(candidate.shift_m)
+            qualities.append(Quality(min(clearance_m, 0.0), centering_m, least_m))
+        return qualities
 
     def tool_pose(self, body: Body, candidate: GraspCandidate) -> Pose:
         """Return the pose of the tool for a grasp, raised so that the fingers clear the ground."""
@@ -197,37 +227,66 @@ class GraspSelector:
         at = _tool_position(body.position, candidate)
         return self.tool_pose(body, candidate).position[2] - at[2]
 
-    def candidate_clearance_m(
+    def clearances_m(
         self,
         body: Body,
-        candidate: GraspCandidate,
+        candidates: Sequence[GraspCandidate],
         others: Sequence[Body],
         position: Vector | None,
-    ) -> float:
-        """Return the clearance between the hand, opened around a body, and some other bodies.
+    ) -> list[float]:
+        """Return the clearances between the hand, opened around a body, and some other bodies.
 
         Of an edge grasp only the far finger counts.
+
+        Args:
+            body: the body.
+            candidates: the grasps.
+            others: the other bodies; those beyond the reach of the hand do not count.
+            position: assumed position of the body; its present one if None.
         """
         at = body.position if position is None else position
-        x, y, z = grasp = _tool_position(at, candidate)
-        extent = math.hypot(*self.robot.hand_half_extents_m) + SUFFICIENT_CLEARANCE_M
-        others = [
-            other
-            for other in others
-            if math.dist(other.position[:2], (x, y)) < extent + footprint_radius_m(other)
-        ]
+        grasps = [_tool_position(at, candidate) for candidate in candidates]
+        extent_m = math.hypot(*self.robot.hand_half_extents_m) + SUFFICIENT_CLEARANCE_M
+        clearances_m = [math.inf] * len(candidates)
+        for other in others:
+            center, reach_m = other.position[:2], extent_m + footprint_radius_m(other)
+            near = [i for i, grasp in enumerate(grasps) if math.dist(center, grasp[:2]) < reach_m]
+            tilted = [i for i in near if candidates[i].tool is not None]
+            found = {
+                i: self._vertical_clearance_m(body, candidates[i], grasps[i], other, at)
+                for i in near
+                if candidates[i].tool is None
+            }
+            if tilted:
+                tools = [Pose(grasps[i], candidates[i].tool) for i in tilted]
+                gaps_m = tool_clearances_m(
+                    self.robot, tools, [other], self.finger_opening, with_knuckles=True
+                )
+                found |= zip(tilted, gaps_m.tolist(), strict=True)
+            for i, gap_m in found.items():
+                clearances_m[i] = min(clearances_m[i], gap_m)
+        return clearances_m
+
+    def _vertical_clearance_m(
+        self, body: Body, candidate: GraspCandidate, grasp: Vector, other: Body, at: Vector
+    ) -> float:
+        """Return the clearance of a tool that points straight down from another body.
+
+        Args:
+            body: the body.
+            candidate: the grasp.
+            grasp: position of the tool.
+            other: the other body.
+            at: position of the body.
+        """
         gripper, yaw = self.robot.gripper, candidate.yaw_rad
-        if candidate.tool is not None:
-            tool = Pose(grasp, candidate.tool)
-            return tool_clearance_m(
-                self.robot, tool, others, self.finger_opening, with_knuckles=True
-            )
         if candidate.shift_m:
             far = (candidate.far_finger_range_m,)
-            fingers = path_clearance_m(gripper, body, yaw, far, others, at)
+            fingers = path_clearance_m(gripper, body, yaw, far, [other], at)
         else:
-            fingers = grasp_clearance_m(gripper, body, yaw, others, self.finger_opening, grasp)
-        return min(fingers, hand_clearance_m(self.robot, PlanarFrame(x, y, yaw), z, others))
+            fingers = grasp_clearance_m(gripper, body, yaw, [other], self.finger_opening, grasp)
+        x, y, z = grasp
+        return min(fingers, hand_clearance_m(self.robot, PlanarFrame(x, y, yaw), z, [other]))
 
     def others(self, body: Body) -> list[Body]:
         """Return the other pieces."""

@@ -87,6 +87,7 @@ class PickPlaceExpert(GraspQueries):
 
     def command(self) -> PickPlaceCommand:
         """Return the pick or place of the planner's next move; a no-op if the structure stands."""
+        self.grasps.on_new_decision()
         held = self.robot.held_body()
         move = self.structure.planner.next_move(self._placement_area(), held, self)
         if move is None:
@@ -175,10 +176,8 @@ class PickPlaceExpert(GraspQueries):
         if position is not None:  # the body is displaced instead of the other piece
             coordinates = zip(at, other.position, position, strict=True)
             at = tuple(a + b - c for a, b, c in coordinates)
-        return [
-            self.grasps.candidate_clearance_m(body, candidate, [other], at) <= 0
-            for candidate in self.grasps.candidates(body)
-        ]
+        candidates = self.grasps.candidates(body)
+        return [gap_m <= 0 for gap_m in self.grasps.clearances_m(body, candidates, [other], at)]
 
     # ----------------------------------------------------------------------------------------
 
@@ -272,8 +271,8 @@ class PickPlaceExpert(GraspQueries):
         rotation = quaternion_matrix(tool.orientation)
         lowest = self.terrain.lowest_tool_m(gripper, (x, y), rotation, self.robot.opening())
         candidate = GraspCandidate(tool.yaw_rad, tool=tool.orientation)
-        clearance_m = self.grasps.candidate_clearance_m(
-            move.body, candidate, self.grasps.others(move.body), tool.position
+        (clearance_m,) = self.grasps.clearances_m(
+            move.body, [candidate], self.grasps.others(move.body), tool.position
         )
         return min(clearance_m, SUFFICIENT_CLEARANCE_M) - max(lowest - z, 0.0)
 

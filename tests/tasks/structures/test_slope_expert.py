@@ -87,5 +87,5 @@ def test_a_tilted_grasp_has_no_clearance_where_the_knuckles_touch_a_piece(make_e
     # its side is beyond the fingers and below the palm
     at = tool.compose(Pose((0.066 + half_m, 0.0, -0.05))).position
     cuboid.set_pose(at, tool.orientation)
-    clearance_m = grasps.candidate_clearance_m(roof, candidate, [cuboid], None)
+    (clearance_m,) = grasps.clearances_m(roof, [candidate], [cuboid], None)
     assert clearance_m < 0
