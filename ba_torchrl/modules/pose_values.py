@@ -103,13 +103,14 @@ class PoseValues(nn.Module):
         Args:
             views: heights or projections [B, K, C, p, p].
             in_hand: [B, C', h, w].
-            scene: feature map [B, C'', h', w'].
+            scene: feature map [S, C'', h', w'] of the first S samples, which repeat B / S times.
             holding: [B, 1], which selects the primitive.
         """
         x = self._features(views, in_hand).unflatten(0, views.shape[:2])
         of_view, of_scene = self.values.weight.split([x.shape[-1], self.scene.out_features], dim=1)
         values = F.linear(x, of_view)
-        values += F.linear(F.relu(self.scene(scene)), of_scene, self.values.bias)[:, None]
+        scene_values = F.linear(F.relu(self.scene(scene)), of_scene, self.values.bias)
+        values += scene_values.repeat(len(views) // len(scene), 1)[:, None]
         values = values.unflatten(-1, (2, self.values_per_view)).transpose(1, 2)
         return select_primitive(values.flatten(2), holding)[:, 0]
 
@@ -154,5 +155,5 @@ class FingerSymmetricValues(nn.Module):
         """
         views = torch.cat(views.chunk(2, dim=1))
         in_hand = torch.cat([in_hand, self.in_hand.reverse_axes(in_hand, "xy")])
-        values = self.values(views, in_hand, scene.repeat(2, 1, 1, 1), holding.repeat(2, 1))
+        values = self.values(views, in_hand, scene, holding.repeat(2, 1))
         return torch.stack(values.chunk(2)).mean(dim=0)
