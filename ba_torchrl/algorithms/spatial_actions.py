@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import torch
@@ -57,13 +56,8 @@ def demonstration_on_grid(
         images: declarations of the network's input images.
     """
     action = episode[keys.ACTION]
-    nearest = grid.nearest(action)
-    out = episode.copy().set(keys.ACTION, nearest)
-    components = grid.actions.components
-    if "rz" not in components or not grid.actions.half_rotation:
-        return out
-    rz = components.index("rz")
-    is_swapped = (nearest[:, rz] - action[:, rz]).abs() > math.pi / 2
+    out = episode.copy().set(keys.ACTION, grid.nearest(action))
+    is_swapped = grid.swaps_fingers(action)
     is_over = torch.zeros(len(episode) + 1, dtype=torch.bool)
     for t, is_holding in enumerate(episode[keys.HOLDING].flatten().tolist()):
         is_over[t + 1] = is_over[t] if is_holding else is_swapped[t]

@@ -139,7 +139,7 @@ class SpatialQ(Learner):
             seed=self.problem.derived_seed(SeedUse.AUGMENTATION),
             probability=config.augmentation_probability,
             order=config.augmentation_order,
-            nearest_action=self.nearest_action,
+            grid=self.actions,
         )
 
     def nearest_action(self, action: Tensor) -> Tensor:

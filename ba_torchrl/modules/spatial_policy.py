@@ -83,7 +83,7 @@ class SpatialActions:
         Where the yaw of the nearest index is half a turn from the nearest yaw, the fingers are
         swapped, and the tilts are negated: except for the fingers, the tool keeps its pose.
         """
-        is_swapped = self._swaps_fingers(action)
+        is_swapped = self.swaps_fingers(action)
         columns = []
         for name, place, axis in zip(self.components, self._positions, self.axes, strict=True):
             value = action[..., place].double()
@@ -97,7 +97,7 @@ class SpatialActions:
             columns.append(index)
         return torch.stack(columns, dim=-1)
 
-    def _swaps_fingers(self, action: Tensor) -> Tensor:
+    def swaps_fingers(self, action: Tensor) -> Tensor:
         """Return whether the nearest indices swap the fingers, bool [...], of actions [..., A]."""
         if "rz" not in self.components or not self.actions.half_rotation:
             return torch.zeros(action.shape[:-1], dtype=torch.bool, device=action.device)

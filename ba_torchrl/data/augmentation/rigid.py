@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -67,6 +67,17 @@ def transform_images(images: Tensor, transform: RigidTransform) -> Tensor:
     return transformed
 
 
+class ActionGrid(Protocol):
+    """A grid of actions."""
+
+    def nearest(self, action: Tensor) -> Tensor:
+        """Return the actions of the grid that are nearest to actions [B, A]."""
+
+    def swaps_fingers(self, action: Tensor) -> Tensor:
+        """Return whether the nearest yaws are half a turn away from the nearest ones of the grid,
+        which swaps the fingers, bool [B]."""
+
+
 class RigidAugmentation(nn.Module):
     """Applies a random rigid transform to images, next images and action of each transition.
 
@@ -82,8 +93,8 @@ class RigidAugmentation(nn.Module):
         seed: of the module's own draws.
         probability: of transforming a transition.
         order: n of C_n.
-        nearest_action: returns the actions of a grid that are nearest to actions [B, A]; None to
-            keep transformed actions as they are.
+        grid: of actions, to whose nearest ones transformed actions are rounded; None to keep them
+            as they are.
 
     Raises:
         ValueError: the probability is outside [0, 1], the order is not positive, an image cannot be
@@ -100,7 +111,7 @@ class RigidAugmentation(nn.Module):
         seed: int,
         probability: float = 1.0,
         order: int = 16,
-        nearest_action: Callable[[Tensor], Tensor] | None = None,
+        grid: ActionGrid | None = None,
     ) -> None:
         super().__init__()
         if not 0 <= probability <= 1 or order < 1:
@@ -121,7 +132,7 @@ class RigidAugmentation(nn.Module):
         self.actions = actions
         self.probability = probability
         self.order = order
-        self._nearest_action = nearest_action
+        self._grid = grid
         self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
         self._gripper_images = {
             key: image for key, image in images.items() if image.frame == "gripper"
@@ -223,10 +234,9 @@ class RigidAugmentation(nn.Module):
                 moved[:, tilt] = torch.where(is_turned_over, -moved[:, tilt], moved[:, tilt])
         moved[:, rz] = yaw
         moved = moved.to(action)
-        if self._nearest_action is not None:
-            exact, moved = moved, self._nearest_action(moved)
-            if self.actions.half_rotation:  # a yaw that is rounded up to pi is 0, fingers swapped
-                is_turned_over ^= (moved[:, rz] - exact[:, rz]).abs() > math.pi / 2
+        if self._grid is not None:
+            is_turned_over ^= self._grid.swaps_fingers(moved)
+            moved = self._grid.nearest(moved)
         return moved, is_turned_over
 
     def _reverse_axes(self, out: TensorDictBase, rows: Tensor, axes: str) -> None:

@@ -135,7 +135,7 @@ def test_images_are_reversed_where_the_grid_swaps_the_fingers(transforms, order)
     action = grid.nearest(torch.from_numpy(action).float())
     in_hand = np.arange(3 * 24 * 24, dtype=np.float64).reshape(3, 24, 24)
     data = transitions(spot(), action, in_hand)
-    module = augmentation(transforms, order=order, nearest_action=grid.nearest)
+    module = augmentation(transforms, order=order, grid=grid)
     angles = []
     draw = module._draw_inside
 
