@@ -13,9 +13,9 @@ from tests.specs import actor_critic_spec
 SEQUENCES = ["pxyzr", "pxyz"]
 
 
-def build(size, sequence="pxyzr", n_hidden=8, seed=0, **group):
+def build(size, sequence="pxyzr", n_hidden=8, seed=0, precision="float32", **group):
     torch.manual_seed(seed)
-    config = NETWORKS["equi"](n_hidden=n_hidden, precision="float32", **group)
+    config = NETWORKS["equi"](n_hidden=n_hidden, precision=precision, **group)
     return config.build(actor_critic_spec(size, sequence))
 
 
@@ -76,6 +76,26 @@ def test_every_quarter_turn_is_exact(size, sequence, group_order, trained):
             )
             tolerance["atol"] = 2e-5 * float(values.abs().max())
             torch.testing.assert_close(turned_values, values, **tolerance)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+@torch.no_grad()
+def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(trained):
+    networks = build(64, precision="bfloat16")
+    if trained:
+        with torch.enable_grad():
+            steps(networks, 64, 5)
+    pixels, holding = torch.rand(4, 1, 64, 64), torch.tensor([[True], [False]] * 2)
+    action = torch.rand(4, 5) * 2 - 1
+    loc, _ = networks.actor(pixels, holding)
+    values = networks.critic(networks.encoder(pixels, holding), action)
+    for quarters in range(1, 4):
+        turned = torch.rot90(pixels, quarters, (-2, -1))
+        expected = turn_action(loc, "pxyzr", quarters)
+        assert (networks.actor(turned, holding)[0] - expected).norm() < 0.005 * loc.norm()
+        features = networks.encoder(turned, holding)
+        turned_values = networks.critic(features, turn_action(action, "pxyzr", quarters))
+        assert (turned_values - values).norm() < 0.005 * values.norm()
 
 
 def test_rotation_in_the_opposite_sense_is_not_equivariant():
