@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar, Literal, Self
 
 import torch
 from pydantic import Field, model_validator
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded
@@ -25,6 +26,8 @@ from ba_torchrl.data.augmentation.views import (
     ViewTransform,
     cropped_images,
 )
+from ba_torchrl.data.episode_assembler import EpisodeAssembler
+from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
@@ -33,6 +36,9 @@ from ba_torchrl.objectives.contrastive import BilinearInfoNCE
 from ba_torchrl.objectives.imitation import ActionDistance
 from ba_torchrl.objectives.sacfd import SACfDLoss
 from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
+
+_REPLAY, _EPISODES = "replay", "episodes"
+"""Folders of a saved replay, if successes are imitated."""
 
 
 @ALGORITHMS.register("sac")
@@ -65,6 +71,10 @@ class SACConfig(LearnerConfig):
     demonstration_distance: ActionDistance = "mse"
     """Distance of the policy's action from the demonstrated one in the behaviour term: the squared
     error of the appendix, or "kl", whose gradient does not vanish at the ends of the range."""
+    imitate_successes: bool = False
+    """Whether collected episodes that succeed count as demonstrations (self-imitation; Oh et al.,
+    2018): the behaviour term and the expert bonus apply to them. Transitions then enter the replay
+    when their episode ends. Not in the appendix."""
     exploration_noise: float = Field(default=0.0, ge=0)
     """Standard deviation of Gaussian noise that is added to collected actions, which are then
     clipped to [-1, 1]. None in the appendix."""
@@ -123,6 +133,10 @@ class SAC(Learner):
 
     config: SACConfig
     loss: SACfDLoss
+
+    def __init__(self, config: SACConfig, network: NetworkConfig, problem: Problem) -> None:
+        self.episodes = EpisodeAssembler() if config.imitate_successes else None
+        super().__init__(config, network, problem)
 
     @property
     def seen_images(self) -> Mapping[str, ImageSpec]:
@@ -241,6 +255,30 @@ class SAC(Learner):
             probability=probability,
             seed=self.problem.derived_seed(use),
         )
+
+    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+        """Return collected data as the transitions [N] that the replay stores; if successes are
+        imitated, those of the episodes that have ended."""
+        if is_expert or self.episodes is None:
+            return super().to_transitions(data, is_expert=is_expert)
+        return super().to_transitions(self.episodes.complete(data), is_expert=True)
+
+    def save_replay(self, folder: Path) -> None:
+        """Write the replay, and the transitions of unfinished episodes if there are any, into a
+        folder."""
+        if self.episodes is None:
+            super().save_replay(folder)
+            return
+        super().save_replay(folder / _REPLAY)
+        write_state(folder / _EPISODES, self.episodes.state_dict())
+
+    def load_replay(self, folder: Path) -> None:
+        """Restore what `save_replay` wrote."""
+        if self.episodes is None:
+            super().load_replay(folder)
+            return
+        super().load_replay(folder / _REPLAY)
+        self.episodes.load_state_dict(read_state(folder / _EPISODES))
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return all parameters but the entropy temperature."""

@@ -30,7 +30,7 @@ def as_transitions(
     Raises:
         KeyError: an entry is missing.
     """
-    flat = tensordict.reshape(-1)
+    flat = tensordict if tensordict.ndim == 1 else tensordict.reshape(-1)  # [0] has no reshape
     state = [*images, keys.HOLDING]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
     out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))

@@ -132,6 +132,20 @@ def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, un
     assert read_result(tmp_path).resumed_at == [after]
 
 
+@pytest.mark.parametrize("after", [7, 10])
+def test_unfinished_episodes_of_self_imitation_are_continued(tmp_path, after):
+    algorithm = {**SAC["algorithm"], "imitate_successes": True}
+    whole = Experiment(config_for(tmp_path / "whole", algorithm=algorithm), progress=False)
+    whole.run()
+    experiment = Experiment(config_for(tmp_path / "run", algorithm=algorithm), progress=False)
+    at_call(experiment, experiment.algorithm, "update", after, terminate)
+    with pytest.raises(RunStopped):
+        experiment.run()
+    assert len(experiment.algorithm.episodes) > 0
+    resumed = config_for(tmp_path / "run", algorithm=algorithm, resume=True)
+    assert_same(run(resumed), outcome(whole))
+
+
 def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undisturbed):
     for number in (3, 2, 5, 4):  # updates until the kill
         config = config_for(tmp_path, resume=True, save_minutes=1e-9)

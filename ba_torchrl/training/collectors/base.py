@@ -44,7 +44,8 @@ class CollectionProblem:
 class Collection(ABC):
     """An iterator over batches of transitions, TensorDicts [N] on the CPU.
 
-    The transitions of an environment are in their order, and each has been returned once.
+    The transitions of an environment are in their order, and each has been returned once. The entry
+    ``env_index`` numbers the environments from 0 on.
     """
 
     scalars: dict[str, float]

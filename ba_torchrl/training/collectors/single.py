@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from tensordict import TensorDict
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 
+from ba_torchrl.envs import keys
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.training.collectors.base import (
     COLLECTORS,
@@ -58,7 +60,8 @@ class SingleCollection(Collection):
             GlobalRNGState().load_state_dict(generators)
 
     def __next__(self) -> TensorDict:
-        return next(self._steps)
+        data = next(self._steps)
+        return data.set(keys.ENV_INDEX, torch.arange(len(data)))
 
     def get_positions(self) -> list[Position] | None:
         """Return the position of each environment; None if one has failed."""

@@ -30,22 +30,26 @@ class VersionedPolicy(TensorDictModuleBase):
 
     Args:
         policy: from the observation to ``action``.
+        first_env: number of the first of its environments, which is an entry, too.
     """
 
     version: Tensor
 
-    def __init__(self, policy: TensorDictModuleBase) -> None:
+    def __init__(self, policy: TensorDictModuleBase, first_env: int = 0) -> None:
         super().__init__()
         self.policy = policy
+        self.first_env = first_env
         self.register_buffer("version", torch.tensor(NO_WEIGHTS))
         self.in_keys = list(policy.in_keys)
-        self.out_keys = [keys.ACTION, VERSION]
+        self.out_keys = [keys.ACTION, VERSION, keys.ENV_INDEX]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action and the version of a root TensorDict of any batch shape."""
+        """Write action, version and numbers of the environments of a root TensorDict [envs]."""
         version = self.version.clone()  # weights that arrive during the call do not count
         out = self.policy(tensordict)
-        return out.set(VERSION, version.expand(*out.batch_size, 1).clone())
+        out.set(VERSION, version.expand(*out.batch_size, 1).clone())
+        numbers = self.first_env + torch.arange(out.batch_size.numel(), device=version.device)
+        return out.set(keys.ENV_INDEX, numbers.reshape(out.batch_size))
 
     def receive(self, weights: TensorDictBase) -> None:
         """Take over the weights of another policy and their version.
@@ -142,11 +146,15 @@ class WorkerCollection(Collection):
         The workers draw different random numbers. They receive the weights before the first step.
         """
         seed = derive_seed(self._seed(attempt), SeedUse.EXPLORATION)
+        count = self.problem.num_envs // self.config.workers
         return [
             partial(
-                _make_policy, self.problem.make_policy, derive_seed(seed, SeedUse.EXPLORATION, i)
+                _make_policy,
+                self.problem.make_policy,
+                derive_seed(seed, SeedUse.EXPLORATION, worker),
+                worker * count,
             )
-            for i in range(self.config.workers)
+            for worker in range(self.config.workers)
         ]
 
     def _seed(self, attempt: int) -> int:
@@ -154,5 +162,7 @@ class WorkerCollection(Collection):
         return seed if attempt == 0 else derive_seed(seed, SeedUse.COLLECTION, attempt)
 
 
-def _make_policy(make: Callable[[int], TensorDictModuleBase], seed: int) -> VersionedPolicy:
-    return VersionedPolicy(make(seed))
+def _make_policy(
+    make: Callable[[int], TensorDictModuleBase], seed: int, first_env: int
+) -> VersionedPolicy:
+    return VersionedPolicy(make(seed), first_env)

@@ -61,7 +61,7 @@ def assert_each_transition_once(batches):
     steps = {}
     for batch in batches:
         for step in batch.unbind(0):
-            trajectory = int(step["collector", "traj_ids"])
+            trajectory = int(step["collector", "traj_ids"]), int(step[keys.ENV_INDEX])
             before = steps.setdefault(trajectory, [])
             assert int(step["step_count"]) == len(before)
             if before:

@@ -45,6 +45,7 @@ def test_every_transition_is_returned_once_and_workers_get_the_weights(kind, col
     size = {"multi_sync": 4, "multi_async": 2}[kind]
     batches = [next(collection) for _ in range(8)]
     assert {len(batch) for batch in batches} == {size}
+    assert set(torch.cat([batch[keys.ENV_INDEX] for batch in batches]).tolist()) == set(range(4))
     for batch in batches:  # beta is one of the weights
         assert torch.allclose(batch[keys.ACTION], batch[keys.EXPERT_ACTION], atol=1e-6)
 

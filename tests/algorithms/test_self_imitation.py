@@ -1,0 +1,63 @@
+"""Collected episodes that succeed as demonstrations."""
+
+import pytest
+import torch
+
+from ba_torchrl.envs import keys
+from tests.algorithms.tiny import build, make_experiment, transitions
+
+
+def collected(learner, done, success):
+    """A step of two environments that begin an episode or are in its second step."""
+    data = transitions(learner, 2).exclude(keys.IS_EXPERT)
+    data[keys.ENV_INDEX] = torch.arange(2)
+    data[keys.STEP_COUNT] = torch.tensor([[0], [1]])
+    data[keys.FAULT] = torch.zeros(2, 1, dtype=torch.bool)
+    data[keys.NEXT, keys.FAULT] = torch.zeros(2, 1, dtype=torch.bool)
+    data[keys.NEXT, keys.DONE] = torch.tensor(done)[:, None]
+    data[keys.NEXT, keys.SUCCESS] = torch.tensor(success)[:, None]
+    return data
+
+
+@pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
+def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
+    learner = build("sac", imitate_successes=True, batch_size=4, replay=replay)
+    data = collected(learner, [True, False], [True, False])
+    learner.extend(learner.to_transitions(data, is_expert=False))
+    assert learner.replay_size == 1
+    batch = learner.sample()
+    assert batch[keys.IS_EXPERT].all()
+    assert float(learner.loss(batch)["demonstration_error"]) > 0
+    data = collected(learner, [False, True], [False, False])
+    learner.extend(learner.to_transitions(data, is_expert=False))
+    assert learner.replay_size == 3
+    assert len(learner.episodes) == 1
+
+
+def test_without_the_option_transitions_are_stored_at_once():
+    learner = build("sac", batch_size=4)
+    data = collected(learner, [True, False], [True, False])
+    stored = learner.to_transitions(data, is_expert=False)
+    assert len(stored) == 2
+    assert not stored[keys.IS_EXPERT].any()
+
+
+@pytest.mark.parametrize("collector", ["single", "multi_sync"])
+def test_a_run_stores_whole_episodes(tmp_path, collector):
+    algorithm = {"name": "sac", "imitate_successes": True}
+    settings = {"collector": {"name": collector}, "total_updates": 20, "eval_every": 20}
+    experiment = make_experiment(tmp_path, "cnn", algorithm, **settings)
+    experiment.run()
+    learner = experiment.algorithm
+    env_steps = experiment._progress.env_steps
+    ended = learner.replay.storage.column((keys.NEXT, keys.DONE)).flatten()
+    is_expert = learner.replay.storage.column(keys.IS_EXPERT).flatten()
+    successful = learner.replay.storage.column((keys.NEXT, keys.REWARD)).flatten() > 0
+    demonstrated = learner.replay_size + len(learner.episodes) - env_steps
+    assert demonstrated > 0
+    assert is_expert[:demonstrated].all()
+    assert ended[-1]
+    assert ended[demonstrated:].sum() > 2
+    # the last transition of an episode determines the flag of all of them
+    for end in ended.nonzero().flatten().tolist():
+        assert is_expert[end] == successful[end]
