@@ -127,6 +127,14 @@ def test_the_open_loop_quick_start_composes():
     assert config.env_config.num_objects == 3
 
 
+def test_the_quick_start_for_stacking_composes():
+    config = experiment("quickstart_stacking")
+    assert config.task == "close_loop/block_stacking"
+    assert config.env_config.obs_size == 128
+    assert config.algorithm_config.imitate_successes
+    assert config.algorithm_config.replay == "prioritized"
+
+
 @pytest.mark.parametrize("network", ["asr", "equi_deictic_asr"])
 def test_the_quick_start_in_six_degrees_of_freedom_composes(network):
     config = experiment("quickstart_six_dof", f"network={network}")
