@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +51,15 @@ class Quality(NamedTuple):
     """The clearance including that of the near finger."""
 
 
+@dataclass
+class _GraspsAtPose:
+    """What depends only on the pose of a body, the ground and the robot."""
+
+    pose: Pose
+    candidates: list[GraspCandidate] | None = None
+    tools: dict[GraspCandidate, Pose] = field(default_factory=dict)
+
+
 class GraspSelector:
     """Compares the grasps of the pieces of a structure, in the present scene.
 
@@ -74,12 +84,11 @@ class GraspSelector:
         self.terrain = terrain
         self.limits = limits
         self.finger_opening = finger_opening
-        self._candidates: dict[Body, tuple[Pose, list[GraspCandidate]]] = {}
-        """Pose of each body and its grasps at this pose."""
+        self._at_pose: dict[Body, _GraspsAtPose] = {}
 
     def on_new_decision(self) -> None:
         """Prepare for a scene whose ground may have changed since the last call."""
-        self._candidates.clear()
+        self._at_pose.clear()
 
     def yaws(self, body: Body) -> list[float]:
         """Return the yaws of the gripper at which it can grasp a body."""
@@ -106,11 +115,17 @@ class GraspSelector:
 
         A body on a slope is grasped along the normal of its side, as far as the arm can reach.
         """
-        pose, candidates = self._candidates.get(body, (None, []))
-        if pose != body.pose:
-            candidates = self._new_candidates(body)
-            self._candidates[body] = body.pose, candidates
-        return candidates
+        known = self._known(body)
+        if known.candidates is None:
+            known.candidates = self._new_candidates(body)
+        return known.candidates
+
+    def _known(self, body: Body) -> _GraspsAtPose:
+        """Return what is known about the grasps of a body at its present pose."""
+        pose, known = body.pose, self._at_pose.get(body)
+        if known is None or known.pose != pose:
+            known = self._at_pose[body] = _GraspsAtPose(pose)
+        return known
 
     def _new_candidates(self, body: Body) -> list[GraspCandidate]:
         piece = self.structure.planner.pieces[body]
@@ -215,6 +230,12 @@ class GraspSelector:
 
     def tool_pose(self, body: Body, candidate: GraspCandidate) -> Pose:
         """Return the pose of the tool for a grasp, raised so that the fingers clear the ground."""
+        tools = self._known(body).tools
+        if candidate not in tools:
+            tools[candidate] = self._new_tool_pose(body, candidate)
+        return tools[candidate]
+
+    def _new_tool_pose(self, body: Body, candidate: GraspCandidate) -> Pose:
         x, y, z = _tool_position(body.position, candidate)
         rotation = None if candidate.tool is None else quaternion_matrix(candidate.tool)
         lowest = self.terrain.lowest_tool_m(self.robot.gripper, (x, y), rotation)
