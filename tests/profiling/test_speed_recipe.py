@@ -51,7 +51,7 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
     tasks = ba_torchrl.list_tasks()
     on_slopes = sum(task.startswith(("ramp/", "bump/")) for task in tasks)
     others = 3 + 2 * len(SLIP_TASKS)  # depth images and the slip test
-    assert len(work) == len(set(work)) == 2 * len(tasks) + 2 * on_slopes + others
+    assert len(work) == len(set(work)) == 4 * len(tasks) + 2 * on_slopes + others
     for task in tasks:
         (step,) = (row for row in rows if f"| {task}, step, 128 px |" in row)
         assert "physics steps per action" in step
