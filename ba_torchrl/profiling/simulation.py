@@ -153,12 +153,12 @@ def _turns(
         ]
         for env in envs:
             stack.callback(env.close)
-        episodes = [_expert_actions(task, bench.repeats) for task in tasks]
+        played = {task: _expert_actions(task, bench.repeats) for task in dict.fromkeys(tasks)}
         order = list(range(len(envs)))
         for number in bench.rounds():
             states = [env.reset() for env in envs]
             on_reset(envs)
-            for actions in zip(*(played[number] for played in episodes), strict=False):
+            for actions in zip(*(played[task][number] for task in tasks), strict=False):
                 times, physics = [0.0] * len(envs), [0] * len(envs)
                 for i in order:
                     states[i][keys.ACTION] = actions[i]

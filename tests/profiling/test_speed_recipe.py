@@ -56,7 +56,7 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
         (step,) = (row for row in rows if f"| {task}, step, 128 px |" in row)
         assert "physics steps per action" in step
         assert sum(f"| {task}, reset |" in row for row in rows) == 1
-    picking = next(row for row in rows if "close_loop/block_picking, step" in row).split("|")
+    picking = next(row for row in rows if "close_loop/block_picking, step, " in row).split("|")
     assert [cell.strip() for cell in picking[7:10]] == ["31", "4", "1.5"]  # from the budgets
     assert all(float(cell) > 0 for cell in picking[3:6])
 
