@@ -117,7 +117,7 @@ def recipe(monkeypatch, tmp_path):
 
 
 def test_the_recipe_writes_a_file_and_compares_with_it(recipe, tmp_path, content, capsys):
-    old = Row("depth image, 128 px, compiled", "ms", [1e3] * 20, unit_s=[1.0] * 20)
+    old = Row("depth image, 128 px, compiled", "ms", [1e3] * 20, unit_s=[1e-3] * 20)
     write_speed_file(tmp_path / "old.json", SpeedFile(machine=content.machine, rows=[old]))
     recipe(
         "which=simulation/depth_image",
