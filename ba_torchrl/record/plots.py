@@ -25,6 +25,8 @@ _STYLES = ("-", "--", ":", "-.")
 _MANY_POINTS = 25
 LEAST_WIDTH_IN = 5.0
 """Least width of a figure, for the legend."""
+MOST_LEGEND_ROWS = 5
+"""Largest number of rows of a legend below the panels; a longer one is at their right."""
 
 
 def plot_learning_curve(
@@ -109,7 +111,12 @@ def plot_panels(
     width_in = max(3.1 * columns + 0.6, LEAST_WIDTH_IN)
     entry_in = 0.6 + 0.09 * max(map(len, names), default=0)
     entries = max(int(width_in / entry_in), 1)  # in a row of the legend
-    figure = _figure((width_in, 2.6 * rows + 0.6 + 0.25 * math.ceil(len(names) / entries)))
+    legend_rows = math.ceil(len(names) / entries)
+    place, height_in = "outside lower center", 2.6 * rows + 0.6 + 0.25 * legend_rows
+    if legend_rows > MOST_LEGEND_ROWS:
+        place, width_in, entries = "outside right upper", width_in + entry_in + 0.4, 1
+        height_in = max(2.6 * rows + 0.6, 0.25 * len(names) + 0.3)
+    figure = _figure((width_in, height_in))
     grid = figure.subplots(rows, columns, squeeze=False, sharey=ylim is not None)
     shown: dict[str, Line2D] = {}
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
@@ -122,12 +129,13 @@ def plot_panels(
     for column in range(columns):
         lowest = (len(panels) - 1 - column) // columns
         grid[lowest, column].set_xlabel(xlabel)
-    figure.supylabel(ylabel, fontsize=10)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(ylabel)
     labels = [name for name in names if name in shown]
     figure.legend(
         [shown[name] for name in labels],
         labels,
-        loc="outside lower center",
+        loc=place,
         ncols=min(entries, max(len(labels), 1)),
         frameon=False,
     )

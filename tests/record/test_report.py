@@ -331,7 +331,7 @@ def test_the_recipe_reports_several_folders(tmp_path):
     }
 
 
-@pytest.mark.parametrize("count", [2, 8])
+@pytest.mark.parametrize("count", [2, 5, 8, 13])
 def test_long_legends_stay_within_the_picture(tmp_path, count):
     names = [f"an algorithm on its network {i}" for i in range(count)]
     x = np.arange(5)
