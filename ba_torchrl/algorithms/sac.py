@@ -27,6 +27,7 @@ from ba_torchrl.data.augmentation.views import (
     cropped_images,
 )
 from ba_torchrl.data.episode_assembler import EpisodeAssembler
+from ba_torchrl.data.replay.symmetric import count_demonstrations
 from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
@@ -73,8 +74,8 @@ class SACConfig(LearnerConfig):
     error of the appendix, or "kl", whose gradient does not vanish at the ends of the range."""
     imitate_successes: bool = False
     """Whether collected episodes that succeed count as demonstrations (self-imitation; Oh et al.,
-    2018): the behaviour term and the expert bonus apply to them. Transitions then enter the replay
-    when their episode ends. Not in the appendix."""
+    2018): the behaviour term and the expert bonus apply to them, until demonstrations fill half of
+    the replay. Transitions then enter the replay when their episode ends. Not in the appendix."""
     exploration_noise: float = Field(default=0.0, ge=0)
     """Standard deviation of Gaussian noise that is added to collected actions, which are then
     clipped to [-1, 1]. None in the appendix."""
@@ -261,7 +262,12 @@ class SAC(Learner):
         imitated, those of the episodes that have ended."""
         if is_expert or self.episodes is None:
             return super().to_transitions(data, is_expert=is_expert)
-        return super().to_transitions(self.episodes.complete(data), is_expert=True)
+        data = self.episodes.complete(data)
+        copies = 1 + self.config.stored_copies
+        stored = count_demonstrations(self.replay) + copies * int(data[keys.IS_EXPERT].sum())
+        if stored > self.config.buffer_size // 2:  # demonstrations are never overwritten
+            data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
+        return super().to_transitions(data, is_expert=True)
 
     def save_replay(self, folder: Path) -> None:
         """Write the replay, and the transitions of unfinished episodes if there are any, into a

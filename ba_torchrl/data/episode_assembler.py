@@ -13,8 +13,8 @@ from ba_torchrl.envs import keys
 class EpisodeAssembler:
     """Holds transitions back until their episodes end, and flags those of successful episodes.
 
-    An episode also ends when its environment begins another one, as after the replacement of a
-    worker; it then counts as unsuccessful.
+    Where the next step of an episode is missing, as after the replacement of a worker, the part
+    before counts as an unsuccessful episode, and the part after as another episode.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class EpisodeAssembler:
             transition = data[row : row + 1].clone()
             index = int(transition[keys.ENV_INDEX])
             running = self._running.setdefault(index, [])
-            if running and not int(transition[keys.STEP_COUNT]):
+            if running and transition[keys.STEP_COUNT] != running[-1][keys.STEP_COUNT] + 1:
                 ended.append(self._flagged(index, is_successful=False))
                 running = self._running.setdefault(index, [])
             running.append(transition)

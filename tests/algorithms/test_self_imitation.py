@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from ba_torchrl.data.replay.symmetric import count_demonstrations
 from ba_torchrl.envs import keys
 from tests.algorithms.tiny import build, make_experiment, transitions
 
@@ -34,6 +35,16 @@ def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
     assert len(learner.episodes) == 1
 
 
+@pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
+def test_successes_fill_at_most_half_of_the_replay(replay):
+    learner = build("sac", imitate_successes=True, batch_size=4, replay=replay, buffer_size=8)
+    data = collected(learner, [True, True], [True, True])
+    for stored in (2, 4, 6, 8, 10):
+        learner.extend(learner.to_transitions(data, is_expert=False))
+        assert count_demonstrations(learner.replay) == min(stored, 4)
+        assert learner.replay_size == min(stored, 8 if replay != "symmetric" else 16)
+
+
 def test_without_the_option_transitions_are_stored_at_once():
     learner = build("sac", batch_size=4)
     data = collected(learner, [True, False], [True, False])
@@ -59,5 +70,7 @@ def test_a_run_stores_whole_episodes(tmp_path, collector):
     assert ended[-1]
     assert ended[demonstrated:].sum() > 2
     # the last transition of an episode determines the flag of all of them
+    begin = 0
     for end in ended.nonzero().flatten().tolist():
-        assert is_expert[end] == successful[end]
+        assert (is_expert[begin : end + 1] == successful[end]).all()
+        begin = end + 1

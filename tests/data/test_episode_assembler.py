@@ -51,6 +51,13 @@ def test_an_episode_that_is_cut_off_by_another_one_is_unsuccessful():
     assert values(found) == ([30, 31, 30], [False, False, True])
 
 
+def test_an_episode_whose_next_step_is_missing_is_unsuccessful():
+    episodes = EpisodeAssembler()
+    episodes.complete(rows((0, 0, False, False), (0, 1, False, False)))
+    found = episodes.complete(rows((0, 5, False, False), (0, 6, True, True)))
+    assert values(found) == ([0, 1, 5, 6], [False, False, True, True])
+
+
 def test_a_batch_can_hold_several_steps_of_an_environment():
     episodes = EpisodeAssembler()
     found = episodes.complete(

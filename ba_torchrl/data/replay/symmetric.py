@@ -108,3 +108,10 @@ class SymmetricReplay(ReplayBufferEnsemble):
 
     def _buffers(self) -> zip[tuple[str, FrameReplayBuffer]]:
         return zip(_NAMES, (self.expert, self.online), strict=True)
+
+
+def count_demonstrations(replay: SymmetricReplay | FrameReplayBuffer) -> int:
+    """Return the number of transitions in a replay with the flag ``is_expert``."""
+    if isinstance(replay, SymmetricReplay):
+        return len(replay.expert)
+    return int(replay.storage.column(keys.IS_EXPERT).sum()) if len(replay) else 0

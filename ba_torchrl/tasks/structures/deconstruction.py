@@ -156,6 +156,7 @@ class Deconstruction(OpenLoopTask):
 
     def expert_command(self) -> PickPlaceCommand:
         """Pick the highest piece that does not lie apart, and place it on free ground."""
+        self.task.expert.grasps.on_new_decision()
         held = self.robot.held_body()
         if held is not None:
             return self._place_apart(held)
