@@ -27,7 +27,9 @@ def _bfloat16_is_fast(device_type: str) -> bool:
         return torch.cuda.is_bf16_supported(including_emulation=False)
     if device_type == "cpu":
         has = torch.cpu.get_capabilities()
-        return bool(has.get("amx_bf16") or has.get("avx512_bf16"))
+        # Intel's AVX512-BF16 is slower than its float32 (docs/performance.md, bfloat16).
+        is_intel = str(has.get("cpu_name", "")).startswith("Intel")
+        return bool(has.get("amx_bf16") or (has.get("avx512_bf16") and not is_intel))
     return False
 
 
@@ -35,7 +37,7 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     """Return the number format that convolutions on ``device`` use.
 
     Args:
-        precision: "auto" is bfloat16 if the hardware has native bfloat16 multiplication, else
+        precision: "auto" is bfloat16 if the hardware multiplies it faster than float32, else
             float32.
         device: device of the input.
     """
