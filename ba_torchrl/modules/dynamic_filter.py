@@ -12,7 +12,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.modules.steerable import KernelBlock, bias_expansion, he_scales, kernel_block
+from ba_torchrl.modules.kernel_blocks import (
+    KernelBlock,
+    bias_expansion,
+    he_scales,
+    kernel_block,
+)
 
 if TYPE_CHECKING:
     from escnn.group import Representation

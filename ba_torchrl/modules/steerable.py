@@ -9,27 +9,30 @@ parameters only.
 from __future__ import annotations
 
 import contextlib
-import io
-import math
 import warnings
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextvars import ContextVar
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ba_torchrl.modules.irrep_convolution import IrrepKernels, irrep_convolution, saves_time
+from ba_torchrl.modules.kernel_blocks import (
+    FieldTypes,
+    KernelBlock,
+    bias_expansion,
+    he_scales,
+    kernel_block,
+    regular_irrep_kernels,
+)
+
 if TYPE_CHECKING:
     from types import ModuleType
 
     from escnn.group import Representation
     from escnn.gspaces import GSpace2D
-
-FieldTypes = Sequence[tuple["Representation", int]]
-"""Representations with their multiplicities, in the order of the channels."""
 
 ESCNN_FIX = (
     "equivariant networks need escnn; install it without its Fortran dependency by "
@@ -115,133 +118,6 @@ def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representati
     return gspace, gspace.regular_repr
 
 
-@dataclass(frozen=True, eq=False)
-class KernelBlock:
-    """The steerable kernels between one input and one output representation.
-
-    Args:
-        kernels: float32 [D, O, K, K, I], escnn's normalised basis, input channels last.
-        in_irreps: for each of the D kernels, the input irrep that it reads.
-        out_irreps: for each kernel, the position of the output irrep that it writes.
-    """
-
-    kernels: Tensor
-    in_irreps: tuple[Any, ...]
-    out_irreps: tuple[int, ...]
-    _copies: dict[tuple[torch.device, torch.dtype], Tensor] = field(default_factory=dict)
-
-    def __deepcopy__(self, memo: dict) -> KernelBlock:
-        return self  # constant, shared by every layer of the process
-
-    def __getstate__(self) -> dict:
-        return {**self.__dict__, "_copies": {}}
-
-    def matrix(self, like: Tensor) -> Tensor:
-        """Return the kernels as [D, O*K*K*I] on the device and in the dtype of ``like``."""
-        key = (like.device, like.dtype)
-        if key not in self._copies:
-            self._copies[key] = self.kernels.flatten(1).to(like)
-        return self._copies[key]
-
-
-_BLOCKS: dict[tuple, KernelBlock | None] = {}
-
-
-def kernel_block(
-    gspace: GSpace2D, in_repr: Representation, out_repr: Representation, kernel_size: int
-) -> KernelBlock | None:
-    """Return the kernels between two representations, None if there are none.
-
-    Built once per process: escnn's construction takes up to a second for large groups.
-
-    Args:
-        gspace: images and their symmetry group.
-        in_repr: representation of the input field.
-        out_repr: representation of the output field.
-        kernel_size: pixels.
-    """
-    key = (gspace, in_repr.name, out_repr.name, kernel_size)
-    if key not in _BLOCKS:
-        _BLOCKS[key] = _build_block(gspace, in_repr, out_repr, kernel_size)
-    return _BLOCKS[key]
-
-
-def _build_block(
-    gspace: GSpace2D, in_repr: Representation, out_repr: Representation, kernel_size: int
-) -> KernelBlock | None:
-    from escnn.nn import FieldType, R2Conv
-
-    types = FieldType(gspace, [in_repr]), FieldType(gspace, [out_repr])
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # escnn prints when the basis is empty
-            layer = R2Conv(*types, kernel_size, initialize=False)
-    except ValueError as error:
-        if "basis" in str(error) and "empty" in str(error):
-            return None  # for example trivial to vector with a 1x1 kernel
-        raise
-    expansion = layer.basisexpansion
-    # One pair of representations has one buffer. Expanding unit vectors gives the same numbers, but
-    # takes almost a minute for 7x7 kernels of C_32.
-    (kernels,) = (v for n, v in expansion.named_buffers() if n.endswith("sampled_basis"))
-    shape = (-1, out_repr.size, in_repr.size, kernel_size, kernel_size)
-    info = list(expansion.get_basis_info())
-    return KernelBlock(
-        kernels=kernels.reshape(shape).permute(0, 1, 3, 4, 2).contiguous().float(),
-        in_irreps=tuple(entry["in_irrep"] for entry in info),
-        out_irreps=tuple(entry["out_irreps_position"] for entry in info),
-    )
-
-
-def he_scales(
-    blocks: dict[tuple[int, int], KernelBlock], in_types: FieldTypes, out_types: FieldTypes
-) -> dict[tuple[int, int], Tensor]:
-    """Return the standard deviation of each kernel's coefficients, for every pair of types.
-
-    The generalised He initialisation (Weiler and Cesa, "General E(2)-equivariant steerable
-    CNNs", 2019): every input irrep that feeds an output irrep contributes equally, and so does
-    every kernel from it. The values are the same for all fields of a type.
-
-    Args:
-        blocks: kernels of each pair (input type, output type) that has kernels.
-        in_types: input fields.
-        out_types: output fields.
-    """
-    sources: dict[tuple[int, int], set] = defaultdict(set)
-    kernels: Counter = Counter()
-    for (i, o), block in blocks.items():
-        for source, target in zip(block.in_irreps, block.out_irreps, strict=True):
-            sources[o, target].add(source)
-            kernels[source, o, target] += in_types[i][1]
-    return {
-        (i, o): torch.tensor(
-            [
-                1 / math.sqrt(len(sources[o, target]) * kernels[source, o, target])
-                for source, target in zip(block.in_irreps, block.out_irreps, strict=True)
-            ]
-        )
-        for (i, o), block in blocks.items()
-    }
-
-
-def bias_expansion(out_types: FieldTypes) -> Tensor:
-    """Return [channels, biases]: a bias acts on a trivial irrep, mapped into its field's basis."""
-    columns, channels = [], sum(rep.size * count for rep, count in out_types)
-    start = 0
-    for rep, count in out_types:
-        position, trivial = 0, []
-        for irrep in (rep.group.irrep(*name) for name in rep.irreps):
-            if irrep.is_trivial():
-                trivial.append(torch.tensor(rep.change_of_basis[:, position], dtype=torch.float32))
-            position += irrep.size
-        for _ in range(count):
-            for values in trivial:
-                column = torch.zeros(channels)
-                column[start : start + rep.size] = values
-                columns.append(column)
-            start += rep.size
-    return torch.stack(columns, dim=1) if columns else torch.zeros(channels, 0)
-
-
 class SteerableConv2d(nn.Module):
     """A convolution whose filter is a learnt combination of steerable kernels.
 
@@ -302,6 +178,11 @@ class SteerableConv2d(nn.Module):
                 for pair, scale in scales.items()
             }
         )
+        self._irrep_kernels = None
+        if list(self._blocks) == [(0, 0)] and kernel_size == 3:
+            ((in_repr, _), *others), ((out_repr, _), *other_outputs) = in_types, out_types
+            if in_repr is out_repr and not others and not other_outputs:
+                self._irrep_kernels = regular_irrep_kernels(gspace, in_repr)
         expansion = bias_expansion(out_types)
         self._bias_block = KernelBlock(expansion.t().contiguous(), (), ())
         count = expansion.shape[1]
@@ -322,10 +203,11 @@ class SteerableConv2d(nn.Module):
             for o in range(len(self._out))
         ]
         weight = torch.cat(rows, dim=0) if len(rows) > 1 else rows[0]
-        bias = None
-        if self.bias is not None:
-            bias = (self.bias @ self._bias_block.matrix(self.bias)).to(dtype)
-        return weight.permute(0, 3, 1, 2), bias
+        bias = self._expand_bias()
+        return weight.permute(0, 3, 1, 2), None if bias is None else bias.to(dtype)
+
+    def _expand_bias(self) -> Tensor | None:
+        return None if self.bias is None else self.bias @ self._bias_block.matrix(self.bias)
 
     def _expand_pair(self, pair: tuple[int, int], dtype: torch.dtype) -> Tensor:
         """Return one block of the filter, [out channels, K, K, in channels]."""
@@ -359,8 +241,25 @@ class SteerableConv2d(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the convolution of x [B, C, H, W], computed in x's dtype."""
+        kernels = self._faster_kernels(x)
+        if kernels is not None:
+            (coefficients,) = self.coefficients.values()
+            return irrep_convolution(x, kernels, coefficients, self._expand_bias(), self.padding)
         weight, bias = self.filters(x.dtype)
         return F.conv2d(x, weight, bias, padding=self.padding)
+
+    def _faster_kernels(self, x: Tensor) -> IrrepKernels | None:
+        """Return the kernels in the basis of irreps where they compute the convolution faster."""
+        if (
+            self._irrep_kernels is None
+            or torch.compiler.is_compiling()
+            or (x.device.type, x.dtype) != ("cpu", torch.float32)
+            or (_expanded.get() is not None and not torch.is_grad_enabled())  # filters are kept
+        ):
+            return None
+        ((_, in_count),), ((_, out_count),) = self._in, self._out
+        is_faster = saves_time(self._irrep_kernels, x.shape[2:], in_count, out_count, self.padding)
+        return self._irrep_kernels if is_faster else None
 
     def extra_repr(self) -> str:
         """Return the sizes for ``print``."""

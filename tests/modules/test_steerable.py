@@ -11,11 +11,10 @@ pytest.importorskip("escnn")
 
 from escnn import nn as enn
 
+from ba_torchrl.modules.kernel_blocks import he_scales, kernel_block
 from ba_torchrl.modules.steerable import (
     SteerableConv2d,
     SteerableLinear,
-    he_scales,
-    kernel_block,
     planar_rotations,
     planar_rotations_and_flips,
     reuse_filters,

@@ -1,0 +1,148 @@
+"""Convolutions in the basis of irreps against those with the expanded filter."""
+
+import os
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+pytest.importorskip("escnn")
+
+from ba_torchrl.modules import irrep_convolution as module
+from ba_torchrl.modules.irrep_convolution import irrep_convolution, saves_time
+from ba_torchrl.modules.kernel_blocks import kernel_block, regular_irrep_kernels
+from ba_torchrl.modules.steerable import (
+    SteerableConv2d,
+    planar_rotations,
+    planar_rotations_and_flips,
+    reuse_filters,
+)
+
+GROUPS = {
+    "C4": lambda: planar_rotations(4),
+    "C8": lambda: planar_rotations(8),
+    "C16": lambda: planar_rotations(16),
+    "D4": lambda: planar_rotations_and_flips(4),
+}
+
+
+def threads_of_a_new_thread():
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(torch.get_num_threads).result()
+
+
+@pytest.fixture(params=[1, 2], ids=["one-thread", "two-threads"])
+def threads(request):
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    assert torch.get_num_threads() == threads_of_a_new_thread() == request.param
+    torch.set_num_threads(before)
+
+
+def expanded(gspace, coefficients):
+    """The filter as the sum of escnn's kernels."""
+    block = kernel_block(gspace, gspace.regular_repr, gspace.regular_repr, 3)
+    filters = torch.einsum("oid,dmyxn->ominyx", coefficients, block.kernels.to(coefficients))
+    return filters.flatten(0, 1).flatten(1, 2)
+
+
+def check(gspace, in_fields, out_fields, size, padding, batch=5):
+    order = gspace.regular_repr.size
+    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    x = torch.randn(batch, in_fields * order, *size, requires_grad=True)
+    terms = kernels.blocks[0].coupling.shape[0]
+    coefficients = torch.randn(out_fields, in_fields, terms, requires_grad=True)
+    bias = torch.randn(out_fields * order, requires_grad=True)
+    inputs = (x, coefficients, bias)
+    found = irrep_convolution(x, kernels, coefficients, bias, padding)
+
+    exact = [tensor.detach().double().requires_grad_() for tensor in inputs]
+    expected = F.conv2d(exact[0], expanded(gspace, exact[1]), exact[2], padding=padding)
+    assert found.shape == expected.shape
+    grad = torch.randn_like(found)
+    pairs = [(found, expected)]
+    pairs += zip(
+        torch.autograd.grad(found, inputs, grad),
+        torch.autograd.grad(expected, exact, grad.double()),
+        strict=True,
+    )
+    for one, other in pairs:
+        assert (one - other).abs().max() < 1e-5 * other.abs().max()
+
+
+@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("padding", [0, 1])
+def test_equals_the_convolution_with_the_expanded_filter(group, padding, threads):
+    check(GROUPS[group](), 3, 2, (6, 9), padding)
+
+
+def test_images_are_computed_in_groups(monkeypatch, threads):
+    monkeypatch.setattr(module, "CHUNK_BYTES", 4 * 48 * 2 * 81 * 3)  # three images of 8 x 8
+    check(planar_rotations(8), 2, 3, (8, 8), 1, batch=11)
+    monkeypatch.setattr(module, "CHUNK_BYTES", 1)
+    check(planar_rotations(8), 2, 3, (8, 8), 1)
+
+
+def test_a_forked_process_starts_threads_of_its_own():
+    module._threads(2)
+    child = os.fork()
+    if not child:
+        os._exit(module._threads.cache_info().currsize)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_images_larger_than_a_strip():
+    check(planar_rotations(4), 2, 2, (40, 40), 1, batch=2)
+
+
+@pytest.mark.parametrize(
+    ("group", "products", "dense"), [("C4", 36, 144), ("C8", 84, 576), ("D4", 72, 576)]
+)
+def test_products_per_pixel(group, products, dense):
+    gspace = GROUPS[group]()
+    order = gspace.regular_repr.size
+    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    assert sum(block.size * block.maps for block in kernels.blocks) == products
+    assert 9 * order**2 == dense
+
+
+def test_only_needed_gradients_are_computed():
+    gspace = planar_rotations(4)
+    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    terms = kernels.blocks[0].coupling.shape[0]
+    for needs_x, needs_weights in [(True, False), (False, True)]:
+        x = torch.randn(2, 8, 6, 6, requires_grad=needs_x)
+        coefficients = torch.randn(3, 2, terms, requires_grad=needs_weights)
+        irrep_convolution(x, kernels, coefficients, None, 1).sum().backward()
+        assert (x.grad is not None, coefficients.grad is not None) == (needs_x, needs_weights)
+
+
+def test_large_layers_use_it_in_float32():
+    gspace = planar_rotations(8)
+    fields = [(gspace.regular_repr, 32)]
+    layer = SteerableConv2d(gspace, fields, fields, 3, padding=1)
+    x = torch.randn(2, 256, 16, 16)
+    assert layer._faster_kernels(x) is not None
+    weight, bias = layer.expand()
+    expected = F.conv2d(x, weight, bias, padding=1)
+    assert (layer(x) - expected).abs().max() < 1e-5 * expected.abs().max()
+    assert layer._faster_kernels(x.bfloat16()) is None
+    with torch.no_grad(), reuse_filters():  # expanded once for all images
+        assert layer._faster_kernels(x) is None
+    copied = pickle.loads(pickle.dumps(layer))
+    assert torch.equal(copied(x), layer(x))
+
+
+def test_small_layers_and_other_fields_keep_the_expanded_filter():
+    gspace = planar_rotations(8)
+    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    assert not saves_time(kernels, (32, 32), 4, 8, 1)
+    assert saves_time(kernels, (16, 16), 64, 128, 1)
+    regular, trivial = gspace.regular_repr, gspace.trivial_repr
+    for fields in ([(trivial, 64)], [(regular, 64), (trivial, 1)]):
+        layer = SteerableConv2d(gspace, fields, [(regular, 64)], 3, padding=1)
+        channels = sum(rep.size * count for rep, count in fields)
+        assert layer._faster_kernels(torch.randn(1, channels, 16, 16)) is None
