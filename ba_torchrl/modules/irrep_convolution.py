@@ -207,8 +207,7 @@ def irrep_kernels(
     groups = _groups(_changed(kernels, change))
     change = change[np.concatenate(groups)]
     entries = _changed(kernels, change)
-    maps: list[np.ndarray] = []
-    blocks = []
+    maps, blocks = [], []
     for number, size in enumerate(map(len, groups)):
         first, first_map = sum(map(len, groups[:number])), len(maps)
         group = range(first, first + size)
@@ -229,11 +228,10 @@ def irrep_kernels(
                 coupling=torch.tensor(coupling, dtype=torch.float32),
             )
         )
-    sums = np.array(maps)
     return IrrepKernels(
         change=change.astype(np.float32),
-        of_maps=Terms.of(sums),
-        of_values=Terms.of(sums.T),
+        of_maps=Terms.of(np.array(maps)),
+        of_values=Terms.of(np.array(maps).T),
         blocks=tuple(blocks),
     )
 
@@ -249,8 +247,7 @@ def saves_time(
     Args:
         kernels: the kernels.
         size: height and width of the images.
-        in_fields: number of input fields.
-        out_fields: number of output fields.
+        in_fields, out_fields: number of fields.
         padding: zeros on each side.
     """
     order = len(kernels.change)
@@ -271,22 +268,30 @@ def irrep_convolution(
         kernels: the kernels in the basis of irreps.
         coefficients: [out, in, D], of the kernels.
         bias: [out * N].
-        padding: zeros added on each side, pixels.
+        padding: zeros added on each side, pixels; at most 2.
+
+    Raises:
+        ValueError: there are no images, or the padding is too large.
     """
+    if not len(x) or padding > 2:
+        raise ValueError(f"got {len(x)} images, padded by {padding}; the padding is at most 2")
     weights = kernels.weights(coefficients)
     y = _IrrepConvolution.apply(x, kernels, padding, *weights)
     return y if bias is None else y + bias[:, None, None]
 
 
+def _use_one_thread() -> None:
+    torch.get_num_threads()  # initialises torch in this thread, which would undo the next line
+    torch.set_num_threads(1)
+
+
 @cache
 def _threads(count: int) -> ThreadPoolExecutor:
     """Return threads whose matrix products do not start threads of their own."""
-    pool = ThreadPoolExecutor(
-        count, "irrep-convolution", initializer=torch.set_num_threads, initargs=(1,)
-    )
-    all_started = Barrier(count)
+    pool = ThreadPoolExecutor(count, "irrep-convolution", initializer=_use_one_thread)
+    before, all_started = torch.get_num_threads(), Barrier(count)
     list(pool.map(lambda _: all_started.wait(), range(count)))
-    torch.set_num_threads(count)  # the calls above also set it for threads that start later
+    torch.set_num_threads(before)  # the calls above also set it for threads that start later
     return pool
 
 

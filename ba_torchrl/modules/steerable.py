@@ -179,9 +179,10 @@ class SteerableConv2d(nn.Module):
             }
         )
         self._irrep_kernels = None
-        if list(self._blocks) == [(0, 0)] and kernel_size == 3:
+        if list(self._blocks) == [(0, 0)] and kernel_size == 3 and padding <= 2:
             ((in_repr, _), *others), ((out_repr, _), *other_outputs) = in_types, out_types
-            if in_repr is out_repr and not others and not other_outputs:
+            is_small = in_repr.size <= 8  # kernels of large groups take seconds to convert
+            if in_repr is out_repr and is_small and not others and not other_outputs:
                 self._irrep_kernels = regular_irrep_kernels(gspace, in_repr)
         expansion = bias_expansion(out_types)
         self._bias_block = KernelBlock(expansion.t().contiguous(), (), ())
@@ -253,9 +254,17 @@ class SteerableConv2d(nn.Module):
         if (
             self._irrep_kernels is None
             or torch.compiler.is_compiling()
+            or torch.jit.is_tracing()
+            or torch.is_autocast_enabled("cpu")
+            or type(x) not in (Tensor, nn.Parameter)
+            or x.dim() != 4
+            or not len(x)
             or (x.device.type, x.dtype) != ("cpu", torch.float32)
+            or torch.get_num_threads() > 1  # slower than oneDNN there (docs/performance.md)
             or (_expanded.get() is not None and not torch.is_grad_enabled())  # filters are kept
         ):
+            return None
+        if any(weight.dtype != x.dtype for weight in self.parameters()):
             return None
         ((_, in_count),), ((_, out_count),) = self._in, self._out
         is_faster = saves_time(self._irrep_kernels, x.shape[2:], in_count, out_count, self.padding)

@@ -38,8 +38,9 @@ def threads(request):
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
     yield request.param
-    assert torch.get_num_threads() == threads_of_a_new_thread() == request.param
+    found = torch.get_num_threads(), threads_of_a_new_thread()
     torch.set_num_threads(before)
+    assert found == (request.param, request.param)
 
 
 def expanded(gspace, coefficients):
@@ -74,7 +75,7 @@ def check(gspace, in_fields, out_fields, size, padding, batch=5):
 
 
 @pytest.mark.parametrize("group", GROUPS)
-@pytest.mark.parametrize("padding", [0, 1])
+@pytest.mark.parametrize("padding", [0, 1, 2])
 def test_equals_the_convolution_with_the_expanded_filter(group, padding, threads):
     check(GROUPS[group](), 3, 2, (6, 9), padding)
 
@@ -120,12 +121,12 @@ def test_only_needed_gradients_are_computed():
         assert (x.grad is not None, coefficients.grad is not None) == (needs_x, needs_weights)
 
 
-def test_large_layers_use_it_in_float32():
+def test_large_layers_use_it_in_float32_on_one_thread(threads):
     gspace = planar_rotations(8)
     fields = [(gspace.regular_repr, 32)]
     layer = SteerableConv2d(gspace, fields, fields, 3, padding=1)
     x = torch.randn(2, 256, 16, 16)
-    assert layer._faster_kernels(x) is not None
+    assert (layer._faster_kernels(x) is not None) == (threads == 1)
     weight, bias = layer.expand()
     expected = F.conv2d(x, weight, bias, padding=1)
     assert (layer(x) - expected).abs().max() < 1e-5 * expected.abs().max()
@@ -134,6 +135,22 @@ def test_large_layers_use_it_in_float32():
         assert layer._faster_kernels(x) is None
     copied = pickle.loads(pickle.dumps(layer))
     assert torch.equal(copied(x), layer(x))
+
+
+def test_other_inputs_keep_the_expanded_filter():
+    gspace = planar_rotations(4)
+    fields = [(gspace.regular_repr, 64)]
+    x = torch.randn(2, 256, 16, 16)
+    layer = SteerableConv2d(gspace, fields, fields, 3, padding=1)
+    assert layer(x[:0]).shape == (0, 256, 16, 16)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer(x).dtype == torch.bfloat16
+    assert layer.double()(x).dtype == torch.float32
+    padded = SteerableConv2d(gspace, fields, fields, 3, padding=3)
+    assert padded(x).shape == (2, 256, 20, 20)
+    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    with pytest.raises(ValueError, match="at most 2"):
+        irrep_convolution(x, kernels, next(iter(layer.parameters())), None, 3)
 
 
 def test_small_layers_and_other_fields_keep_the_expanded_filter():
