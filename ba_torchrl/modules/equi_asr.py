@@ -15,6 +15,7 @@ from ba_torchrl.modules.cnn import initialise_plain
 from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
 from ba_torchrl.modules.equi_unet import EquivariantPixelValues
 from ba_torchrl.modules.in_hand_encoders import InHandVector
+from ba_torchrl.modules.max_pool import relu_of_max_pool
 from ba_torchrl.modules.spatial import SpatialSpec
 from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, require_yaw, select_primitive
 from ba_torchrl.modules.steerable import (
@@ -149,8 +150,7 @@ class EquivariantYawValues(nn.Module):
         x = self.config.heights(patch)
         for conv, pool in zip(self.convs, self.pools, strict=True):
             x = conv(x)
-            # Pooling and ReLU commute; this order leaves the ReLU a quarter of the elements.
-            x = F.relu(F.max_pool2d(x, 2) if pool else x, inplace=True)
+            x = relu_of_max_pool(x) if pool else F.relu(x, inplace=True)
         x = F.relu(self.held(x.float(), self._coefficients(in_hand, scene)))
         return select_primitive(self.values(x.flatten(1)), holding)
 

@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ba_torchrl.modules.cnn import CastConv2d
+from ba_torchrl.modules.max_pool import relu_of_max_pool
 from ba_torchrl.modules.trunk import scaled_width
 
 _LARGEST_LAST_MAP = 6
@@ -36,8 +37,7 @@ class InHandMap(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return [B, out_channels, out_size, out_size] of images [B, C, h, h], in their dtype."""
         x = F.relu(self.first(images), inplace=True)
-        # Pooling and ReLU commute; this order leaves the ReLU a quarter of the elements.
-        x = F.relu(F.max_pool2d(self.second(x), 2), inplace=True)
+        x = relu_of_max_pool(self.second(x))
         return F.relu(self.third(x), inplace=True)
 
 
@@ -75,5 +75,5 @@ class InHandVector(nn.Module):
         x = images
         for conv, pool in zip(self.convs, self.pools, strict=True):
             x = conv(x)
-            x = F.relu(F.max_pool2d(x, 2) if pool else x, inplace=True)
+            x = relu_of_max_pool(x) if pool else F.relu(x, inplace=True)
         return F.relu(self.linear(x.flatten(1).float()), inplace=True)

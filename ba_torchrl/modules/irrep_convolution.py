@@ -11,12 +11,8 @@ basis back. The result equals that of the expanded filter up to rounding.
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
-from threading import Barrier
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ba_torchrl.modules.cpu_threads import in_parts
 from ba_torchrl.modules.irrep_maps import gather_maps, scatter_maps, to_elements, to_irreps
 
 if TYPE_CHECKING:
@@ -32,6 +29,8 @@ if TYPE_CHECKING:
 CHUNK_BYTES = 1_500_000
 """Size of the maps of a group of images, so that they stay in the second cache."""
 _TOLERANCE = 1e-5
+_LOSS_BY_THREADS = 1.35
+"""Duration on several threads relative to oneDNN's, which shares its work among them better."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +236,12 @@ def irrep_kernels(
 
 
 def saves_time(
-    kernels: IrrepKernels, size: Sequence[int], in_fields: int, out_fields: int, padding: int
+    kernels: IrrepKernels,
+    size: Sequence[int],
+    in_fields: int,
+    out_fields: int,
+    padding: int,
+    threads: int,
 ) -> bool:
     """Return whether the convolution is estimated to be faster than with the expanded filter.
 
@@ -249,10 +253,13 @@ def saves_time(
         size: height and width of the images.
         in_fields, out_fields: number of fields.
         padding: zeros on each side.
+        threads: number of torch's threads.
     """
     order = len(kernels.change)
     products = sum(block.size * block.maps for block in kernels.blocks) * in_fields * out_fields
     per_pixel = 2 * (products + order * (210 * in_fields + 40 * out_fields))
+    if threads > 1:
+        per_pixel *= _LOSS_BY_THREADS
     dense = 9 * order**2 * in_fields * out_fields
     pixels = math.prod(length + padding for length in size)
     return per_pixel * pixels < dense * math.prod(length + 2 * padding - 2 for length in size)
@@ -275,37 +282,7 @@ def irrep_convolution(
     """
     if not len(x) or padding > 2:
         raise ValueError(f"got {len(x)} images, padded by {padding}; the padding is at most 2")
-    weights = kernels.weights(coefficients)
-    y = _IrrepConvolution.apply(x, kernels, padding, *weights)
-    return y if bias is None else y + bias[:, None, None]
-
-
-def _use_one_thread() -> None:
-    torch.get_num_threads()  # initialises torch in this thread, which would undo the next line
-    torch.set_num_threads(1)
-
-
-@cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    """Return threads whose matrix products do not start threads of their own."""
-    pool = ThreadPoolExecutor(count, "irrep-convolution", initializer=_use_one_thread)
-    before, all_started = torch.get_num_threads(), Barrier(count)
-    list(pool.map(lambda _: all_started.wait(), range(count)))
-    torch.set_num_threads(before)  # the calls above also set it for threads that start later
-    return pool
-
-
-os.register_at_fork(after_in_child=_threads.cache_clear)  # a child has none of the threads
-
-
-def _in_parts(batch: int, work: Callable[[slice], Any]) -> list[Any]:
-    """Return the results of work(slice) over equal parts of a batch, one part per thread."""
-    count = min(torch.get_num_threads(), batch)
-    if count == 1:
-        return [work(slice(0, batch))]
-    bounds = [batch * i // count for i in range(count + 1)]
-    parts = [slice(*bounds[i : i + 2]) for i in range(count)]
-    return list(_threads(count).map(work, parts))
+    return _IrrepConvolution.apply(x, kernels, padding, bias, *kernels.weights(coefficients))
 
 
 class _Layout:
@@ -341,20 +318,27 @@ class _Layout:
 
 
 class _IrrepConvolution(torch.autograd.Function):
-    """The convolution as a function of its input and the blocks' matrices."""
+    """The convolution as a function of its input, the bias and the blocks' matrices."""
 
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, kernels: IrrepKernels, padding: int, *weights: Tensor
+        ctx: Any,
+        x: Tensor,
+        kernels: IrrepKernels,
+        padding: int,
+        bias: Tensor | None,
+        *weights: Tensor,
     ) -> Tensor:
         x = x.contiguous()
         ctx.save_for_backward(x, *weights)
         ctx.kernels, ctx.padding = kernels, padding
         layout, order = _Layout(x, kernels, padding), len(kernels.change)
         fields = weights[0].shape[0] // kernels.blocks[0].size
-        y = x.new_empty(len(x), fields, order, *layout.output)
+        y = x.new_empty(len(x), fields * order, *layout.output)
         source = x.unflatten(1, (-1, order)).numpy()
-        target = y.numpy()
+        target = y.unflatten(1, (-1, order)).numpy()
+        added = x.new_zeros(fields * order) if bias is None else bias
+        added = added.unflatten(0, (fields, order)).contiguous().numpy()
 
         @torch.no_grad()
         def compute(part: slice) -> None:
@@ -362,10 +346,11 @@ class _IrrepConvolution(torch.autograd.Function):
                 kernels.gather(source[chunk], layout, maps)
                 for block, weight in zip(kernels.blocks, weights, strict=True):
                     torch.mm(weight, block.read(maps), out=block.written(out))
-                to_elements(out.flatten(0, 1).numpy(), kernels.change, layout.width, target[chunk])
+                irreps = out.flatten(0, 1).numpy()
+                to_elements(irreps, kernels.change, added, layout.width, target[chunk])
 
-        _in_parts(len(x), compute)
-        return y.flatten(1, 2)
+        in_parts(len(x), compute)
+        return y
 
     @staticmethod
     @once_differentiable
@@ -376,7 +361,8 @@ class _IrrepConvolution(torch.autograd.Function):
         grad = grad.contiguous().unflatten(1, (-1, order))
         fields = grad.shape[1]
         source, arriving = x.unflatten(1, (-1, order)).numpy(), grad.numpy()
-        needs_weights = any(ctx.needs_input_grad[3:])
+        needs_weights = any(ctx.needs_input_grad[4:])
+        grad_bias = grad.sum((0, 3, 4)).flatten() if ctx.needs_input_grad[3] else None
         grad_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
 
         @torch.no_grad()
@@ -395,6 +381,6 @@ class _IrrepConvolution(torch.autograd.Function):
                     kernels.scatter(maps, layout, target)
             return totals
 
-        parts = _in_parts(len(x), compute)
+        parts = in_parts(len(x), compute)
         totals = [sum(values) for values in zip(*parts, strict=True)] if needs_weights else []
-        return grad_x, None, None, *(totals or [None] * len(weights))
+        return grad_x, None, None, grad_bias, *(totals or [None] * len(weights))

@@ -255,10 +255,11 @@ def scatter_maps(
 def to_elements(
     out: np.ndarray,
     change: np.ndarray,
+    bias: np.ndarray,
     width: int,
     fields: np.ndarray,
 ) -> None:
-    """Change irreps [N * F, pixels] to fields [n, F, N, H, W] of group elements."""
+    """Change irreps [N * F, pixels] to fields [n, F, N, H, W], and add the bias [F, N]."""
     count, number, order, rows, columns = fields.shape
     pixels = out.shape[1]
     area = pixels // count
@@ -268,11 +269,12 @@ def to_elements(
         places = every * number + f
         for m in range(order):
             _sum(plane, 0, 0, out, 0, pixels, matrix, places, order * m, order * m + order)
+            added = bias[f, m]
             for n in range(count):
                 for y in range(rows):
                     begin = np.uintp(n * area + y * width)
                     for x in range(np.uintp(columns)):
-                        fields[n, f, m, y, x] = plane[0, begin + x]
+                        fields[n, f, m, y, x] = plane[0, begin + x] + added
 
 
 @_compiled

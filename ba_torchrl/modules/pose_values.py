@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.cnn import CastConv2d, initialise_plain
+from ba_torchrl.modules.max_pool import relu_of_max_pool
 from ba_torchrl.modules.patches import centre_fit
 from ba_torchrl.modules.spatial import SpatialSpec
 from ba_torchrl.modules.spatial_inputs import UNET_STRIDE, SpatialImageConfig, select_primitive
@@ -47,7 +48,7 @@ class SceneMapVector(nn.Module):
 
     def forward(self, scene: Tensor) -> Tensor:
         """Return float32 [B, out_features] of a map [B, C, h, w]."""
-        x = F.relu(F.max_pool2d(self.conv(scene), 2))
+        x = relu_of_max_pool(self.conv(scene))
         return self.second(F.relu(self.first(x.flatten(1).float())))
 
 
@@ -123,8 +124,7 @@ class PoseValues(nn.Module):
         x = _convolve(self.config.in_hand(views.flatten(0, 1)), of_view, first.bias)
         x.unflatten(0, views.shape[:2]).add_(_convolve(hand, of_hand)[:, None])
         for conv in others:
-            # Pooling and ReLU commute; this order leaves the ReLU a quarter of the elements.
-            x = conv(F.relu(F.max_pool2d(x, 2), inplace=True))
+            x = conv(relu_of_max_pool(x))
         x = F.relu(x, inplace=True).flatten(1).float()
         return F.relu(self.narrow(F.relu(self.wide(x))))
 

@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ba_torchrl.modules.cpu_threads import is_plain_float32
 from ba_torchrl.modules.irrep_convolution import IrrepKernels, irrep_convolution, saves_time
 from ba_torchrl.modules.kernel_blocks import (
     FieldTypes,
@@ -253,21 +254,22 @@ class SteerableConv2d(nn.Module):
         """Return the kernels in the basis of irreps where they compute the convolution faster."""
         if (
             self._irrep_kernels is None
-            or torch.compiler.is_compiling()
-            or torch.jit.is_tracing()
-            or torch.is_autocast_enabled("cpu")
-            or type(x) not in (Tensor, nn.Parameter)
             or x.dim() != 4
-            or not len(x)
-            or (x.device.type, x.dtype) != ("cpu", torch.float32)
-            or torch.get_num_threads() > 1  # slower than oneDNN there (docs/performance.md)
+            or not is_plain_float32(x)
             or (_expanded.get() is not None and not torch.is_grad_enabled())  # filters are kept
         ):
             return None
         if any(weight.dtype != x.dtype for weight in self.parameters()):
             return None
         ((_, in_count),), ((_, out_count),) = self._in, self._out
-        is_faster = saves_time(self._irrep_kernels, x.shape[2:], in_count, out_count, self.padding)
+        is_faster = saves_time(
+            self._irrep_kernels,
+            x.shape[2:],
+            in_count,
+            out_count,
+            self.padding,
+            torch.get_num_threads(),
+        )
         return self._irrep_kernels if is_faster else None
 
     def extra_repr(self) -> str:

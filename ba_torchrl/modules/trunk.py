@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ba_torchrl.config import StrictModel
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
+from ba_torchrl.modules.max_pool import relu_of_max_pool
 
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -140,8 +141,7 @@ class ImageTrunk(nn.Module):
         x = self._input(pixels.flatten(0, -4) if leading else pixels[None], holding)
         for conv, pool in zip(self.convs, self.pools, strict=True):
             x = conv(x)
-            # Pooling and ReLU commute; this order leaves the ReLU a quarter of the elements.
-            x = F.relu(F.max_pool2d(x, 2) if pool else x)
+            x = relu_of_max_pool(x) if pool else F.relu(x)
         return x.flatten(1).float().reshape(*leading, -1)
 
     def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:

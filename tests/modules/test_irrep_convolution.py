@@ -10,6 +10,7 @@ import torch.nn.functional as F
 
 pytest.importorskip("escnn")
 
+from ba_torchrl.modules import cpu_threads
 from ba_torchrl.modules import irrep_convolution as module
 from ba_torchrl.modules.irrep_convolution import irrep_convolution, saves_time
 from ba_torchrl.modules.kernel_blocks import kernel_block, regular_irrep_kernels
@@ -88,10 +89,10 @@ def test_images_are_computed_in_groups(monkeypatch, threads):
 
 
 def test_a_forked_process_starts_threads_of_its_own():
-    module._threads(2)
+    cpu_threads._threads(2)
     child = os.fork()
     if not child:
-        os._exit(module._threads.cache_info().currsize)
+        os._exit(cpu_threads._threads.cache_info().currsize)
     assert os.waitpid(child, 0)[1] == 0
 
 
@@ -121,12 +122,12 @@ def test_only_needed_gradients_are_computed():
         assert (x.grad is not None, coefficients.grad is not None) == (needs_x, needs_weights)
 
 
-def test_large_layers_use_it_in_float32_on_one_thread(threads):
+def test_large_layers_use_it_in_float32(threads):
     gspace = planar_rotations(8)
     fields = [(gspace.regular_repr, 32)]
     layer = SteerableConv2d(gspace, fields, fields, 3, padding=1)
     x = torch.randn(2, 256, 16, 16)
-    assert (layer._faster_kernels(x) is not None) == (threads == 1)
+    assert layer._faster_kernels(x) is not None
     weight, bias = layer.expand()
     expected = F.conv2d(x, weight, bias, padding=1)
     assert (layer(x) - expected).abs().max() < 1e-5 * expected.abs().max()
@@ -156,8 +157,11 @@ def test_other_inputs_keep_the_expanded_filter():
 def test_small_layers_and_other_fields_keep_the_expanded_filter():
     gspace = planar_rotations(8)
     kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
-    assert not saves_time(kernels, (32, 32), 4, 8, 1)
-    assert saves_time(kernels, (16, 16), 64, 128, 1)
+    for threads in (1, 2):
+        assert not saves_time(kernels, (32, 32), 4, 8, 1, threads)
+        assert saves_time(kernels, (16, 16), 64, 128, 1, threads)
+    assert saves_time(kernels, (32, 32), 8, 16, 1, 1)
+    assert not saves_time(kernels, (32, 32), 8, 16, 1, 2)
     regular, trivial = gspace.regular_repr, gspace.trivial_repr
     for fields in ([(trivial, 64)], [(regular, 64), (trivial, 1)]):
         layer = SteerableConv2d(gspace, fields, [(regular, 64)], 3, padding=1)

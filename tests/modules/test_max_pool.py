@@ -1,0 +1,118 @@
+"""ReLU of max pooling against PyTorch's functions."""
+
+from itertools import chain
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch.utils.flop_counter import FlopCounterMode
+
+from ba_torchrl.modules import cpu_threads
+from ba_torchrl.modules.cpu_threads import in_parts
+from ba_torchrl.modules.max_pool import relu_of_max_pool
+
+LAYOUTS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
+
+
+@pytest.fixture(params=[1, 2], ids=["one-thread", "two-threads"])
+def threads(request):
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+def check(x, grad=None):
+    """Check values, layout and gradient; every bit must be equal."""
+    x = x.detach()
+    ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
+    found, expected = relu_of_max_pool(ours), F.relu(F.max_pool2d(theirs, 2))
+    assert torch.equal(found, expected)
+    for layout in LAYOUTS.values():
+        same = found.is_contiguous(memory_format=layout)
+        assert same == expected.is_contiguous(memory_format=layout)
+    grad = torch.randn_like(expected) if grad is None else grad
+    found.backward(grad)
+    expected.backward(grad)
+    assert torch.equal(ours.grad, theirs.grad)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("size", [(2, 2), (8, 8), (7, 10), (10, 7), (33, 70)], ids=str)
+def test_equals_pytorch(layout, size, threads):
+    x = torch.randn(3, 5, *size).to(memory_format=LAYOUTS[layout])
+    assert x.is_contiguous(memory_format=LAYOUTS[layout])
+    check(x)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_equal_values_give_the_gradient_to_the_first(layout):
+    x = torch.randint(-1, 3, (4, 3, 12, 12)).float().to(memory_format=LAYOUTS[layout])
+    check(x)
+
+
+def test_by_hand():
+    x = torch.tensor([[1.0, 4.0, -1.0, -2.0], [3.0, 4.0, -3.0, 0.0]])[None, None].requires_grad_()
+    y = relu_of_max_pool(x)
+    assert y.flatten().tolist() == [4.0, 0.0]
+    y.sum().backward()
+    assert x.grad.flatten().tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("place", range(4))
+def test_nan_is_not_lost(place):
+    x = torch.randn(1, 2, 2, 2)
+    x.view(2, 4)[0, place] = torch.nan
+    y = relu_of_max_pool(x).flatten()
+    assert y[0].isnan()
+    assert not y[1].isnan()
+
+
+def test_views_and_expanded_gradients():
+    x = torch.randn(2, 6, 9, 12)
+    for view in (x[:, ::2], x[..., 1:], x.transpose(2, 3)):
+        view = view.detach()
+        ours, theirs = view.requires_grad_(), view.detach().clone().requires_grad_()
+        found, expected = relu_of_max_pool(ours), F.relu(F.max_pool2d(theirs, 2))
+        assert torch.equal(found, expected)
+        found.sum().backward()
+        expected.sum().backward()
+        assert torch.equal(ours.grad, theirs.grad)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
+def test_other_formats(dtype):
+    check(torch.randn(2, 3, 8, 8, dtype=dtype))
+
+
+def test_no_images():
+    assert relu_of_max_pool(torch.zeros(0, 3, 8, 8)).shape == (0, 3, 4, 4)
+
+
+def test_positions_take_one_byte():
+    x = torch.randn(2, 3, 8, 8, requires_grad=True)
+    assert relu_of_max_pool(x).grad_fn.positions.nbytes == 2 * 3 * 4 * 4
+
+
+def test_parts_cover_the_batch_once(threads):
+    parts = in_parts(7, lambda part: list(range(7))[part])
+    assert len(parts) == threads
+    assert list(chain(*parts)) == list(range(7))
+
+
+def test_counts_of_operations_contain_all_parts(threads):
+    a, b = torch.randn(6, 4, 5), torch.randn(5, 3)
+    with FlopCounterMode(display=False) as counter:
+        in_parts(6, lambda part: a[part].flatten(0, 1) @ b)
+    assert counter.get_total_flops() == 2 * 6 * 4 * 5 * 3
+
+
+def test_work_in_threads_does_not_start_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert in_parts(4, lambda _: torch.get_num_threads()) == [1, 1]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+        cpu_threads._threads.cache_clear()
