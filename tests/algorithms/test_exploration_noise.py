@@ -37,7 +37,9 @@ def test_actions_stay_in_their_range():
     assert found.max() == 1
 
 
-@pytest.mark.parametrize("collector", ["single", "multi_sync"])
+@pytest.mark.parametrize(
+    "collector", ["single", pytest.param("multi_sync", marks=pytest.mark.slow)]
+)
 def test_a_run_collects_with_noise(tmp_path, collector):
     algorithm = {"name": "sac", "exploration_noise": SIGMA}
     settings = {"collector": {"name": collector}, "total_updates": 2, "eval_every": 2}

@@ -53,7 +53,9 @@ def test_without_the_option_transitions_are_stored_at_once():
     assert not stored[keys.IS_EXPERT].any()
 
 
-@pytest.mark.parametrize("collector", ["single", "multi_sync"])
+@pytest.mark.parametrize(
+    "collector", ["single", pytest.param("multi_sync", marks=pytest.mark.slow)]
+)
 def test_a_run_stores_whole_episodes(tmp_path, collector):
     algorithm = {"name": "sac", "imitate_successes": True}
     settings = {"collector": {"name": collector}, "total_updates": 20, "eval_every": 20}

@@ -62,8 +62,8 @@ print(json.dumps([robot, env.task_class.__name__, "mine/reach_near" in ba_torchr
     "imports",
     [
         "import my_tasks, gymnasium",
-        "import gymnasium, my_tasks",
-        "import ba_torchrl, gymnasium, my_tasks",
+        pytest.param("import gymnasium, my_tasks", marks=pytest.mark.slow),
+        pytest.param("import ba_torchrl, gymnasium, my_tasks", marks=pytest.mark.slow),
         "import gymnasium, ba_torchrl; ba_torchrl.list_tasks(); import my_tasks",
     ],
 )
@@ -73,6 +73,7 @@ def test_gymnasium_knows_a_task_in_any_order_of_imports(folder, imports):
     assert kwargs == {"task": "mine/reach_near", "register_modules": ["my_tasks"]}
 
 
+@pytest.mark.slow
 def test_workers_of_gymnasium_import_the_module_of_the_task(folder):
     code = f"""
 import json, gymnasium, my_tasks
@@ -86,7 +87,9 @@ print(json.dumps(observation["pixels"].shape))
     assert last_line(run(folder, "-c", code)) == [2, 1, 16, 16]
 
 
-@pytest.mark.parametrize("options", ["", "register_modules=['extra'],"])
+@pytest.mark.parametrize(
+    "options", [pytest.param("", marks=pytest.mark.slow), "register_modules=['extra'],"]
+)
 def test_spawned_workers_import_the_modules_of_task_and_robot(folder, options):
     (folder / "extra.py").write_text("import os\nopen(f'seen-{os.getpid()}', 'w').close()\n")
     code = f"""
@@ -296,6 +299,7 @@ print(json.dumps(config.plugins))
     assert last_line(run(folder, "-c", code)) == ["my_tasks"]
 
 
+@pytest.mark.slow
 def test_spawned_workers_import_the_module_of_an_observation(folder):
     code = """
 import json, ba_torchrl, my_tasks

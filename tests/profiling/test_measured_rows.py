@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from ba_torchrl.profiling import learning, limits, throughput
+from ba_torchrl.profiling import layers, learning, limits, throughput
 from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
 from ba_torchrl.profiling.table import COLUMNS, Bench, Budget, Row, as_markdown
 
@@ -113,3 +113,23 @@ def test_frames_per_second_count_all_environments(monkeypatch):
         (row,) = throughput.collection(Halves(2, bar), "close_loop/block_reaching", 5)
     assert taken == [20, "closed"]
     assert list(row.values) == [40.0, 40.0]
+
+
+def test_layers_are_measured_in_pairs(monkeypatch):
+    pytest.importorskip("escnn")
+    monkeypatch.setattr(layers, "BATCH", 2)
+    monkeypatch.setattr(layers, "LearningUnit", lambda _: lambda: None)
+    with tqdm(disable=True) as bar:
+        bench = Bench(1, bar)
+        convolutions = layers.measure_steerable(bench, 2, 3, 8)
+        pools = layers.measure_max_pool(bench, "channels-last")
+        dtypes = layers.measure_dtypes(bench)
+    assert [row.work.rpartition(", ")[2] for row in (*convolutions, *pools, *dtypes)] == [
+        "expanded filter",
+        "basis of irreps",
+        "PyTorch",
+        "one pass",
+        "float32",
+        "bfloat16",
+    ]
+    assert all(row.values[0] > 0 for row in (*convolutions, *pools, *dtypes))

@@ -33,10 +33,11 @@ from ba_torchrl.sim.world import World
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_recipe_prints_the_simulation_rows(tmp_path):
+def printed_table(folder, which):
+    """Run the recipe; return the header, the rows and the column of work."""
     done = subprocess.run(
-        [sys.executable, ROOT / "recipes" / "speed.py", "which=simulation", "repeats=1"],
-        cwd=tmp_path,
+        [sys.executable, ROOT / "recipes" / "speed.py", f"which={which}", "repeats=1"],
+        cwd=folder,
         capture_output=True,
         text=True,
         check=True,
@@ -47,7 +48,19 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
     assert "torch" in where
     columns = header.count("|")
     assert all(row.count("|") == columns for row in rows)
-    work = [row.split("|")[1].strip() for row in rows]
+    return header, rows, [row.split("|")[1].strip() for row in rows]
+
+
+def test_the_recipe_prints_a_table(tmp_path):
+    header, rows, work = printed_table(tmp_path, "simulation/depth_image")
+    assert len(work) == len(set(work)) == 3
+    median = header.split("|").index(" median ")
+    assert all(float(row.split("|")[median].split()[0]) > 0 for row in rows)
+
+
+@pytest.mark.slow
+def test_the_recipe_prints_the_simulation_rows(tmp_path):
+    _, rows, work = printed_table(tmp_path, "simulation")
     tasks = ba_torchrl.list_tasks()
     on_slopes = sum(task.startswith(("ramp/", "bump/")) for task in tasks)
     others = 3 + 2 * len(SLIP_TASKS)  # depth images and the slip test
@@ -113,7 +126,10 @@ def test_steps_on_slopes_are_compared_with_those_on_level_ground():
         assert row.notes.startswith(f"{ratio:.2f} times that on level ground, ")
 
 
-@pytest.mark.parametrize(("collector", "workers"), [("single", 1), ("multi_sync", 2)])
+@pytest.mark.parametrize(
+    ("collector", "workers"),
+    [("single", 1), pytest.param("multi_sync", 2, marks=pytest.mark.slow)],
+)
 def test_the_frames_of_a_runs_collector_are_counted(collector, workers, monkeypatch):
     monkeypatch.setattr(throughput, "ROUND_S", 0.2)
     with tqdm(disable=True) as bar:

@@ -124,7 +124,11 @@ def test_specs(task):
 
 @pytest.mark.parametrize(
     ("task", "parallel"),
-    [*((task, False) for task in TASKS), *((task, True) for task in TASKS[::4])],
+    [
+        *((task, False) for task in TASKS),
+        *((task, True) for task in TASKS[::8]),
+        *(pytest.param(task, True, marks=pytest.mark.slow) for task in TASKS[4::8]),
+    ],
 )
 def test_vector_specs(task, parallel):
     checks.check_vector_specs(task, parallel=parallel)
@@ -250,7 +254,7 @@ def check_recovery(task, episodes, margin):
 
 @pytest.mark.parametrize(("task", "config"), PROGRESS)
 def test_the_expert_repeats_no_action_in_an_unchanged_scene(task, config):
-    check_progress(task, episodes=4 if task in LONG_EPISODES else 10, **config)
+    check_progress(task, episodes=2 if task in LONG_EPISODES else 5, **config)
 
 
 @pytest.mark.slow

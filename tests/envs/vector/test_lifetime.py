@@ -68,7 +68,12 @@ def wait_until_gone(pids, seconds=10.0):
 
 
 @pytest.mark.parametrize(
-    ("how", "method"), [("killed", "fork"), ("killed", "spawn"), ("ended", "fork")]
+    ("how", "method"),
+    [
+        ("killed", "fork"),
+        pytest.param("killed", "spawn", marks=pytest.mark.slow),
+        ("ended", "fork"),
+    ],
 )
 def test_no_worker_survives_its_parent(tmp_path, how, method):
     end = "time.sleep(100)" if how == "killed" else "sys.exit(0)"

@@ -53,7 +53,10 @@ def shipped(name, *overrides):
 
 @pytest.mark.parametrize(
     ("name", "actions", "turned"),
-    [("close_loop_3d", "pxyz", False), ("close_loop_4d", "pxyzr", True)],
+    [
+        pytest.param("close_loop_3d", "pxyz", False, marks=pytest.mark.slow),
+        ("close_loop_4d", "pxyzr", True),
+    ],
 )
 def test_close_loop_benchmarks_have_the_values_of_the_paper(name, actions, turned):
     config, _, runs = shipped(name)

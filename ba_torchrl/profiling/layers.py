@@ -1,0 +1,91 @@
+"""Times of single layers, forward and backward, computed in different ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ba_torchrl.modules.irrep_convolution import irrep_convolution
+from ba_torchrl.modules.kernel_blocks import regular_irrep_kernels
+from ba_torchrl.modules.max_pool import relu_of_max_pool
+from ba_torchrl.modules.steerable import SteerableConv2d, planar_rotations
+from ba_torchrl.profiling.learning import LearningUnit
+from ba_torchrl.profiling.table import Bench, Row, measurement, timed_row
+
+BATCH = 64
+FIELDS = ((8, 16, 32), (16, 32, 16), (16, 32, 32), (64, 128, 8), (128, 64, 8))
+"""Input fields, output fields and pixels of steerable convolutions in two actor-critics."""
+LAYOUTS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+def _with_gradient(layer: Callable[[Tensor], Tensor], x: Tensor) -> Callable[[], None]:
+    """Return the forward and backward pass of a layer."""
+    x = x.detach().requires_grad_()
+    grad = torch.ones_like(layer(x).detach())
+
+    def run() -> None:
+        x.grad = None
+        layer(x).backward(grad)
+
+    return run
+
+
+def _rows(bench: Bench, calls: dict[str, Callable[[], None]]) -> list[Row]:
+    times = bench.time_against({"unit": LearningUnit(bench.device)}, calls)
+    return [timed_row(call, "ms", times[call], times["unit"]) for call in calls]
+
+
+@measurement("learning/steerable_convolution", over=lambda: FIELDS)
+def measure_steerable(bench: Bench, in_fields: int, out_fields: int, pixels: int) -> list[Row]:
+    """A 3x3 steerable convolution of C_8 with the expanded filter and in the basis of irreps."""
+    gspace = planar_rotations(8)
+    regular = gspace.regular_repr
+    layer = SteerableConv2d(gspace, [(regular, in_fields)], [(regular, out_fields)], 3, padding=1)
+    layer.to(bench.device)
+    (coefficients,) = layer.coefficients.values()
+    kernels = regular_irrep_kernels(gspace, regular)
+    x = torch.randn(BATCH, 8 * in_fields, pixels, pixels, device=bench.device)
+
+    def expanded(x: Tensor) -> Tensor:
+        weight, bias = layer.expand()
+        return F.conv2d(x, weight, bias, padding=1)
+
+    def irreps(x: Tensor) -> Tensor:
+        return irrep_convolution(x, kernels, coefficients, None, 1)
+
+    name = f"C8 convolution, {in_fields} to {out_fields} fields, {pixels} px, batch {BATCH}"
+    channels_last = x.to(memory_format=torch.channels_last)
+    calls = {f"{name}, expanded filter": _with_gradient(expanded, channels_last)}
+    if bench.device.type == "cpu":
+        calls[f"{name}, basis of irreps"] = _with_gradient(irreps, x)
+    return _rows(bench, calls)
+
+
+@measurement("learning/max_pool", over=lambda: [(layout,) for layout in LAYOUTS])
+def measure_max_pool(bench: Bench, layout: str) -> list[Row]:
+    """ReLU of the 2x2 max pool by PyTorch's functions and in one pass."""
+    x = torch.randn(BATCH, 128, 64, 64, device=bench.device).to(memory_format=LAYOUTS[layout])
+    name = f"ReLU of max pool, 128 channels, 64 px, batch {BATCH}, {layout}"
+    calls = {
+        f"{name}, PyTorch": _with_gradient(lambda x: F.relu(F.max_pool2d(x, 2)), x),
+        f"{name}, one pass": _with_gradient(relu_of_max_pool, x),
+    }
+    return _rows(bench, calls)
+
+
+@measurement("learning/convolution_dtype")
+def measure_dtypes(bench: Bench) -> list[Row]:
+    """A convolution from 128 to 256 channels in two number formats."""
+    calls = {}
+    for name, dtype in DTYPES.items():
+        convolution = nn.Conv2d(128, 256, 3, padding=1, device=bench.device, dtype=dtype)
+        convolution.to(memory_format=torch.channels_last)
+        x = torch.randn(BATCH, 128, 16, 16, device=bench.device, dtype=dtype)
+        x = x.to(memory_format=torch.channels_last)
+        work = f"3x3 convolution, 128 to 256 channels, 16 px, batch {BATCH}, {name}"
+        calls[work] = _with_gradient(convolution, x)
+    return _rows(bench, calls)
