@@ -47,7 +47,7 @@ def checksum(transition):
 
 
 class Storm:
-    """Context in which a thread kills and stops random workers of a vector of environments."""
+    """Context in which a thread kills and stops, in turns, random workers of a vector."""
 
     def __init__(self, env, interval_s):
         self.env, self.interval_s = env, interval_s
@@ -58,7 +58,7 @@ class Storm:
 
     def run(self):
         while not self.ended.wait(self.generator.uniform(*self.interval_s)):
-            number = self.generator.choice(list(self.sent))
+            number = min(self.sent, key=self.sent.get)
             try:
                 os.kill(self.env.worker_pids[self.generator.randrange(NUM_ENVS)], number)
             except (ProcessLookupError, ValueError, IndexError):  # it is replaced now
@@ -130,6 +130,7 @@ def test_no_transition_is_torn_or_duplicated_in_a_storm(method, use_buffers, tmp
     with capsys.disabled():
         way = "buffers" if use_buffers else "pipes"
         sys.stdout.write(f"\n{method}, {way}: {json.dumps(figures)}\n")
-    assert kills + stops > 0
+    assert kills > 0
+    assert stops > 0
     assert 0 < faults <= restarts
     assert during > 0.02 * before
