@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +12,7 @@ import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
@@ -20,10 +21,12 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.base import Algorithm, AlgorithmConfig, NetworkConfig, Problem
+from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import ReplayKind, make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.data.transfer import batch_to_device, decoded_on_device, to_device
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -88,6 +91,10 @@ class Learner(Algorithm):
     implements the first three and can override the others. An update minimises the sum of the
     ``loss_...`` entries of the loss module.
 
+    On a CUDA device the host does not wait for an update: batches are copied as uint8 codes from
+    pinned memory, and priorities are set, and losses checked, at the end of the next update. An
+    update with a loss that is not finite changes no parameter.
+
     Args:
         config: hyper-parameters.
         network: builds the networks.
@@ -111,6 +118,7 @@ class Learner(Algorithm):
         """Declarations of the networks' input images, which the replay stores."""
         self.observation_keys = [*self.images, keys.HOLDING]
         self.codecs = make_codecs(self.images)
+        self.host_tasks = HostTasks(problem.device)
         networks = self.make_networks(network)
         policy = self.make_policy(networks)
         self.loss = self.make_loss(networks).to(problem.device)
@@ -188,6 +196,7 @@ class Learner(Algorithm):
             priority_exponent=config.priority_exponent,
             weight_exponent=config.importance_exponent,
             expert_bonus=config.expert_bonus,
+            returns_codes=self.problem.device.type != "cpu",
         )
 
     def make_stored_augmentation(self) -> nn.Module:
@@ -245,12 +254,23 @@ class Learner(Algorithm):
         """Number of transitions in the replay."""
         return len(self.replay)
 
-    def sample(self) -> TensorDictBase:
-        """Return an augmented batch from the replay, on the learner's device."""
+    def sample(self, *, demonstrations_only: bool = False) -> TensorDictBase:
+        """Return an augmented batch from the replay, on the learner's device.
+
+        Args:
+            demonstrations_only: leave out the batch's other transitions.
+        """
         sampler = self._prioritized_sampler()
         if sampler is not None:
             sampler.anneal(self.updates / max(self.problem.total_updates, 1))
-        return self.augmentation(self.replay.sample().to(self.problem.device))
+        batch, device = self.replay.sample(), self.problem.device
+        rows = batch[keys.IS_EXPERT].reshape(-1).nonzero()[:, 0] if demonstrations_only else None
+        if device.type == "cpu":
+            batch = self.augmentation(batch)
+        else:
+            batch = decoded_on_device(batch, self.codecs, device)
+            batch = batch_to_device(self.augmentation(batch), device)
+        return batch if rows is None else batch[to_device(rows, device)]
 
     # -- updates -----------------------------------------------------------------------------
 
@@ -262,10 +282,13 @@ class Learner(Algorithm):
         """
         batch = self.sample()
         scalars = self.minimize(self.loss(batch))
-        if self._prioritized_sampler() is not None:
-            # the trees of the sampler are on the CPU
-            self.replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
+        if self._prioritized_sampler() is not None:  # whose trees are on the CPU
+            errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
+            self.host_tasks.submit(errors, self._set_priorities)
         return scalars
+
+    def _set_priorities(self, errors: dict[str, Tensor]) -> None:
+        self.replay.update_tensordict_priority(TensorDict(errors, [len(errors["index"])]))
 
     def pretrain_update(self) -> TensorDict:
         """Take one update before the first collection; with ``init="bc"``, of behaviour cloning of
@@ -276,8 +299,7 @@ class Learner(Algorithm):
         """
         if self.init_loss is None:
             return self.update()
-        batch = self.sample()
-        return self.minimize(self.init_loss(batch[batch[keys.IS_EXPERT].squeeze(-1)]))
+        return self.minimize(self.init_loss(self.sample(demonstrations_only=True)))
 
     def minimize(self, scalars: TensorDictBase) -> TensorDict:
         """Take one gradient step on a sum of losses, update target and average, and count it.
@@ -291,10 +313,12 @@ class Learner(Algorithm):
         Raises:
             FloatingPointError: a loss is not finite.
         """
+        before = len(self.host_tasks)
         self.step(scalars)
         if self.averaged_policy is not None:
             self.averaged_policy.update_parameters(self.trained_policy)
         self.updates += 1
+        self.host_tasks.run(before)
         return scalars.detach()
 
     def step(self, scalars: TensorDictBase) -> None:
@@ -307,9 +331,12 @@ class Learner(Algorithm):
             FloatingPointError: a loss is not finite.
         """
         loss = sum(value for name, value in scalars.items() if name.startswith("loss_"))
-        if not torch.isfinite(loss):
-            values = {key: value.item() for key, value in scalars.items()}
-            raise FloatingPointError(f"a loss is not finite at update {self.updates}: {values}")
+        is_finite = torch.isfinite(loss)
+        self.host_tasks.submit(
+            {**scalars, IS_FINITE: is_finite}, partial(check_finite, self.updates)
+        )
+        if self.host_tasks.is_deferred:
+            self.optimizer.found_inf = (~is_finite).float()  # skips the step, as a GradScaler does
         self.optimizer.zero_grad()
         loss.backward()
         if self.config.gradient_clamp is not None:
@@ -332,7 +359,12 @@ class Learner(Algorithm):
         return {name: getattr(self, name) for name in names}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, target, optimiser, schedule, augmentations and number of updates."""
+        """Return networks, target, optimiser, schedule, augmentations and number of updates.
+
+        Raises:
+            FloatingPointError: a loss of the last update was not finite.
+        """
+        self.host_tasks.run()
         state = {name: part.state_dict() for name, part in self._stateful_parts().items()}
         return {**state, "updates": self.updates}
 
@@ -343,7 +375,12 @@ class Learner(Algorithm):
         self.updates = state["updates"]
 
     def save_replay(self, folder: Path) -> None:
-        """Write the replay into a folder: transitions, priorities and the state of its draws."""
+        """Write the replay into a folder: transitions, priorities and the state of its draws.
+
+        Raises:
+            FloatingPointError: a loss of the last update was not finite.
+        """
+        self.host_tasks.run()
         self.replay.dumps(folder)
 
     def load_replay(self, folder: Path) -> None:

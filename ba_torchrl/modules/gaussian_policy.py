@@ -7,8 +7,31 @@ from collections.abc import Sequence
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal, TruncatedNormal
+from torchrl.modules.distributions.continuous import SafeTanhTransform
 
 from ba_torchrl.envs import keys
+
+
+class UnitTanhNormal(TanhNormal):
+    """TorchRL's tanh of a Gaussian variable with the range [-1, 1].
+
+    TorchRL's constructor compares the bounds as tensors on the device and reads the result on the
+    host, which then waits for the device in every forward pass; this one knows the bounds.
+
+    Args:
+        loc: mean of the Gaussian variable, [..., A].
+        scale: its standard deviation, [..., A].
+    """
+
+    def __init__(self, loc: Tensor, scale: Tensor) -> None:
+        self.device = loc.device
+        self.low, self.high = loc.new_full((), -1.0), loc.new_full((), 1.0)
+        self.non_trivial_min = self.non_trivial_max = False
+        self.tanh_loc = False
+        self.upscale = 5.0  # TorchRL's default, unused without tanh_loc
+        self._event_dims = min(1, loc.ndim)
+        self._t = SafeTanhTransform()
+        self.update(loc, scale)
 
 
 def squashed_gaussian_policy(actor: nn.Module, in_keys: Sequence[str]) -> ProbabilisticActor:
@@ -22,8 +45,7 @@ def squashed_gaussian_policy(actor: nn.Module, in_keys: Sequence[str]) -> Probab
         TensorDictModule(actor, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=[keys.ACTION],
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": -1.0, "high": 1.0},
+        distribution_class=UnitTanhNormal,
     )
 
 

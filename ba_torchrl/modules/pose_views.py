@@ -14,6 +14,7 @@ from ba_torchrl.config import StrictModel
 from ba_torchrl.modules.patches import patches
 from ba_torchrl.modules.projections import cell_table, project, project_upright
 from ba_torchrl.modules.spatial import Level, SpatialSpec
+from ba_torchrl.modules.widest_float import constants
 
 POSE_COMPONENTS = ("x", "y", "rz", "z", "ry", "rx")
 """Components of six degrees of freedom in the order of their choice (appendix D.2)."""
@@ -108,7 +109,7 @@ class HeightView:
         """Return one patch per sample [B, 1, 1, p, p], metres."""
         yaw = None
         if self.rz_rad is not None:
-            yaw = torch.tensor(self.rz_rad, dtype=pixels.dtype, device=pixels.device)[chosen[:, 2]]
+            yaw = constants(tuple(self.rz_rad), pixels.device).to(pixels.dtype)[chosen[:, 2]]
         return patches(pixels, chosen[:, :2], self.size, yaw)[:, None]
 
 
@@ -131,8 +132,7 @@ class UprightView:
         """Return projections [B, K, 3, p, p], voxels."""
         patch = patches(pixels, chosen[:, :2], self.size)[:, 0]
         heights, yaws = (
-            torch.tensor(values, dtype=torch.float64, device=pixels.device)
-            for values in (self.grid.z_m, self.grid.rz_rad)
+            constants(tuple(values), pixels.device) for values in (self.grid.z_m, self.grid.rz_rad)
         )
         z = heights.expand(len(patch), -1) if chosen.shape[1] == 3 else heights[chosen[:, 3:4]]
         return project_upright(patch, self.pixel_m, z, yaws[chosen[:, 2]])
@@ -160,7 +160,7 @@ class TiltedView:
         table = cell_table(*self.grid[1:], self.size, pixels.device)
         cells = table[chosen[:, 2], *chosen[:, 4:].unbind(1)]
         cells = cells.reshape(len(patch), -1, *cells.shape[-3:])
-        heights = torch.tensor(self.grid.z_m, dtype=torch.float64, device=pixels.device)
+        heights = constants(tuple(self.grid.z_m), pixels.device)
         z = heights[chosen[:, 3:4]].expand(-1, cells.shape[1])
         return project(patch, self.pixel_m, z, cells)
 

@@ -1,7 +1,8 @@
 """Projections of the voxels below a heightmap in the frames of many tool poses, in one batch.
 
 The numbers are those of the in-hand mode "proj" (`ba_torchrl.sim.vision.in_hand`), for all poses of
-a deictic encoding at once and on any device.
+a deictic encoding at once and on any device. A device without float64 computes in float32; there,
+voxels close to halfway between two cells can belong to the other one.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from ba_torchrl.modules.widest_float import widened
+
 TIE_TOLERANCE = 1e-9
 """Voxels. A rotated voxel centre this close to halfway between two cells belongs to the upper
 one."""
@@ -18,7 +21,7 @@ one."""
 
 def tool_rotations(rz_rad: Tensor, ry_rad: Tensor, rx_rad: Tensor) -> Tensor:
     """Return the matrices Rz(rz) Ry(ry) Rx(rx), float64 [..., 3, 3], of angles [...]."""
-    rz, ry, rx = torch.broadcast_tensors(rz_rad.double(), ry_rad.double(), rx_rad.double())
+    rz, ry, rx = torch.broadcast_tensors(widened(rz_rad), widened(ry_rad), widened(rx_rad))
     cz, sz, cy, sy, cx, sx = rz.cos(), rz.sin(), ry.cos(), ry.sin(), rx.cos(), rx.sin()
     rows = [
         torch.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx], dim=-1),
@@ -41,7 +44,7 @@ def rotated_cells(rotations: Tensor, size: int) -> Tensor:
         int32 [N, size, size, size], one plus the index into the flattened cells; zero for voxels
         that are rotated out of the cube.
     """
-    offset = torch.arange(size, dtype=torch.float64, device=rotations.device) - (size - 1) / 2
+    offset = torch.arange(size, dtype=rotations.dtype, device=rotations.device) - (size - 1) / 2
     cells = torch.zeros((len(rotations), size, size, size), dtype=torch.int32, device=offset.device)
     is_inside = torch.ones_like(cells, dtype=torch.bool)
     for axis in range(3):
@@ -101,7 +104,7 @@ def column_counts(heights: Tensor, z_m: Tensor, pixel_m: float, size: int) -> Te
     Returns:
         int64 [B, K, n], 0 to ``size``.
     """
-    offset = torch.arange(size, dtype=torch.float64, device=heights.device) - (size - 1) / 2
+    offset = torch.arange(size, dtype=heights.dtype, device=heights.device) - (size - 1) / 2
     levels = z_m[..., None] + offset * pixel_m
     values = heights[:, None].expand(*z_m.shape, -1).contiguous()
     return torch.searchsorted(levels, values)
@@ -125,7 +128,7 @@ def project(patches: Tensor, pixel_m: float, z_m: Tensor, cells: Tensor) -> Tens
     batch, count = z_m.shape
     size = patches.shape[-1]
     heights = _rounded(patches).flatten(1)
-    below = column_counts(heights, z_m.double(), pixel_m, size).flatten(0, 1)
+    below = column_counts(heights, widened(z_m), pixel_m, size).flatten(0, 1)
     level = torch.arange(size, device=patches.device)
     is_occupied = level < below[..., None]
     # cell 0 collects the free voxels, and those that are rotated out of the cube
@@ -155,7 +158,7 @@ def project_upright(patches: Tensor, pixel_m: float, z_m: Tensor, rz_rad: Tensor
         float32 [B, K, 3, p, p]: sums along the x, y and z axes.
     """
     size = patches.shape[-1]
-    below = column_counts(_turned(_rounded(patches), rz_rad), z_m.double(), pixel_m, size)
+    below = column_counts(_turned(_rounded(patches), rz_rad), widened(z_m), pixel_m, size)
     columns = _filtered_columns(below.unflatten(-1, (size, size)))
     return torch.stack(
         [_occupied(columns, dim=-2), _occupied(columns, dim=-1), columns.float()], dim=2
@@ -163,7 +166,7 @@ def project_upright(patches: Tensor, pixel_m: float, z_m: Tensor, rz_rad: Tensor
 
 
 def _rounded(patches: Tensor) -> Tensor:
-    return patches.double().round(decimals=5)
+    return widened(patches).round(decimals=5)
 
 
 def _turned(patches: Tensor, rz_rad: Tensor) -> Tensor:
@@ -172,14 +175,15 @@ def _turned(patches: Tensor, rz_rad: Tensor) -> Tensor:
     Columns that no column is rotated into have a height of minus infinity.
     """
     size = patches.shape[-1]
-    offset = torch.arange(size, dtype=torch.float64, device=patches.device) - (size - 1) / 2
-    cos, sin = rz_rad.double().cos()[:, None, None], rz_rad.double().sin()[:, None, None]
+    offset = torch.arange(size, dtype=patches.dtype, device=patches.device) - (size - 1) / 2
+    yaw = widened(rz_rad)
+    cos, sin = (part[:, None, None] for part in (yaw.cos(), yaw.sin()))
     row = _nearest_cell(cos * offset[:, None] + sin * offset, size)
     column = _nearest_cell(cos * offset - sin * offset[:, None], size)
     is_inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
     index = torch.where(is_inside, row * size + column + 1, 0).flatten(1).long()
     highest = torch.full(
-        (len(patches), size**2 + 1), -torch.inf, dtype=torch.float64, device=patches.device
+        (len(patches), size**2 + 1), -torch.inf, dtype=patches.dtype, device=patches.device
     )
     return highest.scatter_reduce(1, index, patches.flatten(1), "amax")[:, 1:]
 

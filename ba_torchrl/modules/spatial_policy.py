@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from ba_torchrl.actions import PLACE, TILTS, GridAxis, OpenLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.spatial import Level, SpatialQNetwork
+from ba_torchrl.modules.widest_float import widened, widest_float
 
 OBJECT_HEIGHT_M = 0.01
 """Random actions choose among the pixels higher than this, if there are any."""
@@ -68,13 +69,14 @@ class SpatialActions:
             holding: [..., 1], true where something is held.
         """
         shape = (*indices.shape[:-1], self.actions.size)
-        # computed in float64, so that the result is the nearest float32 on any device
-        action = torch.zeros(shape, dtype=torch.float64, device=indices.device)
+        # computed in float64, so that the result is the nearest float32 on any device that has it
+        dtype = widest_float(indices.device)
+        action = torch.zeros(shape, dtype=dtype, device=indices.device)
         for i, (place, axis) in enumerate(zip(self._positions, self.axes, strict=True)):
-            action[..., place] = axis.first + axis.step * indices[..., i].double()
+            action[..., place] = axis.first + axis.step * widened(indices[..., i])
         if "p" in self.actions.components:
             primitive = self.actions.components.index("p")
-            action[..., primitive] = PLACE * holding[..., 0].double()
+            action[..., primitive] = PLACE * widened(holding[..., 0])
         return action.float()
 
     def to_indices(self, action: Tensor) -> Tensor:
@@ -86,7 +88,7 @@ class SpatialActions:
         is_swapped = self.swaps_fingers(action)
         columns = []
         for name, place, axis in zip(self.components, self._positions, self.axes, strict=True):
-            value = action[..., place].double()
+            value = widened(action[..., place])
             if name in TILTS:
                 value = torch.where(is_swapped, -value, value)
             index = _nearest_step(value, axis)
@@ -102,14 +104,14 @@ class SpatialActions:
         if "rz" not in self.components or not self.actions.half_rotation:
             return torch.zeros(action.shape[:-1], dtype=torch.bool, device=action.device)
         rz = self.components.index("rz")
-        step = _nearest_step(action[..., self._positions[rz]].double(), self.axes[rz])
+        step = _nearest_step(widened(action[..., self._positions[rz]]), self.axes[rz])
         return step.div(self.axes[rz].count, rounding_mode="floor").remainder(2) == 1
 
     def nearest(self, action: Tensor) -> Tensor:
         """Return the grid actions nearest to actions [..., A]; the primitive is unchanged."""
         indices, out = self.to_indices(action), action.clone()
         for i, (place, axis) in enumerate(zip(self._positions, self.axes, strict=True)):
-            out[..., place] = (axis.first + axis.step * indices[..., i].double()).to(out)
+            out[..., place] = (axis.first + axis.step * widened(indices[..., i])).to(out)
         return out
 
     def at_level(self, indices: Tensor, level: int) -> Tensor:

@@ -18,6 +18,7 @@ from ba_torchrl.data.augmentation.so2 import (
     quarters_and_rotation,
     require_known_frames,
 )
+from ba_torchrl.data.transfer import to_device
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 
@@ -58,7 +59,8 @@ def transform_images(images: Tensor, transform: RigidTransform) -> Tensor:
         torch.stack([sign * cos, -sign * sin, sign * (sin * tx - cos * ty)], dim=-1),
         torch.stack([sin, cos, -cos * tx - sin * ty], dim=-1),
     ]
-    grid = F.affine_grid(torch.stack(rows, dim=1).to(images), list(images.shape), False)
+    source = to_device(torch.stack(rows, dim=1).to(images.dtype), images.device)
+    grid = F.affine_grid(source, list(images.shape), False)
     transformed = F.grid_sample(images, grid, padding_mode="zeros", align_corners=False)
     is_centred = (transform.shift == 0).all(dim=-1)
     for flip in (False, True):
@@ -160,15 +162,14 @@ class RigidAugmentation(nn.Module):
             return out
         rows = is_found.nonzero().squeeze(-1)
         transform = RigidTransform(*(part[rows] for part in transform))
-        index = rows.to(device)
         for key in self._scene_images:
-            map_pairs(out, key, index, lambda images: transform_images(images, transform))
+            map_pairs(out, key, rows, lambda images: transform_images(images, transform))
         moved = action.clone()
         moved[rows], is_turned_over = self._transform_actions(action[rows], transform)
-        out.set(keys.ACTION, moved.to(device))
+        out.set(keys.ACTION, to_device(moved, device))
         for chosen, axes in ((transform.mirrored, "y"), (is_turned_over, "xy")):
             if chosen.any():
-                self._reverse_axes(out, index[chosen.to(device)], axes)
+                self._reverse_axes(out, rows[chosen], axes)
         return out
 
     def _draw_inside(self, action: Tensor) -> tuple[Tensor, RigidTransform]:
@@ -244,7 +245,8 @@ class RigidAugmentation(nn.Module):
         for key, spec in self._gripper_images.items():
             for nested in (key, (keys.NEXT, key)):
                 image = out[nested].clone()
-                image[rows] = spec.reverse_axes(image[rows], axes)
+                index = to_device(rows, image.device)
+                image[index] = spec.reverse_axes(image[index], axes)
                 out.set(nested, image)
 
     def get_extra_state(self) -> Tensor:

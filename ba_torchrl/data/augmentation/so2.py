@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from ba_torchrl.data.transfer import to_device
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 
@@ -43,7 +44,7 @@ def rotate_images(images: Tensor, angle_rad: Tensor) -> Tensor:
     # Source of an output pixel in (column, row): the inverse rotation.
     zero = torch.zeros_like(cos)
     rows = [torch.stack([cos, -sin, zero], dim=-1), torch.stack([sin, cos, zero], dim=-1)]
-    source = torch.stack(rows, dim=1).to(images)
+    source = to_device(torch.stack(rows, dim=1).to(images.dtype), images.device)
     grid = F.affine_grid(source, list(images.shape), align_corners=False)
     rotated = F.grid_sample(images, grid, padding_mode="border", align_corners=False)
     copy_exact_quarters(rotated, images, quarters)
@@ -59,7 +60,7 @@ def copy_exact_quarters(rotated: Tensor, images: Tensor, quarters: Tensor) -> No
         quarters: int64 [B] on the CPU, number of quarter turns; -1 leaves an image unchanged.
     """
     for k in sorted(set(quarters.tolist()) - {-1}):
-        exact = (quarters == k).nonzero().squeeze(-1).to(images.device)
+        exact = to_device((quarters == k).nonzero().squeeze(-1), images.device)
         rotated[exact] = torch.rot90(images[exact], k, (-2, -1))
 
 
@@ -72,8 +73,8 @@ def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
         displacement: [B, 2].
         angle_rad: [B] float64 on the CPU, radians.
     """
-    _, cos, sin = (value.to(displacement.device) for value in quarters_and_rotation(angle_rad))
-    cos, sin = cos.to(displacement.dtype), sin.to(displacement.dtype)
+    _, *rotation = quarters_and_rotation(angle_rad)
+    cos, sin = (to_device(x.to(displacement.dtype), displacement.device) for x in rotation)
     dx, dy = displacement.unbind(dim=-1)
     turned = torch.stack([cos * dx - sin * dy, sin * dx + cos * dy], dim=-1)
     return turned / turned.abs().amax(dim=-1, keepdim=True).clamp_min(1)
@@ -87,12 +88,13 @@ def map_pairs(
     Args:
         tensordict: batch [B]; gets new tensors under ``key`` and ("next", ``key``).
         key: of the image.
-        rows: int64 [R], on the batch's device.
+        rows: int64 [R], on any device.
         transform: maps [R, 2 C, H, W], both images concatenated along the channels, to the same
             shape.
     """
     image = tensordict[key]
     images = torch.cat([image, tensordict[keys.NEXT, key]], dim=1)
+    rows = to_device(rows, images.device)
     images[rows] = transform(images[rows])
     first, second = images.split(image.shape[1], dim=1)
     tensordict.set(key, first.contiguous()).set((keys.NEXT, key), second.contiguous())
@@ -166,11 +168,10 @@ class SO2Augmentation(nn.Module):
         if not len(chosen):
             return out
         action = tensordict[keys.ACTION].clone()
-        index = chosen.to(action.device)
         for key in self._scene_images:
-            map_pairs(out, key, index, lambda images: rotate_images(images, angle))
-        rows = index[:, None]
-        plane = torch.tensor(self._plane, device=action.device)
+            map_pairs(out, key, chosen, lambda images: rotate_images(images, angle))
+        rows = to_device(chosen, action.device)[:, None]
+        plane = to_device(torch.tensor(self._plane), action.device)
         action[rows, plane] = rotate_displacement(action[rows, plane], angle)
         return out.set(keys.ACTION, action)
 

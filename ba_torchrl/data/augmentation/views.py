@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from ba_torchrl.data.transfer import to_device
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.errors import ConfigError
@@ -152,7 +153,7 @@ class RandomViews(nn.Module):
         """Return uniform offsets [B, views, 2]."""
         choices = image.shape[-1] + 2 * self.padding - self.sizes[key] + 1
         offsets = torch.randint(choices, (len(image), views, 2), generator=self._generator)
-        return offsets.to(image.device)
+        return to_device(offsets, image.device)
 
     def _take(self, key: str, image: Tensor, offsets: Tensor) -> Tensor:
         """Return [B, C, size, size] of a single view, and [B, V, C, size, size] of several."""

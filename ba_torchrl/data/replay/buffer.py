@@ -16,6 +16,7 @@ from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
 from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.frames import FrameTable
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.data.replay.schema import Schema, differences
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
@@ -35,16 +36,20 @@ class FrameStorage(LazyTensorStorage):
         max_size: number of transitions.
         codecs: codec of each image by its key, such as ``pixels``; also used for the same key in
             "next".
+        returns_codes: return the images' codes instead of decoded images.
 
     Raises:
         ValueError: ``codecs`` is empty.
     """
 
-    def __init__(self, max_size: int, codecs: Mapping[str, ImageCodec]) -> None:
+    def __init__(
+        self, max_size: int, codecs: Mapping[str, ImageCodec], *, returns_codes: bool = False
+    ) -> None:
         super().__init__(max_size, device="cpu")
         if not codecs:
             raise ValueError("codecs is empty: there is no image to store")
         self.codecs = dict(codecs)
+        self.returns_codes = returns_codes
         self.frame_keys: list[NestedKey] = [
             nested for key in codecs for nested in (key, (keys.NEXT, key))
         ]
@@ -97,7 +102,7 @@ class FrameStorage(LazyTensorStorage):
             slots[place] = new
 
     def get(self, index: int | Sequence[int] | slice | Tensor) -> TensorDictBase:
-        """Return transitions with decoded images.
+        """Return transitions with decoded images, or their codes.
 
         A slice over the whole storage decodes every image; `column` decodes none.
 
@@ -107,7 +112,9 @@ class FrameStorage(LazyTensorStorage):
         data = super().get(index).copy()
         for number, (key, codec) in enumerate(self.codecs.items()):
             slots = self._slots[number, : len(self)][index]
-            images = codec.decode(self._frames[key].read(slots))
+            images = self._frames[key].read(slots)
+            if not self.returns_codes:
+                images = codec.decode(images)
             for i, nested in enumerate((key, (keys.NEXT, key))):
                 data.set(nested, images.select(slots.ndim - 1, i))
         return data
@@ -325,19 +332,13 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             if missing:
                 raise ReplaySchemaError(f"transitions lack {missing}")
             return
-        problems = [f"missing {key!r}" for key in expected if key not in found]
-        problems += [f"unexpected {key!r}" for key in found if key not in expected]
-        problems += [
-            f"{key!r} is {_text(*found[key])}, stored as {_text(*expected[key])}"
-            for key in expected
-            if key in found and found[key] != expected[key]
-        ]
+        problems = differences(found, expected)
         if problems:
             raise ReplaySchemaError(
-                "transitions differ from those in the replay: " + "; ".join(sorted(problems))
+                "transitions differ from those in the replay: " + "; ".join(problems)
             )
 
-    def _schema(self) -> dict[NestedKey, tuple[torch.dtype, torch.Size]] | None:
+    def _schema(self) -> Schema | None:
         """Return type and shape of every stored entry, None if the buffer is empty."""
         storage: FrameStorage = self.storage
         if not storage.initialized:
@@ -352,10 +353,6 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
         return schema
 
 
-def _text(dtype: torch.dtype, shape: torch.Size) -> str:
-    return f"{str(dtype).removeprefix('torch.')}{list(shape)}"
-
-
 def make_replay_buffer(
     capacity: int,
     batch_size: int | None,
@@ -366,6 +363,7 @@ def make_replay_buffer(
     priority_exponent: float = 0.6,
     weight_exponent: float = 0.4,
     expert_bonus: float = 1.0,
+    returns_codes: bool = False,
 ) -> FrameReplayBuffer:
     """Return an empty replay buffer with uniform or prioritised sampling (appendix G.2).
 
@@ -378,6 +376,7 @@ def make_replay_buffer(
         priority_exponent: alpha.
         weight_exponent: beta at the start of the run; ``buffer.sampler.anneal`` raises it.
         expert_bonus: added to the priority of demonstrations.
+        returns_codes: samples hold the images' codes instead of decoded images.
     """
     generator = torch.Generator().manual_seed(seed)
     sampler: Sampler = RandomSampler()
@@ -390,7 +389,7 @@ def make_replay_buffer(
             expert_bonus=expert_bonus,
         )
     return FrameReplayBuffer(
-        storage=FrameStorage(capacity, codecs),
+        storage=FrameStorage(capacity, codecs, returns_codes=returns_codes),
         sampler=sampler,
         batch_size=batch_size,
         generator=generator,

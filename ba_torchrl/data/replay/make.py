@@ -24,6 +24,7 @@ def make_replay(
     priority_exponent: float = 0.6,
     weight_exponent: float = 0.4,
     expert_bonus: float = 1.0,
+    returns_codes: bool = False,
 ) -> FrameReplayBuffer | SymmetricReplay:
     """Return an empty replay.
 
@@ -36,9 +37,12 @@ def make_replay(
         priority_exponent: alpha of a prioritised replay.
         weight_exponent: initial beta of a prioritised replay.
         expert_bonus: added to the priority of demonstrations.
+        returns_codes: samples hold the images' codes instead of decoded images.
     """
     if kind == "symmetric":
-        return SymmetricReplay(capacity, batch_size, codecs=codecs, seed=seed)
+        return SymmetricReplay(
+            capacity, batch_size, codecs=codecs, seed=seed, returns_codes=returns_codes
+        )
     return make_replay_buffer(
         capacity,
         batch_size,
@@ -48,4 +52,5 @@ def make_replay(
         priority_exponent=priority_exponent,
         weight_exponent=weight_exponent,
         expert_bonus=expert_bonus,
+        returns_codes=returns_codes,
     )

@@ -31,13 +31,27 @@ class SymmetricReplay(ReplayBufferEnsemble):
         batch_size: of a sample.
         codecs: codec of each image by key; the acting policy must use the same.
         seed: of the draws.
+        returns_codes: samples hold the images' codes instead of decoded images.
     """
 
     def __init__(
-        self, capacity: int, batch_size: int, *, codecs: Mapping[str, ImageCodec], seed: int
+        self,
+        capacity: int,
+        batch_size: int,
+        *,
+        codecs: Mapping[str, ImageCodec],
+        seed: int,
+        returns_codes: bool = False,
     ) -> None:
         self.expert, self.online = (
-            make_replay_buffer(capacity, None, codecs=codecs, seed=2 * seed + i, prioritized=False)
+            make_replay_buffer(
+                capacity,
+                None,
+                codecs=codecs,
+                seed=2 * seed + i,
+                prioritized=False,
+                returns_codes=returns_codes,
+            )
             for i, _ in enumerate(_NAMES)
         )
         super().__init__(self.expert, self.online, batch_size=batch_size, collate_fn=torch.cat)

@@ -1,0 +1,62 @@
+"""Batches that are decoded after they were copied."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, Uint8Images
+from ba_torchrl.data.replay.make import make_replay
+from ba_torchrl.data.transfer import batch_to_device, decoded_on_device, to_device
+from ba_torchrl.envs import keys
+
+CPU, META = torch.device("cpu"), torch.device("meta")
+CODECS = {keys.PIXELS: DepthQuantizer(0.4), "heights": HalfPrecision(0.4), "camera": Uint8Images()}
+
+
+def transitions(count=20):
+    generator = torch.Generator().manual_seed(0)
+
+    def state():
+        image = torch.rand(count, 1, 8, 8, generator=generator)
+        camera = (255 * torch.rand(count, 3, 8, 8, generator=generator)).to(torch.uint8)
+        return {keys.PIXELS: 0.4 * image, "heights": 0.3 * image, "camera": camera}
+
+    expert = torch.arange(count)[:, None] % 3 == 0
+    action = torch.rand(count, 4, generator=generator)
+    data = {**state(), keys.ACTION: action, keys.IS_EXPERT: expert, keys.NEXT: state()}
+    return TensorDict(data, [count])
+
+
+@pytest.mark.parametrize("kind", ["uniform", "prioritized", "symmetric"])
+def test_codes_decoded_after_the_copy_are_the_images_of_the_replay(kind):
+    samples = []
+    for returns_codes in (False, True):
+        replay = make_replay(kind, 50, 8, codecs=CODECS, seed=1, returns_codes=returns_codes)
+        replay.extend(transitions())
+        samples.append(replay.sample())
+    images, codes = samples
+    assert codes[keys.PIXELS].dtype == torch.uint8
+    assert images[keys.PIXELS].dtype == torch.float32
+    decoded = decoded_on_device(codes, CODECS, CPU)
+    assert set(decoded.keys(True, True)) == set(images.keys(True, True))
+    for key in images.keys(True, True):
+        torch.testing.assert_close(decoded[key], images[key], rtol=0, atol=0)
+    assert codes[keys.PIXELS].dtype == torch.uint8  # unchanged
+
+
+def test_images_go_to_the_device_first_and_the_other_entries_last():
+    batch = transitions()
+    batch.update({keys.PIXELS: CODECS[keys.PIXELS].encode(batch[keys.PIXELS])})
+    codecs = {keys.PIXELS: CODECS[keys.PIXELS]}
+    batch[keys.NEXT, keys.PIXELS] = batch[keys.PIXELS]
+    decoded = decoded_on_device(batch, codecs, META)
+    assert decoded[keys.PIXELS].device == decoded[keys.NEXT, keys.PIXELS].device == META
+    assert decoded[keys.ACTION].device == CPU
+    moved = batch_to_device(decoded, META)
+    assert {value.device for value in moved.values(True, True)} == {META}
+    assert moved.device == META
+
+
+def test_what_is_on_the_device_is_not_copied():
+    value = torch.rand(3)
+    assert to_device(value, CPU) is value
