@@ -60,6 +60,9 @@ class StrictModel(BaseModel):
 
 Rgb = tuple[float, float, float]
 
+MAX_SEED = 2**63 - 1
+"""The largest seed that all generators accept."""
+
 CUSTOM_PHYSICS = ("time_step_s", "solver_iterations", "solver_residual")
 
 _CLOSE_LOOP = {"control": "close_loop"}

@@ -20,6 +20,7 @@ from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs, progress_bar
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_seed,
     check_texts,
     check_writable,
     mapping_of,
@@ -38,7 +39,8 @@ def main(settings: DictConfig) -> None:
     load_plugins(settings.plugins)
     check_texts(settings, "task", "path", "source")
     check_counts(settings, "episodes", "num_envs")
-    check_counts(settings, "replays", "seed", least=0)
+    check_counts(settings, "replays", least=0)
+    check_seed(settings)
     check_noise(settings.noise, settings.source, "noise")
     check_writable(settings.path)
     if Path(settings.path).exists():

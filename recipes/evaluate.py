@@ -19,6 +19,7 @@ from ba_torchrl.record.video import check_video, write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     check_counts,
+    check_seed,
     check_texts,
     check_writable,
     plain_errors,
@@ -37,6 +38,7 @@ def main(settings: DictConfig) -> None:
     check_texts(settings, "checkpoint")
     check_texts(settings, "video", optional=True)
     check_counts(settings, "episodes", "num_envs", "video_episodes")
+    check_seed(settings, optional=True)
     if settings.video is not None:
         check_video(settings.video, FPS)
         check_writable(settings.video)

@@ -21,6 +21,7 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.command_line import (
     check_counts,
     check_lists,
+    check_seed,
     check_texts,
     check_writable,
     mapping_of,
@@ -41,7 +42,7 @@ def main(settings: DictConfig) -> None:
     check_lists(settings, "tasks", optional=True)
     check_texts(settings, "path", optional=True)
     check_counts(settings, "episodes", "num_envs")
-    check_counts(settings, "seed", least=0)
+    check_seed(settings)
     if settings.path is not None:
         check_writable(settings.path)
     for robot in settings.robots:

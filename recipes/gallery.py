@@ -13,7 +13,7 @@ from tqdm import tqdm
 from ba_torchrl import list_tasks
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
-from ba_torchrl.training.command_line import plain_errors
+from ba_torchrl.training.command_line import check_counts, check_seed, plain_errors
 
 
 @hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
@@ -21,6 +21,8 @@ from ba_torchrl.training.command_line import plain_errors
 def main(settings: DictConfig) -> None:
     """Play one episode per task and write its pictures."""
     load_plugins(settings.plugins)
+    check_counts(settings, "pictures")
+    check_seed(settings)
     strips = {}
     for task in tqdm(settings.tasks or list_tasks(), unit="task"):
         strips[task] = expert_strip(task, settings.seed, settings.pictures)

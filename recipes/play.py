@@ -16,6 +16,7 @@ from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.record.video import check_video, write_video
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_seed,
     check_texts,
     check_writable,
     mapping_of,
@@ -40,7 +41,7 @@ def main(settings: DictConfig) -> None:
     if settings.policy not in POLICIES:
         raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
     check_counts(settings, "episodes")
-    check_counts(settings, "seed", least=0)
+    check_seed(settings)
     if settings.video is not None:
         check_video(settings.video, settings.fps)
         check_writable(settings.video)

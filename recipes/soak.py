@@ -19,6 +19,7 @@ from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training.command_line import (
     check_counts,
     check_lists,
+    check_seed,
     check_texts,
     check_writable,
     mapping_of,
@@ -39,7 +40,7 @@ def main(settings: DictConfig) -> None:
     check_lists(settings, "tasks", optional=True)
     check_texts(settings, "folder")
     check_counts(settings, "steps", "long_steps", least=10)
-    check_counts(settings, "seed", least=0)
+    check_seed(settings)
     env = mapping_of(settings, "env")
     tasks = list(settings.tasks or list_tasks())
     for task in tasks:

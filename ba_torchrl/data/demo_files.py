@@ -94,6 +94,9 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
     check_demonstrations(path, task=task, env=env)
     try:
         data = TensorDict.load_memmap(path, allow_pickle=False)
+        for key, value in data.items(True, True):
+            if not len(data) or value.shape[:1] != data.shape:
+                raise ValueError(f"{key} has the shape {list(value.shape)} in {len(data)} rows")
         numbers = data[_EPISODE].squeeze(-1)
         return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Algorithm, Problem
@@ -206,7 +206,7 @@ def _success_rate(checkpoint: Path) -> float:
     It is then examined first, and the warning names it.
     """
     try:
-        return float(Checkpoint.manifest(checkpoint)["metadata"]["success_rate"])
+        return float(DurableCheckpoint.manifest(checkpoint)["metadata"]["success_rate"])
     except (CheckpointError, OSError, ValueError, KeyError, TypeError):
         return math.inf
 

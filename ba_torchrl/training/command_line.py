@@ -12,6 +12,7 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from ba_torchrl.config import MAX_SEED
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import hydra_schema
 
@@ -73,6 +74,23 @@ def check_counts(settings: DictConfig, *names: str, least: int = 1) -> None:
         value: Any = settings[name]
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ConfigError(f"{name}: must be a whole number of at least {least}, got {value!r}")
+
+
+def check_seed(settings: DictConfig, *, optional: bool = False) -> None:
+    """Check the setting ``seed``.
+
+    Args:
+        settings: of the recipe.
+        optional: allow None.
+
+    Raises:
+        ConfigError: it is not a whole number from zero to `MAX_SEED`.
+    """
+    value: Any = settings.seed
+    if optional and value is None:
+        return
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEED:
+        raise ConfigError(f"seed: must be a whole number from 0 to {MAX_SEED}, got {value!r}")
 
 
 def check_texts(settings: DictConfig, *names: str, optional: bool = False) -> None:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
-from ba_torchrl.config import EnvConfig, StrictModel, parse
+from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, parse
 from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import Source, check_noise, source_config
 from ba_torchrl.envs.observations import OBSERVATIONS
@@ -45,7 +45,7 @@ class ExperimentConfig(StrictModel):
     """``name`` of a registered algorithm and its hyper-parameters."""
     network: dict[str, Any]
     """``name`` of a registered network and its hyper-parameters."""
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, le=MAX_SEED)
     """Seed of networks, environments, replay and augmentation."""
     device: str = "auto"
     """Where the learner runs; "auto" takes a GPU if there is one."""

@@ -59,6 +59,18 @@ class DurableCheckpoint(Checkpoint):
                 f"{path} does not fit this version or configuration: {reason}"
             ) from error
 
+    @classmethod
+    def manifest(cls, path: str | Path) -> dict[str, Any]:
+        """Read the manifest of a checkpoint; see TorchRL.
+
+        Raises:
+            CheckpointError: it is none.
+        """
+        try:
+            return super().manifest(path)
+        except AttributeError as error:  # TorchRL expects that the file holds a mapping
+            raise CheckpointError(f"{path}: the manifest is not a mapping") from error
+
 
 def saved_steps(folder: Path) -> list[Path]:
     """Return the checkpoints in a folder of TorchRL's `CheckpointRotation`, the newest first.

@@ -52,10 +52,18 @@ COUNTS = [
 ]
 
 
+SEEDS = [
+    (name, f"seed={value}", "seed: must be a whole number from 0 to 9223372036854775807")
+    for name in ("collect_demos", "experts", "play", "evaluate", "soak", "gallery")
+    for value in ("-1", "0.5", "many", str(2**63))
+]
+
+
 @pytest.mark.parametrize(
     ("name", "override", "words"),
     [
         *COUNTS,
+        *SEEDS,
         ("collect_demos", "replays=-1", "replays"),
         ("collect_demos", "plugins=3", "plugins: must be a list of names of modules"),
         ("collect_demos", "plugins=['']", "plugins: '' is not the name of a module"),
@@ -116,6 +124,7 @@ def test_an_unknown_plugin_on_the_command_line_is_one_line(name, capsys, monkeyp
         ({"env": {"view_scale": 1e30}}, "view_scale"),
         ({"num_envs": 3000}, "num_envs"),
         ({"run_dir": ""}, "run_dir"),
+        ({"seed": 2**63}, "seed"),
         ({"device": "meta"}, "device: use device=cpu"),
         ({"timeout_s": 0.0}, "timeout_s"),
         ({"max_restarts": -1}, "max_restarts"),

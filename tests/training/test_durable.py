@@ -12,7 +12,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.state_files import CHECKSUMS_FILE, _fingerprint
+from ba_torchrl.data.state_files import CHECKSUMS_FILE, _fingerprint, seal
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
@@ -294,6 +294,15 @@ def test_damaged_demonstrations_are_refused(demonstrations, tmp_path):
     flip(largest(folder))
     with pytest.raises(ConfigError, match="its checksum differs"):
         load_demonstrations(folder, task=TASK, env=ENV)
+
+
+@pytest.mark.parametrize("content", ["null", "[]", '"text"', "1", "{}"])
+def test_a_sealed_manifest_of_another_form_is_refused(run, content):
+    checkpoint = find_checkpoint(run, "latest")
+    (checkpoint / "manifest.json").write_text(content)
+    seal(checkpoint)
+    with pytest.raises(ConfigError, match="does not fit this version"):
+        load(run)
 
 
 def test_leftovers_of_an_interrupted_save_are_removed(run):
