@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from ba_torchrl.modules.cpu_threads import in_parts
+from ba_torchrl.modules.cpu_threads import in_parts, refuse_second_derivatives
 from ba_torchrl.modules.irrep_maps import gather_maps, scatter_maps, to_elements, to_irreps
 
 if TYPE_CHECKING:
@@ -306,7 +305,10 @@ class _Layout:
         area, kernels = self.rows * self.width, self.kernels
         step = max(1, CHUNK_BYTES // (4 * kernels.maps * self.fields * area))
         shapes = (kernels.maps, self.fields), (len(kernels.change), out_fields)
-        memory = [torch.empty(math.prod(shape) * step * area) for shape in shapes]
+        memory = [
+            torch.empty(math.prod(shape) * step * area, dtype=torch.float32, device="cpu")
+            for shape in shapes
+        ]
         for start in range(part.start, part.stop, step):
             stop = min(start + step, part.stop)
             sizes = [(*shape, (stop - start) * area) for shape in shapes]
@@ -353,8 +355,8 @@ class _IrrepConvolution(torch.autograd.Function):
         return y
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        refuse_second_derivatives()
         x, *weights = ctx.saved_tensors
         kernels = ctx.kernels
         layout, order = _Layout(x, kernels, ctx.padding), len(kernels.change)

@@ -205,10 +205,11 @@ class SteerableConv2d(nn.Module):
             for o in range(len(self._out))
         ]
         weight = torch.cat(rows, dim=0) if len(rows) > 1 else rows[0]
-        bias = self._expand_bias()
+        bias = self.expand_bias()
         return weight.permute(0, 3, 1, 2), None if bias is None else bias.to(dtype)
 
-    def _expand_bias(self) -> Tensor | None:
+    def expand_bias(self) -> Tensor | None:
+        """Return the bias of the expanded filter, float32 [out channels], None if there is none."""
         return None if self.bias is None else self.bias @ self._bias_block.matrix(self.bias)
 
     def _expand_pair(self, pair: tuple[int, int], dtype: torch.dtype) -> Tensor:
@@ -246,7 +247,7 @@ class SteerableConv2d(nn.Module):
         kernels = self._faster_kernels(x)
         if kernels is not None:
             (coefficients,) = self.coefficients.values()
-            return irrep_convolution(x, kernels, coefficients, self._expand_bias(), self.padding)
+            return irrep_convolution(x, kernels, coefficients, self.expand_bias(), self.padding)
         weight, bias = self.filters(x.dtype)
         return F.conv2d(x, weight, bias, padding=self.padding)
 

@@ -55,7 +55,7 @@ def measure_steerable(bench: Bench, in_fields: int, out_fields: int, pixels: int
         return F.conv2d(x, weight, bias, padding=1)
 
     def irreps(x: Tensor) -> Tensor:
-        return irrep_convolution(x, kernels, coefficients, None, 1)
+        return irrep_convolution(x, kernels, coefficients, layer.expand_bias(), 1)
 
     name = f"C8 convolution, {in_fields} to {out_fields} fields, {pixels} px, batch {BATCH}"
     channels_last = x.to(memory_format=torch.channels_last)

@@ -18,11 +18,11 @@ pytestmark = pytest.mark.cuda
 SACFD = {"name": "sac", "demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
 
 
-def build(network, device):
+def build(network, device, **settings):
     """A learner that computes in float32."""
     torch.manual_seed(0)
     config = parse(NETWORKS[network], {**SIZES[network], "precision": "float32"}, network)
-    return ALGORITHMS["sac"]().build(config, dataclasses.replace(problem(), device=device))
+    return ALGORITHMS["sac"](**settings).build(config, dataclasses.replace(problem(), device=device))
 
 
 def parameters(learner):
@@ -66,6 +66,32 @@ def test_actions_are_those_of_the_cpu(network, cuda):
         found = there.policy(states.to(cuda))["action"]
     assert actions.std(dim=0).max() > 0
     torch.testing.assert_close(found.cpu(), actions, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("network", ["cnn", "equi"])
+def test_the_host_does_not_wait_for_an_update(network, cuda):
+    settings = {key: value for key, value in SACFD.items() if key != "name"}
+    learner = build(network, cuda, **settings)
+    learner.extend(transitions(learner))
+    for _ in range(3):
+        learner.update()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        learner.update()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len(learner.host_tasks) > 0
+
+
+def test_the_images_of_a_batch_are_those_of_the_cpu(cuda):
+    here, there = (build("cnn", device) for device in (torch.device("cpu"), cuda))
+    for learner in (here, there):
+        learner.extend(transitions(learner))
+    one, two = here.sample(), there.sample()
+    assert {value.device.type for value in two.values(True, True)} == {cuda.type}
+    for key in one.keys(True, True):
+        torch.testing.assert_close(two[key].cpu(), one[key], rtol=0, atol=1e-6)
 
 
 def test_speed_of_an_update(cuda):

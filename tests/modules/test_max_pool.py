@@ -1,10 +1,15 @@
 """ReLU of max pooling against PyTorch's functions."""
 
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
+from threading import Barrier
 
 import pytest
 import torch
 import torch.nn.functional as F
+from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils.flop_counter import FlopCounterMode
 
 from ba_torchrl.modules import cpu_threads
@@ -23,7 +28,7 @@ def threads(request):
 
 
 def check(x, grad=None):
-    """Check values, layout and gradient; every bit must be equal."""
+    """Check values, layout and gradient; they must be equal."""
     x = x.detach()
     ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
     found, expected = relu_of_max_pool(ours), F.relu(F.max_pool2d(theirs, 2))
@@ -89,9 +94,35 @@ def test_no_images():
     assert relu_of_max_pool(torch.zeros(0, 3, 8, 8)).shape == (0, 3, 4, 4)
 
 
-def test_positions_take_one_byte():
+def test_positions_take_one_byte_and_are_freed():
+    packed = []
     x = torch.randn(2, 3, 8, 8, requires_grad=True)
-    assert relu_of_max_pool(x).grad_fn.positions.nbytes == 2 * 3 * 4 * 4
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: packed.append(t) or t, lambda t: t):
+        total = relu_of_max_pool(x).sum()
+    assert [tensor.nbytes for tensor in packed] == [2 * 3 * 4 * 4]
+    total.backward()
+    with pytest.raises(RuntimeError, match="second time"):
+        total.backward()
+
+
+def test_second_derivatives_are_refused():
+    x, w = torch.randn(2, 3, 8, 8, requires_grad=True), torch.tensor(3.0, requires_grad=True)
+    for y in (relu_of_max_pool(x), relu_of_max_pool(w * x).square()):
+        with pytest.raises(RuntimeError, match="no second derivative"):
+            torch.autograd.grad(y.sum(), x, create_graph=True)
+
+
+def test_it_works_below_function_transforms():
+    x = torch.randn(4, 2, 3, 8, 8)
+    expected = F.relu(F.max_pool2d(x.flatten(0, 1), 2)).unflatten(0, (4, 2))
+    assert torch.equal(torch.func.vmap(relu_of_max_pool)(x), expected)
+    gradient = torch.func.grad(lambda x: relu_of_max_pool(x).square().sum())(x[0])
+    hand = torch.func.grad(lambda x: F.relu(F.max_pool2d(x, 2)).square().sum())(x[0])
+    assert torch.equal(gradient, hand)
+    _, tangent = torch.func.jvp(relu_of_max_pool, (x[0],), (torch.ones_like(x[0]),))
+    assert torch.equal(tangent, (expected[0] > 0).float())
+    graph = make_fx(relu_of_max_pool)(x[0])
+    assert torch.equal(graph(x[1]), expected[1])
 
 
 def test_parts_cover_the_batch_once(threads):
@@ -105,6 +136,44 @@ def test_counts_of_operations_contain_all_parts(threads):
     with FlopCounterMode(display=False) as counter:
         in_parts(6, lambda part: a[part].flatten(0, 1) @ b)
     assert counter.get_total_flops() == 2 * 6 * 4 * 5 * 3
+
+
+END = """
+import threading, time, torch
+from ba_torchrl.modules.cpu_threads import in_parts
+torch.set_num_threads(2)
+assert in_parts(4, lambda part: part.stop) == [2, 4]
+
+def later():
+    time.sleep(0.5)
+    print(in_parts(4, lambda part: part.stop))
+
+threading.Thread(target=later).start()
+"""
+
+
+def test_threads_that_outlive_the_main_thread_work_on():
+    done = subprocess.run([sys.executable, "-c", END], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "[2, 4]\n", done.stderr
+
+
+def test_the_first_use_by_several_threads_keeps_their_number_of_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        for _ in range(20):
+            cpu_threads._threads.cache_clear()
+            barrier = Barrier(3)
+
+            def use(_, barrier=barrier):
+                barrier.wait()
+                in_parts(4, lambda part: part)
+                return torch.get_num_threads()
+
+            with ThreadPoolExecutor(3) as pool:
+                assert list(pool.map(use, range(3))) == [2, 2, 2]
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_work_in_threads_does_not_start_threads():

@@ -1,0 +1,63 @@
+"""Learners on a device without float64: the CPU is declared as one."""
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ba_torchrl.modules import widest_float
+from tests.algorithms import test_spatial_q_pose as six_dof
+from tests.algorithms import test_wiring, tiny
+
+
+class NoFloat64(TorchDispatchMode):
+    """Refuses operations whose result is of type float64."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        assert getattr(result, "dtype", None) != torch.float64, func
+        return result
+
+
+def learn_and_act(learner, batch):
+    learner.loss(batch)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        return learner.policy(batch.select(*learner.observation_keys))["action"]
+
+
+@pytest.fixture
+def without_float64(monkeypatch):
+    def declare():
+        monkeypatch.setattr(widest_float, "WITHOUT_FLOAT64", {"cpu"})
+        widest_float.constants.cache_clear()
+
+    yield declare
+    widest_float.constants.cache_clear()
+
+
+def check(learner, without_float64, transitions):
+    learner.extend(transitions)
+    batch = learner.sample()
+    expected = learn_and_act(learner, batch.clone())  # tables of rotations exist afterwards
+    without_float64()
+    with NoFloat64():
+        action = learn_and_act(learner, batch.clone())
+    torch.testing.assert_close(action, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("network", ["cnn", "equi"])
+def test_close_loop(network, without_float64):
+    learner = tiny.build("sac", network, demonstration_weight=1.0)
+    check(learner, without_float64, tiny.transitions(learner))
+
+
+@pytest.mark.parametrize("demonstrations", ["sdqfd", "adet"])
+def test_open_loop(demonstrations, without_float64):
+    learner = test_wiring.build("spatial_q", demonstrations=demonstrations)
+    check(learner, without_float64, test_wiring.transitions(learner))
+
+
+@pytest.mark.parametrize("network", six_dof.BOTH)
+def test_six_degrees_of_freedom(network, without_float64):
+    learner = six_dof.build(network, demonstrations="sdqfd")
+    check(learner, without_float64, test_wiring.transitions(learner))
