@@ -51,6 +51,9 @@ class ExperimentConfig(StrictModel):
     """Where the learner runs; "auto" takes a GPU if there is one."""
     threads: int | None = Field(default=None, ge=1)
     """torch threads of the learner; None leaves torch's choice."""
+    tf32: bool | None = None
+    """TensorFloat-32 in float32 convolutions and matrix products of a GPU; None leaves torch's
+    choice, which is convolutions only."""
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool = True

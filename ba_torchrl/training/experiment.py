@@ -49,6 +49,9 @@ class Experiment:
         self.progress = progress
         if config.threads is not None:
             torch.set_num_threads(config.threads)
+        if config.tf32 is not None:
+            torch.backends.cuda.matmul.allow_tf32 = config.tf32
+            torch.backends.cudnn.allow_tf32 = config.tf32
         self.algorithm = build_algorithm(config)
         self._lock = RunLock(config.folder)
         open_run_folder(config)

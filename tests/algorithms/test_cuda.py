@@ -22,7 +22,9 @@ def build(network, device, **settings):
     """A learner that computes in float32."""
     torch.manual_seed(0)
     config = parse(NETWORKS[network], {**SIZES[network], "precision": "float32"}, network)
-    return ALGORITHMS["sac"](**settings).build(config, dataclasses.replace(problem(), device=device))
+    return ALGORITHMS["sac"](**settings).build(
+        config, dataclasses.replace(problem(), device=device)
+    )
 
 
 def parameters(learner):
