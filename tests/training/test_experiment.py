@@ -90,13 +90,16 @@ def test_runs_of_one_seed_are_equal_and_of_two_differ(tmp_path, parallel):
 
 
 @pytest.mark.parametrize("tf32", [None, True, False])
-def test_tensor_float_32_is_set_for_convolutions_and_products(tf32, tmp_path, monkeypatch):
-    flags = torch.backends.cuda.matmul, torch.backends.cudnn
-    for place, default in zip(flags, (False, True), strict=True):
-        monkeypatch.setattr(place, "allow_tf32", default)
-    Experiment(tiny(tmp_path, tf32=tf32), progress=False)
-    expected = [False, True] if tf32 is None else [tf32, tf32]
-    assert [place.allow_tf32 for place in flags] == expected
+def test_tensor_float_32_is_set_for_convolutions_and_products(tf32, tmp_path):
+    places = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [place.allow_tf32 for place in places]
+    try:
+        Experiment(tiny(tmp_path, tf32=tf32), progress=False)
+        found = [place.allow_tf32 for place in places]
+    finally:
+        for place, value in zip(places, before, strict=True):
+            place.allow_tf32 = value
+    assert found == (before if tf32 is None else [tf32, tf32])
 
 
 def test_a_checkpoint_rebuilds_the_policy(tmp_path):
