@@ -61,7 +61,7 @@ print(json.dumps([robot, env.task_class.__name__, "mine/reach_near" in ba_torchr
 @pytest.mark.parametrize(
     "imports",
     [
-        "import my_tasks, gymnasium",
+        pytest.param("import my_tasks, gymnasium", marks=pytest.mark.slow),
         pytest.param("import gymnasium, my_tasks", marks=pytest.mark.slow),
         pytest.param("import ba_torchrl, gymnasium, my_tasks", marks=pytest.mark.slow),
         "import gymnasium, ba_torchrl; ba_torchrl.list_tasks(); import my_tasks",

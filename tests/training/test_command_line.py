@@ -1,42 +1,27 @@
 """Errors of configuration and of resources: one clear line, before work starts."""
 
 import errno
-import importlib.util
 import math
 import os
 import shutil
 from collections import namedtuple
-from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import ba_torchrl
 from ba_torchrl.data.state_files import write_state
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.command_line import EXIT_CODE, check_writable, mapping_of, plain_errors
 from ba_torchrl.training.config import ExperimentConfig
+from tests.recipes import recipe
 
-ROOT = Path(__file__).parents[2]
 RUN = {
     "task": "close_loop/block_reaching",
     "algorithm": {"name": "sac"},
     "network": {"name": "cnn"},
 }
-
-
-def recipe(name, *overrides):
-    """Run a recipe in this process."""
-    spec = importlib.util.spec_from_file_location(f"recipe_{name}", ROOT / f"recipes/{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    hydra_schema.register()
-    with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
-        settings = compose(name, overrides=list(overrides))
-    module.main.__wrapped__(settings)
 
 
 COUNTS = [

@@ -303,6 +303,7 @@ def test_the_recipes_from_the_command_line(tmp_path):
         "episodes=4",
         "num_envs=2",
         "env.obs_size=64",
+        "env.max_steps=10",
         f"path={demos}",
     )
     assert "4 episodes of close_loop/block_reaching, success 1.00" in out
@@ -318,6 +319,8 @@ def test_the_recipes_from_the_command_line(tmp_path):
         "pretrain_updates=2",
         "total_updates=3",
         "eval_every=100",
+        "eval_episodes=2",
+        "env.max_steps=10",
         "final_eval_episodes=4",
         "num_envs=2",
         "video_episodes=1",

@@ -49,6 +49,9 @@ SDQFD = {
 }
 
 
+SLOW = pytest.mark.slow
+
+
 class Killed(BaseException):
     """An exception that no code handles, as after SIGKILL."""
 
@@ -120,7 +123,7 @@ def undisturbed(tmp_path_factory):
     return run(config_for(tmp_path_factory.mktemp("whole") / "run"))
 
 
-@pytest.mark.parametrize("after", [1, 3, 4, 9, 20])
+@pytest.mark.parametrize("after", [1, 3, pytest.param(4, marks=SLOW), 9, 20])
 def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, undisturbed, after):
     experiment = Experiment(config_for(tmp_path), progress=False)
     at_call(experiment, experiment.algorithm, "update", after, terminate)
@@ -132,7 +135,7 @@ def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, un
     assert read_result(tmp_path).resumed_at == [after]
 
 
-@pytest.mark.parametrize("after", [7, 10])
+@pytest.mark.parametrize("after", [pytest.param(7, marks=SLOW), 10])
 def test_unfinished_episodes_of_self_imitation_are_continued(tmp_path, after):
     algorithm = {**SAC["algorithm"], "imitate_successes": True}
     whole = Experiment(config_for(tmp_path / "whole", algorithm=algorithm), progress=False)
@@ -156,7 +159,7 @@ def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undi
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
-@pytest.mark.parametrize("evaluation", [1, 2])
+@pytest.mark.parametrize("evaluation", [pytest.param(1, marks=SLOW), 2])
 def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evaluation):
     experiment = Experiment(config_for(tmp_path), progress=False)
     at_call(experiment, experiment, "_evaluate", evaluation, terminate)
@@ -167,7 +170,7 @@ def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evalua
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
-@pytest.mark.parametrize("number", [1, 5])
+@pytest.mark.parametrize("number", [pytest.param(1, marks=SLOW), 5])
 def test_a_run_stopped_before_its_first_update_continues_its_collection(
     tmp_path, undisturbed, number
 ):

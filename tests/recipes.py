@@ -1,0 +1,21 @@
+"""Recipes that run in the process of the test."""
+
+import importlib.util
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+
+from ba_torchrl.training import hydra_schema
+
+ROOT = Path(__file__).parents[1]
+
+
+def recipe(name, *overrides):
+    """Run a recipe in this process."""
+    spec = importlib.util.spec_from_file_location(f"recipe_{name}", ROOT / f"recipes/{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    hydra_schema.register()
+    with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
+        settings = compose(name, overrides=list(overrides))
+    module.main.__wrapped__(settings)
