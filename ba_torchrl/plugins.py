@@ -13,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Iterable
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import ModuleType
 
 from ba_torchrl.errors import ConfigError
@@ -96,6 +97,27 @@ def load_plugins(names: Iterable[str]) -> None:
     if names and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     import_modules(names)
+
+
+def check_known(names: Iterable[str], file: str | Path) -> None:
+    """Check that this process has imported the plugins that a file names, which may come from
+    somebody else, or that an installed package declares them. None is imported.
+
+    Args:
+        names: dotted names of modules.
+        file: that names them.
+
+    Raises:
+        ConfigError: it is not so; the message says how to import them.
+    """
+    installed = {point.module for point in entry_points(group=GROUP)}
+    unknown = [name for name in names if name not in sys.modules and name not in installed]
+    if unknown:
+        listed = ",".join(unknown)
+        raise ConfigError(
+            f"{file} uses the plugins [{listed}]: modules outside this package, whose import runs "
+            f"their code. If you trust them, add plugins=[{listed}], or import them first"
+        )
 
 
 def check_spawned_process_knows(kind: str, name: str) -> None:

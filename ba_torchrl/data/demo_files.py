@@ -99,7 +99,7 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
                 raise ValueError(f"{key} has the shape {list(value.shape)} in {len(data)} rows")
         numbers = data[_EPISODE].squeeze(-1)
         return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} does not hold episodes: {error}") from error
 
 
@@ -118,7 +118,7 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
     path = Path(path)
     try:
         metadata = json.loads((path / _METADATA_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     check(path)
     kinds = {"task": str, "env": dict}

@@ -22,6 +22,8 @@ from torchrl.checkpoint import StateDictCheckpointAdapter
 
 from ba_torchrl.errors import ConfigError, DamagedFilesError
 
+OLD = ".old"
+"""Suffix of a folder that `publish` replaces."""
 CHECKSUMS_FILE = "checksums.json"
 _DATA_SUFFIXES = frozenset({".json", ".memmap"})
 _CHUNK = 1 << 20
@@ -76,7 +78,7 @@ def seal(folder: str | Path) -> None:
 
 def publish(scratch: Path, folder: Path) -> None:
     """Give a sealed folder its final name; a folder of that name is deleted afterwards."""
-    old = folder.with_name(f".{folder.name}.old")
+    old = folder.with_name(f".{folder.name}{OLD}")
     shutil.rmtree(old, ignore_errors=True)
     if folder.exists():
         os.replace(folder, old)
@@ -101,7 +103,7 @@ def check(folder: str | Path) -> None:
         raise DamagedFilesError(
             f"{folder} has no {CHECKSUMS_FILE}: it is incomplete, or of an earlier version"
         ) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedFilesError(f"{folder / CHECKSUMS_FILE} is damaged: {error}") from None
     found = {path.relative_to(folder).as_posix(): path for path in _files(folder)}
     found.pop(CHECKSUMS_FILE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import logging
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -172,7 +173,7 @@ def _drop_incomplete_row(path: Path) -> None:
     if path.exists():
         content = path.read_bytes()
         if not content.endswith(b"\n"):
-            path.write_bytes(content[: content.rfind(b"\n") + 1])
+            os.truncate(path, content.rfind(b"\n") + 1)
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

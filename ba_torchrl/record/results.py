@@ -150,7 +150,7 @@ def read_failure(folder: str | Path) -> str | None:
         return str(json.loads(path.read_text(encoding="utf-8"))["reason"])
     except FileNotFoundError:
         return None
-    except (ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # nested without end
         return f"{FAILURE_FILE} is damaged"
 
 

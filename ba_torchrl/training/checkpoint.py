@@ -15,6 +15,7 @@ from ba_torchrl.algorithms.base import Algorithm, Problem
 from ba_torchrl.data.state_files import write_text
 from ba_torchrl.envs.factory import make_env
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import check_known
 from ba_torchrl.record.results import CONFIG_FILE
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.config import ExperimentConfig
@@ -92,20 +93,25 @@ def write_config(config: ExperimentConfig) -> None:
 
 
 def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
-    """Read the configuration of a run folder.
+    """Read the configuration of a run folder. Plugins that it names are not imported.
 
     Args:
         folder: the run folder.
         changes: fields to override.
 
     Raises:
-        ConfigError: there is none, or it does not parse.
+        ConfigError: there is none, it does not parse, or it names plugins that are neither imported
+            nor installed.
     """
     file = Path(folder) / CONFIG_FILE
     try:
-        values = {**json.loads(file.read_text(encoding="utf-8")), **changes}
-    except (OSError, ValueError, TypeError) as error:
+        saved = dict(json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"cannot read {file}: {error}") from None
+    plugins = saved.get("plugins")
+    if isinstance(plugins, list) and "plugins" not in changes:
+        check_known(map(str, plugins), file)
+    values = {**saved, **changes}
     return ExperimentConfig.parse(values, what=str(file))
 
 

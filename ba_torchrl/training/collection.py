@@ -72,6 +72,8 @@ def start_collection(
         make_policy=partial(_make_policy, values),
         start_method=config.start_method,
         max_restarts=config.max_restarts,
+        timeout_s=config.timeout_s,
+        start_timeout_s=config.start_timeout_s,
     )
     return config.collector_config.start(problem, positions)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointLoadResult
 
-from ba_torchrl.data.state_files import check, check_space, publish, seal
+from ba_torchrl.data.state_files import OLD, check, check_space, publish, seal
 from ba_torchrl.errors import ConfigError, DamagedFilesError
 
 logger = logging.getLogger(__name__)
@@ -88,7 +89,14 @@ def step_of(path: Path) -> int | None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what an interrupted save left in a folder of checkpoints."""
+    """Delete what an interrupted save left in a folder of checkpoints.
+
+    A checkpoint that was about to be replaced by one of the same step gets its name back.
+    """
+    for replaced in folder.glob(f".checkpoint-*{OLD}"):
+        checkpoint = folder / replaced.name.removeprefix(".").removesuffix(OLD)
+        if not checkpoint.exists():
+            os.replace(replaced, checkpoint)
     for leftover in folder.glob(".checkpoint-*"):
         shutil.rmtree(leftover)
 

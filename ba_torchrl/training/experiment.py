@@ -78,19 +78,19 @@ class Experiment:
             RunStopped: SIGINT or SIGTERM was received, and the state is saved.
         """
         self._started = self._last_save = time.perf_counter()
-        try:
-            with self._signals:
+        with self._signals:  # which last until the state is saved
+            try:
                 if not (self.config.resume and self._resume()):
                     self._demonstrate()
                 self._learn()
                 return self._finish()
-        except Interruption:
-            raise self._signals.stopped(self._save_if_possible(), self.config.folder) from None
-        except Exception:
-            self._save_if_possible()
-            raise
-        finally:
-            self.close()
+            except Interruption:
+                raise self._signals.stopped(self._save_if_possible(), self.config.folder) from None
+            except Exception:
+                self._save_if_possible()
+                raise
+            finally:
+                self.close()
 
     def close(self) -> None:
         """Close environments and loggers, and unlock the run folder."""

@@ -40,8 +40,9 @@ class RunStopped(SystemExit):
 
 
 class StopSignals:
-    """Context in which SIGINT and SIGTERM are noted for `check`; a second one has its usual effect.
+    """Context in which SIGINT and SIGTERM are noted for `check`.
 
+    A second SIGINT has its usual effect; further SIGTERMs, which schedulers repeat, have none.
     Outside the main thread, where Python allows no handlers, signals are left alone.
     """
 
@@ -76,8 +77,11 @@ class StopSignals:
         )
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self._received = number
-        self._restore()
+        if self._received is None:
+            self._received = number
+        elif number == signal.SIGTERM:
+            return
+        signal.signal(signal.SIGINT, self._before[signal.SIGINT])
 
     def _restore(self) -> None:
         for number, handler in self._before.items():

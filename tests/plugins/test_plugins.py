@@ -255,12 +255,15 @@ def test_the_recipes_take_a_plugin(folder):
     assert result["config"]["network"] == {"name": "mine/flat", "hidden": 4}
     assert result["config"]["algorithm"]["gamma"] == 0.9
 
-    out = run(folder, recipes / "evaluate.py", "checkpoint=runs/one", "episodes=2").stdout
-    assert "over 2 episodes of mine/reach_near" in out
+    evaluate = (recipes / "evaluate.py", "checkpoint=runs/one", "episodes=2")
+    assert "over 2 episodes of mine/reach_near" in run(folder, *evaluate, PLUGIN).stdout
+    done = run(folder, *evaluate, check=False)
+    assert "runs/one/config.json uses the plugins [my_tasks,my_learning]" in done.stderr
+    assert f"add {PLUGIN}" in done.stderr
 
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
-    again = (recipes / "evaluate.py", f"checkpoint={folder}/runs/one", "episodes=1")
+    again = (recipes / "evaluate.py", PLUGIN, f"checkpoint={folder}/runs/one", "episodes=1")
     done = run(elsewhere, *again, check=False)
     assert "cannot import the plugin 'my_tasks'" in done.stderr
 

@@ -1,4 +1,6 @@
+import errno
 import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +53,17 @@ class TestScalarLog:
         assert scalars["eval/success_rate"].values.tolist() == [0.25, 1.0]
         log.close()
         log.close()
+
+    def test_an_incomplete_row_is_cut_off_and_no_other_is_written_anew(self, tmp_path, monkeypatch):
+        path = tmp_path / "scalars.csv"
+        path.write_text("step,name,value\n1,a,0.5\n2,a,0")
+
+        def full_disk(*_):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(Path, "write_bytes", full_disk)
+        ScalarLog(tmp_path).close()
+        assert path.read_text() == "step,name,value\n1,a,0.5\n"
 
     def test_resumes_after_an_incomplete_row(self, tmp_path):
         log = ScalarLog(tmp_path)

@@ -1,10 +1,12 @@
 """Damaged and poisoned files of runs and demonstrations: none runs code, older states serve."""
 
 import contextlib
+import importlib
 import json
 import os
 import pickle
 import shutil
+import sys
 
 import pytest
 import torch
@@ -15,9 +17,10 @@ from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.state_files import CHECKSUMS_FILE, _fingerprint, seal
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.record.results import read_result
+from ba_torchrl.record.results import read_failure, read_result
 from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.durable import remove_leftovers
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.resume import resumable_updates
 
@@ -220,6 +223,24 @@ def test_no_record_of_a_run_runs_code(tmp_path, name, opened):
     assert not trace.exists()
 
 
+def test_no_module_that_a_run_names_is_imported(run, monkeypatch):
+    (run / "planted_module.py").write_text("raise AssertionError('imported')")
+    monkeypatch.syspath_prepend(run)
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps({**config, "plugins": ["planted_module"]}))
+    for opened in (read_config, load):
+        with pytest.raises(
+            ConfigError, match=r"uses the plugins \[planted_module\]: .* add plugins"
+        ):
+            opened(run)
+    with pytest.raises(ConfigError, match="planted_module"):
+        Experiment(config_for(run, resume=True), progress=False)
+    (run / "planted_module.py").write_text("")
+    importlib.import_module("planted_module")  # by the user
+    assert read_config(run).plugins == ["planted_module"]
+    del sys.modules["planted_module"]
+
+
 def test_a_replay_holds_no_pickle(run):
     assert {path.suffix for path in (run / "resume").rglob("*") if path.is_file()} == {
         ".json",
@@ -296,6 +317,22 @@ def test_damaged_demonstrations_are_refused(demonstrations, tmp_path):
         load_demonstrations(folder, task=TASK, env=ENV)
 
 
+def test_files_nested_without_end_are_damaged(tmp_path):
+    for name in ("config.json", "failure.json", "demonstrations.json"):
+        (tmp_path / name).write_text("[" * 200_000)
+    assert read_failure(tmp_path) == "failure.json is damaged"
+    with pytest.raises(ConfigError, match="cannot read"):
+        read_config(tmp_path)
+    with pytest.raises(ConfigError, match="no demonstrations at"):
+        load_demonstrations(tmp_path, task=TASK, env=ENV)
+
+
+def test_checksums_nested_without_end_are_damaged(run):
+    checkpoint = find_checkpoint(run, "latest")
+    (checkpoint / CHECKSUMS_FILE).write_text("[" * 200_000)
+    assert find_checkpoint(run, "latest") != checkpoint
+
+
 @pytest.mark.parametrize("content", ["null", "[]", '"text"', "1", "{}"])
 def test_a_sealed_manifest_of_another_form_is_refused(run, content):
     checkpoint = find_checkpoint(run, "latest")
@@ -303,6 +340,17 @@ def test_a_sealed_manifest_of_another_form_is_refused(run, content):
     seal(checkpoint)
     with pytest.raises(ConfigError, match="does not fit this version"):
         load(run)
+
+
+@pytest.mark.parametrize("part", ["resume", "checkpoints"])
+def test_a_state_that_was_about_to_be_replaced_gets_its_name_back(run, part):
+    newest = max((run / part).glob("checkpoint-*"))
+    newest.rename(newest.with_name(f".{newest.name}.old"))
+    older = newest.with_name(".checkpoint-000000000001.old")
+    shutil.copytree(min((run / part).glob("checkpoint-*")), older)
+    remove_leftovers(run / part)
+    assert newest.exists()
+    assert not list((run / part).glob(".checkpoint-*"))
 
 
 def test_leftovers_of_an_interrupted_save_are_removed(run):

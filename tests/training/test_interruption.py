@@ -194,6 +194,15 @@ def test_open_loop_in_worker_processes_continues_with_the_same_bits(tmp_path):
     assert_same(run(config_for(tmp_path / "run", resume=True, **options)), whole)
 
 
+def test_repeated_signals_do_not_interrupt_the_save(tmp_path, undisturbed):
+    experiment = Experiment(config_for(tmp_path), progress=False)
+    at_call(experiment, experiment.algorithm, "update", 9, terminate)
+    at_call(experiment, experiment._state, "save", 2, terminate)  # the first is at an evaluation
+    with pytest.raises(RunStopped, match="state saved"):
+        experiment.run()
+    assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
+
+
 def test_a_run_stopped_among_its_demonstrations_has_nothing_to_save(tmp_path, monkeypatch):
     experiment = Experiment(config_for(tmp_path), progress=False)
     monkeypatch.setattr(experiments, "gather_demonstrations", lambda *_: terminate() or _[2](None))

@@ -39,6 +39,10 @@ class CollectionProblem:
     """How processes start."""
     max_restarts: int
     """Largest number of failures in a row."""
+    timeout_s: float
+    """Seconds after which a process that does not answer is replaced."""
+    start_timeout_s: float
+    """Seconds after which a process that does not start is replaced."""
 
 
 class Collection(ABC):

@@ -9,14 +9,21 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from queue import Empty
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torch import multiprocessing as mp
-from torchrl.collectors import MultiAsyncCollector, MultiSyncCollector, _runner
+from torchrl.collectors import (
+    MultiAsyncCollector,
+    MultiSyncCollector,
+    _multi_async,
+    _multi_sync,
+    _runner,
+)
 from torchrl.weight_update import MultiProcessWeightSyncScheme
 
 from ba_torchrl.envs.positions import Position
@@ -29,7 +36,6 @@ logger = logging.getLogger(__name__)
 _NO_TIMEOUT_S = 1e6
 _SHUTDOWN_S = 2.0
 _HEALTH_CHECK_S = 0.5
-_ANSWER_S = 120.0
 
 
 @COLLECTORS.register("multi_sync")
@@ -92,12 +98,14 @@ class MultiCollection(WorkerCollection):
         """Send the weights and return a batch; see `WorkerCollection.collect`."""
         while True:
             try:
-                self._collector.update_policy_weights_(self.weights())
-                batch = next(self._batches)
+                with _waiting_at_most(self._patience_s):
+                    self._collector.update_policy_weights_(self.weights())
+                    batch = next(self._batches)
             except (RuntimeError, OSError, EOFError) as error:
                 self._replace(error)
                 continue
             self._failures_in_a_row = 0
+            self._patience_s = self.problem.timeout_s
             return batch
 
     def close(self) -> None:
@@ -111,6 +119,7 @@ class MultiCollection(WorkerCollection):
 
     def _start(self) -> MultiSyncCollector | MultiAsyncCollector:
         problem = self.problem
+        self._patience_s = problem.start_timeout_s + problem.timeout_s  # until the first batch
         # A worker is killed when the thread that started it ends, so only for the main thread.
         is_main = threading.current_thread() is threading.main_thread()
         with _start_method(problem.start_method):
@@ -122,7 +131,7 @@ class MultiCollection(WorkerCollection):
                 frames_per_batch=self._frames,
                 total_frames=-1,
                 storing_device="cpu",
-                weight_sync_schemes={"policy": _WeightSync()},
+                weight_sync_schemes={"policy": _WeightSync(lambda: self._patience_s)},
                 num_threads=torch.get_num_threads(),
                 auto_register_policy_transforms=False,
                 init_fn=partial(_prepare_worker, os.getpid() if is_main else None),
@@ -150,7 +159,19 @@ class MultiCollection(WorkerCollection):
 
 
 class _WeightSync(MultiProcessWeightSyncScheme):
-    """TorchRL's scheme, which notices that a worker ended instead of waiting for it forever."""
+    """TorchRL's scheme, which notices that a worker ended instead of waiting for it forever.
+
+    Args:
+        patience_s: returns the seconds after which a worker that does not answer counts as hung.
+    """
+
+    def __init__(self, patience_s: Callable[[], float]) -> None:
+        super().__init__()
+        self._patience_s = patience_s
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a worker, which does not wait."""
+        return {**super().__getstate__(), "_patience_s": None}
 
     def _wait_for_ack(
         self, worker_ids: int | list[int] | None = None, timeout: float | None = None
@@ -160,7 +181,7 @@ class _WeightSync(MultiProcessWeightSyncScheme):
         Raises:
             RuntimeError: a worker has ended, or does not answer.
         """
-        deadline = time.monotonic() + _ANSWER_S
+        deadline = time.monotonic() + self._patience_s()
         for queue in self._ack_queues.values():
             is_waiting = True
             while is_waiting:
@@ -184,6 +205,20 @@ def _prepare_worker(parent: int | None) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     _runner._TIMEOUT = _NO_TIMEOUT_S
+
+
+@contextlib.contextmanager
+def _waiting_at_most(seconds: float) -> Iterator[None]:
+    """Context in which TorchRL's collectors wait so long for a batch and not forever."""
+    modules = (_multi_sync, _multi_async)
+    before = [module._MAX_IDLE_COUNT for module in modules]
+    for module in modules:
+        module._MAX_IDLE_COUNT = seconds / module._TIMEOUT
+    try:
+        yield
+    finally:
+        for module, count in zip(modules, before, strict=True):
+            module._MAX_IDLE_COUNT = count
 
 
 @contextlib.contextmanager

@@ -129,6 +129,7 @@ class _Job:
         self.run = run
         self._deadline = None if max_hours is None else time.monotonic() + 3600 * max_hours
         self._timed_out = False
+        self._is_asked_to_end = False
         run.folder.mkdir(parents=True, exist_ok=True)
         self._log = (run.folder / LOG_FILE).open("a")
         try:  # the process inherits the lock and keeps it if this one is killed
@@ -180,8 +181,9 @@ class _Job:
         return reason
 
     def terminate(self) -> None:
-        """Ask the process to save its state and end."""
-        if self._process.poll() is None:
+        """Ask the process, once, to save its state and end."""
+        if not self._is_asked_to_end and self._process.poll() is None:
+            self._is_asked_to_end = True
             self._process.terminate()
 
     def stop(self) -> None:

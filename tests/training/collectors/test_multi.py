@@ -108,6 +108,21 @@ def test_ended_workers_are_replaced_with_the_present_weights(kind, collecting):
     assert not (new[0][keys.PIXELS][:, None] == first[None]).flatten(2).all(2).any()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_workers_that_hang_are_replaced_after_the_timeout(kind, collecting):
+    collection, _ = collecting(kind, timeout_s=2.0)
+    for _ in range(3):
+        next(collection)
+    pids = collection.worker_pids
+    os.kill(pids[0], signal.SIGSTOP)
+    deadline = time.monotonic() + 60
+    while not collection.scalars["restarts"]:
+        assert time.monotonic() < deadline
+        next(collection)
+    assert collection.scalars["restarts"] == 1
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
+
+
 def test_too_many_failures_in_a_row_end_the_collection(collecting):
     collection, _ = collecting("multi_sync", max_restarts=0)
     next(collection)

@@ -154,6 +154,39 @@ def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
     assert status(runs[0]).state == "missing"
 
 
+SLOW_TO_SAVE = """
+import json, pathlib, signal, sys, time
+config = json.load(sys.stdin)
+folder = pathlib.Path(config["run_dir"])
+asked = []
+signal.signal(signal.SIGTERM, lambda *_: asked.append(0))
+(folder / "calls").write_text("x")
+while not asked:
+    time.sleep(0.05)
+time.sleep(2 + 2 * config["seed"])
+(folder / "asked").write_text(str(len(asked)))
+"""
+
+
+def test_an_interruption_asks_each_job_once_and_waits_for_all(tmp_path, monkeypatch):
+    runs = planned(tmp_path)
+    script = tmp_path / "worker.py"
+    script.write_text(SLOW_TO_SAVE)
+
+    sleep, interrupted = time.sleep, []
+
+    def interrupt(seconds):
+        if not interrupted and all((run.folder / "calls").exists() for run in runs):
+            interrupted.append(True)
+            raise KeyboardInterrupt
+        sleep(seconds)
+
+    monkeypatch.setattr(jobs.time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_all(runs, jobs=2, progress=False, worker=[sys.executable, str(script)])
+    assert [(run.folder / "asked").read_text() for run in runs] == ["1", "1"]
+
+
 def test_a_folder_with_other_settings_is_refused_before_anything_starts(tmp_path, fake):
     fake(planned(tmp_path, seeds=1))
     changed = planned(tmp_path, seeds=2, common={"total_updates": 8})
