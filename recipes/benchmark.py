@@ -17,9 +17,17 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ba_torchrl.config import parse
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.command_line import plain_errors, register_schemas
+from ba_torchrl.training.command_line import (
+    check_counts,
+    check_flags,
+    check_texts,
+    check_writable_folder,
+    plain_errors,
+    register_schemas,
+)
 from ba_torchrl.training.config import choose
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
@@ -32,11 +40,19 @@ register_schemas()
 def main(settings: DictConfig) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
     limit_library_logs()
+    check_flags(settings, "dry_run")
+    check_texts(settings, "folder")
+    if settings.only is not None:
+        check_counts(settings, "only", least=0)
     values = OmegaConf.to_container(settings, resolve=True)
     dry_run, only = values.pop("dry_run"), values.pop("only")
     grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields if name in values}
     config = parse(BenchmarkConfig, grid, "benchmark")
+    if not dry_run:
+        check_writable_folder(config.folder)
     runs = plan(config, values, hydra_schema.preset)
+    if only is not None and only >= len(runs):
+        raise ConfigError(f"only: must be a number from 0 to {len(runs) - 1}, got {only}")
     if dry_run:
         states = {run.run_dir: status(run) for run in runs}
         for run in runs:

@@ -5,7 +5,7 @@ python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstru
 python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction replays=200
 """
 
-from pathlib import Path
+import os
 
 import hydra
 from omegaconf import DictConfig
@@ -15,15 +15,17 @@ from ba_torchrl.data.demo_files import save_demonstrations
 from ba_torchrl.data.demos import check_noise, collect_demonstrations, source_config
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.data.time_reversal import replay_scores
+from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs, progress_bar
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_flags,
     check_seed,
     check_texts,
-    check_writable,
-    mapping_of,
+    check_writable_file,
+    env_of,
     plain_errors,
     register_schemas,
 )
@@ -38,14 +40,16 @@ def main(settings: DictConfig) -> None:
     limit_library_logs()
     load_plugins(settings.plugins)
     check_texts(settings, "task", "path", "source")
-    check_counts(settings, "episodes", "num_envs")
+    check_counts(settings, "episodes")
+    check_counts(settings, "num_envs", most=MAX_ENVS)
     check_counts(settings, "replays", least=0)
     check_seed(settings)
     check_noise(settings.noise, settings.source, "noise")
-    check_writable(settings.path)
-    if Path(settings.path).exists():
+    check_flags(settings, "parallel", "only_successful")
+    if os.path.exists(settings.path):
         raise ConfigError(f"{settings.path} exists already; choose another path")
-    env_settings = mapping_of(settings, "env")
+    check_writable_file(settings.path)
+    env_settings = env_of(settings, seed="seed", expert="source")
     env = make_vector_env(
         settings.task,
         settings.num_envs,

@@ -13,15 +13,17 @@ from omegaconf import DictConfig  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
 from ba_torchrl.algorithms.seeds import SeedUse  # noqa: E402
+from ba_torchrl.envs.vector.make import MAX_ENVS  # noqa: E402
 from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
 from ba_torchrl.record.video import check_video, write_video  # noqa: E402
 from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     check_counts,
+    check_flags,
     check_seed,
     check_texts,
-    check_writable,
+    check_writable_file,
     plain_errors,
 )
 from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes  # noqa: E402
@@ -35,13 +37,15 @@ def main(settings: DictConfig) -> None:
     """Play greedy episodes with the policy of a checkpoint."""
     limit_library_logs()
     load_plugins(settings.plugins)
-    check_texts(settings, "checkpoint")
+    check_texts(settings, "checkpoint", "which", "device")
     check_texts(settings, "video", optional=True)
-    check_counts(settings, "episodes", "num_envs", "video_episodes")
+    check_counts(settings, "episodes", "video_episodes")
+    check_counts(settings, "num_envs", most=MAX_ENVS)
+    check_flags(settings, "parallel")
     check_seed(settings, optional=True)
     if settings.video is not None:
         check_video(settings.video, FPS)
-        check_writable(settings.video)
+        check_writable_file(settings.video)
     checkpoint = find_checkpoint(settings.checkpoint, settings.which)
     config, algorithm = load(checkpoint, device=settings.device)
     policy = acting_on(algorithm.policy, config.torch_device)

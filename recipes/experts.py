@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from ba_torchrl import list_tasks
 from ba_torchrl.data.demos import expert_scores
+from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
@@ -20,14 +21,23 @@ from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_flags,
     check_lists,
     check_seed,
+    check_tasks,
     check_texts,
-    check_writable,
+    check_writable_file,
     mapping_of,
     plain_errors,
     register_schemas,
 )
+
+SET_FOR_ALL = {
+    **{name: f", and set {name}" for name in ("seed", "num_envs", "parallel")},
+    "robot": ", and set robots",
+    "expert": "; all episodes are the expert's",
+}
+"""What the settings of the recipe determine in every column, and what to do instead."""
 
 register_schemas()
 
@@ -38,16 +48,19 @@ def main(settings: DictConfig) -> None:
     """Play the experts' episodes and print their success and length."""
     limit_library_logs()
     load_plugins(settings.plugins)
-    check_lists(settings, "robots")
-    check_lists(settings, "tasks", optional=True)
+    check_lists(settings, "robots", least=1)
+    check_tasks(settings)
     check_texts(settings, "path", optional=True)
-    check_counts(settings, "episodes", "num_envs")
+    check_counts(settings, "episodes")
+    check_counts(settings, "num_envs", most=MAX_ENVS)
+    check_flags(settings, "parallel")
     check_seed(settings)
     if settings.path is not None:
-        check_writable(settings.path)
+        check_writable_file(settings.path)
     for robot in settings.robots:
         _ = ROBOTS[robot]  # raises with the known names
     variants = mapping_of(settings, "variants")
+    _check_variants(variants)
     tables = []
     for table, columns in variants.items():
         tasks = [
@@ -69,6 +82,20 @@ def main(settings: DictConfig) -> None:
     print(f"\n{text}\n\n{settings.episodes} episodes each, seed {settings.seed}")
     if settings.path is not None:
         Path(settings.path).write_text(text + "\n")
+
+
+def _check_variants(variants: dict[str, Any]) -> None:
+    """Check that every table is a group of columns, and every column a group of fields."""
+    for table, columns in variants.items():
+        if not isinstance(columns, dict) or not columns:
+            raise ConfigError(f"variants.{table}: must be a group of columns, got {columns!r}")
+        for column, env in columns.items():
+            where = f"variants.{table}.{column}"
+            if not isinstance(env, dict):
+                raise ConfigError(f"{where}: must be a group of settings, got {env!r}")
+            for name, instead in SET_FOR_ALL.items():
+                if name in env:
+                    raise ConfigError(f"{where}.{name}: leave it out{instead}")
 
 
 def _table_of(task: str, variants: dict[str, Any]) -> str:

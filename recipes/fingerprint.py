@@ -17,37 +17,21 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import ba_torchrl
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.profiling.fingerprint.cases import PARTS, cases
-from ba_torchrl.profiling.fingerprint.compare import compare
+from ba_torchrl.profiling.fingerprint.compare import compare, read_record
 from ba_torchrl.profiling.fingerprint.record import run_all, versions
+from ba_torchrl.training.command_line import check_writable_file
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Record, compare, or both; return the exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, help="file to write the record to")
-    parser.add_argument("--compare", type=Path, help="file of an earlier record")
-    parser.add_argument("--tasks", help="ids, separated by commas; all if left out")
-    parser.add_argument("--parts", help=f"of {','.join(PARTS)}; all, or those of the old record")
-    parser.add_argument("--match", default="", help="only cases whose name contains this")
-    parser.add_argument("--workers", type=int, default=2, help="processes")
-    parser.add_argument("--lines", type=int, default=12, help="to print of each case that differs")
-    options = parser.parse_args(arguments)
-    if options.out is None and options.compare is None:
-        parser.error("give --out, --compare or both")
-    old = json.loads(options.compare.read_text()) if options.compare else None
+    options, old = _parse(arguments)
     parts = options.parts.split(",") if options.parts else (old["parts"] if old else PARTS)
     tasks = options.tasks.split(",") if options.tasks else (old["tasks"] if old else None)
-    unknown = {*parts} - {*PARTS} | (
-        {*(tasks or [])} - {*ba_torchrl.list_tasks()} if not old else set()
-    )
-    if unknown:
-        parser.error(f"unknown: {', '.join(sorted(unknown))}")
-
     started = time.perf_counter()
     wanted = [case for case in cases(parts, tasks) if options.match in case.name]
     records = run_all(wanted, options.workers)
@@ -65,7 +49,6 @@ def main(arguments: list[str] | None = None) -> int:
             "versions": versions(),
             "cases": records,
         }
-        options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(json.dumps(content, separators=(",", ":")) + "\n")
     print(f"{len(records)} cases in {seconds:.0f} s")
     if old is None:
@@ -91,6 +74,39 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     print(f"equal: {len(records)} cases")
     return 0
+
+
+def _parse(
+    arguments: list[str] | None,
+) -> tuple[argparse.Namespace, dict[str, Any] | None]:
+    """Return the checked options, and the old record if they name one."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, help="file to write the record to")
+    parser.add_argument("--compare", type=Path, help="file of an earlier record")
+    parser.add_argument("--tasks", help="ids, separated by commas; all if left out")
+    parser.add_argument("--parts", help=f"of {','.join(PARTS)}; all, or those of the old record")
+    parser.add_argument("--match", default="", help="only cases whose name contains this")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--lines", type=int, default=12, help="to print of each case that differs")
+    options = parser.parse_args(arguments)
+    if options.out is None and options.compare is None:
+        parser.error("give --out, --compare or both")
+    if options.workers < 1 or options.lines < 0:
+        parser.error("--workers must be at least 1, and --lines at least 0")
+    try:
+        old = None if options.compare is None else read_record(options.compare)
+        if options.out is not None:
+            check_writable_file(options.out)
+    except ConfigError as error:
+        parser.error(str(error))
+    unknown = {*options.parts.split(",")} - {*PARTS} if options.parts else set()
+    if options.tasks and old is None:
+        unknown |= {*options.tasks.split(",")} - {*ba_torchrl.list_tasks()}
+    if unknown:
+        parser.error(f"unknown: {', '.join(sorted(unknown))}")
+    return options, old
 
 
 if __name__ == "__main__":

@@ -13,7 +13,16 @@ from tqdm import tqdm
 from ba_torchrl import list_tasks
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
-from ba_torchrl.training.command_line import check_counts, check_seed, plain_errors
+from ba_torchrl.training.command_line import (
+    check_counts,
+    check_deconstructions,
+    check_seed,
+    check_tasks,
+    check_texts,
+    check_writable_file,
+    check_writable_folder,
+    plain_errors,
+)
 
 
 @hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
@@ -23,6 +32,13 @@ def main(settings: DictConfig) -> None:
     load_plugins(settings.plugins)
     check_counts(settings, "pictures")
     check_seed(settings)
+    check_tasks(settings)
+    check_deconstructions(settings, "deconstructions")
+    check_texts(settings, "folder")
+    check_texts(settings, "overview", optional=True)
+    check_writable_folder(settings.folder)
+    if settings.overview is not None:
+        check_writable_file(settings.overview, ".png")
     strips = {}
     for task in tqdm(settings.tasks or list_tasks(), unit="task"):
         strips[task] = expert_strip(task, settings.seed, settings.pictures)

@@ -18,8 +18,8 @@ from ba_torchrl.training.command_line import (
     check_counts,
     check_seed,
     check_texts,
-    check_writable,
-    mapping_of,
+    check_writable_file,
+    env_of,
     plain_errors,
     register_schemas,
 )
@@ -44,9 +44,9 @@ def main(settings: DictConfig) -> None:
     check_seed(settings)
     if settings.video is not None:
         check_video(settings.video, settings.fps)
-        check_writable(settings.video)
+        check_writable_file(settings.video)
+    env = env_of(settings, seed="seed", expert="policy")
     torch.manual_seed(settings.seed)
-    env = mapping_of(settings, "env")
     frames = record_episodes(
         settings.task,
         {**env, "expert": settings.policy == "expert"},

@@ -3,39 +3,71 @@
 python recipes/plot.py runs=[runs/first,runs/second] path=curves.png
 """
 
+import csv
+
 import hydra
+import numpy as np
 from omegaconf import DictConfig
 
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.training.checkpoint import read_config
-from ba_torchrl.training.command_line import plain_errors
+from ba_torchrl.training.command_line import (
+    check_texts,
+    check_writable_file,
+    folders_of,
+    plain_errors,
+)
+
+RATE, ERROR = "eval/success_rate", "eval/standard_error"
 
 
 @hydra.main(config_path="../configs", config_name="plot", version_base="1.3")
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Plot the success rate of the greedy policies against the updates."""
+    runs = folders_of(settings, "runs")
+    check_texts(settings, "path")
+    if not isinstance(settings.title, str):
+        raise ConfigError(f"title: must be text, got {settings.title!r}")
+    check_writable_file(settings.path, ".png")
     curves = {}
-    for run in settings.runs:
+    for run in runs:
         config = read_config(run, device="cpu")  # that of the run may not be here
-        scalars = read_scalars(run)
-        rate, error = scalars["eval/success_rate"], scalars["eval/standard_error"]
         name = f"{config.label}, {config.task.split('/')[-1]}, seed {config.seed}"
-        curves[name] = (
-            rate.steps,
-            rate.values,
-            rate.values - error.values,
-            rate.values + error.values,
+        curves[name] = _curve(run)
+    try:
+        path = plot_learning_curve(
+            curves,
+            settings.path,
+            title=settings.title,
+            xlabel="updates",
+            ylabel="success rate of the greedy policy",
         )
-    path = plot_learning_curve(
-        curves,
-        settings.path,
-        title=settings.title,
-        xlabel="updates",
-        ylabel="success rate of the greedy policy",
-    )
+    except ValueError as error:  # such as a title with an incomplete formula
+        raise ConfigError(f"cannot draw the curves: {error}") from None
     print(path)
+
+
+def _curve(run: str) -> tuple[np.ndarray, ...]:
+    """Return updates, success rate, and the rate minus and plus its standard error.
+
+    Raises:
+        ConfigError: the run has no evaluation, or its scalars cannot be read.
+    """
+    try:
+        scalars = read_scalars(run)
+    except (OSError, ValueError, ArithmeticError, csv.Error) as error:
+        raise ConfigError(f"cannot read the scalars of {run}: {error}") from None
+    if RATE not in scalars or ERROR not in scalars:
+        raise ConfigError(f"{run} has no evaluation yet")
+    rate, error = scalars[RATE], scalars[ERROR]
+    if not np.array_equal(rate.steps, error.steps):
+        raise ConfigError(
+            f"the scalars of {run} are incomplete: {RATE} and {ERROR} differ in steps"
+        )
+    return rate.steps, rate.values, rate.values - error.values, rate.values + error.values
 
 
 if __name__ == "__main__":

@@ -10,16 +10,28 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.report import write_report
-from ba_torchrl.training.command_line import plain_errors
+from ba_torchrl.record.results import run_folders
+from ba_torchrl.training.command_line import (
+    check_texts,
+    check_writable_folder,
+    folders_of,
+    plain_errors,
+)
 
 
 @hydra.main(config_path="../configs", config_name="report", version_base="1.3")
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Write the report and print its tables."""
-    roots = [settings.runs] if isinstance(settings.runs, str) else list(settings.runs)
-    page = write_report(roots, settings.folder or Path(roots[0]) / "report")
+    roots = folders_of(settings, "runs")
+    check_texts(settings, "folder", optional=True)
+    folder = Path(settings.folder or Path(roots[0]) / "report")
+    if not run_folders(roots)[0]:
+        raise ConfigError(f"no finished run below {', '.join(roots)}")
+    check_writable_folder(folder)
+    page = write_report(roots, folder)
     print((page.parent / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
     print(f"  tables  {page.parent / 'table.csv'}, {page.parent / 'table.md'}")
@@ -27,7 +39,7 @@ def main(settings: DictConfig) -> None:
 
 if __name__ == "__main__":
     # folders may be positional: report.py runs/a runs/b
-    folders = [argument for argument in sys.argv[1:] if "=" not in argument and argument[0] != "-"]
+    folders = [argument for argument in sys.argv[1:] if "=" not in argument and argument[:1] != "-"]
     if folders:
         others = [argument for argument in sys.argv[1:] if argument not in folders]
         sys.argv[1:] = [f"runs=[{','.join(folders)}]", *others]

@@ -20,9 +20,10 @@ from ba_torchrl.training.command_line import (
     check_counts,
     check_lists,
     check_seed,
+    check_tasks,
     check_texts,
-    check_writable,
-    mapping_of,
+    check_writable_file,
+    env_of,
     plain_errors,
     register_schemas,
 )
@@ -37,16 +38,16 @@ def main(settings: DictConfig) -> None:
     limit_library_logs()
     load_plugins(settings.plugins)
     check_lists(settings, "long_tasks")
-    check_lists(settings, "tasks", optional=True)
+    check_tasks(settings)
     check_texts(settings, "folder")
     check_counts(settings, "steps", "long_steps", least=10)
     check_seed(settings)
-    env = mapping_of(settings, "env")
+    env = env_of(settings, seed="seed", expert="steps: every other episode is the expert's")
     tasks = list(settings.tasks or list_tasks())
     for task in tasks:
         resolve(task, **env)  # raises with the known names
     folder = Path(settings.folder)
-    check_writable(folder / TABLE_FILE)
+    check_writable_file(folder / TABLE_FILE)
     jobs = [
         SoakJob(
             task=task,

@@ -27,8 +27,9 @@ from ba_torchrl.profiling.table import COLUMNS, as_markdown, measure  # noqa: E4
 from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     check_counts,
+    check_flags,
     check_texts,
-    check_writable,
+    check_writable_file,
     plain_errors,
 )
 from ba_torchrl.training.config import usable_device  # noqa: E402
@@ -43,11 +44,12 @@ def main(settings: DictConfig) -> None:
     check_texts(settings, "which", "device")
     check_texts(settings, "output", "compare", optional=True)
     check_counts(settings, "repeats")
+    check_flags(settings, "profile")
     device = usable_device(settings.device)
     old = None if settings.compare is None else read_speed_file(settings.compare)
     if settings.output is not None:
         check_output(settings.output)
-        check_writable(settings.output)
+        check_writable_file(settings.output)
     where = Machine.here(device)  # includes the load before the measurement
     profiles: dict[str, str] | None = {} if settings.profile else None
     rows = measure(settings.which, settings.repeats, profiles=profiles, device=device)

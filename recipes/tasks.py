@@ -10,7 +10,12 @@ from omegaconf import DictConfig
 
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.task_page import task_page
-from ba_torchrl.training.command_line import plain_errors
+from ba_torchrl.training.command_line import (
+    check_tasks,
+    check_texts,
+    check_writable_file,
+    plain_errors,
+)
 
 
 @hydra.main(config_path="../configs", config_name="tasks", version_base="1.3")
@@ -18,6 +23,9 @@ from ba_torchrl.training.command_line import plain_errors
 def main(settings: DictConfig) -> None:
     """Write the page."""
     load_plugins(settings.plugins)
+    check_tasks(settings)
+    check_texts(settings, "path")
+    check_writable_file(settings.path)
     path = Path(settings.path)
     path.write_text(task_page(list(settings.tasks) if settings.tasks else None), encoding="utf-8")
     print(path)

@@ -17,7 +17,11 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
 from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
-from ba_torchrl.training.command_line import plain_errors, register_schemas  # noqa: E402
+from ba_torchrl.training.command_line import (  # noqa: E402
+    check_writable_folder,
+    plain_errors,
+    register_schemas,
+)
 from ba_torchrl.training.config import ExperimentConfig  # noqa: E402
 from ba_torchrl.training.experiment import Experiment  # noqa: E402
 from ba_torchrl.training.interruption import RunStopped  # noqa: E402
@@ -31,6 +35,7 @@ def main(settings: DictConfig) -> None:
     """Run or resume the experiment of the configuration."""
     limit_library_logs()
     config = ExperimentConfig.parse(OmegaConf.to_container(settings, resolve=True))
+    check_writable_folder(config.run_dir)
     try:
         result = Experiment(config).run()
     except RunStopped as stopped:

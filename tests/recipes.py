@@ -10,12 +10,18 @@ from ba_torchrl.training import hydra_schema
 ROOT = Path(__file__).parents[1]
 
 
-def recipe(name, *overrides):
-    """Run a recipe in this process."""
+def load_recipe(name):
+    """Return the module of a recipe."""
     spec = importlib.util.spec_from_file_location(f"recipe_{name}", ROOT / f"recipes/{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+def recipe(name, *overrides):
+    """Run a recipe in this process."""
+    module = load_recipe(name)
     hydra_schema.register()
     with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
         settings = compose(name, overrides=list(overrides))
-    module.main.__wrapped__(settings)
+        module.main.__wrapped__(settings)

@@ -40,7 +40,7 @@ Init = Literal["random", "bc"]
 class LearnerConfig(AlgorithmConfig):
     """Hyper-parameters of every algorithm that learns from a replay."""
 
-    learning_rate: float = Field(default=1e-3, gt=0)
+    learning_rate: float = Field(default=1e-3, gt=0, le=1e3)
     """Learning rate of Adam."""
     learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
     """Final fraction of the learning rate, which decreases linearly over the run."""

@@ -42,7 +42,7 @@ class SpatialQConfig(LearnerConfig):
     """Inverse temperature of "adet" at the first level; reference implementation."""
     later_beta: float = Field(default=1.0, gt=0)
     """Inverse temperature of "adet" at later levels; reference implementation."""
-    learning_rate: float = Field(default=1e-4, gt=0)
+    learning_rate: float = Field(default=1e-4, gt=0, le=1e3)
     weight_decay: float = Field(default=1e-5, ge=0)
     gradient_clamp: float | None = Field(default=1.0, gt=0)
     """Bound of each element of the gradient; reference implementation."""

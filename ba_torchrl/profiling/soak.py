@@ -143,7 +143,7 @@ def _read(path: Path, job: SoakJob) -> SoakFigures | None:
         return None
     try:
         figures = SoakFigures.model_validate(json.loads(path.read_text()))
-    except (ValueError, ValidationError) as error:
+    except (ValueError, ValidationError, RecursionError) as error:
         logger.warning("%s is damaged and measured again: %s", path, error)
         return None
     return figures if figures.job == job else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.errors import ConfigError
 
 _SUFFIXES = (".mp4", ".gif")
+MIN_FPS, MAX_FPS = 1, 240
 _GIF_COLORS = 128
 _PALETTE_STRIDE = 4
 """Distance of the pixels from which the colours of a GIF are chosen."""
@@ -55,13 +55,14 @@ def check_video(path: str | Path, fps: float) -> None:
         fps: frames per second.
 
     Raises:
-        ConfigError: the suffix is unknown, or ``fps`` is not a positive number.
+        ConfigError: the suffix is unknown, or ``fps`` is not a number from `MIN_FPS` to `MAX_FPS`.
     """
     path = Path(path)
     if path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(f"a video ends in {' or '.join(_SUFFIXES)}, not {path.name!r}")
-    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps < math.inf:
-        raise ConfigError(f"fps must be positive, got {fps!r}")
+    is_number = isinstance(fps, int | float) and not isinstance(fps, bool)
+    if not is_number or not MIN_FPS <= fps <= MAX_FPS:
+        raise ConfigError(f"fps must be a number from {MIN_FPS} to {MAX_FPS}, got {fps!r}")
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> Path:
@@ -78,7 +79,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
 
     Raises:
         ImportError: imageio or its ffmpeg is missing.
-        ValueError: the suffix is unknown, ``fps`` is not positive, or a frame has another shape or
+        ValueError: the suffix is unknown, ``fps`` is out of range, or a frame has another shape or
             type.
     """
     path = Path(path)

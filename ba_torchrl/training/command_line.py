@@ -4,28 +4,43 @@ from __future__ import annotations
 
 import errno
 import functools
+import os
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from ba_torchrl.config import MAX_SEED
+from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
 EXIT_CODE = 2
+MAX_NAME_BYTES = 230
+"""Longest name of a file that a recipe writes. File systems allow 255 bytes, of which temporary
+files need some for a prefix and a suffix."""
 _RESOURCES = {
     errno.EACCES,
     errno.EDQUOT,
+    errno.EFBIG,
+    errno.EISDIR,
+    errno.ELOOP,
     errno.EMFILE,
+    errno.ENAMETOOLONG,
     errno.ENFILE,
     errno.ENOSPC,
+    errno.ENOTDIR,
     errno.EPERM,
     errno.EROFS,
 }
+_OUT_OF_MEMORY = ("can't allocate memory", "Cannot allocate memory")
+"""Parts of the messages of torch's RuntimeError when the CPU's memory is exhausted."""
 
 
 def register_schemas() -> None:
@@ -42,7 +57,8 @@ def register_schemas() -> None:
 def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
     """Decorate a recipe: errors of configuration and of resources are printed without traceback.
 
-    Resources are disk space, file handles and permissions. The exit code is `EXIT_CODE`.
+    Resources are memory, disk space, file handles, permissions and names of files. The exit code is
+    `EXIT_CODE`.
     """
 
     @functools.wraps(main)
@@ -51,29 +67,59 @@ def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], N
             main(settings)
         except ConfigError as error:
             _end(error)
+        except OmegaConfBaseException as error:  # a missing value, or a wrong interpolation
+            _end(error, lines=1)
         except OSError as error:
             if error.errno not in _RESOURCES:
                 raise
             _end(error)
+        except MemoryError as error:
+            _end(error, "out of memory")
+        except RuntimeError as error:
+            is_memory = any(words in str(error) for words in _OUT_OF_MEMORY)
+            if not is_memory and not isinstance(error, torch.OutOfMemoryError):
+                raise
+            _end(error, "out of memory")
 
     return decorated
 
 
-def check_counts(settings: DictConfig, *names: str, least: int = 1) -> None:
+def check_counts(
+    settings: DictConfig, *names: str, least: int = 1, most: int | None = None
+) -> None:
     """Check that settings are whole numbers.
 
     Args:
         settings: of the recipe.
         names: of the settings.
         least: smallest value.
+        most: largest value; None for no limit.
 
     Raises:
-        ConfigError: one of them is not, or is too small.
+        ConfigError: one of them is not, or is too small or too large.
     """
+    wanted = f"of at least {least}" if most is None else f"from {least} to {most}"
     for name in names:
         value: Any = settings[name]
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ConfigError(f"{name}: must be a whole number of at least {least}, got {value!r}")
+        is_number = isinstance(value, int) and not isinstance(value, bool)
+        if not is_number or value < least or (most is not None and value > most):
+            raise ConfigError(f"{name}: must be a whole number {wanted}, got {value!r}")
+
+
+def check_flags(settings: DictConfig, *names: str) -> None:
+    """Check that settings are true or false.
+
+    Args:
+        settings: of the recipe.
+        names: of the settings.
+
+    Raises:
+        ConfigError: one of them is neither.
+    """
+    for name in names:
+        value = settings[name]
+        if not isinstance(value, bool):
+            raise ConfigError(f"{name}: must be true or false, got {value!r}")
 
 
 def check_seed(settings: DictConfig, *, optional: bool = False) -> None:
@@ -110,22 +156,77 @@ def check_texts(settings: DictConfig, *names: str, optional: bool = False) -> No
             raise ConfigError(f"{name}: must be text, got {value!r}")
 
 
-def check_lists(settings: DictConfig, *names: str, optional: bool = False) -> None:
+def check_lists(settings: DictConfig, *names: str, optional: bool = False, least: int = 0) -> None:
     """Check that settings are lists of text.
 
     Args:
         settings: of the recipe.
         names: of the settings.
         optional: allow None.
+        least: smallest number of names in the list.
 
     Raises:
-        ConfigError: one of them is not.
+        ConfigError: one of them is not, or has too few names.
     """
     for name in names:
         value = settings[name]
-        is_list = isinstance(value, ListConfig) and all(isinstance(item, str) for item in value)
-        if not (is_list or (optional and value is None)):
+        if optional and value is None:
+            continue
+        if not isinstance(value, ListConfig) or not all(isinstance(item, str) for item in value):
             raise ConfigError(f"{name}: must be a list of names, got {value!r}")
+        if len(value) < least:
+            raise ConfigError(f"{name}: the list is empty")
+
+
+def check_tasks(settings: DictConfig, name: str = "tasks") -> None:
+    """Check that a setting is None, or a list of ids of tasks that is not empty.
+
+    Args:
+        settings: of the recipe.
+        name: of the setting.
+
+    Raises:
+        ConfigError: it is something else, or a task is unknown.
+    """
+    check_lists(settings, name, optional=True, least=1)
+    for task in settings[name] or ():
+        _ = TASKS[task]  # raises with the known names
+
+
+def check_deconstructions(settings: DictConfig, name: str) -> None:
+    """Check that a setting is a list of ids of tasks whose structures can be deconstructed.
+
+    Args:
+        settings: of the recipe.
+        name: of the setting.
+
+    Raises:
+        ConfigError: it is something else, or one of the tasks has no such structure.
+    """
+    check_lists(settings, name)
+    for task in settings[name]:
+        check_task_parameters(task, parse_env_config(task, {"deconstruct": True}))
+
+
+def folders_of(settings: DictConfig, name: str) -> list[str]:
+    """Return a setting that is a folder or a list of folders.
+
+    Args:
+        settings: of the recipe.
+        name: of the setting.
+
+    Raises:
+        ConfigError: it is something else, the list is empty, or a folder does not exist.
+    """
+    value = settings[name]
+    folders = [value] if isinstance(value, str) else value
+    is_list = isinstance(folders, list | ListConfig) and len(folders) > 0
+    if not is_list or not all(isinstance(folder, str) and folder for folder in folders):
+        raise ConfigError(f"{name}: must be a folder or a list of folders, got {value!r}")
+    for folder in folders:
+        if not os.path.isdir(folder):  # False also if the name is too long
+            raise ConfigError(f"{name}: there is no folder {folder}")
+    return list(folders)
 
 
 def mapping_of(settings: DictConfig, name: str) -> dict[str, Any]:
@@ -144,21 +245,78 @@ def mapping_of(settings: DictConfig, name: str) -> dict[str, Any]:
     return OmegaConf.to_container(value, resolve=True)
 
 
-def check_writable(path: str | Path) -> None:
-    """Check that a file can be written to the folder of a path, which is created if needed.
+def env_of(settings: DictConfig, **reserved: str) -> dict[str, Any]:
+    """Return the fields of `EnvConfig` in the group ``env``.
+
+    Args:
+        settings: of the recipe.
+        reserved: by field that the recipe sets itself, what to set in its place.
 
     Raises:
-        ConfigError: it cannot.
+        ConfigError: it is not a group, or a reserved field is set.
     """
-    folder = Path(path).parent
+    env = mapping_of(settings, "env")
+    for name, instead in reserved.items():
+        if name in env:
+            raise ConfigError(f"env.{name} is set by the recipe; leave it out, and set {instead}")
+    return env
+
+
+def check_writable_folder(folder: str | Path) -> None:
+    """Check that files can be written to a folder, which is created if needed.
+
+    Raises:
+        ConfigError: they cannot.
+    """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        Path(folder).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+    except FileExistsError:
+        raise ConfigError(f"cannot write to {_short(folder)}: it is not a folder") from None
     except OSError as error:
-        raise ConfigError(f"cannot write to {folder}: {error.strerror}") from None
+        raise ConfigError(f"cannot write to {_short(folder)}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"cannot write to {folder!r}: {error}") from None
 
 
-def _end(error: Exception) -> None:
-    sys.stderr.write(f"error: {error}\n")
+def check_writable_file(path: str | Path, *suffixes: str) -> None:
+    """Check that a file can be written; its folder is created if needed.
+
+    Args:
+        path: of the file.
+        suffixes: allowed ends of its name; any if left out.
+
+    Raises:
+        ConfigError: it cannot, its name has another end, or it is a folder.
+    """
+    path = Path(path)
+    if suffixes and path.suffix not in suffixes:
+        raise ConfigError(f"the name of the file ends in {' or '.join(suffixes)}, not {path.name}")
+    if len(os.fsencode(path.name)) > MAX_NAME_BYTES:
+        raise ConfigError(f"cannot write to {_short(path)}: the name is too long")
+    check_writable_folder(path.parent)
+    if os.path.isdir(path):
+        raise ConfigError(f"cannot write to {path}: it is a folder; name a file")
+    if os.path.exists(path) and not os.access(path, os.W_OK):
+        raise ConfigError(f"cannot write to {path}: {os.strerror(errno.EACCES)}")
+
+
+def _short(path: str | Path) -> str:
+    """Return a path as text of at most 200 characters."""
+    text = str(path)
+    return text if len(text) <= 200 else f"{text[:100]}...{text[-80:]}"
+
+
+def _end(error: Exception, kind: str = "", lines: int | None = None) -> None:
+    """Print an error on one line and exit.
+
+    Args:
+        error: its message is printed.
+        kind: printed before the message.
+        lines: number of lines of the message that are printed; None for all.
+    """
+    found = [line.strip() for line in str(error).splitlines() if line.strip()]
+    text = "; ".join(found[:lines]).replace(":; ", ": ")
+    sys.stderr.write(f"error: {': '.join(part for part in (kind, text) if part)}\n")
     sys.exit(EXIT_CODE)

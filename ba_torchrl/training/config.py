@@ -49,7 +49,7 @@ class ExperimentConfig(StrictModel):
     """Seed of networks, environments, replay and augmentation."""
     device: str = "auto"
     """Where the learner runs; "auto" takes a GPU if there is one."""
-    threads: int | None = Field(default=None, ge=1)
+    threads: int | None = Field(default=None, ge=1, le=1024)
     """torch threads of the learner; None leaves torch's choice."""
     tf32: bool | None = None
     """TensorFloat-32 in float32 convolutions and matrix products of a GPU; None leaves torch's

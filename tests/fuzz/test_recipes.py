@@ -24,11 +24,27 @@ WORK = {
     "soak": "run_soak",
     "speed": "measure",
     "evaluate": None,  # there is no checkpoint
+    "train": "Experiment",
+    "benchmark": "plan",
+    "report": None,  # there is no finished run
+    "plot": "read_config",
+    "gallery": "expert_strip",
+    "tasks": "task_page",
 }
 """The first call that works, by recipe."""
 TEXTS = ("null", "true", "0", "-1", "1", "3", "1.5", ".nan", "1e30", "text", "''", "[]", "[a]")
 TEXTS += ("{a: 1}", "close_loop/block_reaching", "open_loop/nothing", "ur5", "/proc/no/x.mp4")
 VALUES = st.one_of(st.sampled_from(TEXTS), st.text(max_size=5), st.integers().map(str))
+
+
+REQUIRED = {
+    "evaluate": ["checkpoint=run"],
+    "train": ["label=a", "run_dir=new"],
+    "benchmark": ["name=a", "folder=new"],
+    "plot": ["runs=[.]"],
+    "report": ["runs=."],
+}
+"""Settings without a default, or whose default is only known to Hydra's command line."""
 
 
 class StartedError(Exception):
@@ -59,7 +75,7 @@ def recipe(request, monkeypatch, tmp_path):
 @examples(12)
 def test_command_lines(recipe, count):
     name, main = recipe
-    required = ["checkpoint=run"] if name == "evaluate" else []
+    required = REQUIRED.get(name, [])
     known = OmegaConf.to_container(compose(name, overrides=required))
 
     def prop(overrides):

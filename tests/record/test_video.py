@@ -74,7 +74,7 @@ def test_refuses_other_frames(tmp_path, frames, message):
 def test_refuses_other_suffixes_and_speeds(tmp_path):
     with pytest.raises(ValueError, match=r"mp4 or \.gif"):
         write_video(tmp_path / "episode.avi", record_episodes(2, 32, 32), fps=5)
-    with pytest.raises(ValueError, match="fps must be positive"):
+    with pytest.raises(ValueError, match="fps must be a number from 1 to 240"):
         write_video(tmp_path / "episode.mp4", record_episodes(2, 32, 32), fps=0)
 
 

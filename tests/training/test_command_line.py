@@ -1,6 +1,7 @@
 """Errors of configuration and of resources: one clear line, before work starts."""
 
 import errno
+import json
 import math
 import os
 import shutil
@@ -13,9 +14,16 @@ from omegaconf import OmegaConf
 import ba_torchrl
 from ba_torchrl.data.state_files import write_state
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.training.command_line import EXIT_CODE, check_writable, mapping_of, plain_errors
+from ba_torchrl.profiling.soak import SoakJob
+from ba_torchrl.profiling.soak import _read as read_figures
+from ba_torchrl.training.command_line import (
+    EXIT_CODE,
+    check_writable_file,
+    mapping_of,
+    plain_errors,
+)
 from ba_torchrl.training.config import ExperimentConfig
-from tests.recipes import recipe
+from tests.recipes import load_recipe, recipe
 
 RUN = {
     "task": "close_loop/block_reaching",
@@ -44,6 +52,115 @@ SEEDS = [
 ]
 
 
+FLAGS = [
+    (name, f"{field}={value}", f"{field}: must be true or false")
+    for name, fields in {
+        "benchmark": ("dry_run",),
+        "collect_demos": ("parallel", "only_successful"),
+        "evaluate": ("parallel",),
+        "experts": ("parallel",),
+        "speed": ("profile",),
+    }.items()
+    for field in fields
+    for value in ("maybe", "null", "1")
+]
+
+
+LONG = 300 * "n"
+UNWRITABLE = [
+    (name, f"{field}={path}", "cannot write to ")
+    for name, fields, suffix in (
+        ("train", ("run_dir",), ""),
+        ("benchmark", ("folder",), ""),
+        ("soak", ("folder",), ""),
+        ("gallery", ("folder",), ""),
+        ("report", ("folder",), ""),
+        ("gallery", ("overview",), ".png"),
+        ("plot", ("path",), ".png"),
+        ("play", ("video",), ".mp4"),
+        ("evaluate", ("video",), ".mp4"),
+        ("speed", ("output",), ".json"),
+        ("collect_demos", ("path",), ""),
+        ("experts", ("path",), ""),
+        ("tasks", ("path",), ""),
+    )
+    for field in fields
+    for path in (
+        *((f"folder{suffix}",) if suffix else ()),
+        f"file/x{suffix}",
+        f"/proc/nope/x{suffix}",
+        f"/dev/full/x{suffix}",
+        f"{LONG}{suffix}",
+    )
+    if not (name == "report" and field == "folder")
+]
+UNWRITABLE += [
+    ("train", "run_dir=file", "it is not a folder"),
+    ("train", "run_dir=/dev/full", "it is not a folder"),
+    ("benchmark", "folder=file", "it is not a folder"),
+    ("gallery", "folder=file", "it is not a folder"),
+    ("experts", "path=run", "it is a folder"),
+    ("tasks", "path=run", "it is a folder"),
+]
+"""In a folder with a file called "file", and folders called "run" and "folder" with suffixes."""
+
+
+REFUSED = [
+    ("train", "threads=100000", "threads: Input should be less than or equal to 1024"),
+    ("train", "algorithm.learning_rate=1e300", "learning_rate: Input should be less than"),
+    ("benchmark", "only=9999", "only: must be a number from 0 to "),
+    ("benchmark", "only=abc", "only: must be a whole number"),
+    ("benchmark", "only=-5", "only: must be a whole number"),
+    ("benchmark", "seeds=100000000000", "seeds"),
+    ("collect_demos", "+env.seed=5", "env.seed is set by the recipe; leave it out, and set seed"),
+    ("collect_demos", "+env.expert=false", "leave it out, and set source"),
+    ("collect_demos", "path=run", "run exists already"),
+    ("collect_demos", "num_envs=3000", "num_envs: must be a whole number from 1 to 1024"),
+    ("play", "+env.seed=5", "leave it out, and set seed"),
+    ("play", "+env.expert=true", "leave it out, and set policy"),
+    ("play", "fps=1e-9", "fps must be a number from 1 to 240"),
+    ("play", "fps=1000", "fps must be a number from 1 to 240"),
+    ("soak", "+env.seed=3", "leave it out, and set seed"),
+    ("soak", "+env.expert=false", "env.expert is set by the recipe"),
+    ("soak", "tasks=[]", "tasks: the list is empty"),
+    ("evaluate", "num_envs=3000", "num_envs: must be a whole number from 1 to 1024"),
+    ("experts", "num_envs=3000", "num_envs: must be a whole number from 1 to 1024"),
+    ("experts", "tasks=[]", "tasks: the list is empty"),
+    ("experts", "tasks=[close_loop/none]", "unknown task 'close_loop/none'"),
+    ("experts", "robots=[]", "robots: the list is empty"),
+    ("experts", "variants.close_loop=3", "variants.close_loop: must be a group of columns"),
+    ("experts", "variants.close_loop=null", "variants.close_loop: must be a group of columns"),
+    ("experts", "+variants.open_loop.x=3", "variants.open_loop.x: must be a group of settings"),
+    ("experts", "+variants.open_loop.x={seed: 3}", "variants.open_loop.x.seed: leave it out"),
+    ("gallery", "tasks=3", "tasks: must be a list of names"),
+    ("gallery", "tasks=[]", "tasks: the list is empty"),
+    ("gallery", "deconstructions=[open_loop/bin_packing]", "'deconstruct' has no meaning"),
+    ("gallery", "pictures=-1", "pictures: must be a whole number"),
+    ("gallery", "pictures=abc", "pictures: must be a whole number"),
+    ("gallery", "overview=all.nope", "ends in .png, not all.nope"),
+    ("tasks", "tasks=3", "tasks: must be a list of names"),
+    ("tasks", "tasks=[]", "tasks: the list is empty"),
+    ("plot", "runs=5", "runs: must be a folder or a list of folders"),
+    ("plot", "runs=[]", "runs: must be a folder or a list of folders"),
+    ("plot", "runs=[nope]", "runs: there is no folder nope"),
+    ("plot", "runs=[run]", "cannot read the scalars of run"),
+    ("plot", "path=x.nope", "ends in .png, not x.nope"),
+    ("plot", "title=null", "title: must be text"),
+    ("report", "runs=nope", "runs: there is no folder nope"),
+    ("report", "runs=[]", "runs: must be a folder or a list of folders"),
+    ("report", "runs=5", "runs: must be a folder or a list of folders"),
+    ("report", "runs=null", "runs: must be a folder or a list of folders"),
+    ("report", "runs=run", "no finished run below run"),
+]
+REQUIRED = {
+    "train": ("label=a", "run_dir=new"),
+    "benchmark": ("name=a", "folder=new"),
+    "evaluate": ("checkpoint=run",),
+    "plot": ("runs=[run]",),
+    "report": ("runs=run",),
+}
+
+
 @pytest.mark.parametrize(
     ("name", "override", "words"),
     [
@@ -63,9 +180,12 @@ SEEDS = [
         ("collect_demos", "path=/proc/nowhere/demos", "cannot write to /proc/nowhere"),
         ("play", "video=/proc/nowhere/play.mp4", "cannot write to /proc/nowhere"),
         ("play", "video=play.avi", "a video ends in .mp4 or .gif"),
-        ("play", "fps=0", "fps must be positive"),
-        ("play", "fps=fast", "fps must be positive"),
+        ("play", "fps=0", "fps must be a number from 1 to 240"),
+        ("play", "fps=fast", "fps must be a number from 1 to 240"),
         ("evaluate", "video=evaluation.mov", "a video ends in .mp4 or .gif"),
+        *FLAGS,
+        *UNWRITABLE,
+        *REFUSED,
     ],
 )
 def test_recipes_refuse_what_they_cannot_do_before_they_start(
@@ -76,9 +196,18 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ba_torchrl.envs.factory.make_env", started)
-    required = ["checkpoint=run"] if name == "evaluate" else []
+    monkeypatch.setattr("ba_torchrl.make", started)
+    monkeypatch.setattr("ba_torchrl.training.experiment.Experiment.run", started)
+    monkeypatch.setattr("ba_torchrl.training.grid.launchers.local.run_all", started)
+    (tmp_path / "file").write_text("a file")
+    (tmp_path / "folder.mp4").mkdir()
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "folder.json").mkdir()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.json").write_text(json.dumps(RUN))
+    (tmp_path / "run/scalars.csv").write_text("step,name,value\n5,torn\n")
     with pytest.raises(SystemExit) as end:
-        recipe(name, *required, override)
+        recipe(name, *REQUIRED.get(name, ()), override)
     error = capsys.readouterr().err
     assert end.value.code == EXIT_CODE
     assert words in error
@@ -177,11 +306,59 @@ def test_errors_of_resources_are_one_line(capsys):
         broken(None)
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 7 TiB"),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to\nallocate 7 TiB"),
+        torch.OutOfMemoryError("CUDA out of memory"),
+    ],
+)
+def test_a_lack_of_memory_is_one_line(error, capsys):
+    @plain_errors
+    def large(_):
+        raise error
+
+    with pytest.raises(SystemExit):
+        large(None)
+    line = capsys.readouterr().err
+    assert line.startswith("error: out of memory: ")
+    assert line.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--compare", "missing"], "cannot read missing: No such file"),
+        (["--compare", "torn"], "torn is not a record"),
+        (["--compare", "deep"], "deep is not a record"),
+        (["--compare", "foreign"], "foreign is not a record: parts: Field required"),
+        (["--out", "torn/x"], "cannot write to torn"),
+        (["--out", "record.json", "--workers", "0"], "--workers must be at least 1"),
+    ],
+)
+def test_fingerprint_refuses_what_it_cannot_do(arguments, words, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "torn").write_text('{"parts": ["envs"')
+    (tmp_path / "deep").write_text(200_000 * "[")
+    (tmp_path / "foreign").write_text('{"rows": []}')
+    with pytest.raises(SystemExit) as end:
+        load_recipe("fingerprint").main(arguments)
+    assert end.value.code == EXIT_CODE
+    assert words in capsys.readouterr().err
+
+
+def test_a_deeply_nested_file_of_figures_is_damaged(caplog, tmp_path):
+    (tmp_path / "a.json").write_text(200_000 * "[")
+    assert read_figures(tmp_path / "a.json", SoakJob(task="a", steps=10)) is None
+    assert "is damaged and measured again" in caplog.text
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root can write everywhere")
 def test_a_folder_without_permission_is_refused(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(ConfigError, match="Permission denied"):
-        check_writable(tmp_path / "file")
+        check_writable_file(tmp_path / "file")
 
 
 @pytest.mark.parametrize("value", [None, 1, "text", ["a"]])

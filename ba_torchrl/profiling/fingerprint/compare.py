@@ -2,8 +2,70 @@
 
 from __future__ import annotations
 
+import json
 import math
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.profiling.fingerprint.cases import PARTS
+
+
+class _Trace(BaseModel):
+    """Schema of the recorded steps of an episode or a run."""
+
+    model_config = ConfigDict(strict=True)
+
+    steps: list[dict[str, tuple[str, float | list[float]]]]
+    facts: dict[str, Any]
+
+
+class _CaseRecord(BaseModel):
+    """Schema of the record of a case."""
+
+    model_config = ConfigDict(strict=True)
+
+    part: str
+    task: str
+    facts: dict[str, Any]
+    traces: dict[str, _Trace]
+
+
+class _Record(BaseModel):
+    """Schema of a record."""
+
+    model_config = ConfigDict(strict=True)
+
+    parts: list[Literal[PARTS]]
+    tasks: list[str] | None
+    versions: dict[str, str]
+    cases: dict[str, _CaseRecord]
+
+
+def read_record(path: str | Path) -> dict[str, Any]:
+    """Read a file that `recipes/fingerprint.py` wrote.
+
+    Raises:
+        ConfigError: it cannot be opened, or is no such file.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        _Record.model_validate_json(text)
+        return json.loads(text)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path} is not a record: {_reason(error)}") from None
+
+
+def _reason(error: Exception) -> str:
+    """Return the first line of an error, and where a schema is not met."""
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(map(str, first['loc'])) or 'content'}: {first['msg']}"
+    return str(error).splitlines()[0]
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:

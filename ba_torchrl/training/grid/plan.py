@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -52,7 +52,7 @@ class BenchmarkConfig(StrictModel):
     """Names of preset files in ``configs/algorithm``."""
     networks: list[str] = Field(min_length=1)
     """Names of preset files in ``configs/network``."""
-    seeds: int | list[int] = 4
+    seeds: Annotated[int, Field(ge=1, le=1000)] | list[int] = 4
     """A number of seeds, from 0 on, or a list of seeds."""
     skip: list[dict[str, str | list[str]]] = Field(default_factory=list)
     """Runs to leave out: each entry gives a name or a list of names for ``task``, ``algorithm``,
