@@ -10,6 +10,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.training.checkpoint import read_config
@@ -27,6 +28,7 @@ RATE, ERROR = "eval/success_rate", "eval/standard_error"
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Plot the success rate of the greedy policies against the updates."""
+    load_plugins(settings.plugins)
     runs = folders_of(settings, "runs")
     check_texts(settings, "path")
     if not isinstance(settings.title, str):

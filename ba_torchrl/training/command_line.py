@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable
@@ -80,6 +81,9 @@ def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], N
             if not is_memory and not isinstance(error, torch.OutOfMemoryError):
                 raise
             _end(error, "out of memory")
+        except KeyboardInterrupt:  # where a run does not note it: before and after its work
+            sys.stderr.write("stopped by SIGINT\n")
+            sys.exit(128 + signal.SIGINT)
 
     return decorated
 

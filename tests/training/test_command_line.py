@@ -289,6 +289,17 @@ def test_a_full_disk_is_noticed_before_anything_is_written(monkeypatch, tmp_path
     assert not (tmp_path / "large").exists()
 
 
+def test_an_interruption_outside_of_a_run_is_one_line(capsys):
+    @plain_errors
+    def main(settings):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as end:
+        main(None)
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "stopped by SIGINT\n"
+
+
 def test_errors_of_resources_are_one_line(capsys):
     @plain_errors
     def full(_):
