@@ -48,7 +48,7 @@ def make_vector_env(
     task: str,
     num_envs: int,
     *,
-    parallel: bool = True,
+    parallel: bool | None = True,
     start_method: str = "spawn",
     register_modules: Sequence[str | ModuleType] = (),
     timeout_s: float = 60.0,
@@ -63,7 +63,9 @@ def make_vector_env(
         task: one of `list_tasks`.
         num_envs: how many; environment i has the seed ``seed + i``.
         parallel: one process each (a TorchRL ``ParallelEnv`` that survives its workers), or all
-            in this process (``SerialEnv``). The same seed gives the same episodes in both.
+            in this process (``SerialEnv``). The same seed gives the same episodes in both. None
+            chooses processes where at least three of them can run at a time: with fewer, their
+            communication takes more time than they save (docs/performance.md).
         start_method: ``spawn`` or ``fork``, how processes start. With ``spawn``, scripts need
             an ``if __name__ == "__main__":`` guard.
         register_modules: modules outside the package that each process imports before it makes its

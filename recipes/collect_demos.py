@@ -45,7 +45,8 @@ def main(settings: DictConfig) -> None:
     check_counts(settings, "replays", least=0)
     check_seed(settings)
     check_noise(settings.noise, settings.source, "noise")
-    check_flags(settings, "parallel", "only_successful")
+    check_flags(settings, "only_successful")
+    check_flags(settings, "parallel", optional=True)
     if os.path.exists(settings.path):
         raise ConfigError(f"{settings.path} exists already; choose another path")
     check_writable_file(settings.path)

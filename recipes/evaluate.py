@@ -41,7 +41,7 @@ def main(settings: DictConfig) -> None:
     check_texts(settings, "video", optional=True)
     check_counts(settings, "episodes", "video_episodes")
     check_counts(settings, "num_envs", most=MAX_ENVS)
-    check_flags(settings, "parallel")
+    check_flags(settings, "parallel", optional=True)
     check_seed(settings, optional=True)
     if settings.video is not None:
         check_video(settings.video, FPS)

@@ -53,7 +53,7 @@ def main(settings: DictConfig) -> None:
     check_texts(settings, "path", optional=True)
     check_counts(settings, "episodes")
     check_counts(settings, "num_envs", most=MAX_ENVS)
-    check_flags(settings, "parallel")
+    check_flags(settings, "parallel", optional=True)
     check_seed(settings)
     if settings.path is not None:
         check_writable_file(settings.path)

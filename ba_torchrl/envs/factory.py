@@ -13,7 +13,7 @@ from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
 from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.envs.settings import parse_env_config
-from ba_torchrl.envs.vector.make import make_vector_env
+from ba_torchrl.envs.vector.make import make_vector_env, processes_save_time
 from ba_torchrl.plugins import (
     MAIN,
     check_spawned_process_knows,
@@ -59,7 +59,7 @@ def make_vector(
     task: str,
     num_envs: int,
     *,
-    parallel: bool,
+    parallel: bool | None,
     start_method: str,
     register_modules: Sequence[str | ModuleType] = (),
     timeout_s: float = 60.0,
@@ -72,6 +72,8 @@ def make_vector(
     modules = module_names(register_modules)
     import_modules(modules)
     settings = parse_env_config(task, config)
+    if parallel is None:
+        parallel = processes_save_time(num_envs)
     if parallel and start_method == "spawn":
         modules += _plugins_of(task, settings)
     return make_vector_env(

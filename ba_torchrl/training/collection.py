@@ -79,6 +79,9 @@ def start_collection(
 
 
 def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: int) -> EnvBase:
+    shared_with_other_workers = num_envs < values["num_envs"]
+    if values["parallel"] is None and shared_with_other_workers:
+        values = {**values, "parallel": False}  # the workers are processes already
     config = _read(values, num_envs=num_envs)
     return make_env(config, seed, wait_for_restarts=False, expert=expert)
 

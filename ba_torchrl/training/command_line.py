@@ -110,20 +110,22 @@ def check_counts(
             raise ConfigError(f"{name}: must be a whole number {wanted}, got {value!r}")
 
 
-def check_flags(settings: DictConfig, *names: str) -> None:
+def check_flags(settings: DictConfig, *names: str, optional: bool = False) -> None:
     """Check that settings are true or false.
 
     Args:
         settings: of the recipe.
         names: of the settings.
+        optional: allow None.
 
     Raises:
         ConfigError: one of them is neither.
     """
     for name in names:
         value = settings[name]
-        if not isinstance(value, bool):
-            raise ConfigError(f"{name}: must be true or false, got {value!r}")
+        if not isinstance(value, bool) and not (optional and value is None):
+            allowed = "true, false or null" if optional else "true or false"
+            raise ConfigError(f"{name}: must be {allowed}, got {value!r}")
 
 
 def check_seed(settings: DictConfig, *, optional: bool = False) -> None:

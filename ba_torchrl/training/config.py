@@ -56,8 +56,9 @@ class ExperimentConfig(StrictModel):
     choice, which is convolutions only."""
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
-    parallel: bool = True
-    """One process per environment, or all in the learner's process."""
+    parallel: bool | None = None
+    """One process per environment, or all in the learner's process; None chooses by the number of
+    environments and cores, see `ba_torchrl.make_vector_env`. Results are the same."""
     start_method: Literal["spawn", "fork"] = "spawn"
     """How these processes start."""
     timeout_s: float = Field(default=60.0, gt=0)

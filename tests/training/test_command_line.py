@@ -54,15 +54,16 @@ SEEDS = [
 
 FLAGS = [
     (name, f"{field}={value}", f"{field}: must be true or false")
-    for name, fields in {
-        "benchmark": ("dry_run",),
-        "collect_demos": ("parallel", "only_successful"),
-        "evaluate": ("parallel",),
-        "experts": ("parallel",),
-        "speed": ("profile",),
-    }.items()
-    for field in fields
+    for name, field in (
+        ("benchmark", "dry_run"),
+        ("collect_demos", "only_successful"),
+        ("speed", "profile"),
+    )
     for value in ("maybe", "null", "1")
+] + [
+    (name, f"parallel={value}", "parallel: must be true, false or null")
+    for name in ("collect_demos", "evaluate", "experts")
+    for value in ("maybe", "1")
 ]
 
 

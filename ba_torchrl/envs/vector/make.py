@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,12 +19,38 @@ from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.parallel import VectorEnv
 from ba_torchrl.errors import ConfigError
 
-__all__ = ["SerialVectorEnv", "VectorEnv", "check_actions", "make_vector_env"]
+__all__ = [
+    "SerialVectorEnv",
+    "VectorEnv",
+    "check_actions",
+    "make_vector_env",
+    "processes_save_time",
+]
 
 MakeEnv = Callable[[], EnvBase]
 
 MAX_ENVS = 1024
 _SHARED_MEMORY = Path("/dev/shm")
+
+MIN_CONCURRENT_PROCESSES = 3
+"""Least number of processes at a time that step faster than one. Two take 1.05 to 1.6 times as long
+as one process on two cores (docs/performance.md, throughput)."""
+
+
+def processes_save_time(num_envs: int) -> bool:
+    """Return whether one process per environment is expected to step faster than one process.
+
+    Args:
+        num_envs: number of environments.
+    """
+    return min(num_envs, available_cores()) >= MIN_CONCURRENT_PROCESSES
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def make_vector_env(

@@ -10,7 +10,13 @@ import torch
 from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
 from torchrl.collectors import Collector
 
-from ba_torchrl.envs.vector.make import VectorEnv, make_vector_env
+import ba_torchrl
+from ba_torchrl.envs.vector.make import (
+    SerialVectorEnv,
+    VectorEnv,
+    available_cores,
+    make_vector_env,
+)
 
 
 class TestSeeds:
@@ -218,6 +224,39 @@ def test_refuses_impossible_sizes():
         make_vector_env(FakeEnv, 0)
     with pytest.raises(ValueError, match="2 functions were given for 3"):
         make_vector_env([FakeEnv, FakeEnv], 3)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "cores", "kind"),
+    [
+        (1, 16, SerialVectorEnv),
+        (2, 16, SerialVectorEnv),
+        (5, 2, SerialVectorEnv),
+        (3, 3, VectorEnv),
+        (5, 16, VectorEnv),
+    ],
+)
+def test_processes_start_by_default_where_three_run_at_a_time(monkeypatch, num_envs, cores, kind):
+    monkeypatch.setattr("ba_torchrl.envs.vector.make.available_cores", lambda: cores)
+    env = ba_torchrl.make_vector_env(
+        "close_loop/block_reaching", num_envs, parallel=None, start_method="fork", obs_size=16
+    )
+    try:
+        assert type(env) is kind
+    finally:
+        env.close()
+
+
+def test_available_cores_are_those_of_the_process():
+    if not hasattr(os, "sched_setaffinity"):
+        pytest.skip("the cores of a process can be set on Linux only")
+    before = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {min(before)})
+        assert available_cores() == 1
+    finally:
+        os.sched_setaffinity(0, before)
+    assert available_cores() == len(before)
 
 
 def test_takes_a_function_per_environment(make_fakes):

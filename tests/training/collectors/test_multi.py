@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.vector.make import SerialVectorEnv, VectorEnv
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.experiment import Experiment
@@ -36,6 +37,17 @@ def collecting(tmp_path):
     yield of
     for collection in started:
         collection.close()
+
+
+def test_environments_of_a_worker_step_in_its_process_by_default(collecting, monkeypatch):
+    monkeypatch.setattr("ba_torchrl.envs.vector.make.available_cores", lambda: 16)
+    collection, _ = collecting("multi_sync", num_envs=6, parallel=None)
+    for num_envs, kind in ((3, SerialVectorEnv), (6, VectorEnv)):  # a worker's share, all
+        env = collection.problem.make_env(num_envs, 0)
+        try:
+            assert type(env) is kind
+        finally:
+            env.close()
 
 
 @pytest.mark.parametrize("kind", KINDS)
