@@ -15,6 +15,7 @@ import numpy as np
 import pybullet
 
 from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.mesh_lists import mesh_lists
 from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, write_obj
 
 Color = tuple[float, float, float, float]
@@ -141,7 +142,7 @@ class Solid(Shape):
         if len(self.parts) == 1:
             return pybullet.createCollisionShape(
                 pybullet.GEOM_MESH,
-                vertices=self.parts[0].vertices.tolist(),
+                vertices=mesh_lists(self.parts[0]).vertices,
                 physicsClientId=client,
             )
         # PyBullet creates several hulls only from a file
@@ -152,14 +153,15 @@ class Solid(Shape):
 
     def create_visual(self, client: int) -> int:
         """Create the visual surface."""
-        # PyBullet keeps more memory of a visual shape that is made from arrays
-        with _obj_file([self.mesh()]) as path:
-            return pybullet.createVisualShape(
-                pybullet.GEOM_MESH,
-                fileName=path,
-                rgbaColor=self.color,
-                physicsClientId=client,
-            )
+        lists = mesh_lists(self.mesh())
+        return pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            vertices=lists.corners,
+            normals=lists.normals,
+            indices=lists.indices,
+            rgbaColor=self.color,
+            physicsClientId=client,
+        )
 
 
 @contextmanager
