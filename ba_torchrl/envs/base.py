@@ -201,18 +201,16 @@ class ManipulationEnv(EnvBase):
 
         A state is valid in this process only and takes a few milliseconds. The steps after this
         call and after `set_state` with its result are the same bit for bit; steps without this call
-        may differ from them in the last bits. For tasks with clutter or a bin, this method and
-        `set_state` build a new world, which takes tenths of a second.
+        may differ from them in the last bits.
 
         Raises:
             SimulationError: the environment has not been reset.
         """
         scene = self.scene
-        needs_fresh_world = self.task_class.needs_fresh_world
-        state = EnvState(
+        return EnvState(
             owner=self._identity,
             scale=self._episodes.scale(),
-            scene=scene.get_state(outlives_world=needs_fresh_world),
+            scene=scene.get_state(),
             observation=self._observation,
             memory=self._memory,
             base_seed=self.base_seed,
@@ -220,9 +218,6 @@ class ManipulationEnv(EnvBase):
             step_count=self._step_count,
             ends=self._ends,
         )
-        if needs_fresh_world:
-            self.set_state(state)
-        return state
 
     def set_state(self, state: EnvState) -> TensorDict:
         """Restore a state of this environment; the same actions then give the same steps.
@@ -240,8 +235,6 @@ class ManipulationEnv(EnvBase):
         """
         if state.owner is not self._identity:
             raise SimulationError("the state is of another environment")
-        if self.task_class.needs_fresh_world:
-            self._episodes.close()
         self._episodes.scene = self._episodes.scene_for(state.scale)
         self.scene.set_state(state.scene)
         self._observation, self._memory = state.observation, state.memory
@@ -270,10 +263,7 @@ class ManipulationEnv(EnvBase):
             self._set_seed(seed)
         self._episode += 1
         self._step_count = 0
-        is_first = self._episode == 1
-        if is_first and self.task_class.needs_fresh_world:
-            self._episodes.close()
-        self._observation = self._begin_episode(with_new_objects=is_first)
+        self._observation = self._begin_episode(with_new_objects=self._episode == 1)
         self._ends, self._conditions = {}, None
         return self._tensordict(self._observation)
 

@@ -13,8 +13,8 @@ from ba_torchrl.errors import SimulationError
 
 Position = dict[str, Any]
 """``seed``; ``episode``, the number of the first of some episodes; and ``actions``, float32
-[T, A], of each of them up to the present. For most tasks this is the current episode only. Tasks
-whose episodes depend on earlier ones need all episodes since the seed was set."""
+[T, A], of each of them up to the present. They are the current episode and, where it continues with
+the objects of earlier episodes, these as well."""
 
 
 class RecordedPosition:
@@ -57,8 +57,6 @@ class RecordedPosition:
         """
         self._set_seed(position["seed"])
         self._episode = position["episode"]
-        if self.task_class.needs_fresh_world:
-            self._episodes.close()
         self._episodes.forget()
         for actions in position["actions"]:
             self._reset()
@@ -87,7 +85,7 @@ class RecordedPosition:
             resumed, self._resumed = self._resumed, None
             return resumed
         scene = self._episodes.scene
-        depends = self.task_class.needs_fresh_world or (scene is not None and scene.task.continues)
+        depends = scene is not None and scene.task.continues
         faults = self.faults
         result = super()._reset(tensordict, seed=seed, **options)
         if not depends or self.faults > faults:  # a fault builds a new world

@@ -14,7 +14,7 @@ from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.sim.world import FINE_PHYSICS, Physics, SavedState, Snapshot, World
+from ba_torchrl.sim.world import FINE_PHYSICS, Physics, Snapshot, World
 from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
 from ba_torchrl.tasks.clutter.tray import Tray
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
@@ -41,7 +41,7 @@ class Controller(Protocol):
 class SceneState:
     """The full state of a scene."""
 
-    world: Snapshot | SavedState
+    world: Snapshot
     robot: Any
     controller: Any
     task: Any
@@ -60,14 +60,10 @@ class Scene:
     controller: Controller
     camera: HeightCamera
 
-    def get_state(self, *, outlives_world: bool = False) -> SceneState:
-        """Return the state.
-
-        Args:
-            outlives_world: return a state that any scene of the same configuration can restore.
-        """
+    def get_state(self) -> SceneState:
+        """Return the state."""
         return SceneState(
-            self.world.save() if outlives_world else self.world.snapshot(),
+            self.world.snapshot(),
             self.robot.get_state(),
             self.controller.get_state(),
             self.task.get_state(),
@@ -76,15 +72,12 @@ class Scene:
         )
 
     def set_state(self, state: SceneState) -> None:
-        """Restore a state of this scene, or a state that outlives its world.
+        """Restore a state of this scene.
 
         Raises:
             SimulationError: the state is of another scene.
         """
-        if isinstance(state.world, SavedState):
-            self.world.load(state.world)
-        else:
-            self.world.restore(state.world)
+        self.world.restore(state.world)
         self.task.terrain.set_state(state.terrain)
         self.task.set_state(state.task)
         self.robot.set_state(state.robot)
@@ -118,7 +111,7 @@ def build_scene(
         ConfigError: ``render=True`` without a display.
     """
     task_class = TASKS[task_id]
-    world = _empty_world(config, workspace, physics)
+    world = _empty_world(config, workspace, physics, task_class.simple_broadphase)
     terrain = Tray(world, workspace) if config.close_loop_tray else None
     robot = ROBOTS[config.robot](world)
     task = task_class(
@@ -160,7 +153,9 @@ def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[
                     )
 
 
-def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> World:
+def _empty_world(
+    config: EnvConfig, workspace: Workspace, physics: Physics, simple_broadphase: bool
+) -> World:
     """Return a world with a floor only."""
     if config.physics_mode == "slow":
         physics = FINE_PHYSICS
@@ -170,7 +165,9 @@ def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> W
     color = None if config.floor_color is None else (*config.floor_color, 1.0)
     try:
         world = World(
-            dataclasses.replace(physics, **custom), window=config.render, floor_color=color
+            dataclasses.replace(physics, simple_broadphase=simple_broadphase, **custom),
+            window=config.render,
+            floor_color=color,
         )
     except SimulationError as error:
         if config.render:

@@ -86,10 +86,8 @@ class Task(ABC):
     """Whether the objects fit the tray of `close_loop_tray`."""
     can_be_deconstructed: ClassVar[bool] = False
     """Whether `deconstruction` returns the reversed task."""
-    needs_fresh_world: ClassVar[bool] = False
-    """Whether exact repetition of an episode needs a new world. When many bodies collide, their
-    motion depends on the order of PyBullet's contact pairs, which a saved state does not
-    contain."""
+    simple_broadphase: ClassVar[bool] = False
+    """The field of `ba_torchrl.sim.world.Physics`, for tasks in which many bodies touch."""
 
     Parameters: ClassVar[type[TaskParameters]] = TaskParameters
     """Model of the task's own parameters; its fields are keywords of `ba_torchrl.make`."""

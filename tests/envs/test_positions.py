@@ -38,6 +38,15 @@ def play(env, state, steps, generator):
     return torch.stack(steps_taken) if steps_taken else None, state
 
 
+def test_a_position_without_a_heap_is_the_current_episode():
+    env = vector("open_loop/bin_packing", 0)
+    _, state = play(env, env.reset(), 12, torch.Generator().manual_seed(0))
+    for position, count in zip(env.get_positions(), state["step_count"], strict=True):
+        assert position["episode"] > 0
+        assert [len(actions) for actions in position["actions"]] == [count]
+    env.close()
+
+
 def assert_equal(one, two):
     assert set(one.keys(True, True)) == set(two.keys(True, True))
     for key in one.keys(True, True):

@@ -146,7 +146,7 @@ class ClutterTask(Task):
     reference implementation has a limit, whose value is the default.
     """
 
-    needs_fresh_world = True
+    simple_broadphase = True
     scale_limits = (1.0, 1.0)
 
     class Parameters(TaskParameters):
