@@ -38,9 +38,7 @@ class ManipulationEnv(EnvBase):
     """A manipulation task as an unbatched TorchRL environment on the CPU.
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any
-    other episodes. Exceptions are tasks that continue with the objects of the previous episode. In
-    `open_loop/covid_test` and `open_loop/bottle_arrangement` the contacts of hollow bodies, and so
-    the trajectories, can depend on earlier episodes.
+    other episodes. Exceptions are tasks that continue with the objects of the previous episode.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.

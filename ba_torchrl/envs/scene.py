@@ -111,7 +111,7 @@ def build_scene(
         ConfigError: ``render=True`` without a display.
     """
     task_class = TASKS[task_id]
-    world = _empty_world(config, workspace, physics, task_class.simple_broadphase)
+    world = _empty_world(config, workspace, physics)
     terrain = Tray(world, workspace) if config.close_loop_tray else None
     robot = ROBOTS[config.robot](world)
     task = task_class(
@@ -153,9 +153,7 @@ def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[
                     )
 
 
-def _empty_world(
-    config: EnvConfig, workspace: Workspace, physics: Physics, simple_broadphase: bool
-) -> World:
+def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> World:
     """Return a world with a floor only."""
     if config.physics_mode == "slow":
         physics = FINE_PHYSICS
@@ -165,9 +163,7 @@ def _empty_world(
     color = None if config.floor_color is None else (*config.floor_color, 1.0)
     try:
         world = World(
-            dataclasses.replace(physics, simple_broadphase=simple_broadphase, **custom),
-            window=config.render,
-            floor_color=color,
+            dataclasses.replace(physics, **custom), window=config.render, floor_color=color
         )
     except SimulationError as error:
         if config.render:

@@ -37,10 +37,6 @@ class Physics:
     """Residual below which the solver stops early. It must be zero for exact resets: otherwise the
     number of iterations depends on motor impulses of earlier steps, which no saved state contains.
     """
-    simple_broadphase: bool = False
-    """Find the pairs of bodies whose bounding boxes overlap by comparing all bodies. The default
-    is Bullet's search tree. Its order of pairs depends on all earlier motion, which no saved state
-    contains, and where many bodies touch, this order affects the motion."""
     gravity_m_s2: float = 10.0
     floor_friction: float = 0.5  # at 1.0 a pushed cube tips over its leading edge and jams
     settle_speed_m_s: float = 0.01
@@ -98,10 +94,10 @@ class World:
         if self.client < 0:
             raise SimulationError("PyBullet has no free client: close environments not in use")
         self._disconnect = weakref.finalize(self, _disconnect, self.client)
-        if self.physics.simple_broadphase:
-            pybullet.resetSimulation(
-                pybullet.RESET_USE_SIMPLE_BROADPHASE, physicsClientId=self.client
-            )
+        # The simple broadphase compares the bounding boxes of all bodies. The order of pairs in
+        # Bullet's search tree depends on all earlier motion, which no saved state contains, and
+        # where many bodies touch, this order affects their motion.
+        pybullet.resetSimulation(pybullet.RESET_USE_SIMPLE_BROADPHASE, physicsClientId=self.client)
         self.bodies: list[Body] = []
         self.moving_bodies: list[Body] = []
         """The bodies that are not static."""
@@ -266,10 +262,9 @@ class World:
     def _rebuild_collision_pairs(self) -> None:
         """Remove all collision pairs from the engine and detect them again.
 
-        The engine caches two values that no saved state contains but that affect the trajectory:
-        the last separating direction of each pair of convex hulls, such as a finger and a block,
-        and the index at which it continues to search the list of pairs for those that have
-        separated. Removing all pairs resets both.
+        No saved state contains two properties of the engine that affect the trajectory: the last
+        separating direction of each pair of convex hulls, such as a finger and a block, and the
+        order in which pairs came close. Removing all pairs resets both.
         """
         pybullet.setCollisionFilterGroupMask(self.floor, -1, 0, 0, physicsClientId=self.client)
         for body in self.bodies:

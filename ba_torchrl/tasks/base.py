@@ -86,8 +86,6 @@ class Task(ABC):
     """Whether the objects fit the tray of `close_loop_tray`."""
     can_be_deconstructed: ClassVar[bool] = False
     """Whether `deconstruction` returns the reversed task."""
-    simple_broadphase: ClassVar[bool] = False
-    """The field of `ba_torchrl.sim.world.Physics`, for tasks in which many bodies touch."""
 
     Parameters: ClassVar[type[TaskParameters]] = TaskParameters
     """Model of the task's own parameters; its fields are keywords of `ba_torchrl.make`."""

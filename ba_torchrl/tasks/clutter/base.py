@@ -146,7 +146,6 @@ class ClutterTask(Task):
     reference implementation has a limit, whose value is the default.
     """
 
-    simple_broadphase = True
     scale_limits = (1.0, 1.0)
 
     class Parameters(TaskParameters):

@@ -101,7 +101,6 @@ class BinPacking(PackingTask):
     max_steps = 20
     num_objects = 8
     num_objects_range = (1, 10)
-    simple_broadphase = True
 
     def load_scene(self) -> None:
         """Load the bin, and as many objects of each shape as an episode may draw."""
