@@ -71,7 +71,7 @@ def test_presets_compose_or_are_refused(algorithm, network):
     assert config.run_dir.endswith(f"{name}-{algorithm}_{network}-seed3")
 
 
-def test_the_appendix_sets_the_defaults():
+def test_defaults_are_those_of_the_appendix_or_the_reference():
     config = experiment("train", "algorithm=sacfd_per")
     algorithm, network = config.algorithm_config, config.network_config
     assert (algorithm.learning_rate, algorithm.gamma, algorithm.batch_size) == (1e-3, 0.99, 64)
@@ -106,7 +106,7 @@ def test_training_and_quick_start_have_priorities_and_rotation_by_default():
         assert config.importance_weighted == "critic_and_policy"
 
 
-def test_the_paper_sets_the_defaults_of_the_open_loop():
+def test_open_loop_defaults_are_those_of_the_appendix_or_the_reference():
     overrides = ("task=open_loop/block_stacking", "algorithm=sdqfd", "network=equi_asr")
     config = experiment("train", *overrides)
     algorithm = config.algorithm_config

@@ -152,9 +152,10 @@ class AlgorithmConfig(StrictModel, ABC):
     """Whether the policy collects transitions; if not, all updates are on the demonstrations."""
 
     @property
-    def needs_pretraining(self) -> bool:
-        """Whether the run must take updates before the first collection."""
-        return False
+    def pretraining_option(self) -> str | None:
+        """The option and its value that only affect updates before the first collection, which
+        the run must then have; None if there is none."""
+        return None
 
     @property
     def capacity(self) -> int | None:

@@ -74,9 +74,9 @@ class LearnerConfig(AlgorithmConfig):
     updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
 
     @property
-    def needs_pretraining(self) -> bool:
-        """Whether the run must take updates before the first collection."""
-        return self.init == "bc"
+    def pretraining_option(self) -> str | None:
+        """As for `AlgorithmConfig`."""
+        return "init: 'bc'" if self.init == "bc" else None
 
     @property
     def capacity(self) -> int:

@@ -71,7 +71,8 @@ class SACConfig(LearnerConfig):
     """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
     demonstration_distance: ActionDistance = "mse"
     """Distance of the policy's action from the demonstrated one in the behaviour term: the squared
-    error of the appendix, or "kl", whose gradient does not vanish at the ends of the range."""
+    error of the reference implementation, or "kl", whose gradient does not vanish at the ends of
+    the range."""
     imitate_successes: bool = False
     """Whether collected episodes that succeed count as demonstrations (self-imitation; Oh et al.,
     2018): the behaviour term and the expert bonus apply to them, until demonstrations fill half of
@@ -114,6 +115,13 @@ class SACConfig(LearnerConfig):
         if self.stored_copies and self.augmentation == "none":
             raise ValueError("stored_copies needs augmentation")
         return self
+
+    @property
+    def pretraining_option(self) -> str | None:
+        """As for `AlgorithmConfig`."""
+        if self.pretraining == "contrastive":
+            return "pretraining: 'contrastive'"
+        return super().pretraining_option
 
     def build(self, network: NetworkConfig, problem: Problem) -> SAC:
         """Return a freshly initialised learner."""

@@ -22,9 +22,9 @@ UNET_STRIDE = 16
 class SpatialImageConfig(StrictModel):
     """Hyper-parameters of every spatial Q network.
 
-    By default heights are in metres, as in the paper, and a block of 3 cm hardly affects the values
-    of a freshly initialised network. With a scale of 0.05 it has a height of about one, and
-    learning is faster at the start.
+    By default heights are in metres, as in the reference implementation, and a block of 3 cm hardly
+    affects the values of a freshly initialised network. With a scale of 0.05 it has a height of
+    about one, and learning is faster at the start.
 
     Args:
         precision: number format of the convolutions, see `compute_dtype`. Values of actions, the

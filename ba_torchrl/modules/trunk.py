@@ -79,8 +79,9 @@ class ImageNetworkConfig(StrictModel):
     """Hyper-parameters that every network on depth images has.
 
     The input of the networks is (depth - depth_center_m) / depth_scale_m. The defaults keep metres,
-    as in the paper. With a center of 0.2 and a scale of 0.1, inputs have unit size and differences
-    of a block's height are well above the resolution of bfloat16; learning is much faster.
+    as the reference implementation does. With a center of 0.2 and a scale of 0.1, inputs have unit
+    size and differences of a block's height are well above the resolution of bfloat16; learning is
+    much faster.
 
     Args:
         precision: number format of the convolutions, see `compute_dtype`.

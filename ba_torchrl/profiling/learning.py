@@ -114,7 +114,7 @@ def measure_update(
 
 @measurement("learning/equi_sacfd_update")
 def equivariant_update(bench: Bench) -> list[Row]:
-    """Update of the paper's largest close-loop learner."""
+    """Update of the reference's largest close-loop learner."""
     return measure_update(
         bench,
         "Equi SACfD update, batch 64, 128 px, C8, 64 fields",
@@ -140,7 +140,7 @@ def quickstart_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/cnn_sacfd_update")
 def plain_update(bench: Bench) -> list[Row]:
-    """Update of the paper's plain close-loop learner."""
+    """Update of the reference's plain close-loop learner."""
     return measure_update(
         bench,
         "CNN SACfD update, batch 64, 128 px",
@@ -153,7 +153,7 @@ def plain_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/equi_sdqfd_update")
 def equivariant_spatial_update(bench: Bench) -> list[Row]:
-    """Update of the paper's equivariant open-loop learner."""
+    """Update of the reference's equivariant open-loop learner."""
     return measure_update(
         bench,
         "SDQfD Equi ASR update, batch 16, 128 px, 16 rotations",
@@ -166,7 +166,7 @@ def equivariant_spatial_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/cnn_sdqfd_update")
 def plain_spatial_update(bench: Bench) -> list[Row]:
-    """Update of the paper's plain open-loop learner."""
+    """Update of the reference's plain open-loop learner."""
     return measure_update(
         bench,
         "SDQfD CNN ASR update, batch 16, 128 px, 16 rotations",
@@ -179,7 +179,7 @@ def plain_spatial_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/equi_deictic_sdqfd_update")
 def equivariant_pose_update(bench: Bench) -> list[Row]:
-    """Update of the paper's equivariant learner in six degrees of freedom, ramps' image sizes."""
+    """Update of the reference's equivariant learner in six degrees of freedom, images of ramps."""
     return measure_update(
         bench,
         "SDQfD Equi Deictic ASR update, batch 16, 128 px, 24 px in hand",
@@ -192,7 +192,7 @@ def equivariant_pose_update(bench: Bench) -> list[Row]:
 
 @measurement("learning/cnn_pose_sdqfd_update")
 def plain_pose_update(bench: Bench) -> list[Row]:
-    """Update of the paper's plain learner in six degrees of freedom, ramps' image sizes."""
+    """Update of the reference's plain learner in six degrees of freedom, images of ramps."""
     return measure_update(
         bench,
         "SDQfD CNN ASR update in six degrees of freedom, batch 16, 128 px, 24 px in hand",

@@ -206,8 +206,9 @@ class ExperimentConfig(StrictModel):
                 f"algorithm {config.algorithm['name']!r} learns from demonstrations only; set "
                 "demonstrations"
             )
-        if config.algorithm_config.needs_pretraining and not config.pretrain_updates:
-            raise ConfigError("algorithm.init: 'bc' takes effect in pretrain_updates; set them")
+        option = config.algorithm_config.pretraining_option
+        if option is not None and not config.pretrain_updates:
+            raise ConfigError(f"algorithm.{option} takes effect in pretrain_updates; set them")
         capacity = config.algorithm_config.capacity
         if capacity is not None and config.min_replay > capacity:
             raise ConfigError(

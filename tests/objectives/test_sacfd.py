@@ -156,7 +156,7 @@ def test_unknown_importance_weights_are_refused():
         make(weight_norm="median")
 
 
-def test_defaults_are_those_of_the_paper():
+def test_defaults_are_those_of_the_appendix():
     loss = make()
     assert float(loss.value_estimator.gamma) == pytest.approx(0.99)
     assert float(loss.alpha) == pytest.approx(0.01)

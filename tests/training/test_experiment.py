@@ -174,6 +174,15 @@ def test_a_folder_without_a_run_is_an_error(tmp_path):
         load(tmp_path)
 
 
+NO_PRETRAINING = {"pretrain_updates": 0}
+FERM = {
+    "name": "sac",
+    "view_transform": "crop",
+    "contrastive_weight": 1.0,
+    "pretraining": "contrastive",
+}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -196,6 +205,8 @@ def test_a_folder_without_a_run_is_an_error(tmp_path):
         ({"demonstrations_source": "deconstruction"}, "'deconstruct' has no meaning"),
         ({"demonstrations_path": "/no/such/folder"}, "no demonstrations at"),
         ({"network": {"name": "fcn"}}, "network for open_loop tasks"),
+        ({"algorithm": {"name": "sac", "init": "bc"}, **NO_PRETRAINING}, "init: 'bc' takes effect"),
+        ({"algorithm": FERM, **NO_PRETRAINING}, "pretraining: 'contrastive' takes effect"),
     ],
 )
 def test_wrong_configurations_fail_before_the_run_starts(tmp_path, changes, message):

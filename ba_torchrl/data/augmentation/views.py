@@ -64,13 +64,14 @@ def cropped_images(images: Mapping[str, ImageSpec], size: int) -> dict[str, Imag
         size: rows and columns of the views, pixels.
 
     Raises:
-        ConfigError: an image is smaller than its views.
+        ConfigError: an image is not larger than its views, which would all be the same.
     """
     for key, image in images.items():
-        if image.size < size:
+        if image.size <= size:
             raise ConfigError(
-                f"crop_size={size}: image {key!r} has only {image.size} px; raise env.obs_size "
-                "or lower algorithm.crop_size"
+                f"crop_size={size}: image {key!r} has only {image.size} px, and random crops are "
+                "smaller than the image (appendix: 128 of 142 px); raise env.obs_size or lower "
+                "algorithm.crop_size"
             )
     return {key: replace(image, size=size) for key, image in images.items()}
 

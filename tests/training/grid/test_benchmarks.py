@@ -58,7 +58,7 @@ def shipped(name, *overrides):
         ("close_loop_4d", "pxyzr", True),
     ],
 )
-def test_close_loop_benchmarks_have_the_values_of_the_paper(name, actions, turned):
+def test_close_loop_benchmarks_have_the_appendix_or_reference_values(name, actions, turned):
     config, _, runs = shipped(name)
     assert sorted(config.tasks) == tasks_of("close_loop")
     methods = {run.label for run in runs}
@@ -126,7 +126,7 @@ def test_an_unknown_preset_is_refused_with_the_known_ones():
 
 
 @pytest.mark.parametrize("name", ["open_loop_2d", "open_loop_3d"])
-def test_open_loop_benchmarks_have_the_values_of_the_paper(name):
+def test_open_loop_benchmarks_have_the_values_of_the_appendix_or_the_reference(name):
     config, common, runs = shipped(name, "network.width=0.1")  # planning builds each network
     known = {task for task in tasks_of("open_loop") if task.startswith("open_loop/")}
     left_out = {"open_loop/box_palletizing"} if name == "open_loop_2d" else set()
@@ -147,7 +147,7 @@ def test_open_loop_benchmarks_have_the_values_of_the_paper(name):
         assert not config.skips(task=PICK, algorithm="sdqfd", network="fcn")
 
 
-def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_paper():
+def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_or_the_reference():
     config, common, runs = shipped("open_loop_6d", "network.width=0.1")
     ramps = [task for task in config.tasks if task.startswith("ramp/")]
     bumps = [task for task in config.tasks if task.startswith("bump/")]
