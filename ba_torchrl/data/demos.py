@@ -149,7 +149,13 @@ class ExpertScores(NamedTuple):
 
 
 def expert_scores(
-    task: str, episodes: int, *, seed: int, num_envs: int = 1, parallel: bool = False, **env: Any
+    task: str,
+    episodes: int,
+    *,
+    seed: int,
+    num_envs: int = 1,
+    parallel: bool | None = False,
+    **env: Any,
 ) -> ExpertScores:
     """Play episodes with a task's expert and return its results.
 
@@ -158,7 +164,7 @@ def expert_scores(
         episodes: number of episodes.
         seed: of the first episodes; environment i starts from ``seed + i``.
         num_envs: number of environments.
-        parallel: one process per environment.
+        parallel: one process per environment; see `ba_torchrl.make_vector_env`.
         env: fields of `EnvConfig`.
     """
     envs = make_vector(

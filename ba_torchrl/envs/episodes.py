@@ -14,6 +14,7 @@ from ba_torchrl.envs.scene import Scene, SceneState
 from ba_torchrl.errors import PlacementError
 
 RESET_ATTEMPTS = 50
+MAX_REFUSED = 5
 SETTLE_STEPS = 100
 
 
@@ -115,22 +116,30 @@ class Episodes:
         """Place new objects in a scene.
 
         Raises:
-            PlacementError: no attempt gave a valid scene that is not solved.
+            PlacementError: no attempt gave a valid scene that is not solved, or the objects of
+                several attempts did not fit.
         """
-        invalid = 0
+        invalid = refused = 0
         for _ in range(RESET_ATTEMPTS):
             scene.world.restore_pristine()
             self._place_robot(scene)
-            scene.task.terrain.initialize_episode(rng)
-            scene.task.initialize_episode(rng)
+            try:
+                scene.task.terrain.initialize_episode(rng)
+                scene.task.initialize_episode(rng)
+            except PlacementError:
+                # the next terrain may be wider and the next objects smaller
+                refused += 1
+                if refused == MAX_REFUSED:
+                    raise
+                continue
             scene.world.settle(max_steps=SETTLE_STEPS)
             if scene.task.is_valid_start():
                 return
             invalid += not scene.task.is_valid()
         raise PlacementError(
-            f"of {RESET_ATTEMPTS} random scenes {invalid} had an object outside the workspace and "
-            f"{RESET_ATTEMPTS - invalid} were solved from the start; objects of this size need "
-            "another workspace"
+            f"of {RESET_ATTEMPTS} random scenes {invalid} had an object outside the workspace, "
+            f"{RESET_ATTEMPTS - invalid - refused} were solved from the start, and in {refused} "
+            "the objects did not fit; objects of this size need another workspace"
         )
 
 
