@@ -65,6 +65,10 @@ def test_presets_compose_or_are_refused(algorithm, network):
         with pytest.raises(ConfigError, match="network"):
             experiment("train", *overrides)
         return
+    if algorithm.startswith("ferm"):
+        with pytest.raises(ConfigError, match="pretrain_updates"):
+            experiment("train", *overrides)
+        overrides += ("pretrain_updates=1600",)
     config = experiment("train", *overrides)
     assert config.label == f"{algorithm} {network}"
     name = task.replace("/", "_")

@@ -118,6 +118,7 @@ def test_imports_go_one_way(module):
 SIM = (
     {"geometry", "display"},
     {"contacts", "meshes"},
+    {"mesh_lists"},
     {"shapes"},
     {"assets", "bodies"},
     {"articulated"},
