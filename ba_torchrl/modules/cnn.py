@@ -98,7 +98,7 @@ def plain_trunk(
         widths: of the stages of 128 px images.
     """
     stages = trunk_stages(spec.image_size, widths)
-    inputs = [spec.image_channels + 1, *(width for width, _, _ in stages)]
+    inputs = [config.input_channels(spec.image_channels), *(width for width, _, _ in stages)]
     convs = [
         CastConv2d(channels, width, 3, padding=padding)
         for channels, (width, padding, _) in zip(inputs, stages, strict=False)

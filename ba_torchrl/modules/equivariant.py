@@ -211,7 +211,7 @@ class EquivariantConfig(ImageNetworkConfig):
                 f"first layer has n_hidden/{divisor} fields; got {n}"
             )
         regular = gspace.regular_repr
-        fields: FieldTypes = [(gspace.trivial_repr, spec.image_channels + 1)]
+        fields: FieldTypes = [(gspace.trivial_repr, self.input_channels(spec.image_channels))]
         convs = []
         for width, padding, _ in stages:
             out = [(regular, int(width))]

@@ -83,10 +83,19 @@ class ImageNetworkConfig(StrictModel):
     size and differences of a block's height are well above the resolution of bfloat16; learning is
     much faster.
 
+    With the floor as the reference, the floor's depth is an input of its own, the same at all
+    pixels, and the image becomes heights above it, so that the activations of the floor do not
+    exceed those of the objects on it.
+
     Args:
         precision: number format of the convolutions, see `compute_dtype`.
+        depth_reference: "camera", or "floor" for two inputs: height above the lowest visible point,
+            and the depth of that point.
         depth_center_m: depth that is scaled to zero.
         depth_scale_m: difference in depth that is scaled to one.
+        negative_slope: slope of the activation function below zero; 0 is a ReLU, as in the
+            reference implementation. After a max pool, narrow layers with a ReLU can hide an object
+            completely, and then receive no gradient from it.
     """
 
     control: ClassVar[Control] = "close_loop"
@@ -94,7 +103,17 @@ class ImageNetworkConfig(StrictModel):
 
     precision: Precision = "auto"
     depth_center_m: float = 0.0
+    depth_reference: Literal["camera", "floor"] = "camera"
     depth_scale_m: float = Field(default=1.0, gt=0)
+    negative_slope: float = Field(default=0.0, ge=0, lt=1)
+
+    def input_channels(self, image_channels: int) -> int:
+        """Return the number of input channels of the first convolution.
+
+        Args:
+            image_channels: channels of the image.
+        """
+        return image_channels + (1 if self.depth_reference == "camera" else 2)
 
     def check_images(self, spec: ActorCriticSpec) -> None:
         """Refuse images that are not depth or height.
@@ -140,22 +159,31 @@ class ImageTrunk(nn.Module):
         """Return features [..., F] of pixels [..., C, H, W] and holding [..., 1]."""
         leading = pixels.shape[:-3]
         x = self._input(pixels.flatten(0, -4) if leading else pixels[None], holding)
+        slope = self.config.negative_slope
         for conv, pool in zip(self.convs, self.pools, strict=True):
             x = conv(x)
-            x = relu_of_max_pool(x) if pool else F.relu(x)
+            if slope == 0:
+                x = relu_of_max_pool(x) if pool else F.relu(x)
+            else:
+                x = F.leaky_relu(F.max_pool2d(x, 2) if pool else x, slope)
         return x.flatten(1).float().reshape(*leading, -1)
 
     def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:
         batch, channels, height, width = pixels.shape
         x = torch.empty(
-            (batch, channels + 1, height, width),
+            (batch, self.config.input_channels(channels), height, width),
             dtype=compute_dtype(self.config.precision, pixels.device),
             device=pixels.device,
             memory_format=torch.channels_last,
         )
         center, scale = self.config.depth_center_m, self.config.depth_scale_m
-        x[:, :channels] = pixels if (center, scale) == (0, 1) else (pixels - center) / scale
-        x[:, channels:] = holding.reshape(batch, 1, 1, 1)
+        if self.config.depth_reference == "floor":
+            floor = pixels.amax((-2, -1), keepdim=True)
+            x[:, :channels] = (floor - pixels) / scale
+            x[:, channels:-1] = (floor - center) / scale
+        else:
+            x[:, :channels] = pixels if (center, scale) == (0, 1) else (pixels - center) / scale
+        x[:, -1:] = holding.reshape(batch, 1, 1, 1)
         return x
 
 

@@ -50,11 +50,18 @@ def steps(networks, size, action_size, n=3):
 
 @pytest.mark.parametrize("trained", [False, True])
 @pytest.mark.parametrize(
-    ("size", "sequence", "group_order"),
-    [(64, "pxyzr", 8), (64, "pxyz", 4), (128, "pxyzr", 4), (64, "zypx", 4), (64, "pxyz", 2)],
+    ("size", "sequence", "group_order", "options"),
+    [
+        (64, "pxyzr", 8, {}),
+        (64, "pxyz", 4, {}),
+        (128, "pxyzr", 4, {}),
+        (64, "zypx", 4, {}),
+        (64, "pxyz", 2, {}),
+        (64, "pxyzr", 8, {"depth_reference": "floor", "negative_slope": 0.1}),
+    ],
 )
-def test_every_quarter_turn_is_exact(size, sequence, group_order, trained):
-    networks = build(size, sequence, group_order=group_order)
+def test_every_quarter_turn_is_exact(size, sequence, group_order, options, trained):
+    networks = build(size, sequence, group_order=group_order, **options)
     if trained:
         steps(networks, size, len(sequence))
     pixels, holding = torch.rand(2, 1, size, size), torch.tensor([[True], [False]])
