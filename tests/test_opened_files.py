@@ -1,6 +1,5 @@
 """Files that recipes open besides runs and demonstrations (tests/training/test_durable.py)."""
 
-import os
 import pickle
 import sys
 
@@ -15,18 +14,9 @@ from ba_torchrl.record.results import read_failure
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
 from ba_torchrl.sim.assets.graspnet import read_mesh
 from ba_torchrl.sim.meshes import rod_mesh
+from tests.planted import Planted
 
 REACHING = "close_loop/block_reaching"
-
-
-class Planted:
-    """Unpickling it creates a folder."""
-
-    def __init__(self, trace):
-        self.trace = trace
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.trace),)
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from ba_torchrl.errors import PlacementError
 
 RESET_ATTEMPTS = 50
 MAX_REFUSED = 5
+"""Scenes in which the objects do not fit before a reset fails."""
 SETTLE_STEPS = 100
 
 

@@ -102,8 +102,8 @@ class ImageNetworkConfig(StrictModel):
     image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS,)
 
     precision: Precision = "auto"
-    depth_center_m: float = 0.0
     depth_reference: Literal["camera", "floor"] = "camera"
+    depth_center_m: float = 0.0
     depth_scale_m: float = Field(default=1.0, gt=0)
     negative_slope: float = Field(default=0.0, ge=0, lt=1)
 

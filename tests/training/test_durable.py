@@ -23,6 +23,7 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.durable import remove_leftovers
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.resume import resumable_updates
+from tests.planted import Planted
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
 TINY = {
@@ -47,16 +48,6 @@ SIDECARS = ("other.pickle", "pickle.pkl", "prefetch.pkl", "state.pt", "transform
 
 class Interrupted(BaseException):
     """An exception that no code handles."""
-
-
-class Planted:
-    """Unpickling it creates a file."""
-
-    def __init__(self, trace):
-        self.trace = trace
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.trace),)
 
 
 def config_for(folder, **changes):
