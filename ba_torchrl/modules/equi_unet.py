@@ -131,15 +131,45 @@ class EquivariantPixelValues(nn.Module):
             float32 [B, out, H, W], and [B, scene_channels, H/16, W/16] of invariant channels, whose
             positions rotate with the image.
         """
-        # Samples with an empty gripper first, so each head gets a slice and no large map is copied.
-        order = holding.reshape(-1).long().argsort(stable=True)
-        full = int(holding.bool().sum())
+        is_holding = holding.reshape(-1).bool()
+        if holding.device.type == "cpu":
+            return self._sorted_values(pixels, in_hand, is_holding)
+        return self._selected_values(pixels, in_hand, is_holding)
+
+    def _fields(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the regular fields of every pixel and the invariant bottleneck map."""
+        maps = self.unet.encode(self.config.heights(pixels))
+        return self.unet.decode(maps), maps[-1].unflatten(1, (-1, self._group_size)).amax(dim=2)
+
+    def _place_values(self, fields: Tensor, in_hand: Tensor) -> Tensor:
+        coefficients = self.coefficients(self.hand(self.config.in_hand(in_hand)))
+        return self.place(F.relu(self.held(fields, coefficients)))
+
+    def _sorted_values(
+        self, pixels: Tensor, in_hand: Tensor, is_holding: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return `forward`'s result, with one head for each sample.
+
+        Samples with an empty gripper come first, so each head gets a slice and no large map is
+        copied. The host reads how many they are.
+        """
+        order = is_holding.long().argsort(stable=True)
+        full = int(is_holding.sum())
         parts = [len(order) - full, full]
-        maps = self.unet.encode(self.config.heights(pixels[order]))
-        opened, filled = self.unet.decode(maps).split(parts)
-        hand = self.hand(self.config.in_hand(in_hand[order[parts[0] :]]))
-        filled = F.relu(self.held(filled, self.coefficients(hand)))
+        fields, scene = self._fields(pixels[order])
+        opened, filled = fields.split(parts)
+        places = self._place_values(filled, in_hand[order[parts[0] :]])
         restore = order.argsort()
-        values = torch.cat([self.pick(opened), self.place(filled)])[restore]
-        scene = maps[-1].unflatten(1, (-1, self._group_size)).amax(dim=2)
-        return values, scene[restore]
+        return torch.cat([self.pick(opened), places])[restore], scene[restore]
+
+    def _selected_values(
+        self, pixels: Tensor, in_hand: Tensor, is_holding: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return `forward`'s result, with both heads for each sample.
+
+        Shapes do not depend on the data, and the host reads no result.
+        """
+        fields, scene = self._fields(pixels)
+        places = self._place_values(fields, in_hand)
+        values = torch.where(is_holding[:, None, None, None], places, self.pick(fields))
+        return values, scene

@@ -4,9 +4,11 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.host_tasks import HostTasks
+from ba_torchrl.config import parse
 from ba_torchrl.envs import keys
-from tests.algorithms.tiny import build, transitions
+from tests.algorithms.tiny import build, spatial_problem, spatial_transitions, transitions
 
 CPU = torch.device("cpu")
 SACFD = {"demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
@@ -157,3 +159,33 @@ def test_the_host_reads_no_result_during_an_update(algorithm, network, settings)
     counter = 2 * ["aten::_local_scalar_dense"] if learner.averaged_policy is not None else []
     assert reads.found == counter
     assert len(learner.host_tasks) == 1
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("demonstrations", ["none", "adet", "dqfd", "sdqfd"])
+@pytest.mark.parametrize(
+    ("network", "channels"),
+    [
+        ("asr", 1),
+        ("asr", 3),
+        ("equi_asr", 1),
+        ("equi_deictic_asr", 3),
+        ("equi_fcn", 1),
+        ("fcn", 1),
+        ("rot_fcn", 1),
+    ],
+)
+def test_losses_of_spatial_networks_read_no_result(network, channels, demonstrations):
+    """Tensors of the device "meta" have no values, and reading one raises an error."""
+    pytest.importorskip("escnn")
+    sizes = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
+    if channels == 3:
+        sizes |= {"num_z": 5, "num_tilts": 3}
+    sequence = "pxyzrrr" if channels == 3 else "pxyr"
+    config = parse(ALGORITHMS["spatial_q"], {"demonstrations": demonstrations}, "spatial_q")
+    spec = parse(NETWORKS[network], sizes, network)
+    learner = config.build(spec, spatial_problem(sequence, channels))
+    loss = learner.make_loss(learner.make_networks(spec).to("meta"))
+    terms = loss(spatial_transitions(learner).to("meta"))
+    sum(terms[key] for key in loss.out_keys if key.startswith("loss_")).backward()
+    assert all(value.device.type == "meta" for value in terms.values())

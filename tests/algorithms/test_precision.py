@@ -3,43 +3,18 @@
 import pytest
 import torch
 
-from ba_torchrl.actions import OpenLoopActions
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.config import parse
-from ba_torchrl.envs import keys
-from tests.algorithms.tiny import problem, transitions
-from tests.specs import open_loop_images
+from tests.algorithms.tiny import problem, spatial_problem, spatial_transitions, transitions
 
 pytest.importorskip("escnn")
 
-BOUNDS = ((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))
 SIZES = {
     "cnn": {"width": 0.25},
     "equi": {"group_order": 8, "n_hidden": 16},
     "asr": {"num_rotations": 4, "width": 0.25},
     "equi_asr": {"num_rotations": 4, "width": 0.25},
 }
-
-
-def spatial_problem():
-    return Problem(
-        control="open_loop",
-        images=open_loop_images(),
-        actions=OpenLoopActions("pxyr", BOUNDS),
-        total_updates=10,
-        seed=0,
-        device=torch.device("cpu"),
-    )
-
-
-def spatial_transitions(learner):
-    """Random images with demonstrated actions of the grid."""
-    data = transitions(learner, 8)
-    rng = torch.Generator().manual_seed(2)
-    low, high = torch.tensor(learner.problem.actions.ranges).T
-    action = low + (high - low) * torch.rand(8, len(low), generator=rng)
-    data[keys.ACTION] = learner.nearest_action(action)
-    return data
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -3,13 +3,13 @@
 import torch
 from tensordict import TensorDict
 
-from ba_torchrl.actions import CloseLoopActions
+from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
 from ba_torchrl.config import parse
 from ba_torchrl.envs import keys
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
-from tests.specs import close_loop_images
+from tests.specs import close_loop_images, open_loop_images
 
 SIZES = {
     "cnn": {"width": 0.25},
@@ -26,6 +26,18 @@ def problem():
         control="close_loop",
         images=close_loop_images(64),
         actions=CloseLoopActions("pxyzr"),
+        total_updates=10,
+        seed=0,
+        device=torch.device("cpu"),
+    )
+
+
+def spatial_problem(sequence="pxyr", channels=1):
+    """An open-loop problem of ten updates, whose in-hand image has ``channels`` channels."""
+    return Problem(
+        control="open_loop",
+        images=open_loop_images(channels=channels),
+        actions=OpenLoopActions(sequence, ((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))),
         total_updates=10,
         seed=0,
         device=torch.device("cpu"),
@@ -63,6 +75,16 @@ def transitions(learner, count=24):
         keys.NEXT: following,
     }
     return TensorDict(data, [count])
+
+
+def spatial_transitions(learner):
+    """Eight of `transitions`, with actions of the learner's grid."""
+    data = transitions(learner, 8)
+    generator = torch.Generator().manual_seed(2)
+    low, high = torch.tensor(learner.problem.actions.ranges).T
+    action = low + (high - low) * torch.rand(8, len(low), generator=generator)
+    data[keys.ACTION] = learner.nearest_action(action)
+    return data
 
 
 def make_experiment(folder, network, algorithm, **changes):

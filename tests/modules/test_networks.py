@@ -131,6 +131,8 @@ def test_auto_precision_follows_the_hardware(monkeypatch):
     from ba_torchrl.modules import trunk
 
     cpu = torch.device("cpu")
+    for variable in ("ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA"):
+        monkeypatch.delenv(variable, raising=False)
     for flags, expected in [
         ({"amx_bf16": True}, torch.bfloat16),
         ({"amx_bf16": True, "avx512_bf16": True, "cpu_name": "Intel Xeon"}, torch.bfloat16),
@@ -145,6 +147,35 @@ def test_auto_precision_follows_the_hardware(monkeypatch):
     assert compute_dtype("float32", cpu) is torch.float32
     assert compute_dtype("bfloat16", cpu) is torch.bfloat16
     assert compute_dtype("auto", torch.device("meta")) is torch.float32
+
+
+@pytest.mark.parametrize("variable", ["ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA"])
+@pytest.mark.parametrize(
+    ("allowed", "with_amx", "on_amd"),
+    [
+        ("DEFAULT", torch.bfloat16, torch.bfloat16),
+        ("avx512_core_amx", torch.bfloat16, torch.bfloat16),
+        ("AVX10_1_512_AMX", torch.bfloat16, torch.bfloat16),
+        ("AVX512_CORE_FP16", torch.float32, torch.bfloat16),
+        ("AVX512_CORE_BF16", torch.float32, torch.bfloat16),
+        ("AVX512_CORE", torch.float32, torch.float32),
+        ("AVX2", torch.float32, torch.float32),
+    ],
+)
+def test_auto_precision_uses_the_instructions_that_onednn_may_use(
+    variable, allowed, with_amx, on_amd, monkeypatch
+):
+    from ba_torchrl.modules import trunk
+
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    monkeypatch.setenv(variable, allowed)
+    intel = {"amx_bf16": True, "avx512_bf16": True, "cpu_name": "Intel Xeon"}
+    amd = {"avx512_bf16": True, "cpu_name": "AMD Zen 4"}
+    for flags, expected in [(intel, with_amx), (amd, on_amd)]:
+        trunk._bfloat16_is_fast.cache_clear()
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags)
+        assert compute_dtype("auto", torch.device("cpu")) is expected
+    trunk._bfloat16_is_fast.cache_clear()
 
 
 def test_functional_calls_use_the_given_parameters():

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from torchrl.objectives import LossModule
 
 from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.equi_unet import EquivariantPixelValues
 from tests.specs import spatial_spec
 
 pytest.importorskip("escnn")
@@ -49,6 +50,24 @@ def values_of(network, pixels, in_hand, holding, chosen):
     first, state = network.first(pixels, in_hand, holding)
     later = range(1, len(network.levels))
     return [first, *(network.later(n, state, chosen[:, : n + 1]) for n in later)]
+
+
+@pytest.mark.parametrize("name", ["equi_fcn", "equi_asr", "equi_deictic_asr/pose"])
+def test_values_of_both_heads_are_those_of_the_samples_head(name, monkeypatch):
+    channels = 3 if "pose" in name else 1
+    network, inputs = build(name, channels=channels), batch(channels=channels)
+    fields, _ = network.first(*inputs[:3])
+    weights = torch.randn(fields.shape, generator=torch.Generator().manual_seed(1))
+    parameters = list(network.parameters())
+    found = []
+    for method in (EquivariantPixelValues._sorted_values, EquivariantPixelValues._selected_values):
+        monkeypatch.setattr(EquivariantPixelValues, "_sorted_values", method)
+        values = values_of(network, *inputs)[0]
+        slopes = torch.autograd.grad((weights * values).sum(), parameters, materialize_grads=True)
+        found.append([values, *slopes])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+    assert any(slope.any() for slope in found[0][1:])
 
 
 def count(module):
