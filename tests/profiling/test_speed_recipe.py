@@ -12,8 +12,9 @@ import torch
 from tqdm import tqdm
 
 import ba_torchrl
+from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.profiling import throughput
+from ba_torchrl.profiling import simulation, throughput
 from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
 from ba_torchrl.profiling.simulation import SLIP_TASKS
 from ba_torchrl.profiling.table import (
@@ -106,6 +107,20 @@ def test_each_timed_image_is_drawn(monkeypatch):
     compiled = measure("simulation/depth_image", repeats=2, progress=False)[0]
     assert "compiled" in compiled.work
     assert len(drawn) > len(compiled.values) == 20
+
+
+def test_resets_with_a_seed_are_timed(monkeypatch):
+    monkeypatch.setattr(simulation, "list_tasks", lambda: ["close_loop/object_grasping"])
+    seeds = []
+    reset = ManipulationEnv.reset
+    monkeypatch.setattr(
+        ManipulationEnv,
+        "reset",
+        lambda self, *args, **named: seeds.append(named["seed"]) or reset(self, *args, **named),
+    )
+    (row,) = measure("simulation/seeded_reset", repeats=3, progress=False)
+    assert row.work == "close_loop/object_grasping, reset with a seed"
+    assert len(row.values) == len(seeds) == len(set(seeds)) == 3
 
 
 def test_steps_with_and_without_the_slip_test_are_taken_in_turns():
