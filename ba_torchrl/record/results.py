@@ -26,6 +26,8 @@ CONFIG_FILE = "config.json"
 FAILURE_FILE = "failure.json"
 """Written by a benchmark into the folder of a run that failed: ``reason``, ``when``, ``log``."""
 PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
+INSTRUCTIONS = {"amx_bf16": "AMX", "avx512_f": "AVX-512", "avx2": "AVX2", "sve": "SVE"}
+"""Names of instruction sets by PyTorch's name of the capability, widest first."""
 
 NON_LEARNING_FIELDS = frozenset(
     {
@@ -223,7 +225,13 @@ def hardware(device: torch.device) -> dict[str, Any]:
 
 
 def processor() -> str:
-    """Return the name of the processor."""
+    """Return the name of the processor and its widest vector or matrix instructions."""
+    has = torch.cpu.get_capabilities()
+    widest = next((name for flag, name in INSTRUCTIONS.items() if has.get(flag)), None)
+    return _processor_name() + ("" if widest is None else f" ({widest})")
+
+
+def _processor_name() -> str:
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):

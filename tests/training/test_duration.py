@@ -3,6 +3,7 @@ import time
 import pytest
 import torch
 
+from ba_torchrl.record import results
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.duration import (
     MEASURED_UPDATES,
@@ -33,6 +34,21 @@ def test_the_path_names_number_format_and_processor(tmp_path, precision):
     path = compute_path(config)
     assert path.startswith(f"{precision} on ")
     assert path.endswith(f"{torch.get_num_threads()} threads")
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "expected"),
+    [
+        ({"avx2": True, "avx512_f": True, "amx_bf16": True}, " (AMX)"),
+        ({"avx2": True, "avx512_f": True, "amx_bf16": False}, " (AVX-512)"),
+        ({"avx2": True}, " (AVX2)"),
+        ({"architecture": "aarch64"}, ""),
+    ],
+)
+def test_the_processor_is_named_with_its_widest_instructions(monkeypatch, capabilities, expected):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    monkeypatch.setattr(results, "_processor_name", lambda: "Xeon")
+    assert results.processor() == f"Xeon{expected}"
 
 
 def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog):
