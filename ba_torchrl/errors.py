@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import re
+
 
 class ConfigError(ValueError):
     """A configuration that cannot be used; the message says what is allowed."""
@@ -36,3 +39,17 @@ class WorkerError(RuntimeError):
 
 class ReplaySchemaError(ValueError):
     """Transitions whose entries, types or shapes differ from those already stored."""
+
+
+def as_os_error(error: RuntimeError) -> OSError | None:
+    """Return the error of the operating system that a message of torch ends with, or None.
+
+    torch raises RuntimeError for files and shared memory: "...: Too many open files (24)".
+
+    Args:
+        error: of torch.
+    """
+    match = re.search(r"(.*): ([^:]+) \((\d+)\)$", str(error).strip(), re.DOTALL)
+    if match is None or os.strerror(int(match[3])) != match[2]:
+        return None
+    return OSError(int(match[3]), f"{match[2]}: {match[1]}")

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torchrl.checkpoint import StateDictCheckpointAdapter
 
-from ba_torchrl.errors import ConfigError, DamagedFilesError
+from ba_torchrl.errors import ConfigError, DamagedFilesError, as_os_error
 
 OLD = ".old"
 """Suffix of a folder that `publish` replaces."""
@@ -126,10 +126,13 @@ def write_state(folder: str | Path, state: dict[str, Any]) -> None:
         state: as ``state_dict`` returns.
 
     Raises:
-        OSError: there is not enough space.
+        OSError: there is not enough space, or a file cannot be written.
     """
     check_space(folder, state)
-    _ADAPTER.save(_State(state), Path(folder), args=(), kwargs={})
+    try:
+        _ADAPTER.save(_State(state), Path(folder), args=(), kwargs={})
+    except RuntimeError as error:
+        raise as_os_error(error) or error from None
 
 
 def read_state(folder: str | Path) -> dict[str, Any]:

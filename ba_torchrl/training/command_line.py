@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ba_torchrl.config import MAX_SEED
 from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, as_os_error
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
@@ -78,9 +78,12 @@ def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], N
             _end(error, "out of memory")
         except RuntimeError as error:
             is_memory = any(words in str(error) for words in _OUT_OF_MEMORY)
-            if not is_memory and not isinstance(error, torch.OutOfMemoryError):
+            if is_memory or isinstance(error, torch.OutOfMemoryError):
+                _end(error, "out of memory")
+            of_system = as_os_error(error)
+            if of_system is None or of_system.errno not in _RESOURCES:
                 raise
-            _end(error, "out of memory")
+            _end(of_system)
         except KeyboardInterrupt:  # where a run does not note it: before and after its work
             sys.stderr.write("stopped by SIGINT\n")
             sys.exit(128 + signal.SIGINT)
