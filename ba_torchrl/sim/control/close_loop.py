@@ -150,7 +150,7 @@ class CloseLoopController:
             joints = path.joints_at(i / count)
             if joints is None:
                 break
-            self.robot.teleport(joints)
+            self.robot.place_arm(joints)
             if self.robot.is_near_anything():
                 break
             free, done = joints, i / count

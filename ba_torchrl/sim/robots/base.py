@@ -182,8 +182,16 @@ class Robot(ABC):
         Args:
             joints: radians.
         """
-        self._set_arm([(q, 0.0) for q in joints])
+        self.place_arm(joints)
         self.command(joints)
+
+    def place_arm(self, joints: Sequence[float]) -> None:
+        """Set the arm joints, with zero velocities, without a change of the motors' targets.
+
+        Args:
+            joints: radians.
+        """
+        self._set_arm([(q, 0.0) for q in joints])
 
     def _set_arm(self, states: Sequence[tuple[float, float]]) -> None:
         """Set positions and velocities of the arm joints."""
@@ -238,7 +246,7 @@ class Robot(ABC):
             joints: of the arm, radians.
         """
         states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
-        self._set_arm([(q, 0.0) for q in joints])
+        self.place_arm(joints)
         points = [
             point
             for body_id in body_ids
