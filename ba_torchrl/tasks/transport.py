@@ -26,10 +26,12 @@ from ba_torchrl.tasks.motion_primitives import (
 from ba_torchrl.tasks.pick_place_commands import carrying_pose
 from ba_torchrl.tasks.workspace import ActionLimits
 
-TRAVEL_CLEARANCE_M = 0.012
+TRAVEL_CLEARANCE_M = 0.02
 """Gap between obstacles and the held body, or the fingertips, that pass over them."""
-CLEARANCE_TOLERANCE_M = 8e-3
+CLEARANCE_TOLERANCE_M = 14e-3
 """Part of that gap that may be missing during the motion."""
+_SAMPLE_M = 0.01
+"""Largest distance between the samples of a motion."""
 RELEASE_GAP_M = 1e-3
 """Height of a body above its support at its release."""
 
@@ -77,7 +79,6 @@ def carry_to(
         above,
         yaw + turn,
         CLOSED,
-        limits,
         below_m=max(tool[2] - vertical_extent(body)[0], tips_below_tool_m(robot)),
         obstacles=[other for other in obstacles if other is not body],
         ceiling_m=ceiling_m,
@@ -130,7 +131,6 @@ def pick_up(
         (bx, by, over_z),
         target_yaw,
         OPEN,
-        limits,
         below_m=below_m,
         obstacles=[body, *others],
         ceiling_m=ceiling_m,
@@ -142,7 +142,6 @@ def travel(
     target: Vector,
     yaw_rad: float,
     opening: float,
-    limits: ActionLimits,
     *,
     below_m: float,
     obstacles: Sequence[Body],
@@ -151,25 +150,21 @@ def travel(
 ) -> GripperCommand:
     """Return the next command towards a pose, over the obstacles.
 
-    The displacement is straight if the next action has clearance, else horizontal if that has
-    clearance, else vertical.
+    The displacement is straight if the whole way has clearance, else horizontal if that has
+    clearance, else vertical. So the tool rises before it moves sideways, and to a height from which
+    small errors lead to no other displacement: what a learner can imitate.
 
     Args:
         robot: the robot.
         target: target position of the tool.
         yaw_rad: target yaw of the gripper.
         opening: opening of the gripper, 0 to 1.
-        limits: limits of an action.
         below_m: distance from the tool down to the lowest point of gripper and held body.
         obstacles: bodies to pass over.
         ceiling_m: largest height of the tool.
         clearance_m: gap above the obstacles.
     """
     start = robot.tool_pose()[0]
-    end = tuple(
-        s + min(max(t - s, -limits.step_m), limits.step_m)
-        for s, t in zip(start, target, strict=True)
-    )
     extent = finger_extent_m(robot.gripper)
     zones = [
         (
@@ -179,9 +174,9 @@ def travel(
         )
         for body in obstacles
     ]
-    if _height_needed(start, end, zones) is None:
+    if _height_needed(start, target, zones) is None:
         return move_toward(robot, target, yaw_rad, opening)
-    needed = _height_needed(start, (end[0], end[1], start[2]), zones)
+    needed = _height_needed(start, (target[0], target[1], start[2]), zones)
     if needed is None or start[2] >= ceiling_m - 1e-3:
         return move_toward(robot, (target[0], target[1], start[2]), yaw_rad, opening)
     return lift(min(needed + 1e-3, ceiling_m) - start[2], opening)
@@ -194,12 +189,13 @@ def _height_needed(
 
     Args:
         start: present position of the tool.
-        end: next position of the tool.
+        end: position of the tool at its end.
         zones: centre and radius of the zone around each obstacle, and height of the tool there.
     """
     needed = None
-    for i in range(5):
-        x, y, z = (s + (e - s) * i / 4 for s, e in zip(start, end, strict=True))
+    count = max(4, math.ceil(math.dist(start, end) / _SAMPLE_M))
+    for i in range(count + 1):
+        x, y, z = (s + (e - s) * i / count for s, e in zip(start, end, strict=True))
         for center, radius, height in zones:
             if z < height - CLEARANCE_TOLERANCE_M and math.dist((x, y), center[:2]) < radius:
                 needed = height if needed is None else max(needed, height)

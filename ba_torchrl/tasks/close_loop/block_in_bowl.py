@@ -127,7 +127,6 @@ class BlockInBowl(CloseLoopTask):
             (x + dx, y + dy, z - low + top + self.clearance_m),
             yaw,
             CLOSED,
-            self.action_limits,
             below_m=z - low,
             obstacles=(self.bowl,),
             ceiling_m=self.settings.workspace.z[1],
