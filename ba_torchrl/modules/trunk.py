@@ -180,10 +180,10 @@ class ImageTrunk(nn.Module):
         slope = self.config.negative_slope
         for conv, pool in zip(self.convs, self.pools, strict=True):
             x = conv(x)
-            if slope == 0:
-                x = relu_of_max_pool(x) if pool else F.relu(x)
+            if pool:
+                x = relu_of_max_pool(x, slope)
             else:
-                x = F.leaky_relu(F.max_pool2d(x, 2) if pool else x, slope)
+                x = F.leaky_relu(x, slope) if slope else F.relu(x)
         return x.flatten(1).float().reshape(*leading, -1)
 
     def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:

@@ -29,17 +29,19 @@ def threads(request):
 
 def check(x, grad=None):
     """Check values, layout and gradient; they must be equal."""
-    x = x.detach()
-    ours, theirs = x.clone().requires_grad_(), x.clone().requires_grad_()
-    found, expected = relu_of_max_pool(ours), F.relu(F.max_pool2d(theirs, 2))
-    assert torch.equal(found, expected)
-    for layout in LAYOUTS.values():
-        same = found.is_contiguous(memory_format=layout)
-        assert same == expected.is_contiguous(memory_format=layout)
-    grad = torch.randn_like(expected) if grad is None else grad
-    found.backward(grad)
-    expected.backward(grad)
-    assert torch.equal(ours.grad, theirs.grad)
+    for slope in (0.0, 0.1):
+        ours, theirs = x.detach().clone().requires_grad_(), x.detach().clone().requires_grad_()
+        found = relu_of_max_pool(ours, slope)
+        expected = F.max_pool2d(theirs, 2)
+        expected = F.leaky_relu(expected, slope) if slope else F.relu(expected)
+        assert torch.equal(found, expected)
+        for layout in LAYOUTS.values():
+            same = found.is_contiguous(memory_format=layout)
+            assert same == expected.is_contiguous(memory_format=layout)
+        slopes = torch.randn_like(expected) if grad is None else grad
+        found.backward(slopes)
+        expected.backward(slopes)
+        assert torch.equal(ours.grad, theirs.grad)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -62,6 +64,14 @@ def test_by_hand():
     assert y.flatten().tolist() == [4.0, 0.0]
     y.sum().backward()
     assert x.grad.flatten().tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_a_slope_below_zero_by_hand():
+    x = torch.tensor([[1.0, 4.0, -1.0, -2.0], [3.0, 4.0, -3.0, -5.0]])[None, None].requires_grad_()
+    y = relu_of_max_pool(x, 0.25)
+    assert y.flatten().tolist() == [4.0, -0.25]
+    y.sum().backward()
+    assert x.grad.flatten().tolist() == [0.0, 1.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("place", range(4))
@@ -121,7 +131,7 @@ def test_it_works_below_function_transforms():
     assert torch.equal(gradient, hand)
     _, tangent = torch.func.jvp(relu_of_max_pool, (x[0],), (torch.ones_like(x[0]),))
     assert torch.equal(tangent, (expected[0] > 0).float())
-    graph = make_fx(relu_of_max_pool)(x[0])
+    graph = make_fx(lambda x: relu_of_max_pool(x))(x[0])
     assert torch.equal(graph(x[1]), expected[1])
 
 
