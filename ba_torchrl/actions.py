@@ -102,11 +102,16 @@ class CloseLoopActions:
         )
 
     def encode(self, command: GripperCommand) -> np.ndarray:
-        """Return the action [size] float32 of ``command``, each component clipped to [-1, 1]."""
+        """Return the action [size] float32 of ``command``, each component clipped to [-1, 1].
+
+        A horizontal displacement beyond the limit is scaled to it. This keeps its direction, so
+        that the actions of an expert rotate with the scene.
+        """
+        scale = max(self.dpos_m, abs(command.dx_m), abs(command.dy_m))
         value = {
             "p": 2.0 * command.opening - 1.0,
-            "x": command.dx_m / self.dpos_m,
-            "y": command.dy_m / self.dpos_m,
+            "x": command.dx_m / scale,
+            "y": command.dy_m / scale,
             "z": command.dz_m / self.dpos_m,
             "r": command.dyaw_rad / self.drot_rad,
         }

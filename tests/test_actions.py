@@ -30,6 +30,18 @@ def test_decoding_clips_and_encoding_inverts():
         np.testing.assert_allclose(layout.encode(layout.decode(action)), action, atol=1e-6)
 
 
+@pytest.mark.parametrize("angle", np.linspace(-math.pi, math.pi, 17))
+def test_encoding_keeps_the_direction_of_a_long_displacement(angle):
+    layout = CloseLoopActions(dpos_m=0.05)
+    command = GripperCommand(1.0, 0.3 * math.cos(angle), 0.3 * math.sin(angle), 0.2, 0.0)
+    action = layout.encode(command)
+    assert math.atan2(action[2], action[1]) == pytest.approx(angle, abs=1e-6)
+    assert abs(action[1:3]).max() == pytest.approx(1.0)
+    assert action[3] == 1.0
+    short = layout.encode(GripperCommand(1.0, 0.05, -0.01, 0.0, 0.0))
+    np.testing.assert_allclose(short[1:3], [1.0, -0.2], atol=1e-6)
+
+
 def test_without_yaw_the_gripper_is_not_turned():
     layout = CloseLoopActions("pxyz")
     assert layout.size == 4
