@@ -7,13 +7,14 @@ be queried in any state. The environment clips the commands to the action limits
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import half_gap_m, passing_height_m
+from ba_torchrl.tasks.clearance import grasp_clearance_m, half_gap_m, passing_height_m
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
@@ -28,6 +29,8 @@ ALIGNED_M = 4e-3
 """Largest horizontal offset, along each axis, of a gripper that is aligned with its target."""
 ALIGNED_RAD = 0.08
 """Largest yaw error of a gripper that is aligned with its target."""
+DESCENT_OFFSET_M = 0.01
+"""Largest horizontal offset, along each axis, of a gripper that descends towards its target."""
 PUSH_HEIGHT_M = 0.02
 """Height of the tool above the lower bound of the workspace during a push."""
 PUSH_HEIGHT_TOLERANCE_M = 0.015
@@ -130,11 +133,40 @@ def lift(height_m: float, opening: float = CLOSED) -> GripperCommand:
     return GripperCommand(opening, 0.0, 0.0, height_m, 0.0)
 
 
+def can_descend(
+    robot: Robot,
+    body: Body,
+    target_yaw_rad: float,
+    limits: ActionLimits,
+    others: Sequence[Body] = (),
+) -> bool:
+    """Return whether the open gripper can descend to a body on a straight line, and turn meanwhile.
+
+    It can where it is aligned, or close to that with free ways of both fingers. A learner's errors
+    in yaw and position then lead to a grasp, which aligns the body, and not to another ascent.
+
+    Args:
+        robot: the robot.
+        body: the body.
+        target_yaw_rad: yaw of the grasp.
+        limits: limits of an action.
+        others: bodies to avoid besides it.
+    """
+    (x, y, _), yaw = robot.tool_pose()
+    bx, by, bz = body.position
+    offset, turn = max(abs(bx - x), abs(by - y)), abs(wrap_angle(target_yaw_rad - yaw))
+    if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
+        return True
+    if offset > DESCENT_OFFSET_M or turn > limits.turn_rad + ALIGNED_RAD:
+        return False
+    return grasp_clearance_m(robot.gripper, body, yaw, [body, *others], at=(x, y, bz)) > 0
+
+
 def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
     """Return the next command to grasp a block with four-fold symmetry and no obstacles near it.
 
-    The gripper moves above the block, descends once it is aligned, and closes the fingers with the
-    action that reaches the grasp height.
+    The gripper moves above the block, descends once its fingers have free ways, and closes them
+    with the action that reaches the grasp height.
 
     Args:
         robot: the robot.
@@ -146,12 +178,11 @@ def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
     target_yaw = nearest_equivalent_yaw(yaw, body.yaw_rad, limits, math.pi / 2)
     above_z = bz + body.shape.height_m / 2 + passing_height_m(robot.gripper)
     is_centered = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
-    is_aligned = is_centered and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
     if robot.opening() < IS_OPEN:
         # at the block, fingers open before the hand moves, unless something stops them
         is_stopped = robot.commanded_opening >= IS_OPEN
         return lift(max(above_z - z, 0.0) if is_stopped or not is_centered else 0.0, OPEN)
-    if is_aligned:
+    if can_descend(robot, body, target_yaw, limits):
         return move_toward(
             robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= limits.step_m else OPEN
         )

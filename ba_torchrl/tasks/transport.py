@@ -14,11 +14,12 @@ from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.clearance import finger_extent_m, grasp_clearance_m, tips_below_tool_m
 from ba_torchrl.tasks.motion_primitives import (
-    ALIGNED_M,
     ALIGNED_RAD,
     CLOSED,
+    DESCENT_OFFSET_M,
     IS_OPEN,
     OPEN,
+    can_descend,
     lift,
     move_toward,
     nearest_equivalent_yaw,
@@ -69,8 +70,8 @@ def carry_to(
     x, y, _ = pose.position
     released = (*position[:2], position[2] + RELEASE_GAP_M)
     target = carrying_pose(tool_pose, pose, pose.moved_to(released, turn)).position
-    is_centered = max(abs(position[0] - x), abs(position[1] - y)) <= ALIGNED_M
-    if is_centered and abs(turn) <= ALIGNED_RAD:
+    offset = max(abs(position[0] - x), abs(position[1] - y))
+    if offset <= DESCENT_OFFSET_M and abs(turn) <= max(limits.turn_rad, ALIGNED_RAD):
         arrives = tool[2] - target[2] <= limits.step_m
         return move_toward(robot, target, yaw + turn, OPEN if arrives else CLOSED)
     above = (*target[:2], min(target[2] + clearance_m, ceiling_m))
@@ -116,11 +117,9 @@ def pick_up(
             abs(wrap_angle(wanted - yaw)),
         ),
     )
-    is_centered = max(abs(bx - x), abs(by - y)) <= ALIGNED_M
-    is_aligned = is_centered and abs(wrap_angle(target_yaw - yaw)) <= ALIGNED_RAD
     if robot.opening() < IS_OPEN and math.dist((x, y), (bx, by)) < footprint_radius_m(body):
         return lift(5e-3, OPEN)  # the body may be between the fingers
-    if is_aligned and robot.opening() >= IS_OPEN:
+    if robot.opening() >= IS_OPEN and can_descend(robot, body, target_yaw, limits, others):
         return move_toward(
             robot, (bx, by, bz), target_yaw, CLOSED if z - bz <= limits.step_m else OPEN
         )

@@ -27,7 +27,7 @@ from ba_torchrl.tasks.motion_primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
-from ba_torchrl.tasks.transport import TRAVEL_CLEARANCE_M, pick_up
+from ba_torchrl.tasks.transport import pick_up
 
 WALL_COLOR: Color = (0.72, 0.7, 0.66, 1.0)
 BASE_COLOR: Color = (0.86, 0.85, 0.82, 1.0)
@@ -38,6 +38,8 @@ each other, and the friction of the base is too low to stop the block."""
 
 GRASP_CLEARANCE_M = 2e-3
 """Least clearance of the open fingers for a grasp."""
+PASSING_CLEARANCE_M = 0.012
+"""Gap between the closed fingertips and the block or the walls that they pass over."""
 DRAG_CLEARANCE_M = 15e-3
 """Clearance at which a drag ends, larger than for a grasp so that no second drag follows."""
 DRAG_GOAL_M = 0.0
@@ -145,7 +147,7 @@ class CornerPicking(CloseLoopTask):
             return self._drag() if is_pressing else self._press()
         if is_pressing:  # steeply up and without rotation, so that the block does not move along
             x, y, z = block.position
-            above_z = z + self.block_m / 2 + self._tips_below_m + TRAVEL_CLEARANCE_M
+            above_z = z + self.block_m / 2 + self._tips_below_m + PASSING_CLEARANCE_M
             return move_toward(robot, (x, y, above_z), yaw, OPEN)
         ceiling = self.settings.workspace.z[1]
         return pick_up(robot, block, limits, yaws_rad=yaws, ceiling_m=ceiling)
@@ -205,7 +207,7 @@ class CornerPicking(CloseLoopTask):
         if z < low_z - APPROACH_TOLERANCE_M / 2 and distance > PRESS_TOLERANCE_M:
             return lift(low_z + APPROACH_TOLERANCE_M - z)  # a low hand would push the block back
         if not is_clear or robot.opening() >= IS_CLOSED:
-            low_z = wall_top + self._tips_below_m + TRAVEL_CLEARANCE_M
+            low_z = wall_top + self._tips_below_m + PASSING_CLEARANCE_M
             if z < low_z - 1e-3:
                 return lift(low_z - z, closing(robot))
         return move_toward(robot, (*target, low_z), target_yaw, closing(robot))
