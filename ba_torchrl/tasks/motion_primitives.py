@@ -142,8 +142,9 @@ def can_descend(
 ) -> bool:
     """Return whether the open gripper can descend to a body on a straight line, and turn meanwhile.
 
-    It can where it is aligned, or close to that with free ways of both fingers. A learner's errors
-    in yaw and position then lead to a grasp, which aligns the body, and not to another ascent.
+    It can if it is aligned, or close to that with both fingers clear of all bodies when the tips
+    pass the top of this one. A learner's errors in yaw and position then lead to a grasp, which
+    aligns the body, and not to another ascent.
 
     Args:
         robot: the robot.
@@ -152,14 +153,18 @@ def can_descend(
         limits: limits of an action.
         others: bodies to avoid besides it.
     """
-    (x, y, _), yaw = robot.tool_pose()
+    (x, y, z), yaw = robot.tool_pose()
     bx, by, bz = body.position
-    offset, turn = max(abs(bx - x), abs(by - y)), abs(wrap_angle(target_yaw_rad - yaw))
-    if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
+    offset, turn = max(abs(bx - x), abs(by - y)), wrap_angle(target_yaw_rad - yaw)
+    if offset <= ALIGNED_M and abs(turn) <= ALIGNED_RAD:
         return True
-    if offset > DESCENT_OFFSET_M or turn > limits.turn_rad + ALIGNED_RAD:
+    if offset > DESCENT_OFFSET_M or abs(turn) > limits.turn_rad + ALIGNED_RAD:
         return False
-    return grasp_clearance_m(robot.gripper, body, yaw, [body, *others], at=(x, y, bz)) > 0
+    above = z - (vertical_extent(body)[1] - robot.gripper.lowest_tip_m)
+    share = min(max(above / (z - bz), 0.0), 1.0) if z > bz else 0.0
+    at = (x + share * (bx - x), y + share * (by - y), bz)
+    bodies = [body, *others]
+    return grasp_clearance_m(robot.gripper, body, yaw + share * turn, bodies, at=at) > 0
 
 
 def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
