@@ -300,7 +300,7 @@ class ManipulationEnv(EnvBase):
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Return the entries of `_step` as they are: none is missing, and shapes are the specs'.
 
-        TorchRL's search through the specs takes a twentieth of a close-loop step.
+        TorchRL walks through the specs after every step to complete them.
         """
         if self.run_type_checks:
             return super()._step_proc_data(next_tensordict_out)

@@ -1,7 +1,7 @@
 """Motion primitives of the close-loop experts.
 
 Each returns the next command as a function of the present scene, without memory, so an expert can
-be queried in any state. The environment clips the commands to the action limits.
+be queried in any state. The environment limits the commands, see `CloseLoopActions.encode`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ STANDOFF_M = 0.08
 def move_toward(
     robot: Robot, target: tuple[float, float, float], yaw_rad: float, opening: float
 ) -> GripperCommand:
-    """Return the command towards a pose; the environment clips each component.
+    """Return the command towards a pose; the environment limits it.
 
     Args:
         robot: the robot.
