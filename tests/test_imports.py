@@ -116,7 +116,7 @@ def test_imports_go_one_way(module):
 
 
 SIM = (
-    {"geometry", "display"},
+    {"geometry", "display", "model_files"},
     {"contacts", "meshes"},
     {"mesh_lists"},
     {"shapes"},

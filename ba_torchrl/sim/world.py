@@ -14,6 +14,7 @@ from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.articulated import ArticulatedBody, ArticulatedLink, PrismaticJoint
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.display import why_no_display
+from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.shapes import Color, Shape
 
 MAX_CLIENTS = 1024
@@ -115,9 +116,9 @@ class World:
             physicsClientId=self.client,
         )
         pybullet.setGravity(0, 0, -self.physics.gravity_m_s2, physicsClientId=self.client)
-        self.floor = pybullet.loadURDF(
-            f"{pybullet_data.getDataPath()}/plane.urdf", physicsClientId=self.client
-        )
+        model = f"{pybullet_data.getDataPath()}/plane.urdf"
+        with loading(model):
+            self.floor = pybullet.loadURDF(model, physicsClientId=self.client)
         pybullet.changeDynamics(
             self.floor,
             -1,

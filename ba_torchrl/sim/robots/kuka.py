@@ -9,6 +9,7 @@ import pybullet
 import pybullet_data
 
 from ba_torchrl.sim.geometry import Matrix, Vector, dot
+from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _SHOULDER_HEIGHT_M = 0.36
@@ -44,7 +45,8 @@ class Kuka(Robot):
     def load(self) -> int:
         """Load the model, couple the fingers by a gear, and widen the joint limits."""
         model = f"{pybullet_data.getDataPath()}/kuka_iiwa/kuka_with_gripper2.sdf"
-        robot = pybullet.loadSDF(model, physicsClientId=self.client)[0]
+        with loading(model):
+            robot = pybullet.loadSDF(model, physicsClientId=self.client)[0]
         # PyBullet sets the pose of the centre of mass, not of the link frame
         offset = pybullet.getDynamicsInfo(robot, -1, physicsClientId=self.client)[3]
         pybullet.resetBasePositionAndOrientation(

@@ -10,6 +10,7 @@ import pybullet
 import pybullet_data
 
 from ba_torchrl.sim.geometry import Matrix, Vector, cross, dot, perpendicular
+from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _SHOULDER_HEIGHT_M = 0.333
@@ -63,12 +64,11 @@ class Panda(Robot):
 
     def load(self) -> int:
         """Load the model, couple the fingers by a gear, and widen the joint limits."""
-        robot = pybullet.loadURDF(
-            f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf",
-            _BASE_M,
-            useFixedBase=True,
-            physicsClientId=self.client,
-        )
+        model = f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf"
+        with loading(model):
+            robot = pybullet.loadURDF(
+                model, _BASE_M, useFixedBase=True, physicsClientId=self.client
+            )
         self._widen_joint_limits(robot)
         # without the gear, two fingers with limited force do not resist motion of a held body along
         # the closing axis

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import pybullet
 
 from ba_torchrl.sim.geometry import Matrix, Vector, cross, dot
+from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 
 _MODELS = Path(__file__).parent / "models"
@@ -196,12 +197,13 @@ def _load_joined(models: Sequence[Path], base_m: Vector, client: int) -> int:
     try:
         with os.fdopen(file, "wb") as out:
             ElementTree.ElementTree(joined).write(out)
-        return pybullet.loadURDF(
-            name,
-            base_m,
-            useFixedBase=True,
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
-            physicsClientId=client,
-        )
+        with loading(name):
+            return pybullet.loadURDF(
+                name,
+                base_m,
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                physicsClientId=client,
+            )
     finally:
         os.unlink(name)
