@@ -13,6 +13,8 @@ from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.state_files import CHECKSUMS_FILE, read_state, seal, write_state
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.profiling.soak import TABLE_FILE, SoakJob, run_soak
+from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result, run_folders
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, load, write_config
 from ba_torchrl.training.config import ExperimentConfig
@@ -166,3 +168,55 @@ def test_results(tmp_path, count):
             read_result(run)
 
     check(count, st.one_of(st.binary(max_size=40), JSON), prop)
+
+
+ROWS = st.lists(st.lists(st.text(max_size=5), max_size=4).map(",".join), max_size=4).map(
+    lambda rows: "\n".join(["step,name,value", *rows, ""]).encode()
+)
+"""Files with the columns of scalars and any rows."""
+
+
+@examples(150)
+def test_scalars(tmp_path, count):
+    path = tmp_path / "scalars.csv"
+    path.write_text("step,name,value\n0,loss,1.5\n20,loss,0.5\n20,eval/success_rate,1.0\n")
+    content = path.read_bytes()
+    assert read_scalars(path)["loss"].values.tolist() == [1.5, 0.5]
+
+    def prop(changes):
+        how, value = changes
+        path.write_bytes(content)
+        damage(path, how, value)
+        try:
+            for series in read_scalars(path).values():
+                assert len(series.steps) == len(series.values) > 0
+        except (FileNotFoundError, ValueError):
+            pass  # documented
+
+    check(count, st.one_of(DAMAGES, st.tuples(st.just("bytes"), ROWS)), prop)
+
+
+@examples(60)
+def test_figures_of_a_soak_test(tmp_path, count):
+    job = SoakJob(task=TASK, steps=10)
+    figures = {
+        "job": job.model_dump(),
+        "episodes": 2,
+        "expert_success": 1.0,
+        "faults": 0,
+        "steps_per_s": 3.0,
+        "memory_mb": 4.0,
+        "memory_growth": 0.0,
+        "clients_left": 0,
+    }
+    path = tmp_path / f"{TASK.replace('/', '-')}.json"
+    worker = ("sh", "-c", f"echo '{json.dumps(figures)}'")
+
+    def prop(changes):
+        path.write_text(json.dumps(figures))
+        damage(path, *changes)
+        failures = run_soak([job], tmp_path, progress=False, worker=worker)
+        assert set(failures) <= {TASK}
+        assert (tmp_path / TABLE_FILE).read_text().count(TASK) == 1
+
+    check(count, DAMAGES, prop)
