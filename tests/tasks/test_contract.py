@@ -225,13 +225,17 @@ def test_the_expert_succeeds_over_200_episodes(task, variant):
     check_expert(task, episodes=200, margin=0.0, **config)
 
 
-def least_success(task, yaw):
-    """Return the least success rate of 50 episodes with robots other than kuka.
+GRASPING_WITHOUT_YAW = {"panda": 0.6, "ur5": 0.7, "ur5_robotiq": 0.75}
+"""Least success rates in a heap, where some poses cannot be grasped without yaw.
 
-    Without yaw, some poses in a heap cannot be grasped; docs/experts.md has the rates.
-    """
+docs/experts.md has the rates; these are three standard errors of 50 episodes lower.
+"""
+
+
+def least_success(task, robot, yaw):
+    """Return the least success rate of 50 episodes with robots other than kuka."""
     if task.endswith("object_grasping"):
-        return 0.85 if yaw else 0.6
+        return 0.85 if yaw else GRASPING_WITHOUT_YAW[robot]
     return 0.95
 
 
@@ -245,7 +249,7 @@ def test_the_expert_succeeds_with_every_robot(task, robot, yaw):
     checks.check_expert(
         task,
         episodes=50,
-        min_success_rate=least_success(task, yaw),
+        min_success_rate=least_success(task, robot, yaw),
         robot=robot,
         **({} if yaw else without_yaw(task)),
     )
