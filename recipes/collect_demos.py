@@ -12,9 +12,16 @@ from omegaconf import DictConfig
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.data.demo_files import save_demonstrations
-from ba_torchrl.data.demos import check_noise, collect_demonstrations, source_config
+from ba_torchrl.data.demos import (
+    check_noise,
+    check_turn_noise,
+    collect_demonstrations,
+    source_config,
+    turn_components,
+)
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.data.time_reversal import replay_scores
+from ba_torchrl.envs.factory import resolve
 from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
@@ -45,12 +52,15 @@ def main(settings: DictConfig) -> None:
     check_counts(settings, "replays", least=0)
     check_seed(settings)
     check_noise(settings.noise, settings.source, "noise")
+    check_noise(settings.turn_noise, settings.source, "turn_noise")
     check_flags(settings, "only_successful")
     check_flags(settings, "parallel", optional=True)
     if os.path.exists(settings.path):
         raise ConfigError(f"{settings.path} exists already; choose another path")
     check_writable_file(settings.path)
     env_settings = env_of(settings, seed="seed", expert="source")
+    turns = turn_components(resolve(settings.task, **env_settings).action_sequence)
+    check_turn_noise(settings.turn_noise, settings.source, turns, "turn_noise")
     env = make_vector_env(
         settings.task,
         settings.num_envs,
@@ -67,6 +77,8 @@ def main(settings: DictConfig) -> None:
                 source=settings.source,
                 only_successful=settings.only_successful,
                 noise=settings.noise,
+                turn_noise=settings.turn_noise,
+                turns=turns,
                 on_episode=lambda _: bar.update(),
             )
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -36,6 +36,8 @@ def collect_demonstrations(
     source: Source = "expert",
     only_successful: bool = False,
     noise: float = 0.0,
+    turn_noise: float = 0.0,
+    turns: Sequence[int] = (),
     nearest_action: Callable[[Tensor], Tensor] | None = None,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
@@ -53,6 +55,8 @@ def collect_demonstrations(
             "expert". The expert then acts from states that it does not reach by itself (DART:
             Laskey et al., 2017). If it is positive, the entry ``is_expert`` [T, 1] tells which
             actions are the expert's.
+        turn_noise: probability of random turns beside the expert's other components, likewise.
+        turns: indices of the components that turn the gripper, see `turn_components`.
         nearest_action: maps the expert's action to the action that is executed and recorded. A
             policy with discrete actions needs it; None for the expert's own action.
         on_episode: called with each episode when it ends, for progress bars.
@@ -61,12 +65,18 @@ def collect_demonstrations(
         Episodes as TensorDicts [T], with the entries of an environment without ``expert``.
 
     Raises:
-        ConfigError: the source is unknown or cannot have noise, or ``noise`` is no probability.
+        ConfigError: the source is unknown or cannot have noise, the noise is no probability, or
+            the action has no turns.
     """
     if source not in SOURCES:
         raise ConfigError(f"source: {source!r} is not one of {', '.join(SOURCES)}")
     check_noise(noise, source, "noise")
-    add_noise = RandomActions(env, noise, 0 if seed is None else seed) if noise else None
+    check_turn_noise(turn_noise, source, turns, "turn_noise")
+    add_noise = None
+    if noise or turn_noise:
+        add_noise = RandomActions(
+            env, noise, 0 if seed is None else seed, turn_probability=turn_noise, turns=turns
+        )
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         out = expert_policy(tensordict)
@@ -95,11 +105,24 @@ class RandomActions:
         env: whose actions are drawn, uniformly within the bounds.
         probability: of a random action.
         seed: of the draws.
+        turn_probability: of an action that is random in some components only.
+        turns: indices of these components.
     """
 
-    def __init__(self, env: EnvBase, probability: float, seed: int) -> None:
+    def __init__(
+        self,
+        env: EnvBase,
+        probability: float,
+        seed: int,
+        *,
+        turn_probability: float = 0.0,
+        turns: Sequence[int] = (),
+    ) -> None:
         self._space = env.action_spec.space
         self._probability = probability
+        self._turn_probability = turn_probability
+        self._is_turn = torch.zeros(env.action_spec.shape[-1], dtype=torch.bool)
+        self._is_turn[list(turns)] = True
         self._generator = torch.Generator().manual_seed(seed)
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -111,9 +134,13 @@ class RandomActions:
         action = tensordict[keys.ACTION]
         low, high = self._space.low, self._space.high
         drawn = low + (high - low) * torch.rand(action.shape, generator=self._generator)
-        is_expert = torch.rand(len(action), 1, generator=self._generator) >= self._probability
-        tensordict.set(keys.ACTION, torch.where(is_expert, action, drawn))
-        return tensordict.set(keys.IS_EXPERT, is_expert)
+        is_random = torch.rand(len(action), 1, generator=self._generator) < self._probability
+        replaced = is_random.expand_as(action)
+        if self._turn_probability:
+            turns = torch.rand(len(action), 1, generator=self._generator) < self._turn_probability
+            replaced = replaced | (turns & self._is_turn)
+        tensordict.set(keys.ACTION, torch.where(replaced, drawn, action))
+        return tensordict.set(keys.IS_EXPERT, ~replaced.any(dim=-1, keepdim=True))
 
 
 def check_noise(noise: float, source: Source, name: str) -> None:
@@ -131,6 +158,32 @@ def check_noise(noise: float, source: Source, name: str) -> None:
         raise ConfigError(f"{name}: must be at least 0 and less than 1, got {noise!r}")
     if noise and source != "expert":
         raise ConfigError(f"{name}: demonstrations of the source {source!r} have no random actions")
+
+
+def turn_components(action_sequence: str) -> list[int]:
+    """Return the indices of the components that turn the gripper.
+
+    Args:
+        action_sequence: one letter per component.
+    """
+    return [i for i, letter in enumerate(action_sequence) if letter == "r"]
+
+
+def check_turn_noise(noise: float, source: Source, turns: Sequence[int], name: str) -> None:
+    """Check the probability of random turns in demonstrations.
+
+    Args:
+        noise: the probability.
+        source: of the demonstrations.
+        turns: indices of the components that turn the gripper.
+        name: of the setting, for error messages.
+
+    Raises:
+        ConfigError: see `check_noise`; or there is noise and no such component.
+    """
+    check_noise(noise, source, name)
+    if noise and not turns:
+        raise ConfigError(f"{name}: the actions have no turns; leave it at 0")
 
 
 def source_config(source: Source) -> dict[str, bool]:

@@ -129,6 +129,8 @@ def gather_demonstrations(
             source=config.demonstrations_source,
             only_successful=config.only_successful_demonstrations,
             noise=config.demonstrations_noise,
+            turn_noise=config.demonstrations_turn_noise,
+            turns=config.turn_components,
             nearest_action=algorithm.nearest_action,
             on_episode=on_episode,
         )

@@ -13,7 +13,14 @@ from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, Ne
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, parse
 from ba_torchrl.data.demo_files import check_demonstrations
-from ba_torchrl.data.demos import Source, check_noise, source_config
+from ba_torchrl.data.demos import (
+    Source,
+    check_noise,
+    check_turn_noise,
+    source_config,
+    turn_components,
+)
+from ba_torchrl.envs.factory import resolve
 from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
 from ba_torchrl.errors import ConfigError
@@ -80,6 +87,10 @@ class ExperimentConfig(StrictModel):
     """Probability of a random action in place of the expert's in each step of a demonstration that
     is played for the run (Laskey et al., 2017). The expert recovers. Steps with random actions are
     stored as if the policy had collected them. None in the appendix."""
+    demonstrations_turn_noise: float = Field(default=0.0, ge=0, lt=1)
+    """Probability of a random turn beside the expert's other components, likewise. An expert turns
+    the gripper at the beginning of a motion, so that few of its steps show how to turn; after a
+    random turn, the next one does. None in the appendix."""
     demonstrations_path: str | None = None
     """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
     pretrain_updates: int = Field(default=0, ge=0)
@@ -239,9 +250,20 @@ class ExperimentConfig(StrictModel):
         found = [name for name in modules if name is not None and name not in MAIN]
         return list(dict.fromkeys([*self.plugins, *found]))
 
+    @property
+    def turn_components(self) -> list[int]:
+        """Indices of the action's components that turn the gripper."""
+        return turn_components(resolve(self.task, **self.env).action_sequence)
+
     def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
+        check_turn_noise(
+            self.demonstrations_turn_noise,
+            self.demonstrations_source,
+            self.turn_components,
+            "demonstrations_turn_noise",
+        )
         if self.demonstrations:
             check_task_parameters(
                 self.task, parse_env_config(self.task, {**self.env, **source}, "env")
