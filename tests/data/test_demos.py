@@ -5,7 +5,7 @@ import torch
 
 import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations, source_config
+from ba_torchrl.data.demos import collect_demonstrations, source_config, turn_components
 from ba_torchrl.data.state_files import seal
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
@@ -166,12 +166,47 @@ def test_flags_are_those_of_the_transitions_and_of_a_file(noisy, tmp_path):
             assert torch.equal(stored[keys.IS_EXPERT], episode[keys.IS_EXPERT])
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_random_turns_leave_the_other_components(noise):
+    env = ba_torchrl.make_vector_env(
+        NOISY_TASK, 2, parallel=False, seed=0, obs_size=32, expert=True
+    )
+    played = []
+    collect_demonstrations(
+        env,
+        40,
+        seed=0,
+        noise=noise,
+        turn_noise=0.5,
+        turns=turn_components("pxyzr"),
+        on_episode=played.append,
+    )
+    env.close()
+    steps = torch.cat(played)
+    same = steps[keys.ACTION] == steps[keys.EXPERT_ACTION]
+    others, turn = same[:, :4].all(dim=-1), same[:, 4]
+    assert torch.equal(steps[keys.IS_EXPERT].squeeze(-1), others & turn)
+    assert others.float().mean() == pytest.approx(1 - noise, abs=0.08)
+    assert turn.float().mean() == pytest.approx((1 - noise) * 0.5, abs=0.08)
+    drawn = steps[keys.ACTION][~turn, 4]
+    assert drawn.min() < -0.8
+    assert drawn.max() > 0.8
+
+
+def test_turn_components():
+    assert turn_components("pxyzr") == [4]
+    assert turn_components("rxyrrp") == [0, 3, 4]
+    assert turn_components("pxyz") == []
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"noise": 0.1, "source": "deconstruction"}, "noise"),
         ({"noise": -0.1}, "noise: .* -0.1"),
         ({"noise": 1.5}, "noise: .* 1.5"),
+        ({"turn_noise": 1.5, "turns": [4]}, "turn_noise: .* 1.5"),
+        ({"turn_noise": 0.1}, "turn_noise: the actions have no turns"),
     ],
 )
 def test_noise_that_cannot_be_added_is_refused(settings, message):
