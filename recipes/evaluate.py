@@ -2,6 +2,7 @@
 
 python recipes/evaluate.py checkpoint=runs/my-run episodes=100 video=my-run.mp4
 python recipes/evaluate.py checkpoint=runs/my-run which=latest
+python recipes/evaluate.py checkpoint=runs/my-run expert=true  # close loop: compare the actions
 """
 
 from ba_torchrl._malloc import tune_malloc
@@ -10,13 +11,16 @@ tune_malloc()  # before torch allocates anything
 
 import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
 from ba_torchrl.algorithms.seeds import SeedUse  # noqa: E402
+from ba_torchrl.envs.factory import resolve  # noqa: E402
 from ba_torchrl.envs.vector.make import MAX_ENVS  # noqa: E402
 from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
 from ba_torchrl.record.video import check_video, write_video  # noqa: E402
+from ba_torchrl.training.agreement import agreement_table, check_comparable  # noqa: E402
 from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     check_counts,
@@ -42,12 +46,15 @@ def main(settings: DictConfig) -> None:
     check_counts(settings, "episodes", "video_episodes")
     check_counts(settings, "num_envs", most=MAX_ENVS)
     check_flags(settings, "parallel", optional=True)
+    check_flags(settings, "expert")
     check_seed(settings, optional=True)
     if settings.video is not None:
         check_video(settings.video, FPS)
         check_writable_file(settings.video)
     checkpoint = find_checkpoint(settings.checkpoint, settings.which)
     config, algorithm = load(checkpoint, device=settings.device)
+    if settings.expert:
+        check_comparable(config.task)
     policy = acting_on(algorithm.policy, config.torch_device)
     seed, chosen = settings.seed, ""
     if seed is None:
@@ -58,11 +65,17 @@ def main(settings: DictConfig) -> None:
         settings.num_envs,
         parallel=settings.parallel,
         register_modules=[*settings.plugins, *config.plugins],
-        **{**config.env, "seed": seed},
+        **{**config.env, "seed": seed, "expert": settings.expert},
     )
+    episodes = []
+
+    def on_episode(episode: TensorDict) -> None:
+        episodes.append(episode)
+        bar.update()
+
     try:
         with progress_bar(total=settings.episodes, unit="episode") as bar:
-            evaluation = evaluate(env, policy, settings.episodes, seed, lambda _: bar.update())
+            evaluation = evaluate(env, policy, settings.episodes, seed, on_episode)
     finally:
         env.close()
     print(
@@ -72,6 +85,9 @@ def main(settings: DictConfig) -> None:
     )
     print(f"  policy    update {algorithm.updates}, {checkpoint}")
     print(f"  episodes  seed {seed}{chosen}")
+    if settings.expert:
+        sequence = resolve(config.task, **config.env).action_sequence
+        print(f"\n{agreement_table(episodes, sequence)}")
     if settings.video is not None:
         frames = record_episodes(config.task, config.env, policy, settings.video_episodes, seed)
         print(f"  video     {write_video(settings.video, frames, fps=FPS)}")

@@ -45,7 +45,7 @@ def collect_episodes(
         policy: writes the action.
         episodes: total number of episodes.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        results_only: keep only the entries of `RESULT_KEYS`.
+        results_only: keep only the actions and the entries of `RESULT_KEYS`.
         on_episode: called with each episode when it ends, for progress bars.
         max_lost: largest number of episodes that may be lost to faults.
 
@@ -64,7 +64,8 @@ def collect_episodes(
     while any(len(done) < quota for done, quota in zip(finished, wanted, strict=True)):
         step, state = env.step_and_maybe_reset(policy(state))
         if results_only:
-            step = step.select(*((keys.NEXT, key) for key in RESULT_KEYS))
+            results = ((keys.NEXT, key) for key in RESULT_KEYS)
+            step = step.select(keys.ACTION, keys.EXPERT_ACTION, *results, strict=False)
         for i, transition in enumerate(step.unbind(0)):
             if len(finished[i]) == wanted[i]:
                 continue

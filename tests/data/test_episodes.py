@@ -63,7 +63,7 @@ def test_results_without_observations(expert_env):
     (episode,) = collect_episodes(
         expert_env, lambda td: td.set("action", td["expert_action"]), 1, results_only=True
     )
-    assert set(episode.keys()) == {"next"}
+    assert set(episode.keys()) == {"action", "expert_action", "next"}
     assert set(episode["next"].keys()) == {*RESULT_KEYS}
     assert success_rate([episode]) == 1.0
 

@@ -57,6 +57,7 @@ FLAGS = [
     for name, field in (
         ("benchmark", "dry_run"),
         ("collect_demos", "only_successful"),
+        ("evaluate", "expert"),
         ("speed", "profile"),
     )
     for value in ("maybe", "null", "1")
@@ -184,6 +185,7 @@ REQUIRED = {
         ("play", "fps=0", "fps must be a number from 1 to 240"),
         ("play", "fps=fast", "fps must be a number from 1 to 240"),
         ("evaluate", "video=evaluation.mov", "a video ends in .mp4 or .gif"),
+        ("collect_demos", "turn_noise=2", "turn_noise: must be at least 0 and less than 1, got 2"),
         *FLAGS,
         *UNWRITABLE,
         *REFUSED,

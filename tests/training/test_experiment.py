@@ -341,8 +341,14 @@ def test_the_recipes_from_the_command_line(tmp_path):
     assert f"{tmp_path}/run/learning_curve.png" in out
     gif = tmp_path / "film.gif"
     out = run_recipe(
-        "evaluate", f"checkpoint={tmp_path}/run", "episodes=3", f"video={gif}", "video_episodes=1"
+        "evaluate",
+        f"checkpoint={tmp_path}/run",
+        "episodes=3",
+        "expert=true",
+        f"video={gif}",
+        "video_episodes=1",
     )
+    assert [line[2] for line in out.splitlines() if "| first |" in line] == list("pxyzr")
     assert "over 3 episodes of close_loop/block_reaching" in out
     config = read_config(tmp_path / "run")
     assert f"seed {config.derived_seed(SeedUse.TEST)}, none of which training used" in out
