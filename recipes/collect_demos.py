@@ -52,7 +52,6 @@ def main(settings: DictConfig) -> None:
     check_counts(settings, "replays", least=0)
     check_seed(settings)
     check_noise(settings.noise, settings.source, "noise")
-    check_noise(settings.turn_noise, settings.source, "turn_noise")
     check_flags(settings, "only_successful")
     check_flags(settings, "parallel", optional=True)
     if os.path.exists(settings.path):

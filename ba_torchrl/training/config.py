@@ -89,8 +89,8 @@ class ExperimentConfig(StrictModel):
     stored as if the policy had collected them. None in the appendix."""
     demonstrations_turn_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random turn beside the expert's other components, likewise. An expert turns
-    the gripper at the beginning of a motion, so that few of its steps show how to turn; after a
-    random turn, the next one does. None in the appendix."""
+    the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
+    policy that has not learnt to turn arrives. None in the appendix."""
     demonstrations_path: str | None = None
     """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
     pretrain_updates: int = Field(default=0, ge=0)
