@@ -67,7 +67,7 @@ def main(settings: DictConfig) -> None:
         register_modules=[*settings.plugins, *config.plugins],
         **{**config.env, "seed": seed, "expert": settings.expert},
     )
-    episodes = []
+    episodes: list[TensorDict] = []
 
     def on_episode(episode: TensorDict) -> None:
         episodes.append(episode)
