@@ -16,14 +16,13 @@ from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, rod_mesh, transform_mesh
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.clearance import passing_height_m
+from ba_torchrl.tasks.clearance import SIDE_MARGIN_M, passing_height_m, tips_below_tool_m
 from ba_torchrl.tasks.close_loop_task import CloseLoopTask
 from ba_torchrl.tasks.motion_primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
     CLOSED,
     IS_CLOSED,
-    lift,
     move_toward,
     nearest_equivalent_yaw,
 )
@@ -59,6 +58,8 @@ between rod and front."""
 HOOK_YAW_RAD = 0.4
 """Largest yaw error of fingers that pull. Beyond it the gripper is wider in front of the
 cabinet."""
+HEIGHT_TOLERANCE_M = 8e-3
+"""Part of the height above cabinet and rod that may be missing while the tool moves there."""
 BEHIND_ROD_M = 0.0095
 """Distance behind the rod up to which the workspace must contain the path of the tool."""
 OVERSHOOT_M = 0.01
@@ -160,16 +161,54 @@ class DrawerOpening(CloseLoopTask):
         descent_gap = min(DESCENT_GAP_M, (-radius - front) / 2 - finger)
         behind = -radius - finger - descent_gap
         hx, hy = handle.to_world(behind, 0.0)
-        is_centered = max(abs(hx - x), abs(hy - y)) <= ALIGNED_M
-        if is_centered and turn <= ALIGNED_RAD and is_closed:
+        if is_closed and self._can_descend(behind, (ahead, across, z), turn):
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
         extent = 2 * finger if turn < HOOK_YAW_RAD else robot.hand_half_extents_m[0]
         is_over_cabinet = ahead < front + extent
         top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
         over_z = top + passing_height_m(robot.gripper)
-        if z < over_z - 1e-3:
-            return lift(over_z - z, robot.opening())
+        if z < over_z - HEIGHT_TOLERANCE_M:
+            opening = CLOSED if turn < math.pi / 4 else robot.opening()  # the rod may be between
+            return move_toward(robot, (x, y, over_z), target_yaw, opening)
         return move_toward(robot, (hx, hy, over_z), target_yaw, CLOSED)
+
+    def _can_descend(self, behind: float, tool: Vector, turn: float) -> bool:
+        """Return whether closed fingers can descend behind the rod, and turn meanwhile.
+
+        They can if they are aligned, or clear of cabinet, rod, front and posts when their tips
+        pass the tops of these on the straight way. A learner's errors in yaw and position then
+        lead to the slot behind the rod, and not to another ascent.
+
+        Args:
+            behind: target of the descent along the handle's direction of motion.
+            tool: position of the tool along and across that direction from the rod, and height.
+            turn: yaw error.
+        """
+        robot, limits, scale = self.robot, self.action_limits, self.settings.scale
+        ahead, across, z = tool
+        offset = max(abs(behind - ahead), abs(across))
+        if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
+            return True
+        if offset > limits.step_m or turn > limits.turn_rad + ALIGNED_RAD:
+            return False
+        rod_z, radius = self.handle_pose[0][2], ROD_DIAMETER_M / 2 * scale
+        depth = z - (rod_z - HOOK_DEPTH_M * scale)
+        thick = robot.gripper.half_width_m
+        wide = robot.gripper.finger_reach_m - robot.gripper.half_gap_m
+        front, side = -ROD_OFFSET_M * scale, POST_GAP_M / 2 * scale
+        for top_z, rear, side_m in (
+            (CABINET_M[2] * scale, math.inf, math.inf),
+            (rod_z + radius, -radius, side),
+        ):
+            above = z - tips_below_tool_m(robot) - top_z
+            left = 1.0 - (min(above / depth, 1.0) if above > 0 else 0.0)
+            margin = SIDE_MARGIN_M if above > 0 else 0.0
+            cos, sin = math.cos(left * turn), math.sin(left * turn)
+            along, reach = behind + left * (ahead - behind), thick * cos + wide * sin + margin
+            aside = left * abs(across) + wide * cos + thick * sin + margin
+            if along - reach < front or along + reach > rear or aside > side_m:
+                return False
+        return True
 
     @property
     def handle_pose(self) -> YawPose:

@@ -182,12 +182,66 @@ def test_a_drawer_that_moves_back_is_not_a_success(make):
     assert cabinet.travel_m < 0.15
 
 
-def at_handle(env, ahead, height, opening, turn):
+def at_handle(env, ahead, height, opening, turn, across=0.0):
     """Place cabinet and gripper: the rod along y at x = 0.41, the drawer opens towards -x."""
     scene = env.scene
     scene.task.cabinet.place((0.57, 0.0, 0.0), math.pi)
-    scene.controller.reset(((0.41 - ahead, 0.0, height), turn), opening)
+    scene.controller.reset(((0.41 - ahead, across, height), turn), opening)
     return scene
+
+
+def follow(scene, commands):
+    """Follow the expert's commands within 5 cm and 45 degrees each."""
+    for _ in range(commands):
+        command, ((x, y, z), yaw) = scene.task.expert_command(), scene.robot.tool_pose()
+        share = min(1.0, 0.05 / max(abs(d) for d in command[1:4])) if any(command[1:4]) else 1.0
+        dx, dy, dz = (share * d for d in command[1:4])
+        turn = max(-math.pi / 4, min(math.pi / 4, command.dyaw_rad))
+        scene.controller.move_to((x + dx, y + dy, z + dz), yaw + turn)
+
+
+@pytest.mark.parametrize(
+    ("ahead", "across", "height", "turn", "expected"),
+    [
+        (-0.0255, 0.0, 0.14, 0.0, True),
+        (-0.034, 0.009, 0.14, 0.0, True),  # with a free way, at an angle
+        (-0.0255, 0.0, 0.14, 0.5, True),  # the fingers turn on the way
+        (-0.0255, 0.0, 0.14, 0.8, False),
+        (0.01, 0.0, 0.14, 0.0, False),  # above and ahead of the rod
+        (-0.005, 0.0, 0.20, 0.0, True),
+        (-0.07, 0.0, 0.14, 0.0, False),  # the cabinet's edge is on the way
+        (-0.0255, 0.03, 0.12, 0.0, False),  # and a post
+        (-0.038, 0.0, 0.09, 0.0, True),  # between rod and front
+        (-0.038, 0.0, 0.09, 0.4, False),
+    ],
+)
+def test_the_expert_descends_where_its_fingers_have_a_free_way(
+    make, ahead, across, height, turn, expected
+):
+    scene = at_handle(make(), ahead, height, 0.0, math.pi / 2 + turn, across)
+    assert (height + scene.task.expert_command().dz_m < 0.08) == expected  # below the rod's axis
+    follow(scene, 3 if expected else 6)
+    (rx, ry, rz), _ = scene.task.handle_pose
+    (x, y, z), _ = scene.robot.tool_pose()
+    assert z < rz  # hooked, or pulling
+    assert 0.0 < x - rx < 0.05
+    assert abs(y - ry) < 0.015
+
+
+def test_the_expert_succeeds_from_states_of_random_actions_and_turns(make):
+    """As in demonstrations with noise; before it turned on its way, it took 24 steps."""
+    env, rng, lengths = make(expert=True), np.random.default_rng(0), []
+    for _ in range(25):
+        state = env.reset()
+        while not state["done"]:
+            action = state["expert_action"].clone()
+            if rng.random() < 0.1:
+                action = torch.from_numpy(rng.uniform(-1, 1, 5).astype(np.float32))
+            if rng.random() < 0.5:
+                action[4] = float(rng.uniform(-1, 1))
+            state = env.step(state.set("action", action))["next"]
+        lengths.append(int(state["step_count"]))
+    assert np.mean(lengths) < 17
 
 
 def test_a_pulled_drawer_follows_the_fingers_and_stays(make):
