@@ -52,6 +52,9 @@ LIGHT_WOOD: Color = (0.9, 0.78, 0.6, 1.0)
 
 HOOK_DEPTH_M = 0.01
 """Depth of the tool below the rod's axis during the pull; the fingertips are 1.5 cm lower."""
+LEAST_HOOK_M = 0.005
+"""Least depth of the fingertips below the rod's axis during the pull, which continues to lower
+them."""
 DESCENT_GAP_M = 0.0085
 """Gap between rod and fingers that descend behind it; less for fingers that nearly fill the space
 between rod and front."""
@@ -129,8 +132,9 @@ class DrawerOpening(CloseLoopTask):
     def expert_command(self) -> GripperCommand:
         """Descend behind the handle with closed fingers and pull it.
 
-        Behind and below the rod, between the posts, the fingers pull. Directly above, they descend.
-        Elsewhere they move above that point, over the cabinet and the rod.
+        Behind the rod, between the posts, the fingers pull once their tips are below its axis. From
+        where they have a free way, they descend to that point. Elsewhere they move above it, over
+        the cabinet and the rod.
         """
         robot, limits, scale = self.robot, self.action_limits, self.settings.scale
         (x, y, z), yaw = robot.tool_pose()
@@ -146,7 +150,7 @@ class DrawerOpening(CloseLoopTask):
         is_closed = robot.opening() < IS_CLOSED
 
         if (
-            z < rz
+            z < rz + tips_below_tool_m(robot) - LEAST_HOOK_M
             and front < ahead < -radius
             and abs(across) < POST_GAP_M / 2 * scale - finger
             and turn < HOOK_YAW_RAD

@@ -213,6 +213,7 @@ def follow(scene, commands):
         (-0.0255, 0.03, 0.12, 0.0, False),  # and a post
         (-0.038, 0.0, 0.09, 0.0, True),  # between rod and front
         (-0.038, 0.0, 0.09, 0.4, False),
+        (-0.016, 0.0, 0.085, 0.0, True),  # hooked by less than a centimetre: it pulls and lowers
     ],
 )
 def test_the_expert_descends_where_its_fingers_have_a_free_way(
