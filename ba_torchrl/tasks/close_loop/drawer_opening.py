@@ -55,13 +55,13 @@ HOOK_DEPTH_M = 0.01
 LEAST_HOOK_M = 0.005
 """Least depth of the fingertips below the rod's axis during the pull, which continues to lower
 them."""
-DESCENT_GAP_M = 0.0085
+DESCENT_GAP_M = 0.012
 """Gap between rod and fingers that descend behind it; less for fingers that nearly fill the space
 between rod and front."""
 HOOK_YAW_RAD = 0.4
 """Largest yaw error of fingers that pull. Beyond it the gripper is wider in front of the
 cabinet."""
-HEIGHT_TOLERANCE_M = 8e-3
+HEIGHT_TOLERANCE_M = 0.01
 """Part of the height above cabinet and rod that may be missing while the tool moves there."""
 BEHIND_ROD_M = 0.0095
 """Distance behind the rod up to which the workspace must contain the path of the tool."""
@@ -132,9 +132,9 @@ class DrawerOpening(CloseLoopTask):
     def expert_command(self) -> GripperCommand:
         """Descend behind the handle with closed fingers and pull it.
 
-        Behind the rod, between the posts, the fingers pull once their tips are below its axis. From
-        where they have a free way, they descend to that point. Elsewhere they move above it, over
-        the cabinet and the rod.
+        Behind the rod, between the posts, the fingers turn in place, descend, and pull once their
+        tips are below its axis. They also descend there from where they have a free way, and turn
+        meanwhile. Elsewhere they move and turn over the cabinet and the rod.
         """
         robot, limits, scale = self.robot, self.action_limits, self.settings.scale
         (x, y, z), yaw = robot.tool_pose()
@@ -146,35 +146,35 @@ class DrawerOpening(CloseLoopTask):
         radius = ROD_DIAMETER_M / 2 * scale
         front = -ROD_OFFSET_M * scale
         hook_z = rz - HOOK_DEPTH_M * scale
-        finger = robot.gripper.half_width_m
+        finger, tips_m = robot.gripper.half_width_m, tips_below_tool_m(robot)
         is_closed = robot.opening() < IS_CLOSED
-
-        if (
-            z < rz + tips_below_tool_m(robot) - LEAST_HOOK_M
+        gap = min(DESCENT_GAP_M, (-radius - front) / 2 - finger)
+        behind = -radius - finger - gap
+        hx, hy = handle.to_world(behind, 0.0)
+        is_in_slot = (
+            z - tips_m < rz + radius
             and front < ahead < -radius
             and abs(across) < POST_GAP_M / 2 * scale - finger
-            and turn < HOOK_YAW_RAD
-            and is_closed
-        ):
-            gap = -ahead - radius - finger
-            remaining = self._goal_m + OVERSHOOT_M - self.cabinet.travel_m + gap
-            longest = limits.step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
-            target = handle.to_world(ahead + min(remaining, longest), 0.0)
-            return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
-
-        descent_gap = min(DESCENT_GAP_M, (-radius - front) / 2 - finger)
-        behind = -radius - finger - descent_gap
-        hx, hy = handle.to_world(behind, 0.0)
+        )
+        if is_closed and is_in_slot:
+            if turn >= HOOK_YAW_RAD:
+                return move_toward(robot, (hx, hy, z), target_yaw, CLOSED)
+            if z - tips_m < rz - LEAST_HOOK_M:
+                gap = -ahead - radius - finger
+                remaining = self._goal_m + OVERSHOOT_M - self.cabinet.travel_m + gap
+                longest = limits.step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
+                target = handle.to_world(ahead + min(remaining, longest), 0.0)
+                return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
+            return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
         if is_closed and self._can_descend(behind, (ahead, across, z), turn):
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
-        extent = 2 * finger if turn < HOOK_YAW_RAD else robot.hand_half_extents_m[0]
-        is_over_cabinet = ahead < front + extent
-        top = CABINET_M[2] * scale if is_over_cabinet else rz + radius
+        reach = finger * math.cos(turn) + self._half_span_m() * math.sin(turn)
+        top = CABINET_M[2] * scale if ahead - reach < front else rz + radius
         over_z = top + passing_height_m(robot.gripper)
         if z < over_z - HEIGHT_TOLERANCE_M:
             opening = CLOSED if turn < math.pi / 4 else robot.opening()  # the rod may be between
             return move_toward(robot, (x, y, over_z), target_yaw, opening)
-        return move_toward(robot, (hx, hy, over_z), target_yaw, CLOSED)
+        return move_toward(robot, (hx, hy, min(z, over_z)), target_yaw, CLOSED)
 
     def _can_descend(self, behind: float, tool: Vector, turn: float) -> bool:
         """Return whether closed fingers can descend behind the rod, and turn meanwhile.
@@ -197,22 +197,26 @@ class DrawerOpening(CloseLoopTask):
             return False
         rod_z, radius = self.handle_pose[0][2], ROD_DIAMETER_M / 2 * scale
         depth = z - (rod_z - HOOK_DEPTH_M * scale)
-        thick = robot.gripper.half_width_m
-        wide = robot.gripper.finger_reach_m - robot.gripper.half_gap_m
+        thick = robot.gripper.half_width_m + SIDE_MARGIN_M
+        wide = self._half_span_m() + SIDE_MARGIN_M
         front, side = -ROD_OFFSET_M * scale, POST_GAP_M / 2 * scale
         for top_z, rear, side_m in (
             (CABINET_M[2] * scale, math.inf, math.inf),
             (rod_z + radius, -radius, side),
         ):
-            above = z - tips_below_tool_m(robot) - top_z
-            left = 1.0 - (min(above / depth, 1.0) if above > 0 else 0.0)
-            margin = SIDE_MARGIN_M if above > 0 else 0.0
+            above = max(z - tips_below_tool_m(robot) - top_z, 0.0)
+            left = 1.0 - min(above / depth, 1.0) if above else 1.0
             cos, sin = math.cos(left * turn), math.sin(left * turn)
-            along, reach = behind + left * (ahead - behind), thick * cos + wide * sin + margin
-            aside = left * abs(across) + wide * cos + thick * sin + margin
+            along, reach = behind + left * (ahead - behind), thick * cos + wide * sin
+            aside = left * abs(across) + wide * cos + thick * sin
             if along - reach < front or along + reach > rear or aside > side_m:
                 return False
         return True
+
+    def _half_span_m(self) -> float:
+        """Return the distance of the fingers' outer sides from the tool point."""
+        gripper = self.robot.gripper
+        return gripper.finger_reach_m - (1.0 - self.robot.opening()) * gripper.half_gap_m
 
     @property
     def handle_pose(self) -> YawPose:

@@ -206,13 +206,13 @@ def follow(scene, commands):
         (-0.0255, 0.0, 0.14, 0.0, True),
         (-0.034, 0.009, 0.14, 0.0, True),  # with a free way, at an angle
         (-0.0255, 0.0, 0.14, 0.5, True),  # the fingers turn on the way
-        (-0.0255, 0.0, 0.14, 0.8, False),
+        (-0.0255, 0.0, 0.14, 0.9, False),  # by more than one action can
         (0.01, 0.0, 0.14, 0.0, False),  # above and ahead of the rod
         (-0.005, 0.0, 0.20, 0.0, True),
         (-0.07, 0.0, 0.14, 0.0, False),  # the cabinet's edge is on the way
         (-0.0255, 0.03, 0.12, 0.0, False),  # and a post
         (-0.038, 0.0, 0.09, 0.0, True),  # between rod and front
-        (-0.038, 0.0, 0.09, 0.4, False),
+        (-0.038, 0.0, 0.09, 0.5, False),  # it turns first
         (-0.016, 0.0, 0.085, 0.0, True),  # hooked by less than a centimetre: it pulls and lowers
     ],
 )
