@@ -160,13 +160,12 @@ class DrawerOpening(CloseLoopTask):
             if turn >= HOOK_YAW_RAD:
                 return move_toward(robot, (hx, hy, z), target_yaw, CLOSED)
             if z - tips_m < rz - LEAST_HOOK_M:
-                gap = -ahead - radius - finger
-                remaining = self._goal_m + OVERSHOOT_M - self.cabinet.travel_m + gap
+                to_rod = -ahead - radius - finger
+                remaining = self._goal_m + OVERSHOOT_M - self.cabinet.travel_m + to_rod
                 longest = limits.step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
                 target = handle.to_world(ahead + min(remaining, longest), 0.0)
                 return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
-            return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
-        if is_closed and self._can_descend(behind, (ahead, across, z), turn):
+        if is_closed and (is_in_slot or self._can_descend(behind, (ahead, across, z), turn)):
             return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
         reach = finger * math.cos(turn) + self._half_span_m() * math.sin(turn)
         top = CABINET_M[2] * scale if ahead - reach < front else rz + radius
