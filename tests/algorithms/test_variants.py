@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import initialize_config_dir
-from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
@@ -18,11 +17,10 @@ from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
 from ba_torchrl.training import hydra_schema
+from tests.algorithms import tiny
 from tests.specs import close_loop_images, open_loop_images
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-FAMILIES = {"sac": "close_loop", "spatial_q": "open_loop"}
-"""Registered algorithms and their control."""
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
 SMALL = {
     "cnn": {"width": 0.1},
@@ -32,25 +30,35 @@ SMALL = {
         name: {"width": 0.05, "num_rotations": 4}
         for name in ("asr", "equi_asr", "fcn", "equi_fcn", "rot_fcn")
     },
+    **{
+        name: {"width": 0.05, "num_rotations": 4, "num_z": 8, "num_tilts": 3}
+        for name in ("6d_asr", "equi_deictic_asr")
+    },
 }
+"""Sizes of the networks; "6d_asr" is "asr" for actions in six degrees of freedom."""
+SIX_DOF = {"6d_asr", "equi_deictic_asr"}
 IMAGE, CROP = 71, 64
 
 
 @cache
 def presets():
-    """The values of every preset of the families, by name."""
+    """The values of every preset, by name."""
     hydra_schema.register()
     names = sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        values = {name: hydra_schema.preset("algorithm", name) for name in names}
-    return {name: found for name, found in values.items() if found["name"] in FAMILIES}
+        return {name: hydra_schema.preset("algorithm", name) for name in names}
+
+
+def network_class(network):
+    return NETWORKS["asr" if network == "6d_asr" else network]
 
 
 PAIRS = [
     (preset, network)
     for preset, values in presets().items()
     for network in SMALL
-    if NETWORKS[network].control == FAMILIES[values["name"]]
+    if network_class(network).control in ALGORITHMS[values["name"]].controls
+    and (preset, network) != ("rlpd", "ferm")  # it builds no ensemble of critics
 ]
 
 
@@ -58,49 +66,35 @@ def build(preset, network, **changes):
     values = {"batch_size": 4, "buffer_size": 60, **presets()[preset], **changes}
     values |= {"batch_size": 4, "buffer_size": 60}
     name = values.pop("name")
-    is_close = FAMILIES[name] == "close_loop"
+    control = network_class(network).control
     if values.get("view_transform") == "crop":
         values["crop_size"] = CROP
-    images = close_loop_images(IMAGE if values.get("crop_size") == CROP else CROP)
+    if control == "close_loop":
+        images = close_loop_images(IMAGE if values.get("crop_size") == CROP else CROP)
+        actions = CloseLoopActions("pxyzr")
+    else:
+        is_six_dof = network in SIX_DOF
+        images = open_loop_images(32, channels=3 if is_six_dof else 1)
+        actions = OpenLoopActions("pxyzrrr" if is_six_dof else "pxyr", BOUNDS)
     torch.manual_seed(0)
     problem = Problem(
-        control=FAMILIES[name],
-        images=images if is_close else open_loop_images(32),
-        actions=CloseLoopActions("pxyzr") if is_close else OpenLoopActions("pxyr", BOUNDS),
+        control=control,
+        images=images,
+        actions=actions,
         total_updates=10,
         seed=0,
         device=torch.device("cpu"),
     )
     return parse(ALGORITHMS[name], values, preset).build(
-        parse(NETWORKS[network], SMALL[network], network), problem
+        parse(network_class(network), SMALL[network], network), problem
     )
 
 
-def transitions(algorithm, count=8):
-    """Random transitions, every second one a demonstration."""
-    generator = torch.Generator().manual_seed(1)
-
-    def rand(*shape):
-        return torch.rand(count, *shape, generator=generator)
-
-    def state():
-        images = {key: rand(*image.shape) * image.high for key, image in algorithm.images.items()}
-        return {**images, keys.HOLDING: rand(1) < 0.5}
-
-    size = algorithm.problem.actions.size
-    action = rand(size) - 0.5
-    if "in_hand" in algorithm.images:
-        action = torch.tensor([0.5, 0.45, 0.0, 0.1]) + 0.1 * action
-    ended = torch.zeros(count, 1, dtype=torch.bool)
-    following = {
-        **state(),
-        keys.REWARD: rand(1),
-        **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
-    }
-    is_expert = torch.arange(count)[:, None] % 2 == 0
-    return TensorDict(
-        {**state(), keys.ACTION: action, keys.IS_EXPERT: is_expert, keys.NEXT: following}, [count]
-    )
+def transitions(algorithm):
+    """Eight random transitions, every second one a demonstration."""
+    if algorithm.problem.control == "open_loop":
+        return tiny.spatial_transitions(algorithm)
+    return tiny.transitions(algorithm, 8)
 
 
 def parameters(algorithm):
@@ -123,6 +117,11 @@ def test_two_updates_change_every_network(preset, network):
     state = transitions(algorithm).select(*algorithm.observation_keys)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert algorithm.policy(state)[keys.ACTION].isfinite().all()
+
+
+def test_the_network_of_ferm_is_refused_by_an_ensemble_of_critics():
+    with pytest.raises(ConfigError, match="builds no ensemble of critics"):
+        build("rlpd", "ferm")
 
 
 @pytest.mark.parametrize("preset", ["rad_sacfd", "drq_sacfd", "ferm_sacfd"])
