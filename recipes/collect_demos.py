@@ -29,6 +29,7 @@ from ba_torchrl.record.logging import limit_library_logs, progress_bar
 from ba_torchrl.training.command_line import (
     check_counts,
     check_flags,
+    check_known,
     check_seed,
     check_texts,
     check_writable_file,
@@ -45,6 +46,7 @@ register_schemas()
 def main(settings: DictConfig) -> None:
     """Play the expert's episodes and write them as a memory-mapped TensorDict."""
     limit_library_logs()
+    check_known(settings)
     load_plugins(settings.plugins)
     check_texts(settings, "task", "path", "source")
     check_counts(settings, "episodes")

@@ -25,6 +25,7 @@ from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     check_counts,
     check_flags,
+    check_known,
     check_seed,
     check_texts,
     check_writable_file,
@@ -40,6 +41,7 @@ FPS = 5
 def main(settings: DictConfig) -> None:
     """Play greedy episodes with the policy of a checkpoint."""
     limit_library_logs()
+    check_known(settings)
     load_plugins(settings.plugins)
     check_texts(settings, "checkpoint", "which", "device")
     check_texts(settings, "video", optional=True)

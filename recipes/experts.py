@@ -22,6 +22,7 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.command_line import (
     check_counts,
     check_flags,
+    check_known,
     check_lists,
     check_seed,
     check_tasks,
@@ -47,6 +48,7 @@ register_schemas()
 def main(settings: DictConfig) -> None:
     """Play the experts' episodes and print their success and length."""
     limit_library_logs()
+    check_known(settings)
     load_plugins(settings.plugins)
     check_lists(settings, "robots", least=1)
     check_tasks(settings)

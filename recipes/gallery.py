@@ -16,6 +16,7 @@ from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figur
 from ba_torchrl.training.command_line import (
     check_counts,
     check_deconstructions,
+    check_known,
     check_seed,
     check_tasks,
     check_texts,
@@ -29,6 +30,7 @@ from ba_torchrl.training.command_line import (
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Play one episode per task and write its pictures."""
+    check_known(settings)
     load_plugins(settings.plugins)
     check_counts(settings, "pictures")
     check_seed(settings)

@@ -16,6 +16,7 @@ from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.record.video import check_video, write_video
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_known,
     check_seed,
     check_texts,
     check_writable_file,
@@ -35,6 +36,7 @@ register_schemas()
 def main(settings: DictConfig) -> None:
     """Play episodes and write a video of them."""
     limit_library_logs()
+    check_known(settings)
     load_plugins(settings.plugins)
     check_texts(settings, "task", "policy")
     check_texts(settings, "video", optional=True)

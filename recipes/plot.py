@@ -15,6 +15,7 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.training.checkpoint import read_config
 from ba_torchrl.training.command_line import (
+    check_known,
     check_texts,
     check_writable_file,
     folders_of,
@@ -28,6 +29,7 @@ RATE, ERROR = "eval/success_rate", "eval/standard_error"
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Plot the success rate of the greedy policies against the updates."""
+    check_known(settings)
     load_plugins(settings.plugins)
     runs = folders_of(settings, "runs")
     check_texts(settings, "path")

@@ -14,6 +14,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import run_folders
 from ba_torchrl.training.command_line import (
+    check_known,
     check_texts,
     check_writable_folder,
     folders_of,
@@ -25,6 +26,7 @@ from ba_torchrl.training.command_line import (
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Write the report and print its tables."""
+    check_known(settings)
     roots = folders_of(settings, "runs")
     check_texts(settings, "folder", optional=True)
     folder = Path(settings.folder or Path(roots[0]) / "report")

@@ -18,6 +18,7 @@ from ba_torchrl.profiling.soak import TABLE_FILE, SoakJob, run_soak
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training.command_line import (
     check_counts,
+    check_known,
     check_lists,
     check_seed,
     check_tasks,
@@ -36,6 +37,7 @@ register_schemas()
 def main(settings: DictConfig) -> None:
     """Run the tasks without figures, and print the table."""
     limit_library_logs()
+    check_known(settings)
     load_plugins(settings.plugins)
     check_lists(settings, "long_tasks")
     check_tasks(settings)

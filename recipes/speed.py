@@ -28,6 +28,7 @@ from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     check_counts,
     check_flags,
+    check_known,
     check_texts,
     check_writable_file,
     plain_errors,
@@ -40,6 +41,7 @@ from ba_torchrl.training.config import usable_device  # noqa: E402
 def main(settings: DictConfig) -> None:
     """Measure, print a table, and write or compare it."""
     limit_library_logs()
+    check_known(settings)
     load_plugins(settings.plugins)
     check_texts(settings, "which", "device")
     check_texts(settings, "output", "compare", optional=True)

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.task_page import task_page
 from ba_torchrl.training.command_line import (
+    check_known,
     check_tasks,
     check_texts,
     check_writable_file,
@@ -22,6 +23,7 @@ from ba_torchrl.training.command_line import (
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Write the page."""
+    check_known(settings)
     load_plugins(settings.plugins)
     check_tasks(settings)
     check_texts(settings, "path")

@@ -4,6 +4,8 @@ import importlib.util
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import open_dict
 
 from ba_torchrl.training import hydra_schema
 
@@ -23,5 +25,8 @@ def recipe(name, *overrides):
     module = load_recipe(name)
     hydra_schema.register()
     with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
-        settings = compose(name, overrides=list(overrides))
+        settings = compose(name, overrides=list(overrides), return_hydra_config=True)
+        HydraConfig.instance().set_config(settings)
+        with open_dict(settings):
+            del settings["hydra"]
         module.main.__wrapped__(settings)

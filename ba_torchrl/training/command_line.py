@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -89,6 +91,24 @@ def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], N
             sys.exit(128 + signal.SIGINT)
 
     return decorated
+
+
+def check_known(settings: DictConfig) -> None:
+    """Check that a recipe has all settings that the command line adds to its configuration.
+
+    Args:
+        settings: of the recipe, within its main function.
+
+    Raises:
+        ConfigError: a setting is unknown.
+    """
+    started = HydraConfig.get()
+    if not any(each.startswith("+") for each in started.overrides.task):
+        return
+    known = {str(name) for name in compose(started.job.config_name)}
+    unknown = [str(name) for name in settings if name not in known]
+    if unknown:
+        raise ConfigError(f"unknown setting {unknown[0]!r}. Known: {', '.join(sorted(known))}")
 
 
 def check_counts(

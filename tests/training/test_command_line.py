@@ -69,6 +69,23 @@ FLAGS = [
 
 
 LONG = 300 * "n"
+UNKNOWN = [
+    *(
+        (name, "+foo=1", "unknown setting 'foo'. Known: ")
+        for name in (
+            "collect_demos",
+            "evaluate",
+            "gallery",
+            "play",
+            "plot",
+            "report",
+            "soak",
+            "speed",
+            "tasks",
+        )
+    ),
+    ("experts", "+env.num_objects=3", "unknown setting 'env'. Known: episodes, num_envs"),
+]
 UNWRITABLE = [
     (name, f"{field}={path}", "cannot write to ")
     for name, fields, suffix in (
@@ -187,6 +204,7 @@ REQUIRED = {
         ("evaluate", "video=evaluation.mov", "a video ends in .mp4 or .gif"),
         ("collect_demos", "turn_noise=2", "turn_noise: must be at least 0 and less than 1, got 2"),
         *FLAGS,
+        *UNKNOWN,
         *UNWRITABLE,
         *REFUSED,
     ],
