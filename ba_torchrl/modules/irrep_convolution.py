@@ -11,7 +11,7 @@ basis back. The result equals that of the expanded filter up to rounding.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,13 +20,12 @@ import torch
 from torch import Tensor
 
 from ba_torchrl.modules.cpu_threads import in_parts, refuse_second_derivatives
+from ba_torchrl.modules.irrep_chunks import Layout
 from ba_torchrl.modules.irrep_maps import gather_maps, scatter_maps, to_elements, to_irreps
 
 if TYPE_CHECKING:
     from escnn.group import Representation
 
-CHUNK_BYTES = 1_500_000
-"""Size of the maps of a group of images, so that they stay in the second cache."""
 _TOLERANCE = 1e-5
 _LOSS_BY_THREADS = 1.2
 """Duration on several threads relative to oneDNN's, which shares its work among them better."""
@@ -105,15 +104,13 @@ class IrrepKernels:
         """Number of maps of a field."""
         return len(self.of_maps.starts) - 1
 
-    def gather(self, fields: np.ndarray, layout: _Layout, maps: Tensor) -> None:
-        """Compute maps [M, F, pixels] of fields [n, F, N, H, W]."""
-        gather_maps(fields, self.change, *self.of_maps, layout.padding, maps.flatten(0, 1).numpy())
+    def gather(self, fields: np.ndarray, padding: int, top: int, maps: Tensor) -> None:
+        """Compute maps [M, F, pixels] of fields [n, F, N, H, W] from a row of the result on."""
+        gather_maps(fields, self.change, *self.of_maps, padding, top, maps.flatten(0, 1).numpy())
 
-    def scatter(self, maps: Tensor, layout: _Layout, fields: np.ndarray) -> None:
-        """Compute the gradient of fields [n, F, N, H, W] from that of maps [M, F, pixels]."""
-        scatter_maps(
-            maps.flatten(0, 1).numpy(), self.change, *self.of_values, layout.padding, fields
-        )
+    def scatter(self, maps: Tensor, padding: int, top: int, fields: np.ndarray) -> None:
+        """Add the gradient of fields [n, F, N, H, W], from that of maps [M, F, pixels]."""
+        scatter_maps(maps.flatten(0, 1).numpy(), self.change, *self.of_values, padding, top, fields)
 
     def weights(self, coefficients: Tensor) -> list[Tensor]:
         """Return the matrix [size * out, maps * in] of each block.
@@ -284,41 +281,6 @@ def irrep_convolution(
     return _IrrepConvolution.apply(x, kernels, padding, bias, *kernels.weights(coefficients))
 
 
-class _Layout:
-    """How the images of a group of them lie in one row of pixels, with zeros between them.
-
-    A column of zeros ends each row of an image, and a row of zeros each image, if the convolution
-    is padded: one is enough for both neighbours.
-    """
-
-    def __init__(self, x: Tensor, kernels: IrrepKernels, padding: int) -> None:
-        self.kernels, self.padding = kernels, padding
-        self.fields = x.shape[1] // len(kernels.change)
-        self.output = tuple(size + 2 * padding - 2 for size in x.shape[2:])
-        self.rows, self.width = (size + padding for size in x.shape[2:])
-
-    def chunks(self, part: slice, out_fields: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Iterate over slices of images, with uninitialised tensors for maps and output.
-
-        These are [M, F, pixels] and [N, out, pixels]; the next slice uses the same memory.
-        """
-        area, kernels = self.rows * self.width, self.kernels
-        step = max(1, CHUNK_BYTES // (4 * kernels.maps * self.fields * area))
-        shapes = (kernels.maps, self.fields), (len(kernels.change), out_fields)
-        memory = [
-            torch.empty(math.prod(shape) * step * area, dtype=torch.float32, device="cpu")
-            for shape in shapes
-        ]
-        for start in range(part.start, part.stop, step):
-            stop = min(start + step, part.stop)
-            sizes = [(*shape, (stop - start) * area) for shape in shapes]
-            maps, out = (
-                values[: math.prod(size)].view(size)
-                for values, size in zip(memory, sizes, strict=True)
-            )
-            yield slice(start, stop), maps, out
-
-
 class _IrrepConvolution(torch.autograd.Function):
     """The convolution as a function of its input, the bias and the blocks' matrices."""
 
@@ -334,7 +296,8 @@ class _IrrepConvolution(torch.autograd.Function):
         x = x.contiguous()
         ctx.save_for_backward(x, *weights)
         ctx.kernels, ctx.padding = kernels, padding
-        layout, order = _Layout(x, kernels, padding), len(kernels.change)
+        order = len(kernels.change)
+        layout = Layout(x.shape, kernels.maps, order, padding)
         fields = weights[0].shape[0] // kernels.blocks[0].size
         y = x.new_empty(len(x), fields * order, *layout.output)
         source = x.unflatten(1, (-1, order)).numpy()
@@ -344,12 +307,12 @@ class _IrrepConvolution(torch.autograd.Function):
 
         @torch.no_grad()
         def compute(part: slice) -> None:
-            for chunk, maps, out in layout.chunks(part, fields):
-                kernels.gather(source[chunk], layout, maps)
+            for images, top, maps, out in layout.chunks(part, fields):
+                kernels.gather(source[images], padding, top, maps)
                 for block, weight in zip(kernels.blocks, weights, strict=True):
                     torch.mm(weight, block.read(maps), out=block.written(out))
                 irreps = out.flatten(0, 1).numpy()
-                to_elements(irreps, kernels.change, added, layout.width, target[chunk])
+                to_elements(irreps, kernels.change, added, layout.width, top, target[images])
 
         in_parts(len(x), compute)
         return y
@@ -359,28 +322,30 @@ class _IrrepConvolution(torch.autograd.Function):
         refuse_second_derivatives()
         x, *weights = ctx.saved_tensors
         kernels = ctx.kernels
-        layout, order = _Layout(x, kernels, ctx.padding), len(kernels.change)
+        order = len(kernels.change)
+        layout = Layout(x.shape, kernels.maps, order, ctx.padding)
         grad = grad.contiguous().unflatten(1, (-1, order))
         fields = grad.shape[1]
         source, arriving = x.unflatten(1, (-1, order)).numpy(), grad.numpy()
         needs_weights = any(ctx.needs_input_grad[4:])
         grad_bias = grad.sum((0, 3, 4)).flatten() if ctx.needs_input_grad[3] else None
-        grad_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        grad_x = torch.zeros_like(x) if ctx.needs_input_grad[0] else None
 
         @torch.no_grad()
         def compute(part: slice) -> list[Tensor]:
             totals = [torch.zeros_like(weight) for weight in weights]
-            for chunk, maps, out in layout.chunks(part, fields):
-                to_irreps(arriving[chunk], kernels.change, layout.width, out.flatten(0, 1).numpy())
+            for images, top, maps, out in layout.chunks(part, fields):
+                irreps = out.flatten(0, 1).numpy()
+                to_irreps(arriving[images], kernels.change, layout.width, top, irreps)
                 if needs_weights:
-                    kernels.gather(source[chunk], layout, maps)
+                    kernels.gather(source[images], ctx.padding, top, maps)
                     for block, total in zip(kernels.blocks, totals, strict=True):
                         total.addmm_(block.written(out), block.read(maps).t())
                 if grad_x is not None:
                     for block, weight in zip(kernels.blocks, weights, strict=True):
                         torch.mm(weight.t(), block.written(out), out=block.read(maps))
-                    target = grad_x[chunk].unflatten(1, (-1, order)).numpy()
-                    kernels.scatter(maps, layout, target)
+                    target = grad_x[images].unflatten(1, (-1, order)).numpy()
+                    kernels.scatter(maps, ctx.padding, top, target)
             return totals
 
         parts = in_parts(len(x), compute)

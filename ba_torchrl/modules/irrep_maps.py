@@ -1,6 +1,7 @@
 """Fixed linear maps of the neighbourhoods of regular fields, and changes of basis, compiled.
 
-The images of a group lie in one row of pixels, as `irrep_convolution` describes. A value is the
+The images of a group, or some rows of one image from the row ``top`` of the result on, lie in one
+row of pixels, as `irrep_convolution` describes. A value is the
 product of a component of a field in the basis of irreps with one of nine orthonormal patterns of a
 3x3 neighbourhood: the centre, then for the edges and for the corners the mean, two first harmonics
 and the second harmonic. A map is a sum of values.
@@ -151,12 +152,14 @@ def gather_maps(
     terms: np.ndarray,
     factors: np.ndarray,
     padding: int,
+    top: int,
     maps: np.ndarray,
 ) -> None:
-    """Compute maps [M * F, pixels] of fields [n, F, N, H, W]."""
+    """Compute maps [M * F, pixels] of fields [n, F, N, H, W], from the row ``top`` on."""
     count, number, order, rows, columns = fields.shape
     width, pixels = columns + padding, maps.shape[1]
-    area, lead = (rows + padding) * width, padding * (width + 1)
+    area, lead = pixels // count, padding * (width + 1) - top * width
+    upper, lower = max(0, top - padding), min(rows, top + area // width - padding + 2)
     size = pixels + 2 * width + 2
     raw, planes = np.zeros((order, size), np.float32), np.empty((order, size), np.float32)
     values = np.empty((9 * order, STRIP), np.float32)
@@ -167,7 +170,7 @@ def gather_maps(
     for f in range(number):
         for m in range(order):
             for n in range(count):
-                for y in range(rows):
+                for y in range(upper, lower):
                     begin = np.uintp(lead + n * area + y * width)
                     for x in range(np.uintp(columns)):
                         raw[m, begin + x] = fields[n, f, m, y, x]
@@ -199,15 +202,17 @@ def scatter_maps(
     terms: np.ndarray,
     factors: np.ndarray,
     padding: int,
+    top: int,
     fields: np.ndarray,
 ) -> None:
-    """Compute the gradient of fields [n, F, N, H, W] from that of their maps [M * F, pixels].
+    """Add the gradient of fields [n, F, N, H, W], from that of their maps [M * F, pixels].
 
     ``starts``, ``terms`` and ``factors`` list the maps of each value.
     """
     count, number, order, rows, columns = fields.shape
     width, pixels = columns + padding, maps.shape[1]
-    area, lead = (rows + padding) * width, padding * (width + 1)
+    area, lead = pixels // count, padding * (width + 1) - top * width
+    upper, lower = max(0, top - padding), min(rows, top + area // width - padding + 2)
     size, margin = pixels + 2 * width + 2, 2 * width + 2
     raw, planes = np.empty((1, size), np.float32), np.empty((order, size), np.float32)
     values = np.empty((9, pixels), np.float32)
@@ -245,10 +250,10 @@ def scatter_maps(
         for m in range(order):
             _sum(raw, 0, 0, planes, 0, size, matrix, every, order * m, order * m + order)
             for n in range(count):
-                for y in range(rows):
+                for y in range(upper, lower):
                     begin = np.uintp(lead + n * area + y * width)
                     for x in range(np.uintp(columns)):
-                        fields[n, f, m, y, x] = raw[0, begin + x]
+                        fields[n, f, m, y, x] += raw[0, begin + x]
 
 
 @_compiled
@@ -257,12 +262,14 @@ def to_elements(
     change: np.ndarray,
     bias: np.ndarray,
     width: int,
+    top: int,
     fields: np.ndarray,
 ) -> None:
-    """Change irreps [N * F, pixels] to fields [n, F, N, H, W], and add the bias [F, N]."""
+    """Change irreps [N * F, pixels] to rows of fields [n, F, N, H, W], and add the bias [F, N]."""
     count, number, order, rows, columns = fields.shape
     pixels = out.shape[1]
     area = pixels // count
+    lower = min(rows, top + area // width)
     plane = np.empty((1, pixels), np.float32)
     matrix, every = change.T.copy().ravel(), np.arange(order * order) % order
     for f in range(number):
@@ -271,8 +278,8 @@ def to_elements(
             _sum(plane, 0, 0, out, 0, pixels, matrix, places, order * m, order * m + order)
             added = bias[f, m]
             for n in range(count):
-                for y in range(rows):
-                    begin = np.uintp(n * area + y * width)
+                for y in range(top, lower):
+                    begin = np.uintp(n * area + (y - top) * width)
                     for x in range(np.uintp(columns)):
                         fields[n, f, m, y, x] = plane[0, begin + x] + added
 
@@ -282,19 +289,21 @@ def to_irreps(
     fields: np.ndarray,
     change: np.ndarray,
     width: int,
+    top: int,
     out: np.ndarray,
 ) -> None:
-    """Change fields [n, F, N, H, W] to irreps [N * F, pixels], zero beyond each image."""
+    """Change rows of fields [n, F, N, H, W] to irreps [N * F, pixels], zero beyond each image."""
     count, number, order, rows, columns = fields.shape
     pixels = out.shape[1]
     area = pixels // count
+    lower = min(rows, top + area // width)
     planes = np.zeros((order, pixels), np.float32)
     matrix, every = change.ravel(), np.arange(order * order) % order
     for f in range(number):
         for m in range(order):
             for n in range(count):
-                for y in range(rows):
-                    begin = np.uintp(n * area + y * width)
+                for y in range(top, lower):
+                    begin = np.uintp(n * area + (y - top) * width)
                     for x in range(np.uintp(columns)):
                         planes[m, begin + x] = fields[n, f, m, y, x]
         for a in range(order):

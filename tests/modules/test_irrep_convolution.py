@@ -10,8 +10,7 @@ import torch.nn.functional as F
 
 pytest.importorskip("escnn")
 
-from ba_torchrl.modules import cpu_threads
-from ba_torchrl.modules import irrep_convolution as module
+from ba_torchrl.modules import cpu_threads, irrep_chunks
 from ba_torchrl.modules.irrep_convolution import irrep_convolution, saves_time
 from ba_torchrl.modules.kernel_blocks import kernel_block, regular_irrep_kernels
 from ba_torchrl.modules.steerable import (
@@ -82,10 +81,21 @@ def test_equals_the_convolution_with_the_expanded_filter(group, padding, threads
 
 
 def test_images_are_computed_in_groups(monkeypatch, threads):
-    monkeypatch.setattr(module, "CHUNK_BYTES", 4 * 48 * 2 * 81 * 3)  # three images of 8 x 8
+    monkeypatch.setattr(irrep_chunks, "CHUNK_BYTES", 4 * 48 * 2 * 81 * 3)  # three images of 8 x 8
     check(planar_rotations(8), 2, 3, (8, 8), 1, batch=11)
-    monkeypatch.setattr(module, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(irrep_chunks, "CHUNK_BYTES", 1)
     check(planar_rotations(8), 2, 3, (8, 8), 1)
+
+
+@pytest.mark.parametrize("padding", [0, 1, 2])
+@pytest.mark.parametrize("rows", [1, 3, 4, 20])
+def test_rows_of_large_images_are_computed_in_groups(monkeypatch, rows, padding):
+    monkeypatch.setattr(irrep_chunks, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(irrep_chunks, "LEAST_ROWS", rows)
+    check(planar_rotations(4), 2, 3, (13, 9), padding)
+    layout = irrep_chunks.Layout((2, 8, 13, 9), maps=12, order=4, padding=padding)
+    tops = [chunk.top for chunk in layout.chunks(slice(0, 2), 3)]
+    assert tops == 2 * list(range(0, 13 + 2 * padding - 2, rows))
 
 
 def test_a_forked_process_starts_threads_of_its_own():
