@@ -59,10 +59,10 @@ class Layout:
             out_fields: number of output fields.
         """
         rows_that_fit = CHUNK_BYTES // (4 * self.maps * self.fields * self.width)
-        step, rows = max(1, rows_that_fit // self.rows), self.rows
-        tops = [0]
-        if rows_that_fit < self.rows:
-            rows = min(max(LEAST_ROWS, rows_that_fit), self.rows)
+        step, rows, tops = max(1, rows_that_fit // self.rows), self.rows, [0]
+        groups = self.output[0] // max(LEAST_ROWS, rows_that_fit)
+        if groups > 1:
+            rows = math.ceil(self.output[0] / groups)
             tops = list(range(0, self.output[0], rows))
         shapes = (self.maps, self.fields), (self.order, out_fields)
         memory = [

@@ -87,15 +87,24 @@ def test_images_are_computed_in_groups(monkeypatch, threads):
     check(planar_rotations(8), 2, 3, (8, 8), 1)
 
 
-@pytest.mark.parametrize("padding", [0, 1, 2])
-@pytest.mark.parametrize("rows", [1, 3, 4, 20])
-def test_rows_of_large_images_are_computed_in_groups(monkeypatch, rows, padding):
+@pytest.mark.parametrize(
+    ("least_rows", "padding", "tops"),
+    [
+        (1, 0, list(range(11))),
+        (3, 0, [0, 4, 8]),
+        (3, 1, [0, 4, 8, 12]),
+        (3, 2, [0, 3, 6, 9, 12]),
+        (5, 1, [0, 7]),
+        (7, 1, [0]),
+        (20, 2, [0]),
+    ],
+)
+def test_rows_of_large_images_are_computed_in_groups(monkeypatch, least_rows, padding, tops):
     monkeypatch.setattr(irrep_chunks, "CHUNK_BYTES", 1)
-    monkeypatch.setattr(irrep_chunks, "LEAST_ROWS", rows)
+    monkeypatch.setattr(irrep_chunks, "LEAST_ROWS", least_rows)
     check(planar_rotations(4), 2, 3, (13, 9), padding)
     layout = irrep_chunks.Layout((2, 8, 13, 9), maps=12, order=4, padding=padding)
-    tops = [chunk.top for chunk in layout.chunks(slice(0, 2), 3)]
-    assert tops == 2 * list(range(0, 13 + 2 * padding - 2, rows))
+    assert [chunk.top for chunk in layout.chunks(slice(0, 2), 3)] == 2 * tops
 
 
 def test_a_forked_process_starts_threads_of_its_own():
