@@ -29,4 +29,7 @@ def recipe(name, *overrides):
         HydraConfig.instance().set_config(settings)
         with open_dict(settings):
             del settings["hydra"]
-        module.main.__wrapped__(settings)
+        try:
+            module.main.__wrapped__(settings)
+        finally:
+            HydraConfig.instance().cfg = None

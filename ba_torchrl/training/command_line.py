@@ -102,6 +102,8 @@ def check_known(settings: DictConfig) -> None:
     Raises:
         ConfigError: a setting is unknown.
     """
+    if not HydraConfig.initialized():  # called from Python, without a command line
+        return
     started = HydraConfig.get()
     if not any(each.startswith("+") for each in started.overrides.task):
         return
