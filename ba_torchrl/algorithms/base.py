@@ -62,8 +62,8 @@ class Algorithm(ABC):
     exploration type RANDOM and is greedy under DETERMINISTIC."""
     updates: int = 0
     """Gradient updates so far."""
-    stores_expert_action: ClassVar[bool] = False
-    """Whether environments are made with ``expert=True`` and transitions have ``expert_action``."""
+    collects_expert_action: ClassVar[bool] = False
+    """Whether the expert's action is collected in every state that the policy visits."""
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the action nearest to a given one among those that the policy can choose.

@@ -107,21 +107,13 @@ class DAgger(ImitationLearning, Learner):
 
     config: DAggerConfig
     policy: MixedPolicy
-    stores_expert_action: ClassVar[bool] = True
+    collects_expert_action: ClassVar[bool] = True
 
     def __init__(self, config: DAggerConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)
         seed = problem.derived_seed(SeedUse.MIXTURE)
         self.policy = MixedPolicy(self.policy, self.imitator, seed).to(problem.device)
         self._set_beta()
-
-    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
-        """Return the transitions [N], with the expert's action in place of the executed one.
-
-        The loss reads states and labels only, not what followed.
-        """
-        transitions = super().to_transitions(data, is_expert=is_expert)
-        return transitions.set(keys.ACTION, transitions.pop(keys.EXPERT_ACTION))
 
     def update(self) -> TensorDict:
         """Take one step as `Learner.update`, and update beta.

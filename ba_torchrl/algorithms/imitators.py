@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -136,8 +136,17 @@ class ImitationLearning:
         """Return the nearest action that the policy can choose."""
         return self.imitator.nearest_action(action)
 
+    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+        """Return the transitions [N], with the expert's action in place of the executed one.
+
+        The loss reads states and labels only, not what followed.
+        """
+        transitions = super().to_transitions(data, is_expert=is_expert)
+        return transitions.set(keys.ACTION, transitions.pop(keys.EXPERT_ACTION))
+
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store the expert's steps of demonstrations, with actions that the policy can choose.
+        """Store the steps of demonstrations in which the expert's action is known, as an action
+        that the policy can choose.
 
         Args:
             episodes: TensorDicts [T].

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -137,6 +137,10 @@ class Learner(Algorithm):
         self.optimizer = self.make_optimizer()
         self.scheduler = self.make_scheduler()
 
+    stores_expert_action: ClassVar[bool] = True
+    """Whether stored transitions have ``expert_action``, the action that is imitated in
+    demonstrations, next to the executed one."""
+
     # -- parts -------------------------------------------------------------------------------
 
     @abstractmethod
@@ -169,7 +173,9 @@ class Learner(Algorithm):
             raise ConfigError(
                 f"init: {type(self).__name__} has no actor that behaviour cloning could initialise"
             )
-        return BehaviourCloningLoss(policy, "kl")
+        loss = BehaviourCloningLoss(policy, "kl")
+        loss.set_keys(action=keys.EXPERT_ACTION)
+        return loss
 
     def make_acting_transforms(self) -> Mapping[str, nn.Module]:
         """Return the transform of each image that the acting policy sees; by default its codec."""

@@ -206,6 +206,7 @@ class SAC(Learner):
             contrastive=self._make_contrastive(networks.encoder),
             contrastive_weight=config.contrastive_weight,
         )
+        loss.set_keys(expert_action=keys.EXPERT_ACTION)
         if not config.bootstrap_truncated:
             loss.set_keys(terminated=loss.tensor_keys.done)
         return loss.make_value_estimator(gamma=config.gamma)

@@ -88,6 +88,8 @@ class SpatialQ(Learner):
 
     config: SpatialQConfig
     loss: LevelDQNLoss
+    stores_expert_action: ClassVar[bool] = False
+    """The term on demonstrated actions is one of the values of executed actions."""
 
     def __init__(self, config: SpatialQConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)

@@ -52,17 +52,18 @@ def collect_demonstrations(
             reversed are dropped; all others succeed.
         only_successful: drop episodes that did not reach the goal.
         noise: probability of executing a random action in place of the expert's, for the source
-            "expert". The expert then acts from states that it does not reach by itself (DART:
-            Laskey et al., 2017). If it is positive, the entry ``is_expert`` [T, 1] tells which
-            actions are the expert's.
+            "expert". The expert is then seen in states that it does not reach by itself (DART:
+            Laskey et al., 2017).
         turn_noise: probability of random turns beside the expert's other components, likewise.
         turns: indices of the components that turn the gripper, see `turn_components`.
-        nearest_action: maps the expert's action to the action that is executed and recorded. A
-            policy with discrete actions needs it; None for the expert's own action.
+        nearest_action: maps the expert's and the random actions to those that are executed and
+            recorded. A policy with discrete actions needs it; None for the identity.
         on_episode: called with each episode when it ends, for progress bars.
 
     Returns:
-        Episodes as TensorDicts [T], with the entries of an environment without ``expert``.
+        Episodes as TensorDicts [T], with the entries of an environment without ``expert``. With
+        noise of either kind, ``is_expert`` [T, 1] tells which executed actions are the expert's, and
+        ``expert_action`` [T, A] is the expert's in every state.
 
     Raises:
         ConfigError: the source is unknown or cannot have noise, the noise is no probability, or
@@ -83,14 +84,16 @@ def collect_demonstrations(
         if add_noise is not None:
             out = add_noise(out)
         if nearest_action is not None:
-            out.set(keys.ACTION, nearest_action(out[keys.ACTION]))
+            for key in (keys.ACTION, keys.EXPERT_ACTION):
+                out.set(key, nearest_action(out[key]))
         return out
 
     played = collect_episodes(env, policy, episodes, seed=seed, on_episode=on_episode)
     if source == "deconstruction":
         return [reverse_episode(episode) for episode in played if is_reversible(episode)]
+    same_action = () if add_noise is not None else (keys.EXPERT_ACTION,)
     return [
-        episode.exclude(keys.EXPERT_ACTION, (keys.NEXT, keys.EXPERT_ACTION))
+        episode.exclude(*same_action, (keys.NEXT, keys.EXPERT_ACTION))
         for episode in played
         if is_success(episode) or not only_successful
     ]

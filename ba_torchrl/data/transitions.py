@@ -22,10 +22,9 @@ def as_transitions(
     Args:
         tensordict: transitions of any batch shape.
         images: keys of the images to store.
-        is_expert: whether the transitions are demonstrations; those whose entry ``is_expert`` is
-            False, if there is one, are not.
-        expert_action: also store ``expert_action``; for demonstrations without it, a copy of the
-            action.
+        is_expert: whether the transitions are demonstrations. Those whose entry ``is_expert`` is
+            False are not, unless the expert's action in their state is known and stored.
+        expert_action: also store ``expert_action``; a copy of the action where it is not known.
 
     Raises:
         KeyError: an entry is missing.
@@ -34,10 +33,10 @@ def as_transitions(
     state = [*images, keys.HOLDING]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
     out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))
+    is_labelled = expert_action and keys.EXPERT_ACTION in flat
     out[keys.IS_EXPERT] = torch.full((len(flat), 1), is_expert)
-    if is_expert and keys.IS_EXPERT in flat:
+    if is_expert and not is_labelled and keys.IS_EXPERT in flat:
         out[keys.IS_EXPERT] = flat[keys.IS_EXPERT].clone()
     if expert_action:
-        is_missing = is_expert and keys.EXPERT_ACTION not in flat
-        out[keys.EXPERT_ACTION] = flat[keys.ACTION if is_missing else keys.EXPERT_ACTION].clone()
+        out[keys.EXPERT_ACTION] = flat[keys.EXPERT_ACTION if is_labelled else keys.ACTION].clone()
     return out

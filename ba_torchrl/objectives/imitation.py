@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
@@ -55,6 +57,15 @@ class BehaviourCloningLoss(LossModule):
         distance: of actions.
     """
 
+    @dataclass
+    class _AcceptedKeys:
+        """Entries that ``set_keys`` can rename."""
+
+        action: NestedKey = keys.ACTION
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
@@ -67,7 +78,11 @@ class BehaviourCloningLoss(LossModule):
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
         self.distance: ActionDistance = distance
-        self.in_keys = [*actor_network.in_keys, keys.ACTION]
+        self._forward_value_estimator_keys()
+
+    def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
+        """Recompute `in_keys`; the loss has no value estimator."""
+        self.in_keys = [*self.actor_network.in_keys, self.tensor_keys.action]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_bc``.
@@ -79,7 +94,7 @@ class BehaviourCloningLoss(LossModule):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             observation = tensordict.select(*self.actor_network.in_keys)
             sample = self.actor_network.get_dist(observation).rsample()
-        action = tensordict[keys.ACTION]
+        action = tensordict[self.tensor_keys.action]
         if sample.ndim > action.ndim:
             action = action.unsqueeze(-2).expand_as(sample)
         return TensorDict({"loss_bc": action_distance(sample, action, self.distance).mean()})

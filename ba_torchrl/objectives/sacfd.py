@@ -35,11 +35,13 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         y_i         = r_i + gamma (1 - terminated_i) (min_k q'_k(s'_i, a') - alpha log pi(a'|s'_i))
         loss_qvalue = sum_k mean_i u_i (q_k(s_i, a_i) - y_i)^2
         loss_actor  = mean_i v_i (alpha log pi(a | s_i) - min_k q_k(s_i, a)) + demonstration_weight
-                      * mean over experts of w_i d(a, a_i)
+                      * mean over demonstrations of w_i d(a, e_i)
         loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
-    d(a, a_i) is the mean over components of (a - a_i)^2, or another `action_distance`. Without
-    ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
+    e_i is the expert's action in s_i, by default a_i; ``set_keys(expert_action=...)`` names its entry
+    where the executed action may be another. d(a, e_i) is the mean over components of (a - e_i)^2,
+    or another `action_distance`. Without ``entropy_backup``, y_i has no term in alpha (Ball et al.,
+    2023).
 
     u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
     "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are
@@ -92,6 +94,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
         is_expert: NestedKey = keys.IS_EXPERT
+        expert_action: NestedKey = keys.ACTION
         state_action_value: NestedKey = "state_action_value"
         value: NestedKey = "state_value"
         priority: NestedKey = keys.TD_ERROR
@@ -180,12 +183,12 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
 
     def _required_keys(self) -> list[NestedKey]:
         observation = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
-        names = self._transition_keys(observation)
+        names = [*self._transition_keys(observation), self.tensor_keys.expert_action]
         if self._needs_expert_flag:
             names.append(self.tensor_keys.is_expert)
         if self.contrastive is not None:
             names += [(keys.POSITIVE, *_as_path(key)) for key in self.encoder_network.in_keys]
-        return names
+        return list(dict.fromkeys(names))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -225,8 +228,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
         policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
         is_expert = self._expert_flag(tensordict)
-        distance = action_distance(sample, action, self.demonstration_distance)
-        error = self._over_views(distance)
+        error = self._demonstration_error(tensordict, sample)
         demonstration = reduce_over(weighted(error, weights.of("all")), is_expert, self.reduction)
         policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
         loss_actor = policy_term + self.demonstration_weight * demonstration
@@ -300,6 +302,12 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
     def _over_views(self, losses: Tensor) -> Tensor:
         """Return the losses of samples [..., B], means over those of their views."""
         return losses.mean(dim=-1) if self.views > 1 else losses
+
+    def _demonstration_error(self, tensordict: TensorDictBase, sample: Tensor) -> Tensor:
+        """Return the distance [..., B] of drawn actions from the expert's."""
+        expert_action = self._for_views(tensordict[self.tensor_keys.expert_action])
+        distance = action_distance(sample, expert_action, self.demonstration_distance)
+        return self._over_views(distance)
 
     def _expert_flag(self, tensordict: TensorDictBase) -> Tensor:
         """Return the flag of demonstrations, bool [..., B]; False for plain SAC without it.

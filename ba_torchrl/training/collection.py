@@ -68,7 +68,7 @@ def start_collection(
         device=config.torch_device,
         num_envs=config.num_envs,
         seed=seed,
-        make_env=partial(_make_some_envs, values, algorithm.stores_expert_action),
+        make_env=partial(_make_some_envs, values, algorithm.collects_expert_action),
         make_policy=partial(_make_policy, values),
         start_method=config.start_method,
         max_restarts=config.max_restarts,

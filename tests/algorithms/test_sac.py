@@ -37,7 +37,9 @@ def demonstrations():
     env = ba_torchrl.make_vector_env(TASK, 2, parallel=False, expert=True, obs_size=64, seed=0)
     episodes = collect_demonstrations(env, 6, seed=0)
     env.close()
-    return torch.cat([as_transitions(episode, ["pixels"], is_expert=True) for episode in episodes])
+    return torch.cat(
+        [as_transitions(each, ["pixels"], is_expert=True, expert_action=True) for each in episodes]
+    )
 
 
 @pytest.mark.parametrize("network", ["cnn", "equi"])

@@ -10,7 +10,7 @@ from tests.algorithms.tiny import build, make_experiment, transitions
 
 def collected(learner, done, success):
     """A step of two environments that begin an episode or are in its second step."""
-    data = transitions(learner, 2).exclude(keys.IS_EXPERT)
+    data = transitions(learner, 2).exclude(keys.IS_EXPERT, keys.EXPERT_ACTION)
     data[keys.ENV_INDEX] = torch.arange(2)
     data[keys.STEP_COUNT] = torch.tensor([[0], [1]])
     data[keys.FAULT] = torch.zeros(2, 1, dtype=torch.bool)

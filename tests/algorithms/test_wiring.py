@@ -113,8 +113,11 @@ def transitions(algorithm, count=24):
         **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
     }
     is_expert = torch.arange(count)[:, None] % 2 == 0
+    actions = {keys.ACTION: action}
+    if algorithm.stores_expert_action:
+        actions[keys.EXPERT_ACTION] = action.clone()
     return TensorDict(
-        {**state(), keys.ACTION: action, keys.IS_EXPERT: is_expert, keys.NEXT: following}, [count]
+        {**state(), **actions, keys.IS_EXPERT: is_expert, keys.NEXT: following}, [count]
     )
 
 

@@ -68,9 +68,11 @@ def transitions(learner, count=24):
         keys.REWARD: rand(1),
         **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
     }
+    action = 1.8 * rand(learner.problem.actions.size) - 0.9
     data = {
         **state(),
-        keys.ACTION: 1.8 * rand(learner.problem.actions.size) - 0.9,
+        keys.ACTION: action,
+        **({keys.EXPERT_ACTION: action.clone()} if learner.stores_expert_action else {}),
         keys.IS_EXPERT: torch.arange(count)[:, None] % 2 == 0,
         keys.NEXT: following,
     }

@@ -158,7 +158,8 @@ class SO2Augmentation(nn.Module):
         """Return a copy of a batch of transitions [B] with some of them rotated.
 
         Args:
-            tensordict: holds the images, their successors and ``action``.
+            tensordict: holds the images, their successors, ``action`` and, if there is one,
+                ``expert_action``.
         """
         (batch,) = tensordict.batch_size
         draws = torch.rand(2, batch, generator=self._generator, dtype=torch.float64)
@@ -167,13 +168,15 @@ class SO2Augmentation(nn.Module):
         out = tensordict.copy()
         if not len(chosen):
             return out
-        action = tensordict[keys.ACTION].clone()
         for key in self._scene_images:
             map_pairs(out, key, chosen, lambda images: rotate_images(images, angle))
-        rows = to_device(chosen, action.device)[:, None]
-        plane = to_device(torch.tensor(self._plane), action.device)
-        action[rows, plane] = rotate_displacement(action[rows, plane], angle)
-        return out.set(keys.ACTION, action)
+        for key in tensordict.keys() & {keys.ACTION, keys.EXPERT_ACTION}:
+            action = tensordict[key].clone()
+            rows = to_device(chosen, action.device)[:, None]
+            plane = to_device(torch.tensor(self._plane), action.device)
+            action[rows, plane] = rotate_displacement(action[rows, plane], angle)
+            out.set(key, action)
+        return out
 
     def get_extra_state(self) -> Tensor:
         """Return the generator's state, so that a checkpoint continues the same draws."""

@@ -47,7 +47,7 @@ class BehaviourCloningConfig(LearnerConfig):
 class BehaviourCloning(Learner):
     """Training of a policy by regression, with every other part of `Learner`."""
 
-    stores_expert_action = True
+    collects_expert_action = True
 
     def make_networks(self, network):
         """Return the actor of an actor-critic network."""
