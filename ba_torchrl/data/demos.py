@@ -62,8 +62,8 @@ def collect_demonstrations(
 
     Returns:
         Episodes as TensorDicts [T], with the entries of an environment without ``expert``. With
-        noise of either kind, ``is_expert`` [T, 1] tells which executed actions are the expert's, and
-        ``expert_action`` [T, A] is the expert's in every state.
+        noise of either kind, ``is_expert`` [T, 1] tells which executed actions are the expert's,
+        and ``expert_action`` [T, A] is the expert's in every state.
 
     Raises:
         ConfigError: the source is unknown or cannot have noise, the noise is no probability, or

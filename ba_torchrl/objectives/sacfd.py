@@ -38,10 +38,9 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                       * mean over demonstrations of w_i d(a, e_i)
         loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
-    e_i is the expert's action in s_i, by default a_i; ``set_keys(expert_action=...)`` names its entry
-    where the executed action may be another. d(a, e_i) is the mean over components of (a - e_i)^2,
-    or another `action_distance`. Without ``entropy_backup``, y_i has no term in alpha (Ball et al.,
-    2023).
+    e_i is the expert's action in s_i: a_i, unless ``set_keys(expert_action=...)`` names another
+    entry. d(a, e_i) is the mean over components of (a - e_i)^2, or another `action_distance`.
+    Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
 
     u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
     "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are

@@ -124,18 +124,26 @@ def test_any_actor_is_initialised_and_nothing_else(name):
     ],
     ids=["close_loop", "open_loop", "initialisation"],
 )
-def test_random_actions_of_demonstrations_are_not_imitated(tmp_path, network, algorithm, changes):
+def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
+    tmp_path, network, algorithm, changes
+):
     settings = {"total_updates": 2, "eval_every": 2, **changes, "demonstrations_noise": 0.5}
     made = make_experiment(tmp_path, network, algorithm, **settings)
     learner, imitated, episodes = made.algorithm, [], []
     loss = learner.init_loss or learner.loss
-    loss.register_forward_pre_hook(lambda _, args: imitated.append(args[0][keys.IS_EXPERT].clone()))
+    key = loss.tensor_keys.action if learner.init_loss else keys.ACTION
+    loss.register_forward_pre_hook(lambda _, args: imitated.append(args[0][key].clone()))
     store = learner.on_demonstrations
     learner.on_demonstrations = lambda each: (episodes.extend(each), store(each))
     made.run()
-    assert not all(episode[keys.IS_EXPERT].all() for episode in episodes)
-    assert imitated
-    assert all(len(flags) and flags.all() for flags in imitated)
+    played = torch.cat(episodes)
+    assert not played[keys.IS_EXPERT].all()
+    stored = learner.replay.storage[: len(played)]
+    assert stored[keys.IS_EXPERT].all()
+    torch.testing.assert_close(stored[key], played[keys.EXPERT_ACTION])
+    assert len(imitated) == (1 if learner.init_loss else 2)
+    for label in torch.cat(imitated):
+        assert (stored[key] == label).all(dim=-1).any()
 
 
 def demonstration_error(learner):

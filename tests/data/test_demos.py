@@ -132,7 +132,11 @@ def noisy():
 
 def test_random_actions_of_a_demonstration_are_flagged(noisy):
     episodes, played, _ = noisy
-    steps = torch.cat(played)
+    steps = torch.cat(episodes)
+    labels = [episode[keys.EXPERT_ACTION] for episode in played]
+    for episode in episodes:
+        assert any(torch.equal(episode[keys.EXPERT_ACTION], label) for label in labels)
+    assert keys.EXPERT_ACTION not in steps[keys.NEXT]
     is_expert = steps[keys.IS_EXPERT].squeeze(-1)
     same = (steps[keys.ACTION] == steps[keys.EXPERT_ACTION]).all(dim=-1)
     assert torch.equal(same, is_expert)
@@ -141,7 +145,6 @@ def test_random_actions_of_a_demonstration_are_flagged(noisy):
     assert drawn.min() < -0.8
     assert drawn.max() > 0.8
     assert drawn.abs().max() <= 1
-    assert sum(map(len, episodes)) == len(steps)
 
 
 def test_the_expert_recovers_from_random_actions(noisy):
@@ -164,6 +167,30 @@ def test_flags_are_those_of_the_transitions_and_of_a_file(noisy, tmp_path):
         for each in (episode, other):
             stored = as_transitions(each, [keys.PIXELS], is_expert=True)
             assert torch.equal(stored[keys.IS_EXPERT], episode[keys.IS_EXPERT])
+            assert keys.EXPERT_ACTION not in stored
+            labelled = as_transitions(each, [keys.PIXELS], is_expert=True, expert_action=True)
+            assert labelled[keys.IS_EXPERT].all()
+            assert torch.equal(labelled[keys.EXPERT_ACTION], episode[keys.EXPERT_ACTION])
+            assert torch.equal(labelled[keys.ACTION], episode[keys.ACTION])
+
+
+def test_without_labels_only_the_steps_of_the_expert_are_imitated(noisy):
+    episode = noisy[0][0].exclude(keys.EXPERT_ACTION)
+    stored = as_transitions(episode, [keys.PIXELS], is_expert=True, expert_action=True)
+    assert torch.equal(stored[keys.IS_EXPERT], episode[keys.IS_EXPERT])
+    assert torch.equal(stored[keys.EXPERT_ACTION], episode[keys.ACTION])
+
+
+def test_labels_of_demonstrations_are_actions_that_the_policy_can_choose():
+    env = ba_torchrl.make_vector_env(
+        NOISY_TASK, 2, parallel=False, seed=0, obs_size=32, expert=True
+    )
+    episodes = collect_demonstrations(env, 2, seed=0, noise=0.3, nearest_action=torch.round)
+    env.close()
+    steps = torch.cat(episodes)
+    for key in (keys.ACTION, keys.EXPERT_ACTION):
+        assert torch.equal(steps[key], steps[key].round())
+    assert not torch.equal(steps[keys.ACTION], steps[keys.EXPERT_ACTION])
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])

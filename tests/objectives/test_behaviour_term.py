@@ -47,3 +47,18 @@ def test_the_term_with_the_divergence_of_actions():
     assert difference.item() == pytest.approx(
         0.3 * (weights * distances)[flags].mean().item(), rel=1e-5
     )
+
+
+def test_the_term_is_against_the_entry_of_the_expert():
+    data, executed = batch(EXPERTS), batch(EXPERTS)
+    data["label"] = data[keys.ACTION].clone()
+    data[keys.ACTION] = -data[keys.ACTION] / 3  # what was executed in place of the expert's action
+    loss = make(demonstration_weight=0.3)
+    loss.set_keys(expert_action="label")
+    assert {"label", keys.ACTION} <= set(loss.in_keys)
+    found, expected = loss(data), make(demonstration_weight=0.3)(executed)
+    for name in ("loss_actor", "demonstration_error", "entropy"):
+        torch.testing.assert_close(found[name], expected[name])
+    assert not torch.allclose(found["loss_qvalue"], expected["loss_qvalue"])
+    with pytest.raises(KeyError, match="label"):
+        loss(data.exclude("label"))
