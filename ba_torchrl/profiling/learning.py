@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.acting import constant_weights
+from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.precision import network_dtype
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.buffer import FrameStorage
@@ -89,6 +90,23 @@ def _expert_episodes(
     return high, played
 
 
+def make_learner(
+    experiment: dict[str, Any], network: dict[str, Any], obs_size: int, device: torch.device
+) -> Learner:
+    """Return a learner with the expert's transitions in its replay.
+
+    Args:
+        experiment: task, algorithm and fields of the environment.
+        network: its name and parameters.
+        obs_size: pixels of the images.
+        device: of the learner.
+    """
+    config = _config(experiment, network, obs_size, device)
+    learner = build_algorithm(config)
+    learner.on_demonstrations(_expert_episodes(config.task, 20, config.env)[1])
+    return learner
+
+
 def measure_update(
     bench: Bench,
     work: str,
@@ -99,8 +117,7 @@ def measure_update(
 ) -> list[Row]:
     """Return the row of a learner's updates, with the expert's transitions in its replay."""
     config = _config(experiment, network, obs_size, bench.device)
-    learner = build_algorithm(config)
-    learner.on_demonstrations(_expert_episodes(config.task, 20, config.env)[1])
+    learner = make_learner(experiment, network, obs_size, bench.device)
     product = MatrixProduct(network_dtype(config.network_config, bench.device), bench.device)
     multiply_adds = count_multiply_adds(learner.update)
     times = bench.time_against(

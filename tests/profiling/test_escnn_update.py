@@ -1,0 +1,138 @@
+"""The update with escnn's layers, against which updates are measured."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from tqdm import tqdm
+
+from ba_torchrl.envs import keys
+from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
+from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
+from ba_torchrl.objectives.sacfd import SACfDLoss
+from ba_torchrl.profiling.table import Bench
+from tests.specs import close_loop_images
+
+pytest.importorskip("escnn")
+
+from ba_torchrl.profiling import escnn_update
+
+PIXELS = 64
+
+
+@pytest.fixture
+def escnn():
+    torch.manual_seed(0)
+    return escnn_update.EscnnSACfD(4, PIXELS, 4)
+
+
+def batch(count=6):
+    generator = torch.Generator().manual_seed(0)
+
+    def rand(*shape):
+        return torch.rand(count, *shape, generator=generator)
+
+    def state():
+        return {keys.PIXELS: 0.3 * rand(1, PIXELS, PIXELS), keys.HOLDING: rand(1) < 0.5}
+
+    ended = rand(1) < 0.5
+    ends = {keys.REWARD: rand(1), keys.DONE: ended, keys.TERMINATED: ended}
+    data = {
+        **state(),
+        keys.ACTION: 1.8 * rand(5) - 0.9,
+        keys.IS_EXPERT: torch.arange(count)[:, None] % 2 == 0,
+        keys.NEXT: {**state(), **ends},
+    }
+    return TensorDict(data, [count])
+
+
+class Features(nn.Module):
+    """The features of a critic's trunk, for a loss that shares them between its terms."""
+
+    def __init__(self, critic):
+        super().__init__()
+        self.trunk = critic.trunk
+
+    def forward(self, pixels, holding):
+        return self.trunk(pixels, holding).flatten(1)
+
+
+class Heads(nn.Module):
+    """The value heads of a critic on its features."""
+
+    def __init__(self, critic):
+        super().__init__()
+        self.critic = critic
+        self.critic.trunk = nn.Identity()
+
+    def forward(self, features, action):
+        self.critic.trunk.forward = lambda *_: features[..., None, None]
+        return self.critic(None, None, action)
+
+
+def test_network_and_losses_are_those_of_sacfd(escnn):
+    ours = NETWORKS["equi"](n_hidden=4, group_order=4, precision="float32").build(
+        ActorCriticSpec(close_loop_images(PIXELS), "pxyzr")
+    )
+    for found, expected in (
+        (escnn.actor, [ours.actor]),
+        (escnn.critic, [ours.encoder, ours.critic]),
+    ):
+        counts = [p.numel() for module in expected for p in module.parameters()]
+        assert sum(p.numel() for p in found.parameters()) == sum(counts)
+
+    data = batch()
+    torch.manual_seed(5)
+    qvalue = escnn.qvalue_loss(data)
+    actor, log_prob = escnn.actor_loss(data)
+    features = Features(escnn.critic)
+    observation = [keys.PIXELS, keys.HOLDING]
+    loss = SACfDLoss(
+        squashed_gaussian_policy(escnn.actor, observation),
+        TensorDictModule(features, observation, ["features"]),
+        TensorDictModule(Heads(escnn.critic), ["features", keys.ACTION], ["state_action_value"]),
+    )
+    loss.make_value_estimator(gamma=0.99)
+    torch.manual_seed(5)
+    expected = loss(data)
+    torch.testing.assert_close(qvalue, expected["loss_qvalue"], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(actor, expected["loss_actor"], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(-log_prob.mean(), expected["entropy"], rtol=1e-4, atol=1e-6)
+
+
+def test_an_update_changes_every_network(escnn):
+    modules = {"actor": escnn.actor, "critic": escnn.critic, "target": escnn.target}
+    before = {name: [p.clone() for p in each.parameters()] for name, each in modules.items()}
+    temperature = float(escnn.log_alpha)
+    losses = escnn.update(batch())
+    assert all(torch.isfinite(value) for value in losses)
+    for name, module in modules.items():
+        pairs = zip(module.parameters(), before[name], strict=True)
+        assert any(not torch.equal(new, old) for new, old in pairs)
+    for target, new, old in zip(
+        escnn.target.parameters(), escnn.critic.parameters(), before["target"], strict=True
+    ):
+        torch.testing.assert_close(target, old + 0.01 * (new - old))
+    assert float(escnn.log_alpha) != temperature
+
+
+def test_both_updates_are_measured(monkeypatch):
+    monkeypatch.setattr(escnn_update, "LearningUnit", lambda _: lambda: None)
+    small = {"name": "equi", "group_order": 4, "n_hidden": 4}
+    make = escnn_update.make_learner
+    experiment = {
+        "task": "close_loop/block_reaching",
+        "algorithm": {"name": "sac", "batch_size": 2},
+    }
+    monkeypatch.setattr(
+        escnn_update,
+        "make_learner",
+        lambda *_: make(experiment, small, PIXELS, torch.device("cpu")),
+    )
+    monkeypatch.setattr(escnn_update, "SIZE", (4, PIXELS, 4))
+    with tqdm(disable=True) as bar:
+        first, second = escnn_update.measure_escnn(Bench(1, bar))
+    assert second.work == f"{first.work}, escnn's layers"
+    assert first.values[0] > 0
+    assert second.values[0] > 0
