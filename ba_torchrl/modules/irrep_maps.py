@@ -1,10 +1,10 @@
 """Fixed linear maps of the neighbourhoods of regular fields, and changes of basis, compiled.
 
 The images of a group, or some rows of one image from the row ``top`` of the result on, lie in one
-row of pixels, as `irrep_convolution` describes. A value is the
-product of a component of a field in the basis of irreps with one of nine orthonormal patterns of a
-3x3 neighbourhood: the centre, then for the edges and for the corners the mean, two first harmonics
-and the second harmonic. A map is a sum of values.
+row of pixels, as `irrep_convolution` describes. A value is the product of a component of a field in
+the basis of irreps with one of nine orthonormal patterns of a 3x3 neighbourhood: the centre, then
+for the edges and for the corners the mean, two first harmonics and the second harmonic. A map is a
+sum of values.
 """
 
 from __future__ import annotations
