@@ -21,7 +21,7 @@ EXTRA = {
     "data": {"__init__"},
     "algorithms": {"__init__", "modules", "objectives"},
     "training": {"__init__", "record"},
-    "profiling": {"__init__", "record", "modules"},
+    "profiling": {"__init__", "record", "modules", "objectives"},
     "recipes": {"__init__", "record"},
 }
 SHARED = {"_malloc"}

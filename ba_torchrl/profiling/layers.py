@@ -12,6 +12,7 @@ from ba_torchrl.modules.irrep_convolution import irrep_convolution
 from ba_torchrl.modules.kernel_blocks import regular_irrep_kernels
 from ba_torchrl.modules.max_pool import relu_of_max_pool
 from ba_torchrl.modules.steerable import SteerableConv2d, planar_rotations
+from ba_torchrl.objectives.dqn import strict_large_margin
 from ba_torchrl.profiling.learning import LearningUnit
 from ba_torchrl.profiling.table import Bench, Row, measurement, timed_row
 
@@ -19,6 +20,9 @@ BATCH = 64
 FIELDS = ((8, 16, 32), (16, 32, 16), (16, 32, 32), (64, 128, 8), (128, 64, 8))
 """Input fields, output fields and pixels of steerable convolutions in two actor-critics."""
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
+MARGIN_VALUES = 128 * 128 * 16
+"""Pixels times rotations."""
+MARGIN = 0.1
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -67,14 +71,41 @@ def measure_steerable(bench: Bench, in_fields: int, out_fields: int, pixels: int
 
 @measurement("learning/max_pool", over=lambda: [(layout,) for layout in LAYOUTS])
 def measure_max_pool(bench: Bench, layout: str) -> list[Row]:
-    """ReLU of the 2x2 max pool by PyTorch's functions and in one pass."""
+    """ReLU of the 2x2 max pool by PyTorch's functions and in one pass, also with a slope."""
     x = torch.randn(BATCH, 128, 64, 64, device=bench.device).to(memory_format=LAYOUTS[layout])
     name = f"ReLU of max pool, 128 channels, 64 px, batch {BATCH}, {layout}"
     calls = {
         f"{name}, PyTorch": _with_gradient(lambda x: F.relu(F.max_pool2d(x, 2)), x),
         f"{name}, one pass": _with_gradient(relu_of_max_pool, x),
+        f"{name}, one pass, slope 0.1": _with_gradient(lambda x: relu_of_max_pool(x, 0.1), x),
     }
     return _rows(bench, calls)
+
+
+@measurement("learning/margin")
+def measure_margin(bench: Bench) -> list[Row]:
+    """SDQfD's margin of 16 samples, of which half are demonstrations."""
+    values, experts = MARGIN_VALUES, slice(0, 8)
+    q = torch.randn(16, values, device=bench.device)
+    chosen = torch.randint(values, (16,), device=bench.device)
+
+    def loop(q: Tensor) -> Tensor:
+        losses = []
+        for of_sample, number in zip(q[experts], chosen[experts], strict=True):
+            gap = of_sample - of_sample[number] + MARGIN
+            violating = (gap > 0).scatter(0, number, False)
+            losses.append(gap[violating].mean() if violating.any() else 0 * of_sample.sum())
+        return torch.stack(losses)
+
+    name = f"SDQfD's margin, 16 x {values} values"
+    calls = {
+        f"{name}, all samples": lambda q: strict_large_margin(q, chosen, MARGIN),
+        f"{name}, 8 demonstrations": lambda q: strict_large_margin(
+            q[experts], chosen[experts], MARGIN
+        ),
+        f"{name}, 8 demonstrations in a loop": loop,
+    }
+    return _rows(bench, {work: _with_gradient(call, q) for work, call in calls.items()})
 
 
 @measurement("learning/convolution_dtype")
