@@ -6,7 +6,8 @@ from typing import ClassVar, Literal
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.imitators import ImitationLearning
-from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.learner import Learner
+from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.modules.base import NetworkConfig
 
 

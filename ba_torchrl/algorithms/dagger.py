@@ -18,7 +18,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.imitators import ImitationLearning, Imitator
-from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.learner import Learner
+from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import NetworkConfig

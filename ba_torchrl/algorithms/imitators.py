@@ -136,13 +136,24 @@ class ImitationLearning:
         """Return the nearest action that the policy can choose."""
         return self.imitator.nearest_action(action)
 
+    @property
+    def has_expert_action(self) -> bool:
+        """False: the expert's action is stored as ``action``."""
+        return False
+
     def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
         """Return the transitions [N], with the expert's action in place of the executed one.
 
-        The loss reads states and labels only, not what followed.
+        The loss reads states and labels only, not what followed. Demonstrations without
+        ``expert_action`` keep the executed action.
+
+        Raises:
+            KeyError: collected data lack ``expert_action``.
         """
-        transitions = super().to_transitions(data, is_expert=is_expert)
-        return transitions.set(keys.ACTION, transitions.pop(keys.EXPERT_ACTION))
+        if not is_expert or keys.EXPERT_ACTION in data:
+            labels = data[keys.EXPERT_ACTION]
+            data = data.exclude(keys.EXPERT_ACTION, keys.IS_EXPERT).set(keys.ACTION, labels)
+        return super().to_transitions(data, is_expert=is_expert)
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
         """Store the steps of demonstrations in which the expert's action is known, as an action

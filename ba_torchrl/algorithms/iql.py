@@ -17,7 +17,8 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.learner import Learner
+from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.gaussian_policy import truncated_gaussian_policy

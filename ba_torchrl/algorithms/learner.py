@@ -6,10 +6,9 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
-from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
@@ -20,68 +19,18 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from ba_torchrl.algorithms.acting import ActingPolicy
-from ba_torchrl.algorithms.base import Algorithm, AlgorithmConfig, NetworkConfig, Problem
+from ba_torchrl.algorithms.base import Algorithm, NetworkConfig, Problem
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
+from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.replay.codecs import make_codecs
-from ba_torchrl.data.replay.make import ReplayKind, make_replay
+from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device, decoded_on_device, to_device
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
-
-Init = Literal["random", "bc"]
-"""How the policy is initialised."""
-
-
-class LearnerConfig(AlgorithmConfig):
-    """Hyper-parameters of every algorithm that learns from a replay."""
-
-    learning_rate: float = Field(default=1e-3, gt=0, le=1e3)
-    """Learning rate of Adam."""
-    learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
-    """Final fraction of the learning rate, which decreases linearly over the run."""
-    weight_decay: float = Field(default=0.0, ge=0)
-    """Adam's L2 term on the networks' parameters."""
-    gradient_clamp: float | None = Field(default=None, gt=0)
-    """Bound of each element of the networks' gradient; None for no bound."""
-    policy_average: float = Field(default=0.0, ge=0, lt=1)
-    """Decay of the exponential moving average of the policy's parameters with which the policy
-    acts; 0 for acting with the last parameters. None in the appendix."""
-    batch_size: int = Field(default=64, ge=1)
-    """Transitions per update."""
-    replay: ReplayKind = "uniform"
-    """Sampling of transitions: "uniform", "prioritized" or "symmetric"."""
-    buffer_size: int = Field(default=100_000, ge=1)
-    """Transitions in the replay; in each half of a symmetric one."""
-    priority_exponent: float = Field(default=0.6, ge=0)
-    """Exponent alpha of the priorities of a prioritised replay."""
-    importance_exponent: float = Field(default=0.4, ge=0, le=1)
-    """Initial exponent beta of the importance weights, which increases to 1 over the run; with 0,
-    the weights are 1 throughout."""
-    importance_weighted: WeightedTerms = "critic_and_policy"
-    """Terms of the loss that the importance weights multiply: "none", "critic",
-    "critic_and_policy", or "all", which adds those on demonstrations and the temperature."""
-    importance_norm: WeightNorm = "max"
-    """Statistic of a batch by which its importance weights are divided: "max" or "mean"."""
-    expert_bonus: float = Field(default=1.0, ge=0)
-    """Added to the priority of demonstrations."""
-    init: Init = "random"
-    """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
-    updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
-
-    @property
-    def pretraining_option(self) -> str | None:
-        """As for `AlgorithmConfig`."""
-        return "init: 'bc'" if self.init == "bc" else None
-
-    @property
-    def capacity(self) -> int:
-        """Largest number of transitions in the replay."""
-        return self.buffer_size * (2 if self.replay == "symmetric" else 1)
 
 
 class Learner(Algorithm):
@@ -137,10 +86,6 @@ class Learner(Algorithm):
         self.optimizer = self.make_optimizer()
         self.scheduler = self.make_scheduler()
 
-    stores_expert_action: ClassVar[bool] = True
-    """Whether stored transitions have ``expert_action``, the action that is imitated in
-    demonstrations, next to the executed one."""
-
     # -- parts -------------------------------------------------------------------------------
 
     @abstractmethod
@@ -174,7 +119,7 @@ class Learner(Algorithm):
                 f"init: {type(self).__name__} has no actor that behaviour cloning could initialise"
             )
         loss = BehaviourCloningLoss(policy, "kl")
-        loss.set_keys(action=keys.EXPERT_ACTION)
+        loss.set_keys(action=keys.EXPERT_ACTION if self.has_expert_action else keys.ACTION)
         return loss
 
     def make_acting_transforms(self) -> Mapping[str, nn.Module]:
@@ -244,11 +189,24 @@ class Learner(Algorithm):
 
     # -- data --------------------------------------------------------------------------------
 
+    @property
+    def has_expert_action(self) -> bool:
+        """Whether stored transitions have ``expert_action``, the action that is imitated, beside
+        the executed one; by default if it is collected, and with ``init="bc"``."""
+        return self.collects_expert_action or self.config.init == "bc"
+
     def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
-        """Return collected data as the transitions [N] that the replay stores."""
-        return as_transitions(
-            data, self.images, is_expert=is_expert, expert_action=self.stores_expert_action
-        )
+        """Return collected data as the transitions [N] that the replay stores.
+
+        Raises:
+            KeyError: an entry is missing.
+        """
+        label = None
+        if self.has_expert_action:
+            is_labelled = self.collects_expert_action and not is_expert
+            is_labelled |= keys.EXPERT_ACTION in data
+            label = keys.EXPERT_ACTION if is_labelled else keys.ACTION
+        return as_transitions(data, self.images, is_expert=is_expert, label=label)
 
     def extend(self, transitions: TensorDictBase) -> None:
         """Add transitions [N], and augmented copies if configured, to the replay, except those with
@@ -390,5 +348,16 @@ class Learner(Algorithm):
         self.replay.dumps(folder)
 
     def load_replay(self, folder: Path) -> None:
-        """Restore the replay from a folder that `save_replay` wrote."""
+        """Restore the replay from a folder that `save_replay` wrote.
+
+        Raises:
+            ConfigError: its transitions have other entries than those of this learner.
+        """
         self.replay.loads(folder)
+        is_stored = keys.EXPERT_ACTION in self.replay.stored_keys
+        if len(self.replay) and is_stored != self.has_expert_action:
+            raise ConfigError(
+                f"the saved transitions {'have' if is_stored else 'lack'} the entry "
+                f"{keys.EXPERT_ACTION!r}: another version of the library wrote them; start the run "
+                "again in another run_dir"
+            )

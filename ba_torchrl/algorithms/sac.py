@@ -16,7 +16,8 @@ from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.learner import Learner
+from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.augmentation.stored import StoredCopies
@@ -266,12 +267,17 @@ class SAC(Learner):
             seed=self.problem.derived_seed(use),
         )
 
+    @property
+    def has_expert_action(self) -> bool:
+        """True: the behaviour term reads it."""
+        return True
+
     def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
         """Return collected data as the transitions [N] that the replay stores; if successes are
         imitated, those of the episodes that have ended."""
         if is_expert or self.episodes is None:
             return super().to_transitions(data, is_expert=is_expert)
-        data = self.episodes.complete(data)
+        data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
         copies = 1 + self.config.stored_copies
         stored = count_demonstrations(self.replay) + copies * int(data[keys.IS_EXPERT].sum())
         if stored > self.config.buffer_size // 2:  # demonstrations are never overwritten

@@ -12,7 +12,8 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner, LearnerConfig
+from ba_torchrl.algorithms.learner import Learner
+from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
@@ -88,8 +89,6 @@ class SpatialQ(Learner):
 
     config: SpatialQConfig
     loss: LevelDQNLoss
-    stores_expert_action: ClassVar[bool] = False
-    """The term on demonstrated actions is one of the values of executed actions."""
 
     def __init__(self, config: SpatialQConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)

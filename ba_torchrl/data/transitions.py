@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 
 from ba_torchrl.envs import keys
 
@@ -15,7 +16,7 @@ def as_transitions(
     images: Iterable[str],
     *,
     is_expert: bool,
-    expert_action: bool = False,
+    label: NestedKey | None = None,
 ) -> TensorDict:
     """Return the transitions [N] of a rollout with the entries that the replay stores.
 
@@ -23,8 +24,9 @@ def as_transitions(
         tensordict: transitions of any batch shape.
         images: keys of the images to store.
         is_expert: whether the transitions are demonstrations. Those whose entry ``is_expert`` is
-            False are not, unless the expert's action in their state is known and stored.
-        expert_action: also store ``expert_action``; a copy of the action where it is not known.
+            False are not, unless ``label`` is ``expert_action``.
+        label: entry with the action to imitate, stored as ``expert_action``: ``expert_action`` if
+            the expert's action is known, ``action`` for the executed one; None to store none.
 
     Raises:
         KeyError: an entry is missing.
@@ -33,10 +35,9 @@ def as_transitions(
     state = [*images, keys.HOLDING]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
     out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))
-    is_labelled = expert_action and keys.EXPERT_ACTION in flat
     out[keys.IS_EXPERT] = torch.full((len(flat), 1), is_expert)
-    if is_expert and not is_labelled and keys.IS_EXPERT in flat:
+    if is_expert and label != keys.EXPERT_ACTION and keys.IS_EXPERT in flat:
         out[keys.IS_EXPERT] = flat[keys.IS_EXPERT].clone()
-    if expert_action:
-        out[keys.EXPERT_ACTION] = flat[keys.EXPERT_ACTION if is_labelled else keys.ACTION].clone()
+    if label is not None:
+        out[keys.EXPERT_ACTION] = flat[label].clone()
     return out

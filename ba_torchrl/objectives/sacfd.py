@@ -93,7 +93,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
         is_expert: NestedKey = keys.IS_EXPERT
-        expert_action: NestedKey = keys.ACTION
+        expert_action: NestedKey | None = None
         state_action_value: NestedKey = "state_action_value"
         value: NestedKey = "state_value"
         priority: NestedKey = keys.TD_ERROR
@@ -180,9 +180,14 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         """The entropy temperature, without gradient."""
         return self.log_alpha.detach().exp()
 
+    @property
+    def _label_key(self) -> NestedKey:
+        names = self.tensor_keys
+        return names.action if names.expert_action is None else names.expert_action
+
     def _required_keys(self) -> list[NestedKey]:
         observation = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
-        names = [*self._transition_keys(observation), self.tensor_keys.expert_action]
+        names = [*self._transition_keys(observation), self._label_key]
         if self._needs_expert_flag:
             names.append(self.tensor_keys.is_expert)
         if self.contrastive is not None:
@@ -304,7 +309,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
 
     def _demonstration_error(self, tensordict: TensorDictBase, sample: Tensor) -> Tensor:
         """Return the distance [..., B] of drawn actions from the expert's."""
-        expert_action = self._for_views(tensordict[self.tensor_keys.expert_action])
+        expert_action = self._for_views(tensordict[self._label_key])
         distance = action_distance(sample, expert_action, self.demonstration_distance)
         return self._over_views(distance)
 

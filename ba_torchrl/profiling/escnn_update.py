@@ -213,7 +213,7 @@ class EscnnSACfD:
         """Train critic, actor and temperature, in this order, and move the target.
 
         Args:
-            batch: transitions [B] with ``is_expert``.
+            batch: transitions [B] with ``is_expert``; the behaviour term imitates ``action``.
         """
         qvalue = self.qvalue_loss(batch)
         self._step("qvalue", qvalue)

@@ -82,6 +82,23 @@ def measure_max_pool(bench: Bench, layout: str) -> list[Row]:
     return _rows(bench, calls)
 
 
+def margin_in_a_loop(values: Tensor, chosen: Tensor, margin: float) -> Tensor:
+    """Return the margin of each sample [B], computed one by one, as the reference implementation
+    does.
+
+    Args:
+        values: [B, N].
+        chosen: index of the demonstrated action of each sample [B].
+        margin: added to the values of the other actions.
+    """
+    losses = []
+    for of_sample, number in zip(values, chosen, strict=True):
+        gap = of_sample - of_sample[number] + margin
+        violating = (gap > 0).scatter(0, number, False)
+        losses.append(gap[violating].mean() if violating.any() else 0 * of_sample.sum())
+    return torch.stack(losses)
+
+
 @measurement("learning/margin")
 def measure_margin(bench: Bench) -> list[Row]:
     """SDQfD's margin of 16 samples, of which half are demonstrations."""
@@ -89,21 +106,15 @@ def measure_margin(bench: Bench) -> list[Row]:
     q = torch.randn(16, values, device=bench.device)
     chosen = torch.randint(values, (16,), device=bench.device)
 
-    def loop(q: Tensor) -> Tensor:
-        losses = []
-        for of_sample, number in zip(q[experts], chosen[experts], strict=True):
-            gap = of_sample - of_sample[number] + MARGIN
-            violating = (gap > 0).scatter(0, number, False)
-            losses.append(gap[violating].mean() if violating.any() else 0 * of_sample.sum())
-        return torch.stack(losses)
-
     name = f"SDQfD's margin, 16 x {values} values"
     calls = {
         f"{name}, all samples": lambda q: strict_large_margin(q, chosen, MARGIN),
         f"{name}, 8 demonstrations": lambda q: strict_large_margin(
             q[experts], chosen[experts], MARGIN
         ),
-        f"{name}, 8 demonstrations in a loop": loop,
+        f"{name}, 8 demonstrations in a loop": lambda q: margin_in_a_loop(
+            q[experts], chosen[experts], MARGIN
+        ),
     }
     return _rows(bench, {work: _with_gradient(call, q) for work, call in calls.items()})
 

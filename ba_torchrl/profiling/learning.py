@@ -16,8 +16,8 @@ from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.precision import network_dtype
 from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.replay.buffer import FrameStorage
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
+from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds

@@ -85,9 +85,9 @@ class ExperimentConfig(StrictModel):
     """Leave out failed episodes; fewer remain where the expert fails."""
     demonstrations_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random action in place of the expert's in each step of a demonstration that
-    is played for the run (Laskey et al., 2017). The expert recovers. In these steps, algorithms
-    that imitate a close-loop expert imitate the action that it would have executed; the term of
-    DQfD, SDQfD and ADET leaves them out. None in the appendix."""
+    is played for the run (Laskey et al., 2017). The expert recovers. In these steps, the
+    behaviour term of SAC, behaviour cloning and DAgger imitate the action that it would have
+    executed; to the other algorithms, they are no demonstrations. None in the appendix."""
     demonstrations_turn_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random turn beside the expert's other components, likewise. An expert turns
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a

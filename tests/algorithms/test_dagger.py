@@ -21,8 +21,10 @@ def test_the_label_is_the_action_of_the_expert():
     stored = learner.to_transitions(data, is_expert=False)
     assert torch.equal(stored[keys.ACTION], data[keys.EXPERT_ACTION])
     assert keys.EXPERT_ACTION not in stored
-    del data[keys.EXPERT_ACTION]  # demonstrations have only the executed action
-    stored = learner.to_transitions(data, is_expert=True)
+    del data[keys.EXPERT_ACTION]
+    with pytest.raises(KeyError, match="expert_action"):
+        learner.to_transitions(data, is_expert=False)
+    stored = learner.to_transitions(data, is_expert=True)  # demonstrations without noise
     assert torch.equal(stored[keys.ACTION], data[keys.ACTION])
 
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ba_torchrl.data.replay.symmetric import count_demonstrations
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
@@ -144,6 +145,43 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     assert len(imitated) == (1 if learner.init_loss else 2)
     for label in torch.cat(imitated):
         assert (stored[key] == label).all(dim=-1).any()
+
+
+@pytest.mark.parametrize(
+    ("network", "algorithm", "changes", "is_labelled"),
+    [
+        ("cnn", {"name": "sac"}, {}, True),
+        ("cnn", {"name": "rlpd"}, {}, False),
+        ("asr", {"name": "spatial_q"}, OPEN, False),
+    ],
+    ids=["sac", "rlpd", "spatial_q"],
+)
+def test_what_of_demonstrations_with_noise_counts_as_demonstrated(
+    tmp_path, network, algorithm, changes, is_labelled
+):
+    settings = {"demonstrations_noise": 0.5, "min_replay": 10_000, **changes}
+    experiment = make_experiment(tmp_path, network, algorithm, **settings, pretrain_updates=2)
+    learner, episodes = experiment.algorithm, []
+    store = learner.on_demonstrations
+    learner.on_demonstrations = lambda each: (episodes.extend(each), store(each))
+    experiment.run()
+    played = torch.cat(episodes)
+    expert = played[keys.IS_EXPERT]
+    assert 0 < expert.sum() < len(expert)
+    if is_labelled:
+        stored = learner.replay.storage[:]
+        assert stored[keys.IS_EXPERT].all()
+        torch.testing.assert_close(stored[keys.EXPERT_ACTION], played[keys.EXPERT_ACTION])
+        torch.testing.assert_close(stored[keys.ACTION], played[keys.ACTION])
+        return
+    assert keys.EXPERT_ACTION not in learner.replay.stored_keys
+    assert count_demonstrations(learner.replay) == int(expert.sum())
+    assert len(learner.replay) == len(played)
+
+
+def test_rlpd_stores_labels_for_the_initialisation_only():
+    assert not build("rlpd").has_expert_action
+    assert build("rlpd", init="bc").has_expert_action
 
 
 def demonstration_error(learner):

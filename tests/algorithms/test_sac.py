@@ -10,6 +10,9 @@ from ba_torchrl.algorithms.sac import SACConfig
 from ba_torchrl.config import parse
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.transitions import as_transitions
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from tests.algorithms import tiny
 from tests.specs import close_loop_images
 
 TASK = "close_loop/block_reaching"
@@ -38,7 +41,7 @@ def demonstrations():
     episodes = collect_demonstrations(env, 6, seed=0)
     env.close()
     return torch.cat(
-        [as_transitions(each, ["pixels"], is_expert=True, expert_action=True) for each in episodes]
+        [as_transitions(each, ["pixels"], is_expert=True, label=keys.ACTION) for each in episodes]
     )
 
 
@@ -151,3 +154,40 @@ def test_a_restored_learner_continues_identically(demonstrations):
     assert torch.equal(*losses)
     moments = [sac.optimizer.state_dict()["state"][0]["exp_avg"].sum() for sac in (first, second)]
     assert torch.equal(*moments)
+
+
+def test_the_behaviour_term_is_against_the_action_of_the_expert():
+    learner = tiny.build("sac", batch_size=6)
+    learner.extend(tiny.transitions(learner))
+    batch = learner.sample()
+
+    def error(changed=None):
+        torch.manual_seed(0)
+        data = batch.clone()
+        if changed is not None:
+            data[changed] = torch.zeros_like(data[changed])
+        return float(learner.loss(data)["demonstration_error"])
+
+    assert error(keys.ACTION) == error()
+    assert error(keys.EXPERT_ACTION) != error()
+
+
+def test_collected_labels_must_be_there():
+    learner = tiny.build("sac", batch_size=6)
+    data = tiny.transitions(learner).exclude(keys.EXPERT_ACTION)
+    data[keys.NEXT, keys.FAULT] = torch.zeros(len(data), 1, dtype=torch.bool)
+    stored = learner.to_transitions(data, is_expert=False)
+    assert torch.equal(stored[keys.EXPERT_ACTION], data[keys.ACTION])
+    learner.collects_expert_action = True
+    with pytest.raises(KeyError, match="expert_action"):
+        learner.to_transitions(data, is_expert=False)
+    assert learner.to_transitions(data, is_expert=True)[keys.EXPERT_ACTION].any()
+
+
+def test_a_replay_with_other_entries_is_refused(tmp_path):
+    learner = tiny.build("rlpd", batch_size=6)
+    learner.extend(tiny.transitions(learner))
+    learner.save_replay(tmp_path / "replay")
+    tiny.build("rlpd", batch_size=6).load_replay(tmp_path / "replay")
+    with pytest.raises(ConfigError, match=r"lack the entry 'expert_action'.*another run_dir"):
+        tiny.build("rlpd", batch_size=6, init="bc").load_replay(tmp_path / "replay")

@@ -35,6 +35,15 @@ def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
     assert len(learner.episodes) == 1
 
 
+def test_successes_are_imitated_where_the_expert_would_act_otherwise():
+    learner = build("sac", imitate_successes=True, batch_size=4)
+    data = collected(learner, [True, True], [True, False])
+    data[keys.EXPERT_ACTION] = -data[keys.ACTION]
+    stored = learner.to_transitions(data, is_expert=False)
+    assert stored[keys.IS_EXPERT][:, 0].tolist() == [True, False]
+    assert torch.equal(stored[keys.EXPERT_ACTION], data[keys.ACTION])
+
+
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
 def test_successes_fill_at_most_half_of_the_replay(replay):
     learner = build("sac", imitate_successes=True, batch_size=4, replay=replay, buffer_size=8)

@@ -114,8 +114,8 @@ def transitions(algorithm, count=24):
     }
     is_expert = torch.arange(count)[:, None] % 2 == 0
     actions = {keys.ACTION: action}
-    if algorithm.stores_expert_action:
-        actions[keys.EXPERT_ACTION] = action.clone()
+    if algorithm.has_expert_action:
+        actions[keys.EXPERT_ACTION] = -action / 2
     return TensorDict(
         {**state(), **actions, keys.IS_EXPERT: is_expert, keys.NEXT: following}, [count]
     )

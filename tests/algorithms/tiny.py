@@ -72,7 +72,7 @@ def transitions(learner, count=24):
     data = {
         **state(),
         keys.ACTION: action,
-        **({keys.EXPERT_ACTION: action.clone()} if learner.stores_expert_action else {}),
+        **({keys.EXPERT_ACTION: -action / 2} if learner.has_expert_action else {}),
         keys.IS_EXPERT: torch.arange(count)[:, None] % 2 == 0,
         keys.NEXT: following,
     }

@@ -260,7 +260,6 @@ def test_renamed_keys():
     renamed.qvalue_network.in_keys[1] = "act"
     renamed.set_keys(
         action="act",
-        expert_action="act",
         is_expert=("meta", "demo"),
         reward="r",
         terminated="end",

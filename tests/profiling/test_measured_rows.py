@@ -118,6 +118,16 @@ def test_frames_per_second_count_all_environments(monkeypatch):
     assert list(row.values) == [40.0, 40.0]
 
 
+def test_the_measured_loop_computes_the_margin():
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(6, 40, generator=generator)
+    values[0, 7] = 10.0  # above all others by more than the margin
+    chosen = torch.tensor([7, 0, 3, 39, 12, 5])
+    found = layers.margin_in_a_loop(values, chosen, 0.1)
+    assert found[0] == 0
+    torch.testing.assert_close(found, layers.strict_large_margin(values, chosen, 0.1))
+
+
 def test_layers_are_measured_in_pairs(monkeypatch):
     pytest.importorskip("escnn")
     monkeypatch.setattr(layers, "BATCH", 2)

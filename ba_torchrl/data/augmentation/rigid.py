@@ -151,10 +151,15 @@ class RigidAugmentation(nn.Module):
 
         Args:
             tensordict: holds the images, ``action`` and their successors.
+
+        Raises:
+            ValueError: it has ``expert_action``, which would not be transformed.
         """
         out = tensordict.copy()
         if self.transforms == "none":
             return out
+        if keys.EXPERT_ACTION in tensordict:
+            raise ValueError(f"augmentation {self.transforms!r} does not transform expert_action")
         device = tensordict[keys.ACTION].device
         action = tensordict[keys.ACTION].cpu()
         is_found, transform = self._draw_inside(action)

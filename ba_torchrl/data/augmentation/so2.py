@@ -170,7 +170,8 @@ class SO2Augmentation(nn.Module):
             return out
         for key in self._scene_images:
             map_pairs(out, key, chosen, lambda images: rotate_images(images, angle))
-        for key in tensordict.keys() & {keys.ACTION, keys.EXPERT_ACTION}:
+        labels = [keys.EXPERT_ACTION] if keys.EXPERT_ACTION in tensordict else []
+        for key in [keys.ACTION, *labels]:
             action = tensordict[key].clone()
             rows = to_device(chosen, action.device)[:, None]
             plane = to_device(torch.tensor(self._plane), action.device)

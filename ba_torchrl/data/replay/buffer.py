@@ -1,22 +1,21 @@
-"""A TorchRL replay buffer that stores each image once and compressed."""
+"""A TorchRL replay buffer of transitions with compressed images."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
 
 from ba_torchrl.data.replay.codecs import ImageCodec
-from ba_torchrl.data.replay.frames import FrameTable
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.schema import Schema, differences
+from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
@@ -24,214 +23,6 @@ from ba_torchrl.errors import ReplaySchemaError
 
 _INDEX = "index"  # TorchRL's writer adds it
 _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))
-
-
-class FrameStorage(LazyTensorStorage):
-    """A TorchRL storage that stores an image once, also where it is both an image and a next image.
-
-    All other entries are ordinary columns. Images are stored as codes of their codec, compressed
-    without loss; the error of a returned image is the codec's error.
-
-    Args:
-        max_size: number of transitions.
-        codecs: codec of each image by its key, such as ``pixels``; also used for the same key in
-            "next".
-        returns_codes: return the images' codes instead of decoded images.
-
-    Raises:
-        ValueError: ``codecs`` is empty.
-    """
-
-    def __init__(
-        self, max_size: int, codecs: Mapping[str, ImageCodec], *, returns_codes: bool = False
-    ) -> None:
-        super().__init__(max_size, device="cpu")
-        if not codecs:
-            raise ValueError("codecs is empty: there is no image to store")
-        self.codecs = dict(codecs)
-        self.returns_codes = returns_codes
-        self.frame_keys: list[NestedKey] = [
-            nested for key in codecs for nested in (key, (keys.NEXT, key))
-        ]
-        self._frames: dict[str, FrameTable] = {}
-        # Slots of (image, next image) by key and transition, -1 where none is stored yet.
-        self._slots = torch.full((len(codecs), self.max_size, 2), -1, dtype=torch.int32)
-
-    def set(
-        self,
-        cursor: int | Sequence[int] | slice | Tensor,
-        data: TensorDictBase,
-        *,
-        set_cursor: bool = True,
-    ) -> None:
-        """Store transitions.
-
-        Args:
-            cursor: indices of the transitions.
-            data: one transition if ``cursor`` is an int, else a batch of them.
-            set_cursor: whether the storage's length is extended to these indices, as for a writer.
-        """
-        if isinstance(cursor, int) or (isinstance(cursor, Tensor) and not cursor.ndim):
-            cursor, data = [int(cursor)], data.unsqueeze(0)
-        indices = torch.arange(self.max_size)[cursor] if isinstance(cursor, slice) else cursor
-        indices = torch.as_tensor(indices, dtype=torch.long)
-        if len(indices) > self.max_size:  # keep the last of each index
-            indices, data = indices[-self.max_size :], data[-self.max_size :]
-        super().set(indices, data.exclude(*self.frame_keys), set_cursor=set_cursor)
-        for number, (key, codec) in enumerate(self.codecs.items()):
-            images = [data.get(nested).cpu() for nested in (key, (keys.NEXT, key))]
-            if key not in self._frames:
-                self._frames[key] = FrameTable(codec.encode(images[0][:1]).shape[1:])
-            self._store_frames(indices, images, codec, self._frames[key], self._slots[number])
-
-    @staticmethod
-    def _store_frames(
-        indices: Tensor, images: list[Tensor], codec: ImageCodec, frames: FrameTable, slots: Tensor
-    ) -> None:
-        slots = slots.numpy()
-        for row, place in enumerate(indices.tolist()):
-            # One image at a time: torch starts no threads for a single image. Threads cost
-            # milliseconds while the environments use all cores.
-            codes = [codec.encode(image[row]).flatten().numpy() for image in images]
-            # New frames are acquired before the old ones are released, so that a frame in both is
-            # not freed.
-            new = [frames.acquire(code) for code in codes]
-            for slot in slots[place].tolist():
-                if slot >= 0:
-                    frames.release(slot)
-            slots[place] = new
-
-    def get(self, index: int | Sequence[int] | slice | Tensor) -> TensorDictBase:
-        """Return transitions with decoded images, or their codes.
-
-        A slice over the whole storage decodes every image; `column` decodes none.
-
-        Args:
-            index: of the transitions.
-        """
-        data = super().get(index).copy()
-        for number, (key, codec) in enumerate(self.codecs.items()):
-            slots = self._slots[number, : len(self)][index]
-            images = self._frames[key].read(slots)
-            if not self.returns_codes:
-                images = codec.decode(images)
-            for i, nested in enumerate((key, (keys.NEXT, key))):
-                data.set(nested, images.select(slots.ndim - 1, i))
-        return data
-
-    def column(self, key: NestedKey) -> Tensor:
-        """Return a view of one entry of all stored transitions; images have no column.
-
-        Args:
-            key: of the entry.
-
-        Raises:
-            KeyError: the entry is not stored.
-        """
-        if not self.initialized:
-            raise KeyError(f"{key!r}: the replay is empty")
-        return self._storage[key][: len(self)]
-
-    @property
-    def image_types(self) -> dict[str, tuple[torch.dtype, torch.Size]]:
-        """Type and shape of each image by key; empty before the first transition is stored."""
-        decoded = {
-            key: self.codecs[key].decode(torch.zeros(table.shape, dtype=torch.uint8))
-            for key, table in self._frames.items()
-        }
-        return {key: (image.dtype, image.shape) for key, image in decoded.items()}
-
-    @property
-    def frame_count(self) -> int:
-        """Number of distinct frames of all keys."""
-        return sum(len(frames) for frames in self._frames.values())
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of memory in use, without reserved pages that were never written."""
-        if not self._frames:
-            return 0
-        row = sum(
-            value[0].numel() * value.element_size() for value in self._storage.values(True, True)
-        )
-        row += self._slots.element_size() * 2 * len(self.codecs)
-        return len(self) * row + sum(frames.nbytes for frames in self._frames.values())
-
-    def _empty(self) -> None:
-        super()._empty()
-        self._slots.fill_(-1)
-        for frames in self._frames.values():
-            frames.clear()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return columns, frames and slots of the frames. They are views: do not modify them."""
-        if not self.initialized:
-            return {"size": 0}
-        size = len(self)
-        columns = self._storage[:size]
-        frames = {}
-        for number, (key, table) in enumerate(self._frames.items()):
-            packed, sizes = table.dump()
-            frames[key] = {
-                "slots": self._slots[number, :size],
-                "shape": list(table.shape),
-                "sizes": sizes,
-                "packed": packed,
-            }
-        return {
-            "size": size,
-            "columns": {
-                "/".join(key) if isinstance(key, tuple) else key: value
-                for key, value in columns.items(True, True)
-            },
-            "frames": frames,
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the columns and frames of a ``state_dict``.
-
-        Args:
-            state_dict: of a storage that holds at most this storage's capacity.
-
-        Raises:
-            ValueError: it holds too many transitions, or images with other keys.
-        """
-        size = state_dict["size"]
-        if size > self.max_size:
-            raise ValueError(f"{size} saved transitions do not fit into {self.max_size}")
-        self._empty()
-        if not size:
-            return
-        if set(state_dict["frames"]) != set(self.codecs):
-            raise ValueError(
-                f"images saved: {', '.join(state_dict['frames'])}; kept here: "
-                f"{', '.join(self.codecs)}"
-            )
-        columns = TensorDict(
-            {tuple(name.split("/")): value for name, value in state_dict["columns"].items()},
-            batch_size=[size],
-        )
-        super().set(torch.arange(size), columns)
-        self._frames = {}
-        for number, key in enumerate(self.codecs):
-            saved = state_dict["frames"][key]
-            self._slots[number, :size] = saved["slots"]
-            self._frames[key] = FrameTable(torch.Size(saved["shape"]))
-            self._frames[key].load(
-                saved["packed"], saved["sizes"], saved["slots"].reshape(-1).tolist()
-            )
-
-    def dumps(self, path: str | Path) -> None:
-        """Write the contents into a folder, as plain data."""
-        write_state(path, self.state_dict())
-
-    def loads(self, path: str | Path) -> None:
-        """Read a folder that ``dumps`` wrote.
-
-        Raises:
-            ConfigError: it holds files that are not plain data.
-        """
-        self.load_state_dict(read_state(path))
 
 
 class FrameReplayBuffer(TensorDictReplayBuffer):
@@ -323,6 +114,11 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             ConfigError: it holds files that are not plain data.
         """
         self.load_state_dict(read_state(path))
+
+    @property
+    def stored_keys(self) -> frozenset[NestedKey]:
+        """Entries of the stored transitions; empty before the first."""
+        return frozenset(self._schema() or ())
 
     def _check_schema(self, data: TensorDictBase) -> None:
         found = {key: (value.dtype, value.shape[1:]) for key, value in data.items(True, True)}

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.data import ReplayBufferEnsemble
 
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer, make_replay_buffer
@@ -61,6 +62,11 @@ class SymmetricReplay(ReplayBufferEnsemble):
     def __len__(self) -> int:
         """Number of transitions in both buffers."""
         return len(self.expert) + len(self.online)
+
+    @property
+    def stored_keys(self) -> frozenset[NestedKey]:
+        """Entries of the stored transitions, the same in both buffers; empty before the first."""
+        return self.expert.stored_keys | self.online.stored_keys
 
     def extend(self, data: TensorDictBase, *, update_priority: bool | None = None) -> None:
         """Add transitions [N], each to the buffer that its ``is_expert`` flag selects.

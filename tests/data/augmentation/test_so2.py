@@ -103,6 +103,11 @@ def test_a_vector_that_leaves_the_box_keeps_its_direction():
     torch.testing.assert_close(turned[2].norm(), corner[2].norm())  # inside: not shortened
 
 
+def test_transitions_without_an_action_are_refused():
+    with pytest.raises(KeyError, match="action"):
+        SO2Augmentation(IMAGES, "pxyzr", seed=3, probability=1.0)(batch().exclude(keys.ACTION))
+
+
 @pytest.mark.parametrize("sequence", ["pxyzr", "pxyz", "yzpx"])
 def test_one_angle_per_transition_for_all_three_entries(sequence):
     data = batch(actions=len(sequence))

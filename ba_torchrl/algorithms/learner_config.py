@@ -1,0 +1,61 @@
+"""Hyper-parameters that all learners have in common."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from ba_torchrl.algorithms.base import AlgorithmConfig
+from ba_torchrl.data.replay.make import ReplayKind
+from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
+
+Init = Literal["random", "bc"]
+"""How the policy is initialised."""
+
+
+class LearnerConfig(AlgorithmConfig):
+    """Hyper-parameters of every algorithm that learns from a replay."""
+
+    learning_rate: float = Field(default=1e-3, gt=0, le=1e3)
+    """Learning rate of Adam."""
+    learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
+    """Final fraction of the learning rate, which decreases linearly over the run."""
+    weight_decay: float = Field(default=0.0, ge=0)
+    """Adam's L2 term on the networks' parameters."""
+    gradient_clamp: float | None = Field(default=None, gt=0)
+    """Bound of each element of the networks' gradient; None for no bound."""
+    policy_average: float = Field(default=0.0, ge=0, lt=1)
+    """Decay of the exponential moving average of the policy's parameters with which the policy
+    acts; 0 for acting with the last parameters. None in the appendix."""
+    batch_size: int = Field(default=64, ge=1)
+    """Transitions per update."""
+    replay: ReplayKind = "uniform"
+    """Sampling of transitions: "uniform", "prioritized" or "symmetric"."""
+    buffer_size: int = Field(default=100_000, ge=1)
+    """Transitions in the replay; in each half of a symmetric one."""
+    priority_exponent: float = Field(default=0.6, ge=0)
+    """Exponent alpha of the priorities of a prioritised replay."""
+    importance_exponent: float = Field(default=0.4, ge=0, le=1)
+    """Initial exponent beta of the importance weights, which increases to 1 over the run; with 0,
+    the weights are 1 throughout."""
+    importance_weighted: WeightedTerms = "critic_and_policy"
+    """Terms of the loss that the importance weights multiply: "none", "critic",
+    "critic_and_policy", or "all", which adds those on demonstrations and the temperature."""
+    importance_norm: WeightNorm = "max"
+    """Statistic of a batch by which its importance weights are divided: "max" or "mean"."""
+    expert_bonus: float = Field(default=1.0, ge=0)
+    """Added to the priority of demonstrations."""
+    init: Init = "random"
+    """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
+    updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
+
+    @property
+    def pretraining_option(self) -> str | None:
+        """As for `AlgorithmConfig`."""
+        return "init: 'bc'" if self.init == "bc" else None
+
+    @property
+    def capacity(self) -> int:
+        """Largest number of transitions in the replay."""
+        return self.buffer_size * (2 if self.replay == "symmetric" else 1)
