@@ -153,6 +153,30 @@ def read_state(folder: str | Path) -> dict[str, Any]:
     return holder.state
 
 
+class StateFolder:
+    """A class with a state that is written into a folder, as plain data.
+
+    Precedes TorchRL's class among the bases, whose ``loads`` could unpickle.
+    """
+
+    def dumps(self, path: str | Path) -> None:
+        """Write the state into a folder.
+
+        Raises:
+            OSError: there is not enough space, or a file cannot be written.
+        """
+        write_state(path, self.state_dict())
+
+    def loads(self, path: str | Path) -> None:
+        """Read a folder that ``dumps`` wrote.
+
+        Raises:
+            ConfigError: a file is neither a memory map nor JSON.
+            DamagedFilesError: the files are not a state.
+        """
+        self.load_state_dict(read_state(path))
+
+
 def _not_a_state(folder: Path, error: Exception) -> DamagedFilesError:
     reason = (str(error).splitlines() or [""])[0]
     return DamagedFilesError(f"{folder} does not hold a state: {type(error).__name__}: {reason}")

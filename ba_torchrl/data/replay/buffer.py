@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +16,7 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.schema import Schema, differences
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
-from ba_torchrl.data.state_files import read_state, write_state
+from ba_torchrl.data.state_files import StateFolder
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError
 
@@ -25,13 +24,14 @@ _INDEX = "index"  # TorchRL's writer adds it
 _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))
 
 
-class FrameReplayBuffer(TensorDictReplayBuffer):
+class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
     """A replay buffer on a `FrameStorage` that checks transitions and keeps demonstrations.
 
     Entries, types and shapes of the first transitions are required of all later ones, because
     TorchRL would keep stale values of a missing entry. Transitions whose ``fault`` flag is set are
     dropped and counted in ``faults_dropped``; the flag is not stored. When the buffer is full, new
     transitions overwrite the oldest ones that are not demonstrations. The input is not modified.
+    ``dumps`` writes transitions, priorities and the state of the draws.
 
     Args:
         storage: the frame storage.
@@ -102,18 +102,6 @@ class FrameReplayBuffer(TensorDictReplayBuffer):
             return torch.zeros(0, dtype=torch.long)
         data = self.writer.select_fitting(data)
         return super().extend(data, update_priority=update_priority)
-
-    def dumps(self, path: str | Path) -> None:
-        """Write transitions, priorities and the state of the draws into a folder, as plain data."""
-        write_state(path, self.state_dict())
-
-    def loads(self, path: str | Path) -> None:
-        """Read a folder that ``dumps`` wrote.
-
-        Raises:
-            ConfigError: it holds files that are not plain data.
-        """
-        self.load_state_dict(read_state(path))
 
     @property
     def stored_keys(self) -> frozenset[NestedKey]:

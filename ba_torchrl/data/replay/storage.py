@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,11 +13,11 @@ from torchrl.data import LazyTensorStorage
 
 from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.frames import FrameTable
-from ba_torchrl.data.state_files import read_state, write_state
+from ba_torchrl.data.state_files import StateFolder
 from ba_torchrl.envs import keys
 
 
-class FrameStorage(LazyTensorStorage):
+class FrameStorage(StateFolder, LazyTensorStorage):
     """A TorchRL storage that stores an image once, also where it is both an image and a next image.
 
     All other entries are ordinary columns. Images are stored as codes of their codec, compressed
@@ -212,15 +211,3 @@ class FrameStorage(LazyTensorStorage):
             self._frames[key].load(
                 saved["packed"], saved["sizes"], saved["slots"].reshape(-1).tolist()
             )
-
-    def dumps(self, path: str | Path) -> None:
-        """Write the contents into a folder, as plain data."""
-        write_state(path, self.state_dict())
-
-    def loads(self, path: str | Path) -> None:
-        """Read a folder that ``dumps`` wrote.
-
-        Raises:
-            ConfigError: it holds files that are not plain data.
-        """
-        self.load_state_dict(read_state(path))
