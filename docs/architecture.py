@@ -16,7 +16,7 @@ PACKAGE = "ba_torchrl"
 PAGE = ROOT / "docs" / "architecture.md"
 BEGIN, END = "<!-- imports: begin -->\n", "<!-- imports: end -->\n"
 
-BASE = ("errors", "config", "registry", "plugins", "actions", "_malloc")
+BASE = ("errors", "config", "registry", "plugins", "actions", "hardware", "_malloc")
 """Single files that every folder may import; one box in the picture."""
 
 

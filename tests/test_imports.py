@@ -20,18 +20,19 @@ CHAIN = ["sim", "tasks", "envs", "data", "algorithms", "training", "profiling", 
 EXTRA = {
     "data": {"__init__"},
     "algorithms": {"__init__", "modules", "objectives"},
-    "training": {"__init__", "record"},
-    "profiling": {"__init__", "record", "modules", "objectives"},
+    "training": {"__init__", "record", "hardware"},
+    "profiling": {"__init__", "record", "modules", "objectives", "hardware"},
     "recipes": {"__init__", "record"},
 }
 SHARED = {"_malloc"}
 APART = {
     "__init__": BASE | {"tasks", "envs"},
     "testing": BASE | {"testing", "sim", "tasks", "envs", "__init__"},
-    "modules": BASE | {"modules", "envs.keys", "envs.images"},
+    "modules": BASE | {"modules", "envs.keys", "envs.images", "hardware"},
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
     "_malloc": set(),
+    "hardware": set(),
     # whole algorithms as scripts: no learner and no experiment
     "recipes.torchrl": BASE
     | {"envs", "data", "modules", "objectives", "__init__"}

@@ -48,6 +48,8 @@ class Problem:
     """Gradient updates of the run, the length of schedules."""
     seed: int
     device: torch.device
+    pretrain_updates: int = 0
+    """The first of `total_updates`, before the first collection."""
 
     def derived_seed(self, use: SeedUse) -> int:
         """Return the run's seed for one use of randomness."""

@@ -76,10 +76,11 @@ class IQL(Learner):
         """Return actor, critics and state value."""
         actions = self.problem.actions
         spec = ActorCriticSpec(self.images, actions.sequence, critics=1)
-        first, second, third = (network.build(spec) for _ in range(3))
+        # four networks, since those of an actor and its encoder may share parameters
+        first, second, third, fourth = (network.build(spec) for _ in range(4))
         device = self.problem.device
         return IQLNetworks(
-            first.actor.to(device),
+            fourth.actor.to(device),
             [ActionValue(each.encoder, each.critic).to(device) for each in (first, second)],
             StateValue(third.encoder, third.critic, actions.size).to(device),
         )

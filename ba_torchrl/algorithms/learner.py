@@ -226,7 +226,7 @@ class Learner(Algorithm):
         """
         sampler = self._prioritized_sampler()
         if sampler is not None:
-            sampler.anneal(self.updates / max(self.problem.total_updates, 1))
+            sampler.anneal(self._share_of_updates())
         batch, device = self.replay.sample(), self.problem.device
         rows = batch[keys.IS_EXPERT].reshape(-1).nonzero()[:, 0] if demonstrations_only else None
         if device.type == "cpu":
@@ -250,6 +250,14 @@ class Learner(Algorithm):
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
             self.host_tasks.submit(errors, self._set_priorities)
         return scalars
+
+    def _share_of_updates(self) -> float:
+        """Share of the run's updates taken, without pretraining by losses other than the
+        algorithm's."""
+        problem = self.problem
+        pretrained = 0 if self.config.pretraining_option is None else problem.pretrain_updates
+        taken, all_updates = (n - pretrained for n in (self.updates, problem.total_updates))
+        return max(taken, 0) / max(all_updates, 1)
 
     def _set_priorities(self, errors: dict[str, Tensor]) -> None:
         self.replay.update_tensordict_priority(TensorDict(errors, [len(errors["index"])]))

@@ -102,7 +102,8 @@ class SACConfig(LearnerConfig):
     contrastive_weight: float = Field(default=0.0, ge=0)
     """Weight of the encoder's contrastive loss on pairs of views; 0 for none."""
     pretraining: Literal["all", "contrastive"] = "all"
-    """Losses that updates before the first collection minimise."""
+    """Losses that updates before the first collection minimise: all, or the contrastive one alone,
+    with ``init="bc"`` together with that of behaviour cloning."""
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
@@ -111,8 +112,6 @@ class SACConfig(LearnerConfig):
             raise ValueError("several views or a contrastive loss need view_transform")
         if self.pretraining == "contrastive" and not self.contrastive_weight:
             raise ValueError("pretraining 'contrastive' needs contrastive_weight")
-        if self.pretraining == "contrastive" and self.init == "bc":
-            raise ValueError("pretraining 'contrastive' and init 'bc' exclude each other")
         if self.stored_copies and self.augmentation == "none":
             raise ValueError("stored_copies needs augmentation")
         return self
@@ -306,7 +305,11 @@ class SAC(Learner):
         return [p for p in self.loss.parameters() if p is not self.loss.log_alpha]
 
     def pretrain_update(self) -> TensorDict:
-        """Take one update on the demonstrations, of all losses or of the contrastive one alone."""
-        if self.config.pretraining == "contrastive":
-            return self.minimize(self.loss.contrastive_loss(self.sample()))
-        return super().pretrain_update()
+        """Take one update on the demonstrations, as `SACConfig.pretraining` says."""
+        if self.config.pretraining == "all":
+            return super().pretrain_update()
+        batch = self.sample(demonstrations_only=self.init_loss is not None)
+        scalars = self.loss.contrastive_loss(batch)
+        if self.init_loss is not None:
+            scalars.update(self.init_loss(batch))
+        return self.minimize(scalars)

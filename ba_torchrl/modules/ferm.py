@@ -42,7 +42,10 @@ class FERMEncoder(nn.Module):
 
 
 class FERMActor(nn.Module):
-    """Gaussian policy on the convolutions of the critics' encoder, which it does not train.
+    """Gaussian policy on the convolutions of the critics' encoder.
+
+    The losses of actors and critics take the shared parameters as constants in the actor's terms;
+    behaviour cloning trains them.
 
     Args:
         trunk: the encoder's trunk, shared with it.
@@ -62,7 +65,7 @@ class FERMActor(nn.Module):
 
     def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
-        features = self.head(self.trunk(pixels, holding).detach())
+        features = self.head(self.trunk(pixels, holding))
         return self.loc(features), scale_from_log_std(self.log_std(features))
 
 

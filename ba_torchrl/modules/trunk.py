@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable
 from functools import cache
 from typing import ClassVar, Literal
@@ -13,6 +12,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
+from ba_torchrl import hardware
 from ba_torchrl.config import StrictModel
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
@@ -23,32 +23,12 @@ Precision = Literal["auto", "float32", "bfloat16"]
 SUPPORTED_IMAGE_SIZES = (64, 128)
 
 
-_WITH_AVX512_BF16 = ("AVX512_CORE_BF16", "AVX512_CORE_FP16", "AVX512_CORE_AMX", "AVX10")
-
-
-def _onednn_instruction_set() -> str | None:
-    """Return the largest instruction set that oneDNN's environment variable allows.
-
-    None is any. oneDNN reads the variable once, in the first operation of a process.
-    """
-    value = os.environ.get("ONEDNN_MAX_CPU_ISA", os.environ.get("DNNL_MAX_CPU_ISA", ""))
-    return None if value.upper() in ("", "DEFAULT", "ALL") else value.upper()
-
-
 @cache
 def _bfloat16_is_fast(device_type: str) -> bool:
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     if device_type == "cpu":
-        has = torch.cpu.get_capabilities()
-        allowed = _onednn_instruction_set()
-        if has.get("amx_bf16") and (allowed is None or "AMX" in allowed):
-            return True
-        # Intel's AVX512-BF16 is slower than its float32 (docs/performance.md, bfloat16).
-        is_intel = str(has.get("cpu_name", "")).startswith("Intel")
-        return bool(has.get("avx512_bf16") and not is_intel) and (
-            allowed is None or allowed.startswith(_WITH_AVX512_BF16)
-        )
+        return hardware.bfloat16_is_fast()
     return False
 
 

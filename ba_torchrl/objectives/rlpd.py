@@ -84,9 +84,7 @@ class RLPDLoss(SharedEncoderCritics, TransitionLoss):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.convert_to_functional(actor_network, "actor_network")
-        self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
-        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
+        self._convert_networks(actor_network, encoder_network, qvalue_network)
         self.subset = subset
         self.entropy_backup = entropy_backup
         self.target_entropy = target_entropy

@@ -154,9 +154,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
         super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
-        self.convert_to_functional(actor_network, "actor_network")
-        self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
-        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
+        self._convert_networks(actor_network, encoder_network, qvalue_network)
         device = self._default_device
         self.register_coeff_buffer("target_entropy", float(target_entropy), device=device)
         self.register_coeff_buffer(

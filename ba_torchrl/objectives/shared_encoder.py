@@ -3,12 +3,30 @@
 from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 
 class SharedEncoderCritics:
     """Mixin of a loss module with an actor, an encoder and K critics that see its features."""
+
+    def _convert_networks(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        encoder_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase,
+    ) -> None:
+        """Make the networks functional, with targets of encoder and critics.
+
+        Parameters that the actor shares with the encoder are constants in the actor's terms, so
+        that the critics alone train them.
+        """
+        self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
+        self.convert_to_functional(
+            actor_network, "actor_network", compare_against=list(encoder_network.parameters())
+        )
+        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
 
     def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return an action [..., A] drawn with gradient and its log-probability [...]."""

@@ -13,8 +13,9 @@ from pydantic import ValidationError
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.state_files import write_text
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.hardware import hardware, onednn_max_cpu_isa
 from ba_torchrl.profiling.table import Row
-from ba_torchrl.record.results import hardware, now, versions
+from ba_torchrl.record.results import now, versions
 
 SUFFIX = ".json"
 SHOWN_PACKAGES = ("torch", "torchrl", "pybullet")
@@ -51,7 +52,7 @@ class Machine(StrictModel):
         """
         return cls(
             **hardware(device),
-            onednn_max_cpu_isa=os.environ.get("ONEDNN_MAX_CPU_ISA"),
+            onednn_max_cpu_isa=onednn_max_cpu_isa(),
             load_average=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
             versions=versions(),
             commit=_commit(),

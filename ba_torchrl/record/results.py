@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
@@ -14,7 +13,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from pydantic import Field, ValidationError
 
 from ba_torchrl import __version__
@@ -26,8 +24,6 @@ CONFIG_FILE = "config.json"
 FAILURE_FILE = "failure.json"
 """Written by a benchmark into the folder of a run that failed: ``reason``, ``when``, ``log``."""
 PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
-INSTRUCTIONS = {"amx_bf16": "AMX", "avx512_f": "AVX-512", "avx2": "AVX2", "sve": "SVE"}
-"""Names of instruction sets by PyTorch's name of the capability, widest first."""
 
 NON_LEARNING_FIELDS = frozenset(
     {
@@ -208,45 +204,6 @@ def versions() -> dict[str, str]:
     return found
 
 
-def hardware(device: torch.device) -> dict[str, Any]:
-    """Return a description of the hardware of a run.
-
-    Args:
-        device: of the learner.
-    """
-    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
-    return {
-        "cpu": processor(),
-        "cores": os.cpu_count(),
-        "memory_gb": _memory_gb(),
-        "gpu": gpu,
-        "threads": torch.get_num_threads(),
-    }
-
-
-def processor() -> str:
-    """Return the name of the processor and its widest vector or matrix instructions."""
-    has = torch.cpu.get_capabilities()
-    widest = next((name for flag, name in INSTRUCTIONS.items() if has.get(flag)), None)
-    return _processor_name() + ("" if widest is None else f" ({widest})")
-
-
-def _processor_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass  # not Linux
-    return platform.processor() or platform.machine()
-
-
 def now() -> str:
     """Return the current time, UTC, ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-def _memory_gb() -> float | None:
-    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
-        return None
-    return round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)

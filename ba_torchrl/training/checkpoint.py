@@ -201,6 +201,7 @@ def problem_of(config: ExperimentConfig) -> Problem:
         images=env.images,
         actions=env.actions,
         total_updates=config.total_updates,
+        pretrain_updates=config.pretrain_updates,
         seed=config.seed,
         device=config.torch_device,
     )

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.episodes import Policy
+from ba_torchrl.hardware import hardware
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
     CurvePoint,
     FinalEvaluation,
     RunResult,
-    hardware,
     now,
     versions,
     write_result,

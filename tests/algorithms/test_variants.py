@@ -1,5 +1,6 @@
 """Every preset of an algorithm with every network of its control: two updates on small networks."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -114,6 +115,10 @@ def test_two_updates_change_every_network(preset, network):
     changed = {name for name in after if not torch.equal(after[name], before[name])}
     parts = [{name.split("_params")[0] for name in names} for names in (changed, after)]
     assert parts[0] == parts[1]
+    if algorithm.problem.control == "close_loop":  # all convolutions see every image
+        convolutions = {name for name in after if ".convs." in name}
+        assert convolutions
+        assert convolutions <= changed
     state = transitions(algorithm).select(*algorithm.observation_keys)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert algorithm.policy(state)[keys.ACTION].isfinite().all()
@@ -164,14 +169,56 @@ def test_contrastive_pretraining_trains_the_encoder_only():
     assert ferm.updates == 1
     after = parameters(ferm)
     changed = {name for name in after if not torch.equal(after[name], before[name])}
+    # the policy shares the encoder's convolutions, which have the encoder's names
     encoder = {name for name in after if name.startswith("encoder_network")}
-    # the policy shares the encoder's convolutions, which have one name each
-    shared = {name for name in after if name.startswith("actor_network") and ".trunk." in name}
-    assert encoder
-    assert shared
-    assert changed == encoder | shared | {"contrastive.weight"}
+    assert any(".trunk." in name for name in encoder)
+    assert changed == encoder | {"contrastive.weight"}
     losses = [float(ferm.pretrain_update()["loss_contrastive"]) for _ in range(60)]
     assert sum(losses[-10:]) < sum(losses[:10])
+
+
+def test_contrastive_pretraining_and_behaviour_cloning_go_together():
+    ferm = build("ferm_sacfd", "ferm", init="bc")
+    demonstrations = transitions(ferm)
+    demonstrations[keys.IS_EXPERT] = torch.ones_like(demonstrations[keys.IS_EXPERT])
+    ferm.extend(demonstrations)
+    before = parameters(ferm)
+    scalars = [ferm.pretrain_update() for _ in range(60)]
+    assert set(scalars[0].keys()) == {"loss_contrastive", "loss_bc"}
+    after = parameters(ferm)
+    changed = {name for name in after if not torch.equal(after[name], before[name])}
+    assert changed
+    assert not any(name.startswith("qvalue_network") for name in changed)
+    assert {name.split("_params")[0] for name in changed} >= {"actor_network", "encoder_network"}
+    for loss in list(scalars[0].keys()):
+        values = [float(each[loss]) for each in scalars]
+        assert sum(values[-10:]) < sum(values[:10])
+
+
+@pytest.mark.parametrize("preset", ["bc", "dagger"])
+def test_imitation_trains_the_convolutions_of_ferm(preset):
+    imitator = build(preset, "ferm")
+    imitator.extend(transitions(imitator))
+    imitator.update()
+    trunk = [p for name, p in imitator.loss.named_parameters() if ".trunk." in name]
+    assert trunk
+    assert all(float(p.grad.abs().max()) > 0 for p in trunk)
+
+
+@pytest.mark.parametrize(("pretraining", "share"), [("contrastive", 0.0), ("all", 4 / 10)])
+def test_importance_weights_start_with_the_losses_of_the_algorithm(pretraining, share, monkeypatch):
+    ferm = build("ferm_sacfd_per", "ferm", pretraining=pretraining)
+    ferm.problem = replace(ferm.problem, pretrain_updates=4)
+    ferm.extend(transitions(ferm))
+    seen, sampler = [], ferm.replay.sampler
+    monkeypatch.setattr(sampler, "anneal", seen.append)
+    for _ in range(4):
+        ferm.pretrain_update()
+    ferm.update()
+    assert seen[-1] == pytest.approx(share)
+    ferm.updates = 9
+    ferm.sample()
+    assert seen[-1] == pytest.approx(5 / 6 if pretraining == "contrastive" else 9 / 10)
 
 
 def test_pretraining_of_other_variants_takes_all_losses():

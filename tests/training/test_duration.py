@@ -3,7 +3,7 @@ import time
 import pytest
 import torch
 
-from ba_torchrl.record import results
+from ba_torchrl import hardware
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.duration import (
     MEASURED_UPDATES,
@@ -47,8 +47,27 @@ def test_the_path_names_number_format_and_processor(tmp_path, precision):
 )
 def test_the_processor_is_named_with_its_widest_instructions(monkeypatch, capabilities, expected):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
-    monkeypatch.setattr(results, "_processor_name", lambda: "Xeon")
-    assert results.processor() == f"Xeon{expected}"
+    monkeypatch.setattr(hardware, "_processor_name", lambda: "Xeon")
+    assert hardware.processor() == f"Xeon{expected}"
+
+
+@pytest.mark.parametrize("variable", ["ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA"])
+@pytest.mark.parametrize(
+    ("limit", "expected"),
+    [
+        ("AVX512_CORE", " (AVX-512, oneDNN limited to AVX512_CORE)"),
+        ("avx512_core_amx", " (AMX, oneDNN limited to AVX512_CORE_AMX)"),
+        ("ALL", " (AMX)"),
+    ],
+)
+def test_a_limit_of_the_instructions_is_named(monkeypatch, variable, limit, expected):
+    has_amx = {"avx2": True, "avx512_f": True, "amx_bf16": True}
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    monkeypatch.setenv(variable, limit)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: has_amx)
+    monkeypatch.setattr(hardware, "_processor_name", lambda: "Xeon")
+    assert hardware.processor() == f"Xeon{expected}"
+    assert hardware.amx_is_used() is ("AMX" in expected)
 
 
 def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog):

@@ -49,7 +49,7 @@ class ObjectGrasping(ClutterTask, CloseLoopControl):
     """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
     first."""
 
-    def default_max_failures(self) -> int:
+    def default_max_attempts(self) -> int:
         """Return the number of attempts of the reference implementation, 1.5 per object."""
         return math.ceil(1.5 * self.settings.num_objects)
 

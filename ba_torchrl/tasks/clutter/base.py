@@ -39,14 +39,14 @@ RETREAT_Z_M = (0.55, 0.5, 0.45, 0.4, 0.35)
 class Clutter:
     """All objects of an object set, and the heap that some of them form in a tray.
 
-    A heap persists until it is empty or `max_failures` consecutive episodes grasped nothing.
+    A heap persists until it is empty or `max_attempts` episodes have taken place in it.
 
     Args:
         world: not sealed yet.
         robot: the robot; its arm retreats during a drop.
         tray: the tray.
         settings: settings of the task; `parameters` names the object set.
-        max_failures: number of consecutive failures after which new objects are dropped.
+        max_attempts: number of episodes with a heap after which new objects are dropped.
     """
 
     def __init__(
@@ -56,14 +56,16 @@ class Clutter:
         tray: Tray,
         settings: TaskSettings,
         *,
-        max_failures: int,
+        max_attempts: int,
     ) -> None:
         self.world = world
         self.robot = robot
         self.settings = settings
-        self.max_failures = max_failures
+        self.max_attempts = max_attempts
+        self.attempts = 0
+        """Episodes with the present heap that have ended."""
         self.failures = 0
-        """Consecutive episodes without a grasped object."""
+        """The last of them in a row without a grasped object."""
         self.tray = tray
         parameters = settings.parameters
         shapes = load_object_set(parameters.object_set, parameters.asset_root)
@@ -81,16 +83,16 @@ class Clutter:
         Args:
             grasped_object: the object that the last episode grasped, if any.
         """
-        if grasped_object is not None:
-            return len(self.pool.active) > 1
-        return bool(self.pool.active) and self.failures + 1 < self.max_failures
+        remaining = len(self.pool.active) - (grasped_object is not None)
+        return remaining > 0 and self.attempts + 1 < self.max_attempts
 
     def advance(self, grasped_object: Body | None) -> None:
-        """Remove the grasped object from the scene, or count a failure.
+        """Count an attempt, and remove the grasped object from the scene.
 
         Args:
             grasped_object: the object that the last episode grasped, if any.
         """
+        self.attempts += 1
         if grasped_object is None:
             self.failures += 1
         else:
@@ -106,7 +108,7 @@ class Clutter:
         Args:
             rng: random generator.
         """
-        self.failures = 0
+        self.attempts = self.failures = 0
         settings, world, pool = self.settings, self.world, self.pool
         center = np.array(settings.workspace.center)
         half_m = self.tray.half_m
@@ -141,9 +143,9 @@ class ClutterTask(Task):
     """A task of grasping an object from a heap, in which the next episode continues with the rest.
 
     New objects are dropped when the tray is empty, when an object has left the workspace, and after
-    ``max_failures`` consecutive episodes without a grasped object; an episode that is reset early
-    counts as one of these. In the appendix, a heap with remaining objects is never replaced; the
-    reference implementation has a limit, whose value is the default.
+    ``max_attempts`` episodes with the same heap, of which an episode that is reset early is one. In
+    the appendix, a heap with remaining objects is never replaced; the reference implementation
+    replaces it in these cases, and its number of attempts is the default.
     """
 
     scale_limits = (1.0, 1.0)
@@ -155,13 +157,13 @@ class ClutterTask(Task):
         """Name of the object set; see `ba_torchrl.sim.assets`."""
         asset_root: str | None = None
         """Folder of an object set that is not part of the package."""
-        max_failures: int | None = Field(default=None, ge=1)
-        """Consecutive episodes without a grasped object after which new objects are dropped; by
-        default 30 in open loop, and 1.5 per object, rounded up, in close loop."""
+        max_attempts: int | None = Field(default=None, ge=1)
+        """Episodes with the same heap after which new objects are dropped; None for the reference
+        implementation's limit: 30 in open loop, and 1.5 per object, rounded up, in close loop."""
 
     @abstractmethod
-    def default_max_failures(self) -> int:
-        """Return the number of consecutive failures after which new objects are dropped."""
+    def default_max_attempts(self) -> int:
+        """Return the number of episodes with the same heap after which it is replaced."""
 
     @abstractmethod
     def grasped_object(self) -> Body | None:
@@ -169,13 +171,13 @@ class ClutterTask(Task):
 
     def load_scene(self) -> None:
         """Load all objects of the object set."""
-        limit = self.settings.parameters.max_failures
+        limit = self.settings.parameters.max_attempts
         self.clutter = Clutter(
             self.world,
             self.robot,
             self.terrain,
             self.settings,
-            max_failures=self.default_max_failures() if limit is None else limit,
+            max_attempts=self.default_max_attempts() if limit is None else limit,
         )
 
     def make_terrain(self) -> Tray:
@@ -192,7 +194,7 @@ class ClutterTask(Task):
         return self.clutter.should_continue(self.grasped_object())
 
     def resume(self) -> None:
-        """Remove the grasped object from the scene, or count a failure."""
+        """Count an attempt, and remove the grasped object from the scene."""
         self.clutter.advance(self.grasped_object())
 
     @cached_property
@@ -215,13 +217,14 @@ class ClutterTask(Task):
         poses = [(body.position, body.yaw_rad) for body in self.objects]
         return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
 
-    def get_state(self) -> tuple[tuple[int, ...], int]:
-        """Return the indices of the active objects and the number of consecutive failures."""
-        return self.clutter.pool.get_state(), self.clutter.failures
+    def get_state(self) -> tuple[tuple[int, ...], int, int]:
+        """Return the indices of the active objects and the numbers of attempts and failures."""
+        clutter = self.clutter
+        return clutter.pool.get_state(), clutter.attempts, clutter.failures
 
-    def set_state(self, state: tuple[tuple[int, ...], int]) -> None:
-        """Restore the active objects and the number of consecutive failures."""
-        active, self.clutter.failures = state
+    def set_state(self, state: tuple[tuple[int, ...], int, int]) -> None:
+        """Restore the active objects and the numbers of attempts and failures."""
+        active, self.clutter.attempts, self.clutter.failures = state
         self.clutter.pool.set_state(active)
 
 

@@ -46,7 +46,7 @@ class ObjectGrasping(ClutterTask, OpenLoopControl):
     num_objects_range = (1, 20)
     scale_range = (1.0, 1.0)
 
-    def default_max_failures(self) -> int:
+    def default_max_attempts(self) -> int:
         """Return the number of attempts of the reference implementation, 30."""
         return 30
 

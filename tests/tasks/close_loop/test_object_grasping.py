@@ -163,8 +163,8 @@ def test_new_objects_are_dropped_into_an_empty_tray(make):
     assert counts == [2, 1, 2, 1]
 
 
-def test_the_heap_is_replaced_after_the_configured_number_of_failures(make):
-    env = make(max_steps=2, max_failures=3)
+def test_the_heap_is_replaced_after_the_configured_number_of_attempts(make):
+    env = make(max_steps=2, max_attempts=3)
     state, heaps = env.reset(), []
     for _ in range(7):
         heaps.append(tuple(names(env)))
@@ -175,7 +175,7 @@ def test_the_heap_is_replaced_after_the_configured_number_of_failures(make):
 
 
 @pytest.mark.parametrize(("count", "limit"), [(1, 2), (4, 6), (5, 8)])
-def test_the_default_number_of_failures_is_one_and_a_half_per_object(make, count, limit):
+def test_the_default_number_of_attempts_is_one_and_a_half_per_object(make, count, limit):
     env = make(max_steps=1, num_objects=count)
     state, heaps = env.reset(), []
     for _ in range(limit + 1):
@@ -186,15 +186,21 @@ def test_the_default_number_of_failures_is_one_and_a_half_per_object(make, count
     assert heaps[limit] != heaps[0]
 
 
-def test_a_success_resets_the_count_of_failures(make):
-    env = make(expert=True)
-    state = finish(env, env.reset(), NO_OP)
+def test_a_success_is_an_attempt(make):
+    env = make(expert=True, max_attempts=4)
+    state = env.reset()
+    first = set(names(env))
+    finish(env, state, NO_OP)
     finish(env, env.reset(), NO_OP)
-    state = finish(env, env.reset())
-    assert state["success"]
-    env.reset()
+    assert finish(env, env.reset())["success"]
+    state = env.reset()
     assert len(names(env)) == 4
-    assert env.scene.task.get_state()[1] == 0
+    assert set(names(env)) < first
+    assert env.scene.task.get_state()[1:] == (3, 0)
+    assert finish(env, state)["success"]
+    env.reset()
+    assert len(names(env)) == 5
+    assert env.scene.task.get_state()[1:] == (0, 0)
 
 
 def test_an_object_outside_the_workspace_ends_the_episode_and_replaces_the_heap(make):

@@ -47,8 +47,8 @@ def test_new_objects_fall_when_the_tray_is_empty(make):
     assert len({heap for heap in heaps if len(heap) == 2}) >= 2
 
 
-def test_the_heap_is_replaced_after_the_configured_number_of_failures(make):
-    env = make(num_objects=3, max_failures=3)
+def test_the_heap_is_replaced_after_the_configured_number_of_attempts(make):
+    env = make(num_objects=3, max_attempts=3)
     state, heaps = env.reset(), []
     for _ in range(7):
         heaps.append(tuple(names(env)))
@@ -58,25 +58,26 @@ def test_the_heap_is_replaced_after_the_configured_number_of_failures(make):
     assert len({heaps[0], heaps[3], heaps[6]}) == 3
 
 
-def test_the_default_number_of_failures_is_that_of_the_reference(make):
+def test_the_default_number_of_attempts_is_that_of_the_reference(make):
     env = make(num_objects=2)
     env.reset()
-    assert env.scene.task.clutter.max_failures == 30
+    assert env.scene.task.clutter.max_attempts == 30
     heap = names(env)
     for _ in range(5):
         play(env, env.reset(), NO_OP)
     assert names(env) == heap
-    with pytest.raises(ConfigError, match="max_failures"):
-        make(max_failures=0)
+    with pytest.raises(ConfigError, match="max_attempts"):
+        make(max_attempts=0)
 
 
-def test_a_success_resets_the_count_of_failures(make):
+def test_a_success_is_an_attempt_and_resets_the_count_of_failures(make):
     env = make(expert=True)
     for _ in range(2):
         play(env, env.reset(), NO_OP)
     assert play(env, env.reset())["success"]
     env.reset()
     assert len(names(env)) == 14
+    assert env.scene.task.clutter.attempts == 3
     assert env.scene.task.clutter.failures == 0
 
 
@@ -95,25 +96,27 @@ def test_an_object_outside_the_tray_replaces_the_heap(make):
 
 
 @pytest.mark.parametrize(
-    ("present", "failures", "succeeds", "should_continue"),
+    ("present", "attempts", "succeeds", "should_continue"),
     [
         (2, 0, True, True),
         (1, 0, True, False),
-        (2, 2, True, True),
+        (2, 1, True, True),
+        (2, 2, True, False),
         (1, 0, False, True),
         (2, 1, False, True),
         (2, 2, False, False),
     ],
 )
-def test_when_a_heap_is_replaced(make, present, failures, succeeds, should_continue):
-    env = make(num_objects=present, max_failures=3)
+def test_when_a_heap_is_replaced(make, present, attempts, succeeds, should_continue):
+    env = make(num_objects=present, max_attempts=3)
     env.reset()
     clutter = env.scene.task.clutter
-    clutter.failures = failures
+    clutter.attempts = attempts
     grasped_object = clutter.pool.active[0] if succeeds else None
     assert clutter.should_continue(grasped_object) is should_continue
     clutter.advance(grasped_object)
-    assert clutter.failures == (0 if succeeds else failures + 1)
+    assert clutter.attempts == attempts + 1
+    assert clutter.failures == (0 if succeeds else 1)
     assert len(clutter.pool.active) == present - succeeds
 
 

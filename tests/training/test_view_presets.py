@@ -1,0 +1,40 @@
+"""Presets with random views of the images in a whole run: collection, updates and evaluation."""
+
+import pytest
+
+from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.training.experiment import Experiment
+from tests.algorithms.test_variants import presets
+from tests.training.test_experiment import tiny
+
+SMALL = {"batch_size": 4, "buffer_size": 100}
+
+
+@pytest.mark.parametrize(
+    ("preset", "network", "obs_size"),
+    [
+        ("rad_sac", "cnn", 64),
+        ("rad_sacfd", "cnn", 64),
+        ("drq_sac", "cnn", 64),
+        ("drq_sacfd_per", "cnn", 64),
+        ("ferm_sacfd", "ferm", 142),
+        ("ferm_sacfd_per", "ferm", 142),
+    ],
+)
+def test_a_run_collects_learns_and_evaluates(tmp_path, preset, network, obs_size):
+    config = tiny(
+        tmp_path,
+        algorithm={**presets()[preset], **SMALL},
+        network={"name": network, "width": 0.1},
+        env={"obs_size": obs_size, "max_steps": 5},
+        total_updates=4,
+        eval_every=4,
+        video_episodes=0,
+    )
+    result = Experiment(config, progress=False).run()
+    scalars = read_scalars(tmp_path / "run")
+    assert result.updates == 4
+    assert scalars["eval/success_rate"].steps.tolist() == [4]
+    pretraining = [] if network == "ferm" else [1, 2]  # of the encoder alone
+    assert scalars["train/loss_qvalue"].steps.tolist() == [*pretraining, 3, 4]
+    assert ("train/loss_contrastive" in scalars) is (network == "ferm")
