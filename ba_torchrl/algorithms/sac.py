@@ -84,7 +84,7 @@ class SACConfig(LearnerConfig):
     augmentation: Literal["none", "so2"] = "none"
     """Rotation of transitions about the z axis; none in the appendix."""
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
-    """Probability of rotating a sampled transition."""
+    """Probability of rotating a sampled transition; not in the appendix."""
     stored_copies: int = Field(default=0, ge=0)
     """Number of rotated copies that are stored with each transition, which is then not rotated when
     it is sampled; 0 to rotate sampled transitions."""
@@ -100,7 +100,8 @@ class SACConfig(LearnerConfig):
     target_views: int = Field(default=1, ge=1)
     """Views of each next observation, over which the target is averaged."""
     contrastive_weight: float = Field(default=0.0, ge=0)
-    """Weight of the encoder's contrastive loss on pairs of views; 0 for none."""
+    """Weight of the encoder's contrastive loss on pairs of views; 0 for none. The FERM presets have
+    1; the appendix gives no weight."""
     pretraining: Literal["all", "contrastive"] = "all"
     """Losses that updates before the first collection minimise: all, or the contrastive one alone,
     with ``init="bc"`` together with that of behaviour cloning."""

@@ -167,7 +167,8 @@ class EquiASRConfig(ASRNetworkConfig):
     yaws: C_32 for 16 yaws in half a turn.
 
     Args:
-        group_order: number of rotations of the dihedral group of the pixel values.
+        group_order: number of rotations of the dihedral group of the pixel values; the default is
+            that of the reference implementation.
     """
 
     group_order: int = Field(default=4, ge=2)

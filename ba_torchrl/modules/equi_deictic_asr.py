@@ -34,7 +34,8 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
     image turned by half a turn; this doubles the cost of these levels.
 
     Args:
-        group_order: number of rotations of the dihedral group of the pixel values.
+        group_order: number of rotations of the dihedral group of the pixel values; the default is
+            that of the reference implementation.
         swap_fingers: take the mean over both orders of the fingers where yaws span half a turn; the
             paper describes one order.
     """

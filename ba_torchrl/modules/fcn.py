@@ -77,8 +77,8 @@ class EquiFCNConfig(SpatialImageConfig):
     Args:
         num_rotations: yaws, evenly spaced; without a yaw in the action it has no meaning. The
             default is that of the reference implementation.
-        group_order: number of rotations of the dihedral group, 4 if None; only for actions without
-            a yaw.
+        group_order: number of rotations of the dihedral group; None for the reference
+            implementation's 4. Only for actions without a yaw.
     """
 
     num_rotations: int = Field(default=16, ge=2)

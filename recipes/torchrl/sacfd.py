@@ -1,11 +1,11 @@
-"""SACfD in one file: Soft Actor-Critic from demonstrations (appendix G.2), with TorchRL's parts.
+"""SACfD in one file: Soft Actor-Critic from demonstrations (appendix F), with TorchRL's parts.
 
 python recipes/torchrl/sacfd.py
 python recipes/torchrl/sacfd.py task=close_loop/drawer_opening network=equi total_updates=3000
 
-The replay is prioritised, with a bonus for demonstrations, and sampled transitions are rotated;
-neither is part of the appendix's SACfD. ``recipes/train.py`` runs the same algorithm with
-checkpoints, resumption, curves and videos.
+The replay is prioritised, with a bonus for demonstrations (appendix G.2, "PER"). Sampled transitions
+are rotated, which the appendix does not do. ``recipes/train.py`` has more options, checkpoints,
+resumption, curves and videos.
 """
 
 from dataclasses import dataclass
@@ -43,10 +43,10 @@ OBSERVATION = [keys.PIXELS, keys.HOLDING]
 
 @dataclass
 class Config:
-    """A run; every field can be set on the command line as ``name=value``."""
+    """A run of minutes; every field can be set on the command line as ``name=value``."""
 
     task: str = "close_loop/block_picking"
-    obs_size: int = 64
+    obs_size: int = 64  # appendix: 128
     network: str = "equi"  # or "cnn"
     width: int = 16  # regular fields of the equivariant network; of 128 channels of the CNN
     num_envs: int = 5
@@ -56,11 +56,11 @@ class Config:
     total_updates: int = 1500
     batch_size: int = 64
     buffer_size: int = 100_000
-    learning_rate: float = 3e-4
-    gamma: float = 0.95
-    tau: float = 0.05
-    demonstration_weight: float = 5.0
-    rotation_probability: float = 0.8
+    learning_rate: float = 3e-4  # appendix: 1e-3
+    gamma: float = 0.95  # appendix: 0.99
+    tau: float = 0.05  # reference implementation: 0.01
+    demonstration_weight: float = 5.0  # reference implementation: 1
+    rotation_probability: float = 0.8  # not in the appendix
     eval_every: int = 250
     eval_episodes: int = 50
     final_eval_episodes: int = 100

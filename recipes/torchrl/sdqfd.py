@@ -4,8 +4,7 @@ python recipes/torchrl/sdqfd.py
 python recipes/torchrl/sdqfd.py task=open_loop/house_building_2 num_objects=null network=asr
 
 Every action is a pick or a place, chosen level by level: the pixel, then the angle. The greedy
-policy collects. ``recipes/train.py`` runs the same algorithm with resumption, checkpoints, curves
-and videos.
+policy collects. ``recipes/train.py`` has more options, resumption, checkpoints, curves and videos.
 """
 
 from dataclasses import dataclass
@@ -41,14 +40,14 @@ from ba_torchrl.objectives.dqn import LevelDQNLoss
 
 @dataclass
 class Config:
-    """A run; every field can be set on the command line as ``name=value``."""
+    """A run of minutes; every field can be set on the command line as ``name=value``."""
 
     task: str = "open_loop/block_stacking"
     num_objects: int | None = 3  # null for the task's number
-    obs_size: int = 64
+    obs_size: int = 64  # appendix: 128
     network: str = "equi_asr"  # or "asr"
-    width: float = 0.25
-    num_rotations: int = 8
+    width: float = 0.25  # reference implementation: 1
+    num_rotations: int = 8  # reference implementation: 16
     num_envs: int = 5
     parallel: bool = False
     demonstrations: int = 50
@@ -56,13 +55,13 @@ class Config:
     total_updates: int = 1200
     batch_size: int = 16
     buffer_size: int = 100_000
-    learning_rate: float = 3e-4
+    learning_rate: float = 3e-4  # appendix: 1e-4
     weight_decay: float = 1e-5
-    gradient_clamp: float = 1.0
-    gamma: float = 0.9
+    gradient_clamp: float = 1.0  # reference implementation
+    gamma: float = 0.9  # appendix: 0.95
     demonstration_weight: float = 0.1
     margin: float = 0.1
-    target_interval: int = 25
+    target_interval: int = 25  # reference implementation: 100
     eval_every: int = 300
     eval_episodes: int = 50
     final_eval_episodes: int = 100

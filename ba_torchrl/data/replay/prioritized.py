@@ -29,7 +29,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         generator: source of every draw.
         alpha: exponent of the priorities.
         beta: initial exponent of the weights; ``anneal`` raises it to one, except from zero.
-        eps: added to every priority.
+        eps: added to every priority; the default is that of the reference implementation.
         expert_bonus: added to the priority of demonstrations.
         expert_key: entry with the flag of demonstrations.
 
