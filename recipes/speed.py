@@ -43,7 +43,7 @@ def main(settings: DictConfig) -> None:
     limit_library_logs()
     check_known(settings)
     load_plugins(settings.plugins)
-    check_texts(settings, "which", "device")
+    check_texts(settings, "which", "device", "precision")
     check_texts(settings, "output", "compare", optional=True)
     check_counts(settings, "repeats")
     check_flags(settings, "profile")
@@ -54,7 +54,13 @@ def main(settings: DictConfig) -> None:
         check_writable_file(settings.output)
     where = Machine.here(device)  # includes the load before the measurement
     profiles: dict[str, str] | None = {} if settings.profile else None
-    rows = measure(settings.which, settings.repeats, profiles=profiles, device=device)
+    rows = measure(
+        settings.which,
+        settings.repeats,
+        profiles=profiles,
+        device=device,
+        precision=settings.precision,
+    )
     if settings.output is not None:
         write_speed_file(settings.output, SpeedFile(machine=where, rows=rows))
     for work, operations in (profiles or {}).items():

@@ -264,7 +264,7 @@ def measure_escnn(bench: Bench) -> list[Row]:
     """Update of Equi SACfD, and the same with escnn's layers, without sampling and augmentation."""
     group_order, image_size, n_hidden = SIZE
     network = {"name": "equi", "group_order": group_order, "n_hidden": n_hidden}
-    learner = make_learner(CLOSE_LOOP, network, image_size, bench.device)
+    learner = make_learner(bench, CLOSE_LOOP, network, image_size)
     batch = learner.sample()
     torch.manual_seed(SEED)
     escnn = EscnnSACfD(group_order, image_size, n_hidden, bench.device)

@@ -20,6 +20,7 @@ from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCo
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
+from ba_torchrl.hardware import amx_is_used
 from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
 from ba_torchrl.profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 from ba_torchrl.training.checkpoint import build_algorithm
@@ -64,7 +65,7 @@ SIX_DOF = {**OPEN_LOOP, "env": {"action_sequence": "pxyzrrr", "in_hand_mode": "p
 
 
 def _config(
-    experiment: dict[str, Any], network: dict[str, Any], obs_size: int, device: torch.device
+    bench: Bench, experiment: dict[str, Any], network: dict[str, Any], obs_size: int
 ) -> ExperimentConfig:
     """Return the configuration of a learner."""
     env = {**experiment.get("env", {}), "obs_size": obs_size}
@@ -72,9 +73,9 @@ def _config(
         {
             **experiment,
             "env": env,
-            "network": network,
+            "network": {**network, "precision": bench.precision},
             "seed": SEED,
-            "device": str(device),
+            "device": str(bench.device),
         }
     )
 
@@ -91,17 +92,17 @@ def _expert_episodes(
 
 
 def make_learner(
-    experiment: dict[str, Any], network: dict[str, Any], obs_size: int, device: torch.device
+    bench: Bench, experiment: dict[str, Any], network: dict[str, Any], obs_size: int
 ) -> Learner:
     """Return a learner with the expert's transitions in its replay.
 
     Args:
+        bench: device of the learner and precision of its network.
         experiment: task, algorithm and fields of the environment.
         network: its name and parameters.
         obs_size: pixels of the images.
-        device: of the learner.
     """
-    config = _config(experiment, network, obs_size, device)
+    config = _config(bench, experiment, network, obs_size)
     learner = build_algorithm(config)
     learner.on_demonstrations(_expert_episodes(config.task, 20, config.env)[1])
     return learner
@@ -113,11 +114,15 @@ def measure_update(
     experiment: dict[str, Any],
     network: dict[str, Any],
     obs_size: int,
-    budget: Budget,
+    with_amx: Budget | None = None,
+    without_amx: Budget | None = None,
 ) -> list[Row]:
-    """Return the row of a learner's updates, with the expert's transitions in its replay."""
-    config = _config(experiment, network, obs_size, bench.device)
-    learner = make_learner(experiment, network, obs_size, bench.device)
+    """Return the row of a learner's updates, with the expert's transitions in its replay.
+
+    The budget of a CPU depends on whether it computes with AMX.
+    """
+    config = _config(bench, experiment, network, obs_size)
+    learner = make_learner(bench, experiment, network, obs_size)
     product = MatrixProduct(network_dtype(config.network_config, bench.device), bench.device)
     multiply_adds = count_multiply_adds(learner.update)
     times = bench.time_against(
@@ -125,6 +130,7 @@ def measure_update(
     )
     limits = [multiply_adds / product.multiply_adds * value for value in times["product"]]
     notes = f"{multiply_adds / 1e9:.3g} G multiply-adds, {product.describe(times['product'])}"
+    budget = with_amx if amx_is_used() else without_amx
     shown = budget if bench.device.type == "cpu" else None
     return [timed_row(work, "s", times[work], times["unit"], shown, notes, limits)]
 
@@ -138,7 +144,8 @@ def equivariant_update(bench: Bench) -> list[Row]:
         CLOSE_LOOP,
         {"name": "equi", "group_order": 8, "n_hidden": 64},
         128,
-        Budget("13.5", 2.0, 1.3),
+        Budget("13.5", 1.8, 1.3),
+        Budget("25.3", 9.0, 5.0),
     )
 
 
@@ -164,7 +171,8 @@ def plain_update(bench: Bench) -> list[Row]:
         CLOSE_LOOP,
         {"name": "cnn"},
         128,
-        Budget("1.57", 0.35, 0.2),
+        Budget("1.57", 0.29, 0.2),
+        Budget("3.6", 1.0, 0.7),
     )
 
 
@@ -177,7 +185,7 @@ def equivariant_spatial_update(bench: Bench) -> list[Row]:
         OPEN_LOOP,
         {"name": "equi_asr"},
         128,
-        Budget("40.6", 7.0, 4.0),
+        Budget("40.6", 6.0, 4.0),
     )
 
 
@@ -190,7 +198,7 @@ def plain_spatial_update(bench: Bench) -> list[Row]:
         OPEN_LOOP,
         {"name": "asr"},
         128,
-        Budget("3.9", 1.0, 0.5),
+        Budget("3.9", 0.75, 0.5),
     )
 
 
@@ -203,7 +211,6 @@ def equivariant_pose_update(bench: Bench) -> list[Row]:
         SIX_DOF,
         {"name": "equi_deictic_asr"},
         128,
-        Budget("", None, None),
     )
 
 
@@ -216,7 +223,6 @@ def plain_pose_update(bench: Bench) -> list[Row]:
         SIX_DOF,
         {"name": "asr"},
         128,
-        Budget("", None, None),
     )
 
 
@@ -241,7 +247,7 @@ ACTING = {
 def measure_acting(bench: Bench, work: str) -> list[Row]:
     """Greedy actions of five environments, with filters expanded in every pass and once."""
     experiment, network, obs_size = ACTING[work]
-    config = _config(experiment, network, obs_size, bench.device)
+    config = _config(bench, experiment, network, obs_size)
     env = make_vector_env(config.task, 5, parallel=False, seed=SEED, **config.env)
     state = env.reset()
     env.close()
@@ -287,7 +293,7 @@ def close_loop_memory(bench: Bench) -> list[Row]:
         bench,
         "close_loop/block_picking",
         lambda high: {keys.PIXELS: DepthQuantizer(high)},
-        Budget("3300", 1700.0, 500.0),
+        Budget("3300", 50.0, None),
     )
 
 
@@ -298,5 +304,5 @@ def open_loop_memory(bench: Bench) -> list[Row]:
         bench,
         "open_loop/block_stacking",
         lambda high: dict.fromkeys((keys.PIXELS, keys.IN_HAND), HalfPrecision(high)),
-        Budget("13000", 3400.0, 500.0),
+        Budget("13000", 100.0, None),
     )

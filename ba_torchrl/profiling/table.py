@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 from pydantic import Field
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.modules.trunk import Precision
 from ba_torchrl.registry import Registry
 
 GROUPS = ("simulation", "learning", "throughput", "memory")
@@ -42,7 +43,7 @@ class Budget:
     """Values for comparison with a row, in the row's unit."""
 
     reference: str
-    """The reference implementation's figure, on two cores of a Xeon with AMX."""
+    """The reference implementation's figure, on two cores of a Xeon."""
     must: Positive | None
     aim: Positive | None
 
@@ -87,6 +88,7 @@ class Bench:
         bar: progress bar of the rounds.
         profiles: receives a profile of each timed call, by name; None for no profiles.
         device: of the learners.
+        precision: of the learners' networks.
     """
 
     def __init__(
@@ -95,9 +97,11 @@ class Bench:
         bar: tqdm,
         profiles: dict[str, str] | None = None,
         device: torch.device = CPU,
+        precision: Precision = "auto",
     ) -> None:
         self.repeats = repeats
         self.device = device
+        self.precision: Precision = precision
         self._bar = bar
         self._profiles = profiles
 
@@ -198,6 +202,7 @@ def measure(
     progress: bool = True,
     profiles: dict[str, str] | None = None,
     device: torch.device = CPU,
+    precision: Precision = "auto",
 ) -> list[Row]:
     """Measure one group of the table, a single measurement, or "all".
 
@@ -207,13 +212,17 @@ def measure(
         progress: show a progress bar.
         profiles: receives a profile of each timed call, by name; None for no profiles.
         device: of the learners.
+        precision: of the learners' networks.
 
     Raises:
-        ConfigError: ``which`` is unknown, or ``repeats`` is below 1.
+        ConfigError: ``which`` or ``precision`` is unknown, or ``repeats`` is below 1.
     """
     known = (*GROUPS, "all", *MEASUREMENTS)
     if which not in known:
         raise ConfigError(f"which: {which!r} is none of {', '.join(known)}")
+    if precision not in get_args(Precision):
+        allowed = ", ".join(get_args(Precision))
+        raise ConfigError(f"precision: {precision!r} is none of {allowed}")
     if repeats < 1:
         raise ConfigError(f"repeats must be 1 or more, got {repeats}")
     jobs = [
@@ -226,7 +235,7 @@ def measure(
     rows: list[Row] = []
     with tqdm(total=len(jobs) * repeats, disable=not progress, unit="round") as bar:
         for function, arguments in jobs:
-            rows += function(Bench(repeats, bar, profiles, device), *arguments)
+            rows += function(Bench(repeats, bar, profiles, device, precision), *arguments)
     return rows
 
 

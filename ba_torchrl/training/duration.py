@@ -27,11 +27,23 @@ def compute_path(config: ExperimentConfig) -> str:
 
 
 class UpdateTimer:
-    """Measures the mean duration of the first updates of a process, without the very first."""
+    """Measures the mean duration of the first updates, without the very first."""
 
     def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Measure the following updates as if they were the first."""
         self._count = 0
         self._start = 0.0
+
+    def exclude(self, seconds: float) -> None:
+        """Leave out something else between two updates.
+
+        Args:
+            seconds: its duration.
+        """
+        self._start += seconds
 
     def tick(self) -> float | None:
         """Count an update that has ended.

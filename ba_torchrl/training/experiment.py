@@ -155,6 +155,7 @@ class Experiment:
         if self._is_complete:
             return
         self._collection = self._start_collection()
+        self._timer.restart()  # collection between updates takes time
         while not self._take_pending_updates():
             steps = self._store(next(self._collection))
             if algorithm.replay_size >= config.min_replay:
@@ -250,14 +251,16 @@ class Experiment:
         """Log the expected duration of the remaining updates, if it has just been measured."""
         if seconds_per_update is None:
             return
+        target = self.config.stop_at_success
         remaining = self.config.total_updates - self.algorithm.updates
-        minutes = remaining * seconds_per_update / 60
         logger.info(
-            "%s: %.2f s an update, %.0f minutes for the remaining %d, evaluations not included",
+            "%s: %.2f s an update%s, %.0f minutes for the remaining %d without evaluations%s",
             compute_path(self.config),
             seconds_per_update,
-            minutes,
+            "" if self._collection is None else " with collection",
+            remaining * seconds_per_update / 60,
             remaining,
+            "" if target is None else f"; ends once two in a row have a success of {target:g}",
         )
 
     def _evaluate_if_due(self) -> None:
@@ -265,7 +268,9 @@ class Experiment:
         updates, curve = self.algorithm.updates, self._progress.curve
         is_new = updates > (curve[-1].updates if curve else 0)
         if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
+            start = time.perf_counter()
             self._evaluate_and_save()
+            self._timer.exclude(time.perf_counter() - start)
 
     def _stop_or_save(self) -> None:
         """Stop after a signal; save the state if the last save was long ago."""

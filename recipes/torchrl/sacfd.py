@@ -3,9 +3,9 @@
 python recipes/torchrl/sacfd.py
 python recipes/torchrl/sacfd.py task=close_loop/drawer_opening network=equi total_updates=3000
 
-The replay is prioritised, with a bonus for demonstrations (appendix G.2, "PER"). Sampled transitions
-are rotated, which the appendix does not do. ``recipes/train.py`` has more options, checkpoints,
-resumption, curves and videos.
+The replay is prioritised, with a bonus for demonstrations (appendix G.2, "PER"). Sampled
+transitions are rotated, which the appendix does not do. ``recipes/train.py`` has more options,
+checkpoints, resumption, curves and videos.
 """
 
 from dataclasses import dataclass

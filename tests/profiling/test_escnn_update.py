@@ -128,7 +128,7 @@ def test_both_updates_are_measured(monkeypatch):
     monkeypatch.setattr(
         escnn_update,
         "make_learner",
-        lambda *_: make(experiment, small, PIXELS, torch.device("cpu")),
+        lambda bench, *_: make(bench, experiment, small, PIXELS),
     )
     monkeypatch.setattr(escnn_update, "SIZE", (4, PIXELS, 4))
     with tqdm(disable=True) as bar:

@@ -37,8 +37,10 @@ def test_share_of_the_limit():
     assert Row("step", "ms", [1.0]).share_of_limit is None
 
 
-def test_an_update_has_a_limit(monkeypatch):
+@pytest.mark.parametrize("has_amx", [False, True])
+def test_an_update_has_a_limit_and_the_budget_of_its_instructions(monkeypatch, has_amx):
     monkeypatch.setitem(limits.SIZE, "cpu", 64)
+    monkeypatch.setattr(learning, "amx_is_used", lambda: has_amx)
     monkeypatch.setattr(learning, "LearningUnit", lambda _: lambda: None)
     experiment = {
         "task": "close_loop/block_reaching",
@@ -46,13 +48,15 @@ def test_an_update_has_a_limit(monkeypatch):
     }
     with tqdm(disable=True) as bar:
         (row,) = learning.measure_update(
-            Bench(2, bar),
+            Bench(2, bar, precision="float32"),
             "update",
             experiment,
-            {"name": "cnn", "width": 0.125, "precision": "float32"},
+            {"name": "cnn", "width": 0.125},
             64,
-            Budget("", None, None),
+            with_amx=Budget("1", None, None),
+            without_amx=Budget("2", None, None),
         )
+    assert row.budget.reference == ("1" if has_amx else "2")
     assert len(row.values) == len(row.unit_s) == len(row.limit_s) == 2
     medians = [statistics.median(seconds) for seconds in (row.limit_s, row.values)]
     assert row.share_of_limit == pytest.approx(medians[0] / medians[1])

@@ -71,14 +71,19 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
         assert "physics steps per action" in step
         assert sum(f"| {task}, reset |" in row for row in rows) == 1
     picking = next(row for row in rows if "close_loop/block_picking, step, " in row).split("|")
-    assert [cell.strip() for cell in picking[7:10]] == ["31", "4", "1.5"]  # from the budgets
+    assert [cell.strip() for cell in picking[7:10]] == ["31", "1.5", "0.8"]  # from the budgets
     assert all(float(cell) > 0 for cell in picking[3:6])
+
+
+def test_an_unknown_precision_is_an_error():
+    with pytest.raises(ConfigError, match="precision: .* none of auto, float32, bfloat16"):
+        measure("memory", repeats=1, progress=False, precision="float16")
 
 
 def test_memory_is_counted():
     rows = measure("memory", repeats=2, progress=False)
     assert [row.unit for row in rows] == ["MB", "MB"]
-    assert all(5 < row.values[0] <= row.budget.aim for row in rows)
+    assert all(5 < row.values[0] <= row.budget.must for row in rows)
 
 
 def test_the_numpy_camera_agrees_with_the_compiled_one():

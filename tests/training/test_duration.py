@@ -71,9 +71,36 @@ def test_a_limit_of_the_instructions_is_named(monkeypatch, variable, limit, expe
 
 
 def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog):
-    updates = WARM_UP_UPDATES + MEASURED_UPDATES + 4
-    changes = {"total_updates": updates, "eval_every": 100, "video_episodes": 0, "device": "cpu"}
+    measured = WARM_UP_UPDATES + MEASURED_UPDATES
+    changes = {
+        "pretrain_updates": measured + 1,
+        "total_updates": 2 * measured + 4,
+        "stop_at_success": 1.0,
+        "eval_every": 100,
+        "video_episodes": 0,
+        "device": "cpu",
+    }
     config = ExperimentConfig.parse({**TINY, **changes, "run_dir": str(tmp_path / "run")})
     with caplog.at_level("INFO"):
         Experiment(config, progress=False).run()
-    assert "for the remaining 4" in caplog.text
+    first, second = (text for text in caplog.messages if "s an update" in text)
+    ending = "without evaluations; ends once two in a row have a success of 1"
+    assert f"for the remaining {measured + 4} {ending}" in first
+    assert f"for the remaining 3 {ending}" in second
+    assert "with collection" not in first
+    assert "s an update with collection, " in second
+
+
+def test_other_work_between_updates_is_left_out(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    timer = UpdateTimer()
+    for _ in range(2):
+        for number in range(WARM_UP_UPDATES + MEASURED_UPDATES):
+            now[0] += 2.0
+            found = timer.tick()
+            if number % 7 == 3:
+                now[0] += 100.0
+                timer.exclude(100.0)
+        assert found == pytest.approx(2.0)
+        timer.restart()
