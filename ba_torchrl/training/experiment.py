@@ -236,7 +236,8 @@ class Experiment:
         self._bar.update()
         self._log_duration(self._timer.tick())
         if updates % config.log_every == 0:
-            values = {f"train/{key}": float(value) for key, value in scalars.items()}
+            found = torch.stack([value.reshape(()).float() for value in scalars.values()]).tolist()
+            values = {f"train/{key}": x for key, x in zip(scalars.keys(), found, strict=True)}
             progress = self._progress
             values |= {"train/env_steps": progress.env_steps, "train/faults": progress.faults}
             collector = {} if self._collection is None else self._collection.scalars

@@ -76,7 +76,7 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
 
 
 def test_an_unknown_precision_is_an_error():
-    with pytest.raises(ConfigError, match="precision: .* none of auto, float32, bfloat16"):
+    with pytest.raises(ConfigError, match=r"precision: .* none of auto, float32, bfloat16"):
         measure("memory", repeats=1, progress=False, precision="float16")
 
 
