@@ -14,22 +14,31 @@ SIZES = {
     "equi": {"group_order": 8, "n_hidden": 16},
     "asr": {"num_rotations": 4, "width": 0.25},
     "equi_asr": {"num_rotations": 4, "width": 0.25},
+    "fcn": {"num_rotations": 4, "width": 0.25},
+    "equi_fcn": {"num_rotations": 4, "width": 0.25},
+    "rot_fcn": {"num_rotations": 4, "width": 0.25},
+    "equi_deictic_asr": {"num_rotations": 4, "num_z": 8, "num_tilts": 3, "width": 0.25},
 }
+CLOSE_LOOP = {"cnn", "equi"}
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize(
-    ("algorithm", "network"),
-    [("sac", "cnn"), ("sac", "equi"), ("spatial_q", "asr"), ("spatial_q", "equi_asr")],
-)
-def test_losses_in_bfloat16(algorithm, network, seed):
+@pytest.mark.parametrize("network", SIZES)
+def test_losses_in_bfloat16(network, seed):
     losses = {}
+    algorithm = "sac" if network in CLOSE_LOOP else "spatial_q"
+    if network in CLOSE_LOOP:
+        described = problem()
+    elif network == "equi_deictic_asr":
+        described = spatial_problem("pxyzrrr", channels=3)
+    else:
+        described = spatial_problem()
     for precision in ("float32", "bfloat16"):
         torch.manual_seed(seed)
         settings = {"demonstrations": "sdqfd"} if algorithm == "spatial_q" else {}
         config = parse(ALGORITHMS[algorithm], settings, algorithm)
         sizes = parse(NETWORKS[network], {**SIZES[network], "precision": precision}, network)
-        learner = config.build(sizes, problem() if algorithm == "sac" else spatial_problem())
+        learner = config.build(sizes, described)
         data = transitions(learner) if algorithm == "sac" else spatial_transitions(learner)
         torch.manual_seed(3)  # of the sampled actions
         losses[precision] = learner.loss(data).detach()
