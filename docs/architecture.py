@@ -17,7 +17,7 @@ PAGE = ROOT / "docs" / "architecture.md"
 BEGIN, END = "<!-- imports: begin -->\n", "<!-- imports: end -->\n"
 
 BASE = ("errors", "config", "registry", "plugins", "actions", "hardware", "_malloc")
-"""Single files that every folder may import; one box in the picture."""
+"""Single files; one box in the picture."""
 
 
 def part_of(names: list[str]) -> str:

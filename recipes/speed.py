@@ -62,14 +62,15 @@ def main(settings: DictConfig) -> None:
         precision=settings.precision,
     )
     if settings.output is not None:
-        write_speed_file(settings.output, SpeedFile(machine=where, rows=rows))
+        content = SpeedFile(machine=where, precision=settings.precision, rows=rows)
+        write_speed_file(settings.output, content)
     for work, operations in (profiles or {}).items():
         print(f"{work}\n{operations}")
     changes = {} if old is None else columns_of_changes(old.rows, rows)
     print(as_markdown(rows, {**COLUMNS, **changes}))
-    print(f"\n{where}")
+    print(f"\n{where}, precision {settings.precision}")
     if old is not None:
-        print(f"old: {old.machine}")
+        print(f"old: {old.machine}, precision {old.precision}")
 
 
 if __name__ == "__main__":

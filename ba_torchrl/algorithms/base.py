@@ -107,7 +107,8 @@ class Algorithm(ABC):
 
     @abstractmethod
     def update(self) -> TensorDict:
-        """Sample a batch, take one gradient step and return scalars without gradient.
+        """Sample a batch, take one gradient step and return scalars without gradient, all on one
+        device.
 
         Raises:
             FloatingPointError: a loss is not finite.

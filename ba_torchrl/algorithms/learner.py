@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
@@ -31,6 +32,8 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
+
+logger = logging.getLogger(__name__)
 
 
 class Learner(Algorithm):
@@ -226,7 +229,7 @@ class Learner(Algorithm):
         """
         sampler = self._prioritized_sampler()
         if sampler is not None:
-            sampler.anneal(self._share_of_updates())
+            sampler.anneal(self._annealing_progress())
         batch, device = self.replay.sample(), self.problem.device
         rows = batch[keys.IS_EXPERT].reshape(-1).nonzero()[:, 0] if demonstrations_only else None
         if device.type == "cpu":
@@ -251,13 +254,13 @@ class Learner(Algorithm):
             self.host_tasks.submit(errors, self._set_priorities)
         return scalars
 
-    def _share_of_updates(self) -> float:
-        """Share of the run's updates taken, without pretraining by losses other than the
-        algorithm's."""
+    def _annealing_progress(self) -> float:
+        """Return the share of the run's updates taken, not counting pretraining by losses other
+        than the algorithm's."""
         problem = self.problem
         pretrained = 0 if self.config.pretraining_option is None else problem.pretrain_updates
-        taken, all_updates = (n - pretrained for n in (self.updates, problem.total_updates))
-        return max(taken, 0) / max(all_updates, 1)
+        taken = max(self.updates - pretrained, 0)
+        return taken / max(problem.total_updates - pretrained, 1)
 
     def _set_priorities(self, errors: dict[str, Tensor]) -> None:
         self.replay.update_tensordict_priority(TensorDict(errors, [len(errors["index"])]))
@@ -343,6 +346,13 @@ class Learner(Algorithm):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
         for name, part in self._stateful_parts().items():
+            if isinstance(part, torch.optim.Optimizer) and not _fits(part, state[name]):
+                logger.warning(
+                    "%s: the moments are those of other parameters, of another version of the "
+                    "library; they are not restored",
+                    name,
+                )
+                continue
             part.load_state_dict(state[name])
         self.updates = state["updates"]
 
@@ -369,3 +379,18 @@ class Learner(Algorithm):
                 f"{keys.EXPERT_ACTION!r}: another version of the library wrote them; start the run "
                 "again in another run_dir"
             )
+
+
+def _fits(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> bool:
+    """Return whether the moments in a ``state_dict`` have the shapes of the parameters."""
+    groups = state["param_groups"]
+    if len(groups) != len(optimizer.param_groups):
+        return False
+    for group, saved in zip(optimizer.param_groups, groups, strict=True):
+        if len(group["params"]) != len(saved["params"]):
+            return False
+        for parameter, index in zip(group["params"], saved["params"], strict=True):
+            moments = state["state"].get(index, {}).get("exp_avg")
+            if moments is not None and moments.shape != parameter.shape:
+                return False
+    return True

@@ -20,13 +20,16 @@ class SharedEncoderCritics:
         """Make the networks functional, with targets of encoder and critics.
 
         Parameters that the actor shares with the encoder are constants in the actor's terms, so
-        that the critics alone train them.
+        that the critics alone train them. The constants share the parameters' memory: the networks
+        are on their device before, and the loss is neither copied nor moved afterwards.
         """
+        self.convert_to_functional(actor_network, "actor_network")
         self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
-        self.convert_to_functional(
-            actor_network, "actor_network", compare_against=list(encoder_network.parameters())
-        )
         self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
+        shared = set(encoder_network.parameters())
+        for key, parameter in list(self.actor_network_params.items(True, True)):
+            if parameter in shared:
+                self.actor_network_params.set(key, parameter.data)
 
     def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return an action [..., A] drawn with gradient and its log-probability [...]."""

@@ -119,18 +119,19 @@ def measure_update(
 ) -> list[Row]:
     """Return the row of a learner's updates, with the expert's transitions in its replay.
 
-    The budget of a CPU depends on whether it computes with AMX.
+    The budget of a CPU depends on whether it computes in bfloat16 with AMX; None for none.
     """
     config = _config(bench, experiment, network, obs_size)
     learner = make_learner(bench, experiment, network, obs_size)
-    product = MatrixProduct(network_dtype(config.network_config, bench.device), bench.device)
+    dtype = network_dtype(config.network_config, bench.device)
+    product = MatrixProduct(dtype, bench.device)
     multiply_adds = count_multiply_adds(learner.update)
     times = bench.time_against(
         {"unit": LearningUnit(bench.device), "product": product}, {work: learner.update}
     )
     limits = [multiply_adds / product.multiply_adds * value for value in times["product"]]
     notes = f"{multiply_adds / 1e9:.3g} G multiply-adds, {product.describe(times['product'])}"
-    budget = with_amx if amx_is_used() else without_amx
+    budget = with_amx if amx_is_used() and dtype == torch.bfloat16 else without_amx
     shown = budget if bench.device.type == "cpu" else None
     return [timed_row(work, "s", times[work], times["unit"], shown, notes, limits)]
 

@@ -14,6 +14,7 @@ from ba_torchrl.config import StrictModel
 from ba_torchrl.data.state_files import write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.hardware import hardware, onednn_max_cpu_isa
+from ba_torchrl.modules.trunk import Precision
 from ba_torchrl.profiling.table import Row
 from ba_torchrl.record.results import now, versions
 
@@ -62,8 +63,6 @@ class Machine(StrictModel):
     def __str__(self) -> str:
         names = [self.cpu, f"{self.cores} cores", f"{self.threads} torch threads"]
         names += [name for name in (self.gpu,) if name is not None]
-        if self.onednn_max_cpu_isa is not None:
-            names.append(f"ONEDNN_MAX_CPU_ISA={self.onednn_max_cpu_isa}")
         packages = [
             f"{name} {self.versions[name]}" for name in SHOWN_PACKAGES if name in self.versions
         ]
@@ -78,6 +77,8 @@ class SpeedFile(StrictModel):
 
     format: Literal[1] = 1
     machine: Machine
+    precision: Precision = "auto"
+    """Asked for the learners' networks."""
     rows: list[Row]
 
 

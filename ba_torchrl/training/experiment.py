@@ -236,8 +236,10 @@ class Experiment:
         self._bar.update()
         self._log_duration(self._timer.tick())
         if updates % config.log_every == 0:
-            found = torch.stack([value.reshape(()).float() for value in scalars.values()]).tolist()
-            values = {f"train/{key}": x for key, x in zip(scalars.keys(), found, strict=True)}
+            names = [f"train/{key}" for key in scalars.keys()]  # noqa: SIM118, a TensorDict
+            found = [value.reshape(()).float() for value in scalars.values()]
+            # in one copy, since each copy from a GPU waits for it
+            values = dict(zip(names, torch.stack(found).tolist(), strict=True)) if found else {}
             progress = self._progress
             values |= {"train/env_steps": progress.env_steps, "train/faults": progress.faults}
             collector = {} if self._collection is None else self._collection.scalars

@@ -235,8 +235,10 @@ def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_trai
     loss = ferm.loss
     actor = loss.actor_network_params["module", "0", "module", "trunk"]
     encoder = loss.encoder_network_params["module", "trunk"]
-    for key, value in encoder.items(True, True):
-        assert value.data_ptr() == actor[key].data_ptr()
+    for _ in range(2):
+        for key, value in encoder.items(True, True):
+            assert value.data_ptr() == actor[key].data_ptr()
+        ferm.load_state_dict(build("ferm_sacfd", "ferm").state_dict())  # keeps the memory
     acting = ferm.policy.policy.get_submodule("module.0.module").trunk
     assert {p.data_ptr() for p in acting.parameters()} == {
         p.data_ptr() for p in encoder.values(True, True)
@@ -246,6 +248,24 @@ def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_trai
     batch = ferm.sample()
     loss(batch)["loss_actor"].backward()
     assert all(value.grad is None for value in encoder.values(True, True))
+
+
+def test_moments_of_other_parameters_are_not_restored(caplog):
+    saved, restored = build("sacfd", "cnn"), build("sacfd", "cnn")
+    for learner in (saved, restored):
+        learner.extend(transitions(learner))
+    saved.update()
+    state = saved.state_dict()
+    moments = state["optimizer"]["state"]
+    state["optimizer"] = {
+        **state["optimizer"],
+        "state": dict(zip(moments, reversed(moments.values()), strict=True)),
+    }
+    restored.load_state_dict(state)
+    assert "they are not restored" in caplog.text
+    assert not restored.optimizer.state
+    restored.update()
+    assert restored.updates == 2
 
 
 def test_the_acting_policy_sees_the_centre_of_larger_images():

@@ -37,8 +37,13 @@ def test_share_of_the_limit():
     assert Row("step", "ms", [1.0]).share_of_limit is None
 
 
-@pytest.mark.parametrize("has_amx", [False, True])
-def test_an_update_has_a_limit_and_the_budget_of_its_instructions(monkeypatch, has_amx):
+@pytest.mark.parametrize(
+    ("has_amx", "precision", "reference"),
+    [(False, "bfloat16", "2"), (True, "float32", "2"), (True, "bfloat16", "1")],
+)
+def test_an_update_has_a_limit_and_the_budget_of_its_instructions(
+    monkeypatch, has_amx, precision, reference
+):
     monkeypatch.setitem(limits.SIZE, "cpu", 64)
     monkeypatch.setattr(learning, "amx_is_used", lambda: has_amx)
     monkeypatch.setattr(learning, "LearningUnit", lambda _: lambda: None)
@@ -48,7 +53,7 @@ def test_an_update_has_a_limit_and_the_budget_of_its_instructions(monkeypatch, h
     }
     with tqdm(disable=True) as bar:
         (row,) = learning.measure_update(
-            Bench(2, bar, precision="float32"),
+            Bench(2, bar, precision=precision),
             "update",
             experiment,
             {"name": "cnn", "width": 0.125},
@@ -56,11 +61,11 @@ def test_an_update_has_a_limit_and_the_budget_of_its_instructions(monkeypatch, h
             with_amx=Budget("1", None, None),
             without_amx=Budget("2", None, None),
         )
-    assert row.budget.reference == ("1" if has_amx else "2")
+    assert row.budget.reference == reference
     assert len(row.values) == len(row.unit_s) == len(row.limit_s) == 2
     medians = [statistics.median(seconds) for seconds in (row.limit_s, row.values)]
     assert row.share_of_limit == pytest.approx(medians[0] / medians[1])
-    assert "multiply-adds, float32 matrix product" in row.notes
+    assert f"multiply-adds, {precision} matrix product" in row.notes
 
 
 def test_the_matrix_product_has_the_format_of_the_network():
