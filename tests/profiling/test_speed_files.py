@@ -142,7 +142,7 @@ def test_the_recipe_writes_a_file_and_compares_with_it(recipe, tmp_path, content
     assert float(cells[0]["new / old"].split()[0]) < 0.1
     assert cells[1]["old median"] == cells[1]["difference"] == ""
     new = read_speed_file(tmp_path / "new" / "speed.json")
-    assert str(new.machine) == where
+    assert f"{new.machine}, precision {new.precision}" == where
     assert [row.work for row in new.rows] == [row["work"] for row in cells]
     assert len(new.rows[0].values) == len(new.rows[0].unit_s) == 10
 
