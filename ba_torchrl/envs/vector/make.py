@@ -159,6 +159,12 @@ class SerialVectorEnv(SeededVector, SerialEnv):
         for env, position in zip(self._envs, positions, strict=True):
             env.continue_from(position)
 
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the environments, and keep the number of torch threads, which TorchRL increases."""
+        threads = torch.get_num_threads()
+        super().close(raise_if_closed=raise_if_closed)
+        torch.set_num_threads(threads)
+
     def _seed_env(self, index: int, seed: int) -> None:
         self._envs[index].set_seed(seed, static_seed=True)
 

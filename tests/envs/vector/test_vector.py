@@ -277,3 +277,16 @@ def test_refuses_environments_that_cannot_report_a_fault():
 
     with pytest.raises(ValueError, match="fault"):
         VectorEnv(1, partial(GymEnv, "CartPole-v1"), mp_start_method="fork")
+
+
+def test_closing_serial_environments_keeps_the_number_of_threads(monkeypatch):
+    monkeypatch.setattr("torchrl._THREAD_POOL_INIT", 8)  # TorchRL's upper limit
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        env = ba_torchrl.make_vector_env("close_loop/block_reaching", 2, parallel=False)
+        env.reset()
+        env.close()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
