@@ -11,7 +11,7 @@ from torchrl.data import Bounded
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
-from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.envs.images import Frame, ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.control.close_loop import CloseLoopController
@@ -70,7 +70,8 @@ class CloseLoopEnv(RecordedPosition, ManipulationEnv):
     def _declare_images(self) -> dict[str, ImageSpec]:
         low, high = self._view.range_m(self._view_setup)
         channels, size = self._view.channels, self.config.obs_size
-        return {keys.PIXELS: ImageSpec(channels, size, high, low, storage="uint8")}
+        frame: Frame = "scene" if self._view.rotates_with_scene else "camera"
+        return {keys.PIXELS: ImageSpec(channels, size, high, low, storage="uint8", frame=frame)}
 
     def _place_robot(self, scene: Scene) -> None:
         x, y = self.workspace.center

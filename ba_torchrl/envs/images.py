@@ -12,8 +12,8 @@ from torchrl.data import Bounded
 Storage = Literal["uint8", "float16", "exact"]
 """Type of an image in the replay: 255 equal steps over its range, half precision, or unchanged."""
 Frame = Literal["scene", "gripper", "camera"]
-"""Axes of an image: the scene's (rows +x, columns +y), the gripper's, or those of another camera,
-for which no augmentation is defined."""
+"""Axes of an image: the scene's (rows +x, columns +y), the gripper's, or those of a camera that is
+fixed or turns with the tool, for which no augmentation is defined."""
 
 
 @dataclass(frozen=True)

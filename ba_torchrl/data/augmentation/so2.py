@@ -104,13 +104,13 @@ def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
     """Refuse images for which no transformation is defined.
 
     Raises:
-        ValueError: an image has the axes of a fixed camera.
+        ValueError: an image has the frame "camera".
     """
     unknown = [key for key, image in images.items() if image.frame == "camera"]
     if unknown:
         raise ValueError(
-            f"augmentation: {', '.join(unknown)} comes from a camera that does not move with the "
-            "scene and cannot be transformed; use augmentation 'none'"
+            f"augmentation: {', '.join(unknown)} does not rotate with the scene and cannot be "
+            "transformed; use augmentation 'none'"
         )
 
 

@@ -29,27 +29,20 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.geometry import Pose, YawPose, yaw_quaternion
-from ba_torchrl.sim.shapes import Box
+from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
-    PosedShape,
-    SceneMesh,
     depth_image,
     splat_heightmap,
     visible_points,
 )
-from ba_torchrl.sim.vision.kernels import paint_square
+from ba_torchrl.sim.vision.fingers import FINGER_SQUARE_HALF_M, draw_fingers, finger_boxes
 from ba_torchrl.sim.vision.lens import Lens, Range, oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import render_rgbd
 from ba_torchrl.sim.world import World
 
 VIEWS: Registry[View] = Registry("view type", "ba_torchrl.sim")
 
-FINGER_SQUARE_HALF_M = 5 * 0.3 / 128
-"""Half the edge of the square that represents a finger."""
-FINGER_LENGTH_M = 0.1
-"""Height of the box that represents a finger in oblique views."""
 MAX_RECESS_M = 0.02
 """Depth of the recesses that represent goal areas."""
 FIXED_CAMERA_CLEARANCE_M = 0.04
@@ -118,6 +111,11 @@ class View(ABC):
 
     channels: ClassVar[int] = 1
 
+    @property
+    def rotates_with_scene(self) -> bool:
+        """Whether the image of a scene that is rotated about z, with the tool, is rotated."""
+        return True
+
     @abstractmethod
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the lower and upper bound of the values of an image."""
@@ -143,6 +141,11 @@ class TopDown(View):
     follows_z: bool
     follows_yaw: bool
     shows_height: bool
+
+    @property
+    def rotates_with_scene(self) -> bool:
+        """False if the image rotates with the tool, which leaves it unchanged."""
+        return not self.follows_yaw
 
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the bounds of the depth below the camera or tool, or of the height."""
@@ -193,7 +196,7 @@ class TopDown(View):
             values = np.clip(z - np.minimum(heights, camera_z_m), low, high)
         pixel = setup.width_m / setup.pixels
         dx, dy = x - center_m[0], y - center_m[1]  # both zero in views that rotate
-        _draw_fingers(
+        draw_fingers(
             values,
             (setup.pixels / 2 + dx / pixel, setup.pixels / 2 + dy / pixel),
             scene.finger_offset_m / pixel,
@@ -275,7 +278,7 @@ class PerspectiveTopDown(View):
         depth = depth_image([scene.camera.mesh], lens, setup.pixels)
         values = np.clip(depth, *self.range_m(setup))
         scale = lens.focal_px(setup.pixels) / setup.camera_height_m
-        _draw_fingers(
+        draw_fingers(
             values,
             (setup.pixels / 2, setup.pixels / 2),
             scene.finger_offset_m * scale,
@@ -296,6 +299,11 @@ class Oblique(View):
     """
 
     shows_height: bool
+
+    @property
+    def rotates_with_scene(self) -> bool:
+        """False: the camera stays at its side."""
+        return False
 
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the bounds of the depth in the workspace, or of the height."""
@@ -323,6 +331,11 @@ class ObliqueRgbd(View):
 
     channels: ClassVar[int] = 4
 
+    @property
+    def rotates_with_scene(self) -> bool:
+        """False: the camera stays at its side."""
+        return False
+
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the bounds of colours (0 to 1) and depths together."""
         return 0.0, max(1.0, Oblique(shows_height=False).range_m(setup)[1])
@@ -333,50 +346,6 @@ class ObliqueRgbd(View):
         rgb, depth = render_rgbd(scene.world, oblique_lens(setup.center_m), setup.pixels)
         depth = np.clip(depth, *self.range_m(setup))
         return np.concatenate([np.moveaxis(rgb / 255.0, -1, 0), depth[None]])
-
-
-def finger_boxes(tool: YawPose, offset_m: float) -> SceneMesh:
-    """Return the mesh of two boxes that represent the fingers.
-
-    Args:
-        tool: position and yaw of the tool, whose height is that of the lower ends of the boxes.
-        offset_m: distance between the axis of each box and the tool point.
-    """
-    (x, y, z), yaw = tool
-    box = Box(size_m=(2 * FINGER_SQUARE_HALF_M, 2 * FINGER_SQUARE_HALF_M, FINGER_LENGTH_M))
-    return SceneMesh(
-        PosedShape(
-            box,
-            Pose(
-                (x + side * math.cos(yaw), y + side * math.sin(yaw), z + FINGER_LENGTH_M / 2),
-                yaw_quaternion(yaw),
-            ),
-        )
-        for side in (-offset_m, offset_m)
-    )
-
-
-def _draw_fingers(
-    image: np.ndarray,
-    tool_px: tuple[float, float],
-    offset_px: float,
-    half_px: float,
-    yaw_rad: float,
-    value: float,
-) -> None:
-    """Paint the squares that represent the fingers into an image.
-
-    Args:
-        image: [H, W], modified in place.
-        tool_px: row and column of the tool point.
-        offset_px: distance between each square's centre and the tool point.
-        half_px: half the edge of a square.
-        yaw_rad: heading of the closing axis, from rows towards columns.
-        value: new value of the pixels.
-    """
-    for side in (-offset_px, offset_px):
-        center = (tool_px[0] + side * math.cos(yaw_rad), tool_px[1] + side * math.sin(yaw_rad))
-        paint_square(image, center, half_px, yaw_rad, value)
 
 
 def _register(name: str, kind: type[View], **options: bool) -> None:

@@ -10,10 +10,10 @@ from ba_torchrl.errors import UnknownNameError
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera, PosedShape
+from ba_torchrl.sim.vision.fingers import FINGER_SQUARE_HALF_M
 from ba_torchrl.sim.vision.kernels import paint_square
 from ba_torchrl.sim.vision.lens import oblique_lens
 from ba_torchrl.sim.vision.views import (
-    FINGER_SQUARE_HALF_M,
     MAX_RECESS_M,
     VIEWS,
     ViewInput,
@@ -169,6 +169,29 @@ def test_heights_and_depths_are_consistent(name, world):
     np.testing.assert_allclose(depth[~fingers], origin - heights[~fingers], atol=1e-12)
     assert (heights[fingers] == 0.15).all()
     assert {-0.02, 0.0, 0.05} <= set(heights.round(9).ravel())
+
+
+@pytest.mark.parametrize("name", sorted(set(VIEWS) - {IN_COLOR, "render_center_height"}))
+def test_a_quarter_turn_of_the_scene(name, world):
+    """It rotates the image where the view says so, and nowhere else."""
+
+    def seen(turns):
+        """Return the image of block and tool after quarter turns about the workspace's centre."""
+
+        def turned(x, y):
+            for _ in range(turns):
+                x, y = SETUP.center_m[0] - y, x - SETUP.center_m[0]
+            return x, y
+
+        angle = turns * math.pi / 2
+        bodies = [block(*turned(0.47, -0.03), 0.4 + angle, size=(0.05, 0.08, 0.05))]
+        return image(name, world, bodies, ((*turned(0.41, 0.05), 0.15), 0.5 + angle))
+
+    before, after = seen(0), seen(1)
+    differs = np.abs(after - np.rot90(before)).mean() > 2e-3
+    assert differs != VIEWS[name].rotates_with_scene
+    if "r" in name.removesuffix("_height").rpartition("_")[2] and name.startswith("camera_center"):
+        np.testing.assert_allclose(after, before, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["camera_center_xyzr", "camera_center_xyr"])
