@@ -16,6 +16,7 @@ from ba_torchrl.data.demos import (
     check_noise,
     check_turn_noise,
     collect_demonstrations,
+    primitive_component,
     source_config,
     turn_components,
 )
@@ -26,6 +27,7 @@ from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs, progress_bar
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.command_line import (
     check_counts,
     check_flags,
@@ -60,7 +62,8 @@ def main(settings: DictConfig) -> None:
         raise ConfigError(f"{settings.path} exists already; choose another path")
     check_writable_file(settings.path)
     env_settings = env_of(settings, seed="seed", expert="source")
-    turns = turn_components(resolve(settings.task, **env_settings).action_sequence)
+    sequence = resolve(settings.task, **env_settings).action_sequence
+    turns = turn_components(sequence)
     check_turn_noise(settings.turn_noise, settings.source, turns, "turn_noise")
     env = make_vector_env(
         settings.task,
@@ -80,6 +83,7 @@ def main(settings: DictConfig) -> None:
                 noise=settings.noise,
                 turn_noise=settings.turn_noise,
                 turns=turns,
+                primitive=primitive_component(TASKS[settings.task].control, sequence),
                 on_episode=lambda _: bar.update(),
             )
     finally:

@@ -38,6 +38,7 @@ def collect_demonstrations(
     noise: float = 0.0,
     turn_noise: float = 0.0,
     turns: Sequence[int] = (),
+    primitive: int | None = None,
     nearest_action: Callable[[Tensor], Tensor] | None = None,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
@@ -56,6 +57,8 @@ def collect_demonstrations(
             Laskey et al., 2017).
         turn_noise: probability of random turns beside the expert's other components, likewise.
         turns: indices of the components that turn the gripper, see `turn_components`.
+        primitive: index of the primitive of open-loop actions, which stays the expert's, see
+            `primitive_component`.
         nearest_action: maps the expert's and the random actions to those that are executed and
             recorded. A policy with discrete actions needs it; None for the identity.
         on_episode: called with each episode when it ends, for progress bars.
@@ -76,7 +79,12 @@ def collect_demonstrations(
     add_noise = None
     if noise or turn_noise:
         add_noise = RandomActions(
-            env, noise, 0 if seed is None else seed, turn_probability=turn_noise, turns=turns
+            env,
+            noise,
+            0 if seed is None else seed,
+            turn_probability=turn_noise,
+            turns=turns,
+            primitive=primitive,
         )
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
@@ -110,6 +118,8 @@ class RandomActions:
         seed: of the draws.
         turn_probability: of an action that is random in some components only.
         turns: indices of these components.
+        primitive: index of a component that is never drawn: whether the gripper holds something
+            determines the primitive of open-loop actions, and the other one has no effect.
     """
 
     def __init__(
@@ -120,12 +130,16 @@ class RandomActions:
         *,
         turn_probability: float = 0.0,
         turns: Sequence[int] = (),
+        primitive: int | None = None,
     ) -> None:
         self._space = env.action_spec.space
         self._probability = probability
         self._turn_probability = turn_probability
         self._is_turn = torch.zeros(env.action_spec.shape[-1], dtype=torch.bool)
         self._is_turn[list(turns)] = True
+        self._is_drawn = torch.ones_like(self._is_turn)
+        if primitive is not None:
+            self._is_drawn[primitive] = False
         self._generator = torch.Generator().manual_seed(seed)
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -138,7 +152,7 @@ class RandomActions:
         low, high = self._space.low, self._space.high
         drawn = low + (high - low) * torch.rand(action.shape, generator=self._generator)
         is_random = torch.rand(len(action), 1, generator=self._generator) < self._probability
-        replaced = is_random.expand_as(action)
+        replaced = is_random & self._is_drawn
         if self._turn_probability:
             turns = torch.rand(len(action), 1, generator=self._generator) < self._turn_probability
             replaced = replaced | (turns & self._is_turn)
@@ -170,6 +184,20 @@ def turn_components(action_sequence: str) -> list[int]:
         action_sequence: one letter per component.
     """
     return [i for i, letter in enumerate(action_sequence) if letter == "r"]
+
+
+def primitive_component(control: str, action_sequence: str) -> int | None:
+    """Return the index of the primitive of open-loop actions; None if there is none.
+
+    In close loop, the same letter is the opening of the gripper.
+
+    Args:
+        control: "close_loop" or "open_loop".
+        action_sequence: one letter per component.
+    """
+    if control != "open_loop" or "p" not in action_sequence:
+        return None
+    return action_sequence.index("p")
 
 
 def check_turn_noise(noise: float, source: Source, turns: Sequence[int], name: str) -> None:

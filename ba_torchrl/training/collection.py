@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -15,12 +16,15 @@ from ba_torchrl.algorithms.base import Algorithm
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.demo_files import load_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
+from ba_torchrl.data.episodes import is_success
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem
 from ba_torchrl.training.config import ExperimentConfig
+
+logger = logging.getLogger(__name__)
 
 
 def make_env(
@@ -108,7 +112,7 @@ def gather_demonstrations(
         on_episode: called with each episode that is played.
 
     Raises:
-        ConfigError: the folder holds fewer than the run asks for.
+        ConfigError: the folder holds fewer than the run asks for, or none that can be used.
         RuntimeError: no episode can be used.
     """
     if config.demonstrations_path is not None:
@@ -118,7 +122,15 @@ def gather_demonstrations(
                 f"{config.demonstrations_path} holds {len(episodes)} episodes, fewer than "
                 f"demonstrations={config.demonstrations}"
             )
-        return episodes[: config.demonstrations]
+        for name in ("demonstrations_noise", "demonstrations_turn_noise", "demonstrations_source"):
+            if getattr(config, name) != type(config).model_fields[name].default:
+                logger.warning("%s has no effect on episodes of demonstrations_path", name)
+        episodes = episodes[: config.demonstrations]
+        if config.only_successful_demonstrations:
+            episodes = [episode for episode in episodes if is_success(episode)]
+        if not episodes:
+            raise ConfigError(f"no episode of {config.demonstrations_path} succeeds")
+        return episodes
     seed = config.derived_seed(SeedUse.DEMONSTRATIONS)
     env = make_env(config, seed, **source_config(config.demonstrations_source))
     try:
@@ -131,6 +143,7 @@ def gather_demonstrations(
             noise=config.demonstrations_noise,
             turn_noise=config.demonstrations_turn_noise,
             turns=config.turn_components,
+            primitive=config.primitive_component,
             nearest_action=algorithm.nearest_action,
             on_episode=on_episode,
         )

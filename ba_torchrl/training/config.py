@@ -17,6 +17,7 @@ from ba_torchrl.data.demos import (
     Source,
     check_noise,
     check_turn_noise,
+    primitive_component,
     source_config,
     turn_components,
 )
@@ -93,7 +94,8 @@ class ExperimentConfig(StrictModel):
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
     policy that has not learnt to turn arrives. None in the appendix."""
     demonstrations_path: str | None = None
-    """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones."""
+    """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones, and
+    source and noise are those of the folder."""
     pretrain_updates: int = Field(default=0, ge=0)
     """Updates on the demonstrations before the first environment step."""
     total_updates: int = Field(default=10_000, ge=1)
@@ -221,11 +223,11 @@ class ExperimentConfig(StrictModel):
         option = config.algorithm_config.pretraining_option
         if option is not None and not config.pretrain_updates:
             raise ConfigError(f"algorithm.{option} takes effect in pretrain_updates; set them")
-        capacity = config.algorithm_config.capacity
+        capacity = config.algorithm_config.collected_capacity
         if capacity is not None and config.min_replay > capacity:
             raise ConfigError(
-                f"min_replay: {config.min_replay} transitions are more than the replay holds "
-                f"({capacity}); the run would never start to learn"
+                f"min_replay: {config.min_replay} transitions are more than the replay holds of "
+                f"collected ones ({capacity}); the run would never start to learn"
             )
         config.collector_config.check(config.num_envs)
         config._check_demonstrations()
@@ -256,6 +258,12 @@ class ExperimentConfig(StrictModel):
         """Indices of the action's components that turn the gripper."""
         return turn_components(resolve(self.task, **self.env).action_sequence)
 
+    @property
+    def primitive_component(self) -> int | None:
+        """Index of the primitive of open-loop actions; None if there is none."""
+        sequence = resolve(self.task, **self.env).action_sequence
+        return primitive_component(TASKS[self.task].control, sequence)
+
     def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
@@ -270,6 +278,8 @@ class ExperimentConfig(StrictModel):
                 self.task, parse_env_config(self.task, {**self.env, **source}, "env")
             )
         if self.demonstrations_path is not None:
+            if not self.demonstrations:
+                raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")
             check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
 
 

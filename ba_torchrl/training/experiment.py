@@ -68,6 +68,8 @@ class Experiment:
         self._signals = StopSignals()
         self._is_between_updates = False
         """Whether the state can be saved: there is one, and no update is under way."""
+        self._is_reporting = False
+        """Whether the networks may be those of an earlier update; the last state is saved then."""
         self._started = self._last_save = time.perf_counter()
         self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 
@@ -195,6 +197,7 @@ class Experiment:
         if not progress.curve or progress.curve[-1].updates < self.algorithm.updates:
             self._evaluate_and_save()
         checkpoint = self.checkpoints.latest()
+        self._is_reporting = True
         if config.report == "best":
             checkpoint = self.checkpoints.load_best()
         updates = self.algorithm.updates
@@ -291,6 +294,8 @@ class Experiment:
 
     def _save_if_possible(self) -> bool:
         """Save the state of a run that ends early; return whether it could be saved."""
+        if self._is_reporting:
+            return True
         if not self._is_between_updates:
             return False
         try:

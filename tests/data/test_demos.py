@@ -5,7 +5,12 @@ import torch
 
 import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations, source_config, turn_components
+from ba_torchrl.data.demos import (
+    collect_demonstrations,
+    primitive_component,
+    source_config,
+    turn_components,
+)
 from ba_torchrl.data.state_files import seal
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
@@ -241,3 +246,33 @@ def test_turn_components():
 def test_noise_that_cannot_be_added_is_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         collect_demonstrations(None, 1, **settings)
+
+
+def test_random_actions_keep_the_primitive_that_the_gripper_can_execute():
+    env = ba_torchrl.make_vector_env(
+        "open_loop/block_stacking",
+        2,
+        parallel=False,
+        seed=0,
+        obs_size=32,
+        num_objects=2,
+        expert=True,
+    )
+    episodes = collect_demonstrations(
+        env, 10, seed=0, noise=0.4, primitive=primitive_component("open_loop", "pxyr")
+    )
+    env.close()
+    steps = torch.cat(episodes)
+    is_random = ~steps[keys.IS_EXPERT].squeeze(-1)
+    assert is_random.sum() > 10
+    holding = steps[keys.HOLDING].to(steps[keys.ACTION].dtype)
+    assert torch.equal(steps[keys.ACTION][:, :1], holding)
+    drawn, expert = (steps[key][is_random, 1:] for key in (keys.ACTION, keys.EXPERT_ACTION))
+    assert (drawn != expert).all()
+
+
+def test_primitive_component():
+    assert primitive_component("open_loop", "pxyr") == 0
+    assert primitive_component("open_loop", "xyp") == 2
+    assert primitive_component("open_loop", "xyr") is None
+    assert primitive_component("close_loop", "pxyzr") is None

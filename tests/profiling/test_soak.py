@@ -81,3 +81,9 @@ def test_criteria_that_are_not_met_are_reported(tmp_path, figures, change, probl
 
 def test_the_worker_is_the_module_of_one_task():
     assert soak.WORKER[1:] == ("-m", "ba_torchrl.profiling.soak_one")
+
+
+def test_a_deeply_nested_file_of_figures_is_damaged(caplog, tmp_path):
+    (tmp_path / "a.json").write_text(200_000 * "[")
+    assert soak._read(tmp_path / "a.json", SoakJob(task="a", steps=10)) is None
+    assert "is damaged and measured again" in caplog.text

@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.data.demo_files import save_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.checkpoint import (
@@ -19,6 +22,7 @@ from ba_torchrl.training.checkpoint import (
     load,
     read_config,
 )
+from ba_torchrl.training.collection import gather_demonstrations
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
@@ -204,6 +208,10 @@ FERM = {
         ({"device": "cuda:99"}, "device: use device=cpu"),
         ({"demonstrations_source": "deconstruction"}, "'deconstruct' has no meaning"),
         ({"demonstrations_path": "/no/such/folder"}, "no demonstrations at"),
+        (
+            {"demonstrations": 0, **NO_PRETRAINING, "demonstrations_path": "/a"},
+            "set demonstrations",
+        ),
         ({"network": {"name": "fcn"}}, "network for open_loop tasks"),
         ({"algorithm": {"name": "sac", "init": "bc"}, **NO_PRETRAINING}, "init: 'bc' takes effect"),
         ({"algorithm": FERM, **NO_PRETRAINING}, "pretraining: 'contrastive' takes effect"),
@@ -213,6 +221,29 @@ def test_wrong_configurations_fail_before_the_run_starts(tmp_path, changes, mess
     with pytest.raises(ConfigError, match=message):
         tiny(tmp_path, **changes)
     assert not (tmp_path / "run").exists()
+
+
+def test_demonstrations_of_a_folder_are_filtered(tmp_path, caplog):
+    """Episodes of one step are too short for a success."""
+    env = {"obs_size": 64, "max_steps": 8}
+    for name, steps in (("good", 8), ("bad", 1)):
+        task = TINY["task"]
+        vector = make_vector_env(
+            task, 1, parallel=False, seed=0, expert=True, obs_size=64, max_steps=steps
+        )
+        episodes = collect_demonstrations(vector, 3, seed=0)
+        vector.close()
+        save_demonstrations(tmp_path / name, episodes, task=task, env=env, seed=0)
+    changes = {"only_successful_demonstrations": True, "demonstrations_turn_noise": 0.5}
+    good, bad = (
+        tiny(tmp_path, demonstrations_path=str(tmp_path / name), **changes)
+        for name in ("good", "bad")
+    )
+    algorithm = build_algorithm(good)
+    assert len(gather_demonstrations(good, algorithm)) == 3
+    assert "demonstrations_turn_noise has no effect" in caplog.text
+    with pytest.raises(ConfigError, match=r"no episode of .* succeeds"):
+        gather_demonstrations(bad, algorithm)
 
 
 def test_a_logger_without_its_package_is_refused(tmp_path, monkeypatch):
@@ -260,8 +291,17 @@ def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view, reason)
 
 
 def test_another_view_can_be_used_for_training(tmp_path):
-    config = tiny(tmp_path, env={**TINY["env"], "view_type": "camera_center_xyzr"})
+    config = tiny(tmp_path, env={**TINY["env"], "view_type": "camera_center_z"})
     assert Experiment(config, progress=False).run().updates == 6
+
+
+@pytest.mark.parametrize("view", ["camera_center_xyzr", "camera_side"])
+def test_rotation_is_refused_for_views_that_do_not_rotate_with_the_scene(tmp_path, view):
+    env = {**TINY["env"], "view_type": view}
+    with pytest.raises(ConfigError, match=r"pixels does not rotate.*use augmentation 'none'"):
+        Experiment(tiny(tmp_path, env=env), progress=False)
+    plain = {**TINY["algorithm"], "augmentation": "none"}
+    assert Experiment(tiny(tmp_path, env=env, algorithm=plain), progress=False).run().updates == 6
 
 
 def test_seeds_of_different_uses_and_runs_differ(tmp_path):

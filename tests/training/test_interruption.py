@@ -170,6 +170,19 @@ def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evalua
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
+def test_a_run_stopped_while_its_best_policy_is_evaluated_keeps_the_last_state(tmp_path):
+    whole = run(config_for(tmp_path / "whole", report="best"))
+    experiment = Experiment(config_for(tmp_path / "run", report="best"), progress=False)
+    at_call(experiment, experiment, "_evaluate", 4, terminate)  # after those at 8, 16 and 21
+    saved = []
+    save = experiment._state.save
+    experiment._state.save = lambda updates: (saved.append(updates), save(updates))
+    with pytest.raises(RunStopped, match="state saved"):
+        experiment.run()
+    assert saved == [8, 16, 21]
+    assert_same(run(config_for(tmp_path / "run", report="best", resume=True)), whole)
+
+
 @pytest.mark.parametrize("number", [pytest.param(1, marks=SLOW), 5])
 def test_a_run_stopped_before_its_first_update_continues_its_collection(
     tmp_path, undisturbed, number
