@@ -161,8 +161,8 @@ class AlgorithmConfig(StrictModel, ABC):
         return None
 
     @property
-    def capacity(self) -> int | None:
-        """Largest number of stored transitions; None without a limit."""
+    def collected_capacity(self) -> int | None:
+        """Number of collected transitions that always fit; None without a limit."""
         return None
 
     def check(self, network: NetworkConfig, control: Control) -> None:

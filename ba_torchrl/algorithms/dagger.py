@@ -39,7 +39,8 @@ class DAggerConfig(LearnerConfig):
     beta_init: float = Field(default=1.0, ge=0, le=1)
     """Probability of executing the expert's action at the first update."""
     beta_updates: int = Field(default=1000, ge=1)
-    """Updates over which that probability decreases linearly to zero."""
+    """Updates over which that probability decreases linearly to zero, those on the demonstrations
+    alone included."""
     replay: Literal["uniform"] = "uniform"
     init: Literal["random"] = "random"
 

@@ -23,6 +23,7 @@ from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.base import Algorithm, NetworkConfig, Problem
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.learner_config import LearnerConfig
+from ba_torchrl.algorithms.optimizer_state import fits
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
@@ -214,7 +215,10 @@ class Learner(Algorithm):
     def extend(self, transitions: TensorDictBase) -> None:
         """Add transitions [N], and augmented copies if configured, to the replay, except those with
         a fault."""
-        self.replay.extend(self.stored_augmentation(transitions))
+        stored = self.stored_augmentation(transitions)
+        if len(self.replay) + len(stored) > self.config.buffer_size:
+            self.host_tasks.run()  # before its transitions are overwritten: deferred priorities
+        self.replay.extend(stored)
 
     @property
     def replay_size(self) -> int:
@@ -254,13 +258,14 @@ class Learner(Algorithm):
             self.host_tasks.submit(errors, self._set_priorities)
         return scalars
 
+    def own_updates(self, updates: int) -> int:
+        """Return how many of the first updates of a run minimise the algorithm's own loss."""
+        is_own = self.config.pretraining_option is None
+        return updates if is_own else max(updates - self.problem.pretrain_updates, 0)
+
     def _annealing_progress(self) -> float:
-        """Return the share of the run's updates taken, not counting pretraining by losses other
-        than the algorithm's."""
-        problem = self.problem
-        pretrained = 0 if self.config.pretraining_option is None else problem.pretrain_updates
-        taken = max(self.updates - pretrained, 0)
-        return taken / max(problem.total_updates - pretrained, 1)
+        total = self.own_updates(self.problem.total_updates)
+        return self.own_updates(self.updates) / max(total, 1)
 
     def _set_priorities(self, errors: dict[str, Tensor]) -> None:
         self.replay.update_tensordict_priority(TensorDict(errors, [len(errors["index"])]))
@@ -346,7 +351,7 @@ class Learner(Algorithm):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
         for name, part in self._stateful_parts().items():
-            if isinstance(part, torch.optim.Optimizer) and not _fits(part, state[name]):
+            if isinstance(part, torch.optim.Optimizer) and not fits(part, state[name]):
                 logger.warning(
                     "%s: the moments are those of other parameters, of another version of the "
                     "library; they are not restored",
@@ -354,6 +359,9 @@ class Learner(Algorithm):
                 )
                 continue
             part.load_state_dict(state[name])
+        rates = self.scheduler.get_last_lr()  # the optimiser's, unless its state was left out
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=False):
+            group["lr"] = rate
         self.updates = state["updates"]
 
     def save_replay(self, folder: Path) -> None:
@@ -379,18 +387,3 @@ class Learner(Algorithm):
                 f"{keys.EXPERT_ACTION!r}: another version of the library wrote them; start the run "
                 "again in another run_dir"
             )
-
-
-def _fits(optimizer: torch.optim.Optimizer, state: Mapping[str, Any]) -> bool:
-    """Return whether the moments in a ``state_dict`` have the shapes of the parameters."""
-    groups = state["param_groups"]
-    if len(groups) != len(optimizer.param_groups):
-        return False
-    for group, saved in zip(optimizer.param_groups, groups, strict=True):
-        if len(group["params"]) != len(saved["params"]):
-            return False
-        for parameter, index in zip(group["params"], saved["params"], strict=True):
-            moments = state["state"].get(index, {}).get("exp_avg")
-            if moments is not None and moments.shape != parameter.shape:
-                return False
-    return True

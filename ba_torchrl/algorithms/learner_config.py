@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ba_torchrl.algorithms.base import AlgorithmConfig
 from ba_torchrl.data.replay.make import ReplayKind
@@ -50,12 +50,19 @@ class LearnerConfig(AlgorithmConfig):
     """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
     updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
 
+    @model_validator(mode="after")
+    def _check_halves(self) -> Self:
+        if self.replay == "symmetric" and self.batch_size < 2:
+            raise ValueError("batch_size must be at least 2 with a symmetric replay, half of each")
+        return self
+
     @property
     def pretraining_option(self) -> str | None:
         """As for `AlgorithmConfig`."""
         return "init: 'bc'" if self.init == "bc" else None
 
     @property
-    def capacity(self) -> int:
-        """Largest number of transitions in the replay."""
-        return self.buffer_size * (2 if self.replay == "symmetric" else 1)
+    def collected_capacity(self) -> int:
+        """Number of collected transitions that always fit; a symmetric replay holds as many
+        demonstrations beside them."""
+        return self.buffer_size

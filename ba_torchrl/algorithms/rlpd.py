@@ -135,11 +135,13 @@ class RLPD(Learner):
 
     def make_scheduler(self) -> LinearLR:
         """Return the schedule of the learning rate, which steps once per critic update."""
+        problem = self.problem
+        own = self.own_updates(problem.total_updates)
         return LinearLR(
             self.optimizer,
             start_factor=1.0,
             end_factor=self.config.learning_rate_end_factor,
-            total_iters=self.problem.total_updates * self.config.critic_updates,
+            total_iters=problem.total_updates + own * (self.config.critic_updates - 1),
         )
 
     def network_parameters(self) -> list[nn.Parameter]:

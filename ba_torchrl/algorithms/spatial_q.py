@@ -64,7 +64,8 @@ class SpatialQConfig(LearnerConfig):
     epsilon_end: float = Field(default=0.0, ge=0, le=1)
     """Final probability of a random action."""
     epsilon_updates: int = Field(default=1000, ge=1)
-    """Updates over which that probability changes linearly."""
+    """Updates over which that probability changes linearly, those on the demonstrations alone
+    included."""
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
         """Return a freshly initialised learner.

@@ -189,3 +189,15 @@ def test_losses_of_spatial_networks_read_no_result(network, channels, demonstrat
     terms = loss(spatial_transitions(learner).to("meta"))
     sum(terms[key] for key in loss.out_keys if key.startswith("loss_")).backward()
     assert all(value.device.type == "meta" for value in terms.values())
+
+
+def test_priorities_are_set_before_their_transitions_are_overwritten():
+    """New transitions get the largest error so far, and no error of those that they replace."""
+    learner = deferred(**SACFD, buffer_size=24)
+    learner.update()
+    assert len(learner.host_tasks) == 2
+    learner.extend(transitions(learner)[1::2])  # in place of the 12 that are no demonstrations
+    assert len(learner.host_tasks) == 0
+    demonstrations, new = priorities(learner)[::2], priorities(learner)[1::2]
+    assert (demonstrations != demonstrations[0]).any()
+    assert (new == new[0]).all()

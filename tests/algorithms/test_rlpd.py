@@ -132,3 +132,26 @@ def test_two_iterations_of_a_run(tmp_path, network):
     learner = run(tmp_path, network, {"name": "rlpd", "critics": 3, "critic_updates": 2})
     assert len(learner.replay.expert) > 0
     assert len(learner.replay.online) > 0
+
+
+@pytest.mark.parametrize(("init", "pretrained"), [("random", 0), ("bc", 3)])
+def test_the_learning_rate_ends_with_the_run(init, pretrained):
+    """An update of behaviour cloning is one step, one of RLPD several."""
+    settings = {**UNUSUAL, "learning_rate_end_factor": 0.1, "init": init}
+    config = parse(ALGORITHMS["rlpd"], settings, "rlpd")
+    task = dataclasses.replace(problem(), total_updates=6, pretrain_updates=3)
+    learner = config.build(CNNConfig(width=0.25), task)
+    learner.extend(transitions(learner))
+    for _ in range(pretrained):
+        learner.pretrain_update()
+    for _ in range(5 - pretrained):
+        learner.update()
+    rate = learner.optimizer.param_groups[0]["lr"]
+    assert rate > 0.15 * 0.003
+    learner.update()
+    assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * 0.003)
+
+
+def test_a_symmetric_batch_has_both_halves():
+    with pytest.raises(ConfigError, match="batch_size must be at least 2"):
+        build("rlpd", batch_size=1)
