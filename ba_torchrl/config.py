@@ -78,7 +78,12 @@ def _as_tuple(value: Any) -> Any:
 
 
 class TaskParameters(StrictModel):
-    """The parameters that one task adds to `EnvConfig`; a task without any uses this class."""
+    """The parameters that one task adds to `EnvConfig`; a task without any uses this class.
+
+    The docstring below a field is its description in the page of the tasks.
+    """
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     @model_validator(mode="before")
     @classmethod

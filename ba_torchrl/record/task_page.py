@@ -45,12 +45,13 @@ def _section(task: str) -> list[str]:
         ("success", ", ".join(f"`{name}`" for name in conditions)),
         ("steps", f"{steps}"),
         ("action", f"`{actions}` by default"),
-        ("`num_objects`", f"{cls.num_objects}" + (f" ({numbers})" if least < most else "")),
         ("scale", "{:g} to {:g} (limits {:g} to {:g})".format(*cls.scale_range, *cls.scale_limits)),
     ]
-    rows += [
-        (f"`{name}`", f"{field.default!r}") for name, field in cls.Parameters.model_fields.items()
-    ]
+    if least < most:
+        rows.append(("`num_objects`", f"{cls.num_objects} ({numbers})"))
+    for name, field in cls.Parameters.model_fields.items():
+        text = " ".join((field.description or "").split())
+        rows.append((f"`{name}`", f"{field.default!r}" + (f". {text}" if text else "")))
     return [
         f"### `{task}`",
         "",
