@@ -85,9 +85,7 @@ class ArticulatedLink(Body):
         """Return False: a gripper cannot lift a link."""
         return False
 
-    @property
-    def pose(self) -> Pose:
-        """Pose of the frame of the geometry in the world."""
+    def _read_pose(self) -> Pose:
         if self.is_static:
             return Pose(
                 *pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
 import pybullet
 
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import (
+    PlanarFrame,
     Pose,
     Quaternion,
     Vector,
@@ -17,6 +19,11 @@ from ba_torchrl.sim.geometry import (
     yaw_quaternion,
 )
 from ba_torchrl.sim.shapes import Shape
+
+Interval = tuple[float, float]
+"""Lower and upper end."""
+MAX_FRAMES = 256
+"""Number of horizontal frames in which the extents of a surface are kept."""
 
 
 class Body:
@@ -28,8 +35,10 @@ class Body:
         name: used in error messages.
     """
 
-    _vertices: tuple[Pose, np.ndarray] | None = None
-    """Pose and result of the last call of `world_vertices`."""
+    _surface: _Surface | None = None
+    """The surface at the pose at which it was last measured."""
+    _fixed_pose: Pose | None = None
+    """The pose while it cannot change, see `World.fixed_poses`; None otherwise."""
 
     def __init__(self, client: int, shape: Shape, name: str) -> None:
         self.client = client
@@ -76,8 +85,19 @@ class Body:
     @property
     def pose(self) -> Pose:
         """Pose of the frame of the geometry in the world."""
+        return self._read_pose() if self._fixed_pose is None else self._fixed_pose
+
+    def _read_pose(self) -> Pose:
         pose = Pose(*pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client))
         return pose if self._from_center is None else bullet_compose(pose, self._from_center)
+
+    def fix_pose(self, is_fixed: bool) -> None:
+        """Read the pose once and return it until this is called with False.
+
+        Args:
+            is_fixed: whether the body cannot move.
+        """
+        self._fixed_pose = self._read_pose() if is_fixed else None
 
     @property
     def position(self) -> Vector:
@@ -145,20 +165,65 @@ class Body:
         return tuple(vertices.min(axis=0).tolist()), tuple(vertices.max(axis=0).tolist())
 
 
+class _Surface:
+    """A body's visual surface at one pose.
+
+    Args:
+        body: the body.
+        pose: of the frame of its geometry.
+    """
+
+    def __init__(self, body: Body, pose: Pose) -> None:
+        self.pose = pose
+        self.vertices = pose.apply(body.shape.vertices)
+        self.vertices.flags.writeable = False
+        self._planar_extents: dict[PlanarFrame, tuple[Interval, Interval]] = {}
+
+    @cached_property
+    def vertical_extent(self) -> tuple[float, float]:
+        heights = self.vertices[:, 2]
+        return float(heights.min()), float(heights.max())
+
+    def planar_extents(self, frame: PlanarFrame) -> tuple[Interval, Interval]:
+        found = self._planar_extents.get(frame)
+        if found is None:
+            if len(self._planar_extents) >= MAX_FRAMES:  # the surface of a static body stays
+                self._planar_extents.clear()
+            x, y = frame.to_local(self.vertices[:, 0], self.vertices[:, 1])
+            found = (float(x.min()), float(x.max())), (float(y.min()), float(y.max()))
+            self._planar_extents[frame] = found
+        return found
+
+
+def _surface(body: Body) -> _Surface:
+    """Return the surface at the present pose."""
+    pose = body.pose
+    if body._surface is None or body._surface.pose != pose:
+        body._surface = _Surface(body, pose)
+    return body._surface
+
+
 def world_vertices(body: Body) -> np.ndarray:
     """Return the vertices of a body's visual surface in the world frame, [V, 3] metres."""
-    pose = body.pose
-    if body._vertices is None or body._vertices[0] != pose:
-        vertices = pose.apply(body.shape.vertices)
-        vertices.flags.writeable = False
-        body._vertices = pose, vertices
-    return body._vertices[1]
+    return _surface(body).vertices
 
 
 def vertical_extent(body: Body) -> tuple[float, float]:
     """Return the heights of a body's lowest and highest vertex in the world frame, metres."""
-    heights = world_vertices(body)[:, 2]
-    return float(heights.min()), float(heights.max())
+    return _surface(body).vertical_extent
+
+
+def planar_extents(body: Body, frame: PlanarFrame) -> tuple[Interval, Interval]:
+    """Return the intervals that a body's vertices cover along the axes of a horizontal frame.
+
+    Args:
+        body: the body.
+        frame: the frame, relative to the world.
+
+    Returns:
+        Lower and upper end along the x axis, and along the y axis, metres.
+    """
+    return _surface(body).planar_extents(frame)
 
 
 def footprint_radius_m(body: Body) -> float:

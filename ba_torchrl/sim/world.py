@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Self
 
@@ -103,6 +105,7 @@ class World:
         self.moving_bodies: list[Body] = []
         """The bodies that are not static."""
         self._moved_last: Body | None = None
+        self._has_fixed_poses = False
         self.steps = 0
         """Number of physics steps since construction."""
         self._pristine: Snapshot | None = None
@@ -198,8 +201,10 @@ class World:
         """Restore a snapshot of this world; the caller must repeat the motor commands.
 
         Raises:
-            SimulationError: the snapshot belongs to another or a closed world.
+            SimulationError: the snapshot belongs to another or a closed world, or within
+                `fixed_poses`.
         """
+        self._check_not_fixed()
         # PyBullet reuses client ids, so that the connection identifies the world
         if snapshot.connection is not self._disconnect or self.is_closed:
             raise SimulationError(
@@ -211,7 +216,12 @@ class World:
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
 
     def step(self, count: int = 1) -> None:
-        """Advance the physics by ``count`` time steps."""
+        """Advance the physics by ``count`` time steps.
+
+        Raises:
+            SimulationError: within `fixed_poses`.
+        """
+        self._check_not_fixed()
         for _ in range(count):
             pybullet.stepSimulation(physicsClientId=self.client)
         self.steps += count
@@ -219,6 +229,22 @@ class World:
     def detect_collisions(self) -> None:
         """Update the contact points without advancing time."""
         pybullet.performCollisionDetection(physicsClientId=self.client)
+
+    @contextmanager
+    def fixed_poses(self) -> Iterator[None]:
+        """A context in which no body moves, so that the pose of each is read once.
+
+        In it, steps and restored states raise a `SimulationError`.
+        """
+        for body in self.bodies:
+            body.fix_pose(True)
+        self._has_fixed_poses = True
+        try:
+            yield
+        finally:
+            self._has_fixed_poses = False
+            for body in self.bodies:
+                body.fix_pose(False)
 
     def is_still(self) -> bool:
         """Whether no visible body exceeds the speeds of a body at rest."""
@@ -290,6 +316,10 @@ class World:
         """Add loaded bodies to the lists of bodies."""
         self.bodies.extend(bodies)
         self.moving_bodies.extend(body for body in bodies if not body.is_static)
+
+    def _check_not_fixed(self) -> None:
+        if self._has_fixed_poses:
+            raise SimulationError("bodies cannot move here: their poses are fixed")
 
     def _check_not_sealed(self, name: str) -> None:
         if self._pristine is not None:

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, world_vertices
+from ba_torchrl.sim.bodies import Body, planar_extents, vertical_extent, world_vertices
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, Vector, downward, rotation_array
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
@@ -132,14 +132,13 @@ def path_clearance_m(
     frame = PlanarFrame(bx, by, yaw_rad)
     gap = math.inf
     for other in others:
-        corners = world_vertices(other)
-        if corners[:, 2].max() < bz + gripper.lowest_tip_m:
+        if vertical_extent(other)[1] < bz + gripper.lowest_tip_m:
             continue
-        along, across = frame.to_local(corners[:, 0], corners[:, 1])
-        gap_across = max(across.min(), -across.max()) - gripper.half_width_m
+        (nearest, farthest), (left, right) = planar_extents(other, frame)
+        gap_across = max(left, -right) - gripper.half_width_m
         for low, high in ranges_m:
-            gap = min(gap, max(along.min() - high, low - along.max(), gap_across))
-    return float(gap)
+            gap = min(gap, max(nearest - high, low - farthest, gap_across))
+    return gap
 
 
 def grasp_clearance_m(
@@ -180,11 +179,9 @@ def hand_clearance_m(
     """
     gap = math.inf
     for other in others:
-        corners = world_vertices(other)
-        if corners[:, 2].max() > tool_z_m + robot.gripper.palm_height_m:
-            local = np.stack(tool.to_local(corners[:, 0], corners[:, 1]), axis=1)
-            gaps = np.maximum(local.min(axis=0), -local.max(axis=0)) - robot.hand_half_extents_m
-            gap = min(gap, float(gaps.max()))
+        if vertical_extent(other)[1] > tool_z_m + robot.gripper.palm_height_m:
+            axes = zip(planar_extents(other, tool), robot.hand_half_extents_m, strict=True)
+            gap = min(gap, max(max(low, -high) - half for (low, high), half in axes))
     return gap
 
 

@@ -114,7 +114,8 @@ def outline(body: Body, yaw_rad: float | None = None) -> Rectangle:
         yaw_rad: yaw of the rectangle; that of the body if None.
     """
     yaw = body.yaw_rad if yaw_rad is None else yaw_rad
-    return _bounding_rectangle(world_vertices(body), yaw)
+    (rectangle,) = _bounding_rectangles(world_vertices(body), [yaw])
+    return rectangle
 
 
 def narrowest(body: Body, yaw_rad: float | None = None) -> list[Rectangle]:
@@ -129,22 +130,26 @@ def narrowest(body: Body, yaw_rad: float | None = None) -> list[Rectangle]:
     """
     corners = world_vertices(body)
     if yaw_rad is not None:
-        return [_bounding_rectangle(corners, yaw_rad)]
+        return _bounding_rectangles(corners, [yaw_rad])
     # the axes of the body first: their rectangles are the tightest
     yaws = [body.yaw_rad + math.pi * i / WIDTH_YAWS for i in range(WIDTH_YAWS)]
     yaws.sort(key=lambda yaw: round((yaw - body.yaw_rad) / (math.pi / 2), 6) % 1 > 0)
-    found = [_bounding_rectangle(corners, yaw) for yaw in yaws]
+    found = _bounding_rectangles(corners, yaws)
     least = min(rectangle.half_x for rectangle in found)
     return [rectangle for rectangle in found if rectangle.half_x <= least + WIDTH_TOLERANCE_M]
 
 
-def _bounding_rectangle(corners: np.ndarray, yaw_rad: float) -> Rectangle:
-    """Return the bounding rectangle with a yaw of x and y of points [N, 3]."""
-    frame = PlanarFrame(0.0, 0.0, yaw_rad)
-    along, across = frame.to_local(corners[:, 0], corners[:, 1])
-    (x0, x1), (y0, y1) = ((float(values.min()), float(values.max())) for values in (along, across))
-    center = frame.to_world((x0 + x1) / 2, (y0 + y1) / 2)
-    return Rectangle(*center, yaw_rad, (x1 - x0) / 2, (y1 - y0) / 2)
+def _bounding_rectangles(corners: np.ndarray, yaws_rad: Sequence[float]) -> list[Rectangle]:
+    """Return the bounding rectangle with each yaw of x and y of points [N, 3]."""
+    cos, sin = (np.array([[f(yaw)] for yaw in yaws_rad]) for f in (math.cos, math.sin))
+    x, y = corners[:, 0], corners[:, 1]
+    along, across = cos * x + sin * y, cos * y - sin * x  # in frames at the world's origin
+    ends = (along.min(1), along.max(1), across.min(1), across.max(1))
+    rectangles = []
+    for yaw, x0, x1, y0, y1 in zip(yaws_rad, *(e.tolist() for e in ends), strict=True):
+        center = PlanarFrame(0.0, 0.0, yaw).to_world((x0 + x1) / 2, (y0 + y1) / 2)
+        rectangles.append(Rectangle(*center, yaw, (x1 - x0) / 2, (y1 - y0) / 2))
+    return rectangles
 
 
 def extents_m(points: np.ndarray) -> np.ndarray:

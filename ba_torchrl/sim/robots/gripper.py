@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -128,18 +128,8 @@ class Gripper:
         Returns:
             [N, 3] metres, relative to the tool point, along the axes of the world.
         """
-        widest = max(opening * self.half_gap_m, self.tip_arc[0][0])
-        depth_m = self.finger_depth_m
-        gaps, tips = np.array(self.tip_arc).T
-        depths = np.array([0.0, depth_m / 2, depth_m, depth_m, depth_m])
-        heights = np.array([0.0, 0.0, 0.0, GRASP_HEIGHT_M, 2 * GRASP_HEIGHT_M])
-        local = np.empty((len(gaps), len(depths), len(_SIDES), len(_EDGES), 3))
-        along = np.minimum(gaps, widest)[:, None] + depths
-        local[..., 0] = along[:, :, None, None] * _SIDES[:, None]
-        local[..., 1] = _EDGES * self.half_width_m
-        local[..., 2] = (-tips[:, None] - heights)[:, :, None, None]
         rotation = downward(0.0) if rotation is None else rotation
-        return local.reshape(-1, 3) @ np.array(rotation).T
+        return _tip_points_of_tool(self, opening) @ np.array(rotation).T
 
     def lowest_tool_m(self, rotation: Matrix | None = None, opening: float = 1.0) -> float:
         """Return the least height of the tool at which the fingers close clear of the floor.
@@ -160,6 +150,22 @@ class Gripper:
             for gap, height in self.tip_arc
         ]
         return max(depths) + FLOOR_CLEARANCE_M
+
+
+@lru_cache(maxsize=64)
+def _tip_points_of_tool(gripper: Gripper, opening: float) -> np.ndarray:
+    """Return the points of `Gripper.tip_points` in the frame of the tool, [N, 3] metres."""
+    widest = max(opening * gripper.half_gap_m, gripper.tip_arc[0][0])
+    depth_m = gripper.finger_depth_m
+    gaps, tips = np.array(gripper.tip_arc).T
+    depths = np.array([0.0, depth_m / 2, depth_m, depth_m, depth_m])
+    heights = np.array([0.0, 0.0, 0.0, GRASP_HEIGHT_M, 2 * GRASP_HEIGHT_M])
+    points = np.empty((len(gaps), len(depths), len(_SIDES), len(_EDGES), 3))
+    along = np.minimum(gaps, widest)[:, None] + depths
+    points[..., 0] = along[:, :, None, None] * _SIDES[:, None]
+    points[..., 1] = _EDGES * gripper.half_width_m
+    points[..., 2] = (-tips[:, None] - heights)[:, :, None, None]
+    return points.reshape(-1, 3)
 
 
 @cache

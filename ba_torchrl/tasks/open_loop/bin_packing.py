@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
@@ -274,15 +273,13 @@ def _best_site(
     ring = round(RING_M / PIXEL_M)
     if max(size) > min(heights.shape):
         return None
-    tops = sliding_window_view(
-        sliding_window_view(heights, size[0], axis=0).max(-1), size[1], axis=1
-    ).max(-1)
+    tops = _window_maxima(_window_maxima(heights, size[0]).T, size[1]).T
     means = _window_sums(heights, size) / (size[0] * size[1])
     wide = [extent + 2 * ring for extent in size]
     around = np.pad(heights, ring, mode="edge")
     taller = np.zeros(tops.shape)
     levels = np.round(tops / LEVEL_M)
-    for level in np.unique(levels):
+    for level in set(levels.ravel().tolist()):
         is_taller = around > level * LEVEL_M + TALLER_M
         at = levels == level
         taller[at] = _window_sums(is_taller, wide)[at]
@@ -294,6 +291,16 @@ def _best_site(
         for first, extent, count in zip((row, column), size, heights.shape, strict=True)
     ]
     return float(costs[row, column]), tuple(map(float, center)), float(tops[row, column])
+
+
+def _window_maxima(values: np.ndarray, size: int) -> np.ndarray:
+    """Return the maxima of ``size`` successive rows of an array [N, M], [N - size + 1, M]."""
+    width = 1
+    while 2 * width <= size:
+        values = np.maximum(values[:-width], values[width:])
+        width *= 2
+    overlap = size - width  # two windows of the largest power of two cover the rest
+    return np.maximum(values[: len(values) - overlap], values[overlap:])
 
 
 def _window_sums(values: np.ndarray, size: Sequence[int]) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -316,13 +317,20 @@ class GraspSelector:
 
 def _tool_position(position: Vector, candidate: GraspCandidate) -> Vector:
     """Return the position of the tool for a grasp of a body at a position."""
-    x, y, z = position
-    across_m = candidate.shift_m + candidate.middle_m
+    across, along = _tool_offsets(candidate)
+    return tuple(p + a + b for p, a, b in zip(position, across, along, strict=True))
+
+
+@lru_cache(maxsize=1024)
+def _tool_offsets(candidate: GraspCandidate) -> tuple[Vector, Vector]:
+    """Return the offsets of the tool from a body's origin along and perpendicular to the closing
+    axis, in the world frame; of a tilted tool, their sum and zero."""
+    across_m, along_m = candidate.shift_m + candidate.middle_m, candidate.along_m
     if candidate.tool is None:
-        frame = PlanarFrame(x, y, candidate.yaw_rad)
-        return *frame.to_world(across_m, candidate.along_m), z
-    offset = (across_m, -candidate.along_m, 0.0)  # the y axis of a tool is reversed
-    return Pose(position, candidate.tool).compose(Pose(offset)).position
+        cos, sin = math.cos(candidate.yaw_rad), math.sin(candidate.yaw_rad)
+        return (cos * across_m, sin * across_m, 0.0), (-sin * along_m, cos * along_m, 0.0)
+    offset = (across_m, -along_m, 0.0)  # the y axis of a tool is reversed
+    return Pose((0.0, 0.0, 0.0), candidate.tool).compose(Pose(offset)).position, (0.0, 0.0, 0.0)
 
 
 def _middle_m(body: Body, candidate: GraspCandidate) -> float:
