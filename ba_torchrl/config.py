@@ -58,6 +58,22 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
+def refuse_without_effect(config: StrictModel, names: Iterable[str], why: str) -> None:
+    """Check that fields that cannot have an effect have their default values.
+
+    Args:
+        config: the settings.
+        names: of the fields.
+        why: reason, for the error message: "without a replay".
+
+    Raises:
+        ConfigError: a field differs from its default.
+    """
+    for name in names:
+        if getattr(config, name) != type(config).model_fields[name].default:
+            raise ConfigError(f"{name} has no effect {why}; leave it out")
+
+
 Rgb = tuple[float, float, float]
 
 MAX_SEED = 2**63 - 1

@@ -9,6 +9,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from ba_torchrl.algorithms import base as registries
+from ba_torchrl.config import parse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
@@ -51,6 +52,8 @@ def control_of(network):
 
 
 def suits(algorithm, network):
+    if algorithm.startswith("ferm") and names_of("network")[network] != "ferm":
+        return False  # the contrastive loss would not reach the policy
     return control_of(network) in controls_of(algorithm)
 
 
@@ -123,6 +126,24 @@ def test_open_loop_defaults_are_those_of_the_appendix_or_the_reference():
     assert experiment("train", *overrides[:1], "algorithm=adet", overrides[2]).algorithm_config == (
         algorithm.model_copy(update={"demonstrations": "adet", "demonstration_weight": 0.01})
     )
+
+
+@pytest.mark.parametrize("name", ["quickstart", "quickstart_stacking"])
+@pytest.mark.parametrize(
+    "algorithm", [a for a in ALGORITHMS if suits(a, "cnn") or suits(a, "ferm")]
+)
+def test_algorithms_have_their_own_values_in_every_configuration(name, algorithm):
+    """A preset without demonstrations does not get a behaviour term from the configuration."""
+    overrides = [f"algorithm={algorithm}"]
+    if algorithm.startswith("ferm"):
+        overrides += ["network=ferm", "env.obs_size=142"]
+    if name == "quickstart_stacking":  # the group of rotations is the default network's
+        overrides += ["~network.group_order", "~network.reflections"]
+    config = experiment(name, *overrides)
+    assert config.label.startswith(f"{algorithm} ")
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        own = hydra_schema.preset("algorithm", algorithm)
+    assert config.algorithm_config == parse(registries.ALGORITHMS[own.pop("name")], own, algorithm)
 
 
 def test_the_open_loop_quick_start_composes():

@@ -30,7 +30,9 @@ class IQLConfig(LearnerConfig):
     """Hyper-parameters of implicit Q-learning.
 
     Expectile and temperature are those of Kostrikov et al. (2021) for sparse rewards (AntMaze), tau
-    is theirs as well.
+    is theirs as well. They subtract one from AntMaze's rewards; with rewards of 0 and 1, advantages
+    are of the order of 1 - gamma, so that the policy is close to behaviour cloning. Unlike theirs,
+    the critics have layer normalisation (`ba_torchrl.modules.ensembles`).
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
@@ -71,6 +73,7 @@ class IQL(Learner):
 
     config: IQLConfig
     loss: IQLLoss
+    imitates_actions: ClassVar[bool] = False
 
     def make_networks(self, network: NetworkConfig) -> IQLNetworks:
         """Return actor, critics and state value."""

@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -90,6 +90,10 @@ class Learner(Algorithm):
         self.optimizer = self.make_optimizer()
         self.scheduler = self.make_scheduler()
 
+    imitates_actions: ClassVar[bool] = True
+    """Whether a term of the loss imitates the actions of transitions with ``is_expert``. Without
+    such a term, random actions of demonstrations are part of the demonstrations."""
+
     # -- parts -------------------------------------------------------------------------------
 
     @abstractmethod
@@ -122,7 +126,7 @@ class Learner(Algorithm):
             raise ConfigError(
                 f"init: {type(self).__name__} has no actor that behaviour cloning could initialise"
             )
-        loss = BehaviourCloningLoss(policy, "kl")
+        loss = BehaviourCloningLoss(policy, "kl", self.config.init_entropy_weight)
         loss.set_keys(action=keys.EXPERT_ACTION if self.has_expert_action else keys.ACTION)
         return loss
 
@@ -210,6 +214,8 @@ class Learner(Algorithm):
             is_labelled = self.collects_expert_action and not is_expert
             is_labelled |= keys.EXPERT_ACTION in data
             label = keys.EXPERT_ACTION if is_labelled else keys.ACTION
+        if is_expert and not self.imitates_actions:
+            data = data.exclude(keys.IS_EXPERT)
         return as_transitions(data, self.images, is_expert=is_expert, label=label)
 
     def extend(self, transitions: TensorDictBase) -> None:

@@ -7,24 +7,40 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from ba_torchrl.algorithms.base import AlgorithmConfig
+from ba_torchrl.config import refuse_without_effect
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 
 Init = Literal["random", "bc"]
 """How the policy is initialised."""
 
+_OF_PRIORITIES = (
+    "priority_exponent",
+    "importance_exponent",
+    "importance_weighted",
+    "importance_norm",
+    "expert_bonus",
+)
+"""Fields of a prioritised replay."""
+
 
 class LearnerConfig(AlgorithmConfig):
-    """Hyper-parameters of every algorithm that learns from a replay."""
+    """Hyper-parameters of every algorithm that learns from a replay.
+
+    Learning rate, batch, capacity, exponents and bonus are those of appendix G.2. Each other field
+    says where its default is from.
+    """
 
     learning_rate: float = Field(default=1e-3, gt=0, le=1e3)
     """Learning rate of Adam."""
     learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
-    """Final fraction of the learning rate, which decreases linearly over the run."""
+    """Final fraction of the learning rate, which decreases linearly over the run; constant in the
+    reference implementation."""
     weight_decay: float = Field(default=0.0, ge=0)
-    """Adam's L2 term on the networks' parameters."""
+    """Adam's L2 term on the networks' parameters; none in the reference implementation's SAC."""
     gradient_clamp: float | None = Field(default=None, gt=0)
-    """Bound of each element of the networks' gradient; None for no bound."""
+    """Bound of each element of the networks' gradient; None for no bound, as in the reference
+    implementation's SAC."""
     policy_average: float = Field(default=0.0, ge=0, lt=1)
     """Decay of the exponential moving average of the policy's parameters with which the policy
     acts; 0 for acting with the last parameters. None in the appendix."""
@@ -41,9 +57,11 @@ class LearnerConfig(AlgorithmConfig):
     the weights are 1 throughout."""
     importance_weighted: WeightedTerms = "critic_and_policy"
     """Terms of the loss that the importance weights multiply: "none", "critic",
-    "critic_and_policy", or "all", which adds those on demonstrations and the temperature."""
+    "critic_and_policy", or "all", which adds those on demonstrations and the temperature. The
+    appendix does not say; the reference implementation computes weights and does not use them."""
     importance_norm: WeightNorm = "max"
-    """Statistic of a batch by which its importance weights are divided: "max" or "mean"."""
+    """Statistic of a batch by which its importance weights are divided: "max", as in Schaul et al.
+    (2016), or "mean"."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
     init: Init = "random"
@@ -51,10 +69,18 @@ class LearnerConfig(AlgorithmConfig):
     updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
 
     @model_validator(mode="after")
-    def _check_halves(self) -> Self:
+    def _check_replay(self) -> Self:
+        if self.replay != "prioritized":
+            refuse_without_effect(self, _OF_PRIORITIES, "without replay='prioritized'")
         if self.replay == "symmetric" and self.batch_size < 2:
             raise ValueError("batch_size must be at least 2 with a symmetric replay, half of each")
         return self
+
+    @property
+    def init_entropy_weight(self) -> float:
+        """Weight of the policy's negative entropy in the updates of behaviour cloning of
+        ``init="bc"``."""
+        return 0.0
 
     @property
     def pretraining_option(self) -> str | None:

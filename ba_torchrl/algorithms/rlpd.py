@@ -7,9 +7,9 @@ update of the policy. There is no term that imitates the demonstrations.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -21,6 +21,7 @@ from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.config import refuse_without_effect
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -63,6 +64,17 @@ class RLPDConfig(LearnerConfig):
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
     """Probability of rotating a sampled transition."""
 
+    @model_validator(mode="after")
+    def _check_augmentation(self) -> Self:
+        if self.augmentation == "none":
+            refuse_without_effect(self, ["augmentation_probability"], "without augmentation")
+        return self
+
+    @property
+    def init_entropy_weight(self) -> float:
+        """The initial entropy temperature, so that the cloned policy explores."""
+        return self.alpha_init
+
     def build(self, network: NetworkConfig, problem: Problem) -> RLPD:
         """Return a freshly initialised learner.
 
@@ -88,6 +100,7 @@ class RLPD(Learner):
 
     config: RLPDConfig
     loss: RLPDLoss
+    imitates_actions: ClassVar[bool] = False
 
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and ensemble."""

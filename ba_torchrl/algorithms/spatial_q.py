@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -16,6 +16,7 @@ from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
+from ba_torchrl.config import refuse_without_effect
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.modules.base import NetworkConfig
@@ -66,6 +67,21 @@ class SpatialQConfig(LearnerConfig):
     epsilon_updates: int = Field(default=1000, ge=1)
     """Updates over which that probability changes linearly, those on the demonstrations alone
     included."""
+
+    @model_validator(mode="after")
+    def _check_options(self) -> Self:
+        kind = f"with demonstrations={self.demonstrations!r}"
+        if self.demonstrations == "none":
+            refuse_without_effect(self, ["demonstration_weight"], kind)
+        if self.demonstrations not in ("dqfd", "sdqfd"):
+            refuse_without_effect(self, ["margin"], kind)
+        if self.demonstrations != "adet":
+            refuse_without_effect(self, ["first_beta", "later_beta"], kind)
+        if self.augmentation == "none":
+            refuse_without_effect(self, ["augmentation_probability"], "without augmentation")
+        if self.augmentation != "cn":
+            refuse_without_effect(self, ["augmentation_order"], "without augmentation='cn'")
+        return self
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
         """Return a freshly initialised learner.

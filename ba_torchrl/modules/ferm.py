@@ -5,6 +5,8 @@ The architecture is the reference implementation's; the appendix does not give i
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -107,6 +109,7 @@ class FERMConfig(ImageNetworkConfig):
         features: size of the encoder's features, on which the contrastive loss acts.
     """
 
+    shares_encoder: ClassVar[bool] = True
     width: float = Field(default=1.0, gt=0)
     features: int = Field(default=50, ge=1)
 

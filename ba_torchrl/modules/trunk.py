@@ -98,6 +98,8 @@ class ImageNetworkConfig(StrictModel):
 
     control: ClassVar[Control] = "close_loop"
     image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS,)
+    shares_encoder: ClassVar[bool] = False
+    """Whether the policy sees features of the critics' encoder."""
 
     precision: Precision = "auto"
     depth_reference: Literal["camera", "floor"] = "camera"

@@ -46,15 +46,17 @@ class BehaviourCloningLoss(LossModule):
     """Behaviour cloning of a stochastic policy: the distance of an action drawn from it.
 
     The mean over the batch of the `action_distance` of a ~ pi, drawn with gradient, from the
-    expert's action a_e. With "mse", which is the behaviour term of SACfD (appendix G.2), its
-    expectation is the squared error of the mean plus the variance, so it trains the standard
-    deviation as well. TorchRL's ``BCLoss`` has the likelihood instead, which a squashed Gaussian
-    does not bound at the ends of the action's range, where the experts' gripper commands are, or
-    the error of the mode.
+    expert's action a_e, plus w log pi(a). With "mse", which is the behaviour term of SACfD
+    (appendix G.2), the expectation of the distance is the squared error of the mean plus the
+    variance, so it trains the standard deviation as well. Without the entropy term (w = 0) the
+    standard deviation tends to zero. TorchRL's ``BCLoss`` has the likelihood instead, which a
+    squashed Gaussian does not bound at the ends of the action's range, where the experts' gripper
+    commands are, or the error of the mode.
 
     Args:
         actor_network: policy; from the observation to a distribution with ``rsample``.
         distance: of actions.
+        entropy_weight: weight w of the negative entropy of the policy.
     """
 
     @dataclass
@@ -70,14 +72,17 @@ class BehaviourCloningLoss(LossModule):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
 
-    out_keys = ("loss_bc",)
-
     def __init__(
-        self, actor_network: ProbabilisticTensorDictSequential, distance: ActionDistance = "mse"
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        distance: ActionDistance = "mse",
+        entropy_weight: float = 0.0,
     ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
         self.distance: ActionDistance = distance
+        self.entropy_weight = entropy_weight
+        self.out_keys = ["loss_bc", "entropy"] if entropy_weight else ["loss_bc"]
         self._forward_value_estimator_keys()
 
     def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
@@ -85,7 +90,7 @@ class BehaviourCloningLoss(LossModule):
         self.in_keys = [*self.actor_network.in_keys, self.tensor_keys.action]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``loss_bc``.
+        """Return ``loss_bc`` and, with the entropy term, ``entropy`` without gradient.
 
         Args:
             tensordict: observations and expert actions [B]. The observation's entries may have a
@@ -93,11 +98,18 @@ class BehaviourCloningLoss(LossModule):
         """
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             observation = tensordict.select(*self.actor_network.in_keys)
-            sample = self.actor_network.get_dist(observation).rsample()
+            distribution = self.actor_network.get_dist(observation)
+            sample = distribution.rsample()
         action = tensordict[self.tensor_keys.action]
         if sample.ndim > action.ndim:
             action = action.unsqueeze(-2).expand_as(sample)
-        return TensorDict({"loss_bc": action_distance(sample, action, self.distance).mean()})
+        loss = action_distance(sample, action, self.distance).mean()
+        if not self.entropy_weight:
+            return TensorDict({"loss_bc": loss})
+        log_prob = distribution.log_prob(sample).mean()
+        return TensorDict(
+            {"loss_bc": loss + self.entropy_weight * log_prob, "entropy": -log_prob.detach()}
+        )
 
 
 class LevelCrossEntropyLoss(LossModule):

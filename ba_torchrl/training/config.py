@@ -11,7 +11,7 @@ from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
-from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, parse
+from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, parse, refuse_without_effect
 from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import (
     Source,
@@ -33,6 +33,15 @@ from ba_torchrl.training.collectors.base import COLLECTORS, CollectorConfig
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
 """Fields of `EnvConfig` that are not for the user to set."""
+
+_OF_DEMONSTRATIONS = (
+    "demonstrations_noise",
+    "demonstrations_turn_noise",
+    "demonstrations_source",
+    "only_successful_demonstrations",
+    "demonstrations_path",
+)
+"""Fields that describe the demonstrations."""
 
 
 class ExperimentConfig(StrictModel):
@@ -83,12 +92,13 @@ class ExperimentConfig(StrictModel):
     demonstrations_source: Source = "expert"
     """Their source: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
-    """Leave out failed episodes; fewer remain where the expert fails."""
+    """Leave out failed episodes; fewer remain where the expert fails. The reference implementation
+    keeps them in close loop and not in open loop."""
     demonstrations_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random action in place of the expert's in each step of a demonstration that
     is played for the run (Laskey et al., 2017). The expert recovers. In these steps, the
     behaviour term of SAC, behaviour cloning and DAgger imitate the action that it would have
-    executed; to the other algorithms, they are no demonstrations. None in the appendix."""
+    executed; to spatial Q-learning, they are no demonstrations. None in the appendix."""
     demonstrations_turn_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random turn beside the expert's other components, likewise. An expert turns
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
@@ -101,7 +111,7 @@ class ExperimentConfig(StrictModel):
     total_updates: int = Field(default=10_000, ge=1)
     """Gradient updates of the run, pretraining included; reference implementation."""
     updates_per_step: int = Field(default=1, ge=1)
-    """Updates for each step of all environments together."""
+    """Updates for each step of all environments together; reference implementation."""
     min_replay: int = Field(default=100, ge=1)
     """Transitions in the replay before the first update; reference implementation."""
     eval_every: int = Field(default=500, ge=1)
@@ -113,7 +123,7 @@ class ExperimentConfig(StrictModel):
     """Success rate that ends the run when two evaluations in a row reach it; None for all updates.
     If it is set, every evaluation has other episodes."""
     final_eval_episodes: int = Field(default=100, ge=1)
-    """Episodes of the last evaluation, which is reported."""
+    """Episodes of the last evaluation, which is reported; not in the appendix."""
     report: Literal["last", "best"] = "last"
     """The reported policy: the last one, or that of the checkpoint with the best evaluation. The
     episodes of its evaluation differ from those that selected the checkpoint."""
@@ -265,6 +275,8 @@ class ExperimentConfig(StrictModel):
         return primitive_component(TASKS[self.task].control, sequence)
 
     def _check_demonstrations(self) -> None:
+        if not self.demonstrations:
+            refuse_without_effect(self, _OF_DEMONSTRATIONS, "with demonstrations=0")
         source = source_config(self.demonstrations_source)
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
         check_turn_noise(
@@ -278,8 +290,6 @@ class ExperimentConfig(StrictModel):
                 self.task, parse_env_config(self.task, {**self.env, **source}, "env")
             )
         if self.demonstrations_path is not None:
-            if not self.demonstrations:
-                raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")
             check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
 
 

@@ -106,6 +106,8 @@ def make_loss(config: Config, networks: ActorCritic) -> SACfDLoss:
         TensorDictModule(networks.encoder, OBSERVATION, ["critic_features"]),
         TensorDictModule(networks.critic, critic_inputs, ["state_action_value"]),
         demonstration_weight=config.demonstration_weight,
+        demonstration_distance="kl",  # reference implementation: the squared error
+        entropy_backup=False,  # as in the quick start; reference implementation: true
     )
     return loss.make_value_estimator(gamma=config.gamma).to(config.device)
 

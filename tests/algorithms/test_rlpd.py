@@ -80,7 +80,8 @@ def test_optimiser_and_augmentation_have_their_values():
     assert (learner.replay.expert.storage.max_size, learner.replay.batch_size) == (55, 6)
     assert isinstance(learner.augmentation, SO2Augmentation)
     assert learner.augmentation.probability == 0.35
-    assert isinstance(made(augmentation="none").augmentation, torch.nn.Identity)
+    plain = made(augmentation="none", augmentation_probability=0.8)
+    assert isinstance(plain.augmentation, torch.nn.Identity)
     learner.update()
     decay = {
         id(p): group["weight_decay"]

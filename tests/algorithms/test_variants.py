@@ -60,6 +60,7 @@ PAIRS = [
     for network in SMALL
     if network_class(network).control in ALGORITHMS[values["name"]].controls
     and (preset, network) != ("rlpd", "ferm")  # it builds no ensemble of critics
+    and (not preset.startswith("ferm") or network == "ferm")
 ]
 
 
@@ -184,13 +185,13 @@ def test_contrastive_pretraining_and_behaviour_cloning_go_together():
     ferm.extend(demonstrations)
     before = parameters(ferm)
     scalars = [ferm.pretrain_update() for _ in range(60)]
-    assert set(scalars[0].keys()) == {"loss_contrastive", "loss_bc"}
+    assert set(scalars[0].keys()) == {"loss_contrastive", "loss_bc", "entropy"}
     after = parameters(ferm)
     changed = {name for name in after if not torch.equal(after[name], before[name])}
     assert changed
     assert not any(name.startswith("qvalue_network") for name in changed)
     assert {name.split("_params")[0] for name in changed} >= {"actor_network", "encoder_network"}
-    for loss in list(scalars[0].keys()):
+    for loss in ("loss_contrastive", "loss_bc"):
         values = [float(each[loss]) for each in scalars]
         assert sum(values[-10:]) < sum(values[:10])
 

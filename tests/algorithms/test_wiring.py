@@ -51,7 +51,6 @@ SPATIAL_Q = {
     "gamma": 0.6,
     "demonstrations": "adet",
     "demonstration_weight": 0.7,
-    "margin": 0.4,
     "first_beta": 7.0,
     "later_beta": 3.0,
     "target_interval": 3,
@@ -68,6 +67,13 @@ SPATIAL_Q = {
     "epsilon_updates": 4,
 }
 KINDS = {"sac": SAC, "spatial_q": SPATIAL_Q}
+OF_PRIORITIES = {
+    "priority_exponent",
+    "importance_exponent",
+    "importance_weighted",
+    "importance_norm",
+    "expert_bonus",
+}
 
 
 def build(name, **changes):
@@ -86,7 +92,10 @@ def build(name, **changes):
         if is_close
         else parse(NETWORKS["asr"], {"num_rotations": 4, "width": 0.125}, "asr")
     )
-    settings = parse(ALGORITHMS[name], {**KINDS[name], **changes}, name)
+    values = {**KINDS[name], **changes}
+    if values["replay"] != "prioritized":
+        values = {key: value for key, value in values.items() if key not in OF_PRIORITIES}
+    settings = parse(ALGORITHMS[name], values, name)
     return settings.build(network, problem)
 
 
@@ -176,13 +185,15 @@ def test_the_terms_of_sac_have_their_values():
 def test_the_terms_of_spatial_q_have_their_values():
     loss = build("spatial_q").loss
     assert loss.demonstrations == "adet"
-    values = (loss.demonstration_weight, loss.margin, loss.first_beta, loss.later_beta)
-    assert values == (0.7, 0.4, 7.0, 3.0)
+    values = (loss.demonstration_weight, loss.first_beta, loss.later_beta)
+    assert values == (0.7, 7.0, 3.0)
+    defaults = {"first_beta": 100.0, "later_beta": 1.0}
+    assert build("spatial_q", demonstrations="dqfd", margin=0.4, **defaults).loss.margin == 0.4
 
 
 @pytest.mark.parametrize("name", ["sac", "spatial_q"])
 def test_the_loss_has_the_configured_importance_weights(name):
-    loss, config = build(name).loss, KINDS[name]
+    loss, config = build(name, replay="prioritized").loss, KINDS[name]
     assert loss.weighted_terms == config["importance_weighted"]
     assert loss.weight_norm == config["importance_norm"]
 
@@ -241,7 +252,8 @@ def test_batches_are_augmented_with_the_configured_probability(name, probability
 def test_the_order_and_kind_of_rigid_transforms_are_the_configured_ones():
     augmentation = build("spatial_q").augmentation
     assert (augmentation.transforms, augmentation.order) == ("cn", 6)
-    assert isinstance(build("sac", augmentation="none").augmentation, nn.Identity)
+    plain = build("sac", augmentation="none", augmentation_probability=0.8)
+    assert isinstance(plain.augmentation, nn.Identity)
 
 
 def test_weight_decay_applies_to_the_networks_and_not_to_the_temperature(algorithm):

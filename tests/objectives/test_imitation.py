@@ -54,6 +54,27 @@ def test_the_error_is_that_of_the_drawn_action(distance):
     assert (actor.log_scale.grad != 0).all()
 
 
+def test_the_entropy_term_is_that_of_the_drawn_action():
+    actor = Constant([0.3, -0.4], [0.5, 0.2])
+    policy = squashed_gaussian_policy(actor, OBSERVATION)
+    plain, loss = BehaviourCloningLoss(policy), BehaviourCloningLoss(policy, entropy_weight=0.3)
+    assert list(plain.out_keys) == ["loss_bc"]
+    assert list(loss.out_keys) == ["loss_bc", "entropy"]
+    data = batch()
+    torch.manual_seed(5)
+    error = plain(data)["loss_bc"]
+    torch.manual_seed(5)
+    found = loss(data)
+    torch.manual_seed(5)
+    noise, scale = torch.randn(4, 2, dtype=torch.float64), actor.log_scale.exp()
+    u = actor.loc + scale * noise
+    gaussian = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2 * math.pi)
+    log_prob = (gaussian - (1 - torch.tanh(u).square()).log()).sum(dim=-1).mean()
+    torch.testing.assert_close(found["loss_bc"], error + 0.3 * log_prob)
+    torch.testing.assert_close(found["entropy"], -log_prob)
+    assert not found["entropy"].requires_grad
+
+
 def test_the_expected_error_is_the_squared_bias_plus_the_variance():
     actor = Constant([0.1], [0.01])  # narrow: tanh is linear there
     loss = BehaviourCloningLoss(squashed_gaussian_policy(actor, OBSERVATION))

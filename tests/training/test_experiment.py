@@ -210,11 +210,15 @@ FERM = {
         ({"demonstrations_path": "/no/such/folder"}, "no demonstrations at"),
         (
             {"demonstrations": 0, **NO_PRETRAINING, "demonstrations_path": "/a"},
-            "set demonstrations",
+            "demonstrations_path has no effect with demonstrations=0",
         ),
         ({"network": {"name": "fcn"}}, "network for open_loop tasks"),
         ({"algorithm": {"name": "sac", "init": "bc"}, **NO_PRETRAINING}, "init: 'bc' takes effect"),
-        ({"algorithm": FERM, **NO_PRETRAINING}, "pretraining: 'contrastive' takes effect"),
+        (
+            {"algorithm": FERM, "network": {"name": "ferm"}, **NO_PRETRAINING},
+            "pretraining: 'contrastive' takes effect",
+        ),
+        ({"algorithm": FERM}, "use network: ferm"),
     ],
 )
 def test_wrong_configurations_fail_before_the_run_starts(tmp_path, changes, message):

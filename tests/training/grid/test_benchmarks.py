@@ -1,4 +1,4 @@
-"""The benchmarks in ``configs`` have the paper's values."""
+"""The benchmarks in ``configs`` have the values of the appendix or the reference."""
 
 import math
 from pathlib import Path
