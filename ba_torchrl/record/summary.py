@@ -244,7 +244,7 @@ def _row(title: str, group: Group) -> dict[str, Any]:
         float(standard_error(group.final)),
         low,
         high,
-        float(group.rates.mean()),
+        float(group.rates.mean()) if group.rates.size else float("nan"),
         updates,
         steps,
         float(np.mean([result.final.mean_length for result in results])),

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import pybullet
 
+from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
@@ -91,6 +92,10 @@ class Body:
         pose = Pose(*pybullet.getBasePositionAndOrientation(self.id, physicsClientId=self.client))
         return pose if self._from_center is None else bullet_compose(pose, self._from_center)
 
+    def _check_can_move(self) -> None:
+        if self._fixed_pose is not None:
+            raise SimulationError(f"{self.name} cannot move here: its pose is fixed")
+
     def fix_pose(self, is_fixed: bool) -> None:
         """Read the pose once and return it until this is called with False.
 
@@ -129,7 +134,11 @@ class Body:
         Args:
             position: of the frame of the geometry, metres.
             orientation: unit quaternion (x, y, z, w).
+
+        Raises:
+            SimulationError: the pose is fixed, see `World.fixed_poses`.
         """
+        self._check_can_move()
         if self._center is not None:
             position, orientation = bullet_compose(Pose(position, orientation), self._center)
         pybullet.resetBasePositionAndOrientation(

@@ -234,7 +234,7 @@ class World:
     def fixed_poses(self) -> Iterator[None]:
         """A context in which no body moves, so that the pose of each is read once.
 
-        In it, steps and restored states raise a `SimulationError`.
+        In it, steps, restored states and teleported bodies raise a `SimulationError`.
         """
         for body in self.bodies:
             body.fix_pose(True)

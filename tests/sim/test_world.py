@@ -75,6 +75,31 @@ def test_settle_returns_whether_bodies_came_to_rest():
         assert world.steps - before == 20
 
 
+def test_bodies_with_fixed_poses_cannot_move():
+    with World() as world:
+        body = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
+        body.place((0.4, 0.1, 1.0), 0.3)
+        world.seal()
+        pose = body.pose
+        with world.fixed_poses():
+            assert body.pose is body.pose
+            assert body.pose == pose
+            for move in (world.step, world.restore_pristine, lambda: body.place((0.0, 0.0, 1.0))):
+                with pytest.raises(SimulationError, match="fixed"):
+                    move()
+        world.step(5)
+        assert body.position[2] < pose.position[2]
+
+
+def test_poses_are_not_fixed_after_an_error():
+    with World() as world:
+        body = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
+        with pytest.raises(ZeroDivisionError), world.fixed_poses():
+            _ = 1 / 0
+        body.place((0.4, 0.1, 1.0))
+        world.step()
+
+
 def test_close_disconnects_the_client():
     world = World()
     client = world.client

@@ -1,10 +1,12 @@
 """Bin packing: when an object is packed, release heights, kinds of objects."""
 
+import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.tasks.footprints import Rectangle
-from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, object_shapes
+from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, _window_maxima, object_shapes
 from tests.tasks.packing.scenes import BIN, QUARTER_TURN, follow
 
 
@@ -94,3 +96,10 @@ def test_kinds_are_drawn_with_replacement(make_env):
     assert all(len(kinds) == 8 for kinds in seen)
     assert {kind for kinds in seen for kind in kinds} == set(object_shapes(1.0))
     assert any(kinds.count(kind) >= 3 for kinds in seen for kind in kinds)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 7, 8, 9, 20])
+def test_maxima_of_windows(size):
+    values = np.random.default_rng(0).normal(size=(20, 5))
+    expected = sliding_window_view(values, size, axis=0).max(axis=-1)
+    np.testing.assert_array_equal(_window_maxima(values, size), expected)
