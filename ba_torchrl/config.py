@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import cache
 from typing import Any, Literal, Self, TypeVar
 
@@ -58,20 +58,17 @@ class StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-def refuse_without_effect(config: StrictModel, names: Iterable[str], why: str) -> None:
-    """Check that fields that cannot have an effect have their default values.
+def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str]:
+    """Yield a message for each of some fields, which have no effect, that is not at its default.
 
     Args:
         config: the settings.
         names: of the fields.
-        why: reason, for the error message: "without a replay".
-
-    Raises:
-        ConfigError: a field differs from its default.
+        why: reason: "without a replay".
     """
     for name in names:
         if getattr(config, name) != type(config).model_fields[name].default:
-            raise ConfigError(f"{name} has no effect {why}; leave it out")
+            yield f"{name} has no effect {why}"
 
 
 Rgb = tuple[float, float, float]

@@ -52,8 +52,6 @@ def control_of(network):
 
 
 def suits(algorithm, network):
-    if algorithm.startswith("ferm") and names_of("network")[network] != "ferm":
-        return False  # the contrastive loss would not reach the policy
     return control_of(network) in controls_of(algorithm)
 
 
@@ -128,17 +126,24 @@ def test_open_loop_defaults_are_those_of_the_appendix_or_the_reference():
     )
 
 
-@pytest.mark.parametrize("name", ["quickstart", "quickstart_stacking"])
+QUICK_STARTS = sorted(path.stem for path in CONFIGS.glob("quickstart*.yaml"))
+OPEN_LOOP = {"quickstart_open_loop", "quickstart_six_dof"}
+
+
 @pytest.mark.parametrize(
-    "algorithm", [a for a in ALGORITHMS if suits(a, "cnn") or suits(a, "ferm")]
+    ("name", "algorithm"),
+    [
+        (name, algorithm)
+        for name in QUICK_STARTS
+        for algorithm in ALGORITHMS
+        if suits(algorithm, "asr" if name in OPEN_LOOP else "cnn")
+    ],
 )
-def test_algorithms_have_their_own_values_in_every_configuration(name, algorithm):
+def test_algorithms_have_their_own_values_in_every_quick_start(name, algorithm):
     """A preset without demonstrations does not get a behaviour term from the configuration."""
     overrides = [f"algorithm={algorithm}"]
     if algorithm.startswith("ferm"):
         overrides += ["network=ferm", "env.obs_size=142"]
-    if name == "quickstart_stacking":  # the group of rotations is the default network's
-        overrides += ["~network.group_order", "~network.reflections"]
     config = experiment(name, *overrides)
     assert config.label.startswith(f"{algorithm} ")
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
@@ -168,8 +173,9 @@ def test_the_quick_start_in_six_degrees_of_freedom_composes(network):
     assert (config.network_config.voxel_scale, config.network_config.num_rotations) == (10, 8)
 
 
+@pytest.mark.parametrize("name", ["quickstart", "quickstart_stacking"])
 @pytest.mark.parametrize("network", [name for name in NETWORKS if suits("sacfd", name)])
-def test_the_quick_start_takes_any_network(network):
-    config = experiment("quickstart", f"network={network}", "env.max_steps=20")
+def test_the_quick_starts_of_close_loop_take_any_network(name, network):
+    config = experiment(name, f"network={network}", "env.max_steps=20")
     assert config.env_config.max_steps == 20
-    assert config.env_config.obs_size == 64
+    assert config.env_config.obs_size == {"quickstart": 64, "quickstart_stacking": 128}[name]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -186,6 +186,14 @@ class AlgorithmConfig(StrictModel, ABC):
                 f"{type(network).__name__} is a network for {network.control} tasks; "
                 f"{control} tasks take network: {', '.join(known)}"
             )
+
+    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
+        """Yield a message for each value that has no effect together with the others.
+
+        Args:
+            network: hyper-parameters of the network.
+        """
+        yield from ()
 
     @abstractmethod
     def build(self, network: NetworkConfig, problem: Problem) -> Algorithm:

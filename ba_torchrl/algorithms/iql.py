@@ -73,7 +73,11 @@ class IQL(Learner):
 
     config: IQLConfig
     loss: IQLLoss
-    imitates_actions: ClassVar[bool] = False
+
+    @property
+    def imitates_demonstrations(self) -> bool:
+        """False: all transitions have the same loss."""
+        return False
 
     def make_networks(self, network: NetworkConfig) -> IQLNetworks:
         """Return actor, critics and state value."""

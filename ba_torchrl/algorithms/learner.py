@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -89,10 +89,6 @@ class Learner(Algorithm):
         self.augmentation = self.make_augmentation()
         self.optimizer = self.make_optimizer()
         self.scheduler = self.make_scheduler()
-
-    imitates_actions: ClassVar[bool] = True
-    """Whether a term of the loss imitates the actions of transitions with ``is_expert``. Without
-    such a term, random actions of demonstrations are part of the demonstrations."""
 
     # -- parts -------------------------------------------------------------------------------
 
@@ -198,6 +194,12 @@ class Learner(Algorithm):
     # -- data --------------------------------------------------------------------------------
 
     @property
+    def imitates_demonstrations(self) -> bool:
+        """Whether a term of the loss is for transitions with ``is_expert`` only, by default True.
+        Without such a term, random actions of demonstrations count as demonstrations too."""
+        return True
+
+    @property
     def has_expert_action(self) -> bool:
         """Whether stored transitions have ``expert_action``, the action that is imitated, beside
         the executed one; by default if it is collected, and with ``init="bc"``."""
@@ -214,7 +216,7 @@ class Learner(Algorithm):
             is_labelled = self.collects_expert_action and not is_expert
             is_labelled |= keys.EXPERT_ACTION in data
             label = keys.EXPERT_ACTION if is_labelled else keys.ACTION
-        if is_expert and not self.imitates_actions:
+        if is_expert and not self.imitates_demonstrations:
             data = data.exclude(keys.IS_EXPERT)
         return as_transitions(data, self.images, is_expert=is_expert, label=label)
 

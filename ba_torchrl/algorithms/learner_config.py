@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from ba_torchrl.algorithms.base import AlgorithmConfig
-from ba_torchrl.config import refuse_without_effect
+from ba_torchrl.algorithms.base import AlgorithmConfig, NetworkConfig
+from ba_torchrl.config import changed
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 
@@ -69,12 +70,17 @@ class LearnerConfig(AlgorithmConfig):
     updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
 
     @model_validator(mode="after")
-    def _check_replay(self) -> Self:
-        if self.replay != "prioritized":
-            refuse_without_effect(self, _OF_PRIORITIES, "without replay='prioritized'")
+    def _check_halves(self) -> Self:
         if self.replay == "symmetric" and self.batch_size < 2:
             raise ValueError("batch_size must be at least 2 with a symmetric replay, half of each")
         return self
+
+    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
+        """As for `AlgorithmConfig`: fields of another replay."""
+        if self.replay != "prioritized":
+            yield from changed(self, _OF_PRIORITIES, "without replay='prioritized'")
+        elif self.importance_weighted == "none":
+            yield from changed(self, ["importance_norm"], "with importance_weighted='none'")
 
     @property
     def init_entropy_weight(self) -> float:

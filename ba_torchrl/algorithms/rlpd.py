@@ -7,9 +7,10 @@ update of the policy. There is no term that imitates the demonstrations.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self
+from collections.abc import Iterator
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -21,7 +22,7 @@ from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
-from ba_torchrl.config import refuse_without_effect
+from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -64,11 +65,11 @@ class RLPDConfig(LearnerConfig):
     augmentation_probability: float = Field(default=0.8, ge=0, le=1)
     """Probability of rotating a sampled transition."""
 
-    @model_validator(mode="after")
-    def _check_augmentation(self) -> Self:
+    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
+        """As for `AlgorithmConfig`: fields of another replay or of the augmentation."""
+        yield from super().without_effect(network)
         if self.augmentation == "none":
-            refuse_without_effect(self, ["augmentation_probability"], "without augmentation")
-        return self
+            yield from changed(self, ["augmentation_probability"], "without augmentation")
 
     @property
     def init_entropy_weight(self) -> float:
@@ -100,7 +101,11 @@ class RLPD(Learner):
 
     config: RLPDConfig
     loss: RLPDLoss
-    imitates_actions: ClassVar[bool] = False
+
+    @property
+    def imitates_demonstrations(self) -> bool:
+        """False: half of every batch is demonstrations, and all transitions have the same loss."""
+        return False
 
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and ensemble."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
@@ -15,11 +15,11 @@ from torchrl.data import Bounded
 from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Control, Problem
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
-from ba_torchrl.config import refuse_without_effect
+from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.augmentation.stored import StoredCopies
 from ba_torchrl.data.augmentation.views import (
@@ -33,7 +33,6 @@ from ba_torchrl.data.replay.symmetric import count_demonstrations
 from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.contrastive import BilinearInfoNCE
@@ -117,22 +116,27 @@ class SACConfig(LearnerConfig):
             raise ValueError("pretraining 'contrastive' needs contrastive_weight")
         if self.stored_copies and self.augmentation == "none":
             raise ValueError("stored_copies needs augmentation")
-        self._refuse_without_effect()
         return self
 
-    def _refuse_without_effect(self) -> None:
+    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
+        """As for `AlgorithmConfig`: fields of other augmentations, of a term without weight, and a
+        contrastive loss that does not reach the policy."""
+        yield from super().without_effect(network)
         if self.augmentation == "none" or self.stored_copies:
             why = "without augmentation='so2' of sampled transitions"
-            refuse_without_effect(self, ["augmentation_probability"], why)
+            yield from changed(self, ["augmentation_probability"], why)
         if self.view_transform != "crop":
-            refuse_without_effect(self, ["crop_size"], "without view_transform='crop'")
+            yield from changed(self, ["crop_size"], "without view_transform='crop'")
         if self.view_transform != "shift":
-            refuse_without_effect(self, ["shift_pixels"], "without view_transform='shift'")
+            yield from changed(self, ["shift_pixels"], "without view_transform='shift'")
         if not self.demonstration_weight:
             why = "with demonstration_weight=0"
-            refuse_without_effect(self, ["demonstration_distance"], why)
+            yield from changed(self, ["demonstration_distance"], why)
             if self.replay == "uniform":
-                refuse_without_effect(self, ["imitate_successes"], f"{why} and uniform replay")
+                yield from changed(self, ["imitate_successes"], f"{why} and uniform replay")
+        if self.contrastive_weight and getattr(network, "shares_encoder", None) is False:
+            name = type(network).__name__
+            yield f"contrastive_weight has no effect on the policy's own encoder in {name}"
 
     @property
     def init_entropy_weight(self) -> float:
@@ -145,21 +149,6 @@ class SACConfig(LearnerConfig):
         if self.pretraining == "contrastive":
             return "pretraining: 'contrastive'"
         return super().pretraining_option
-
-    def check(self, network: NetworkConfig, control: Control) -> None:
-        """Check network and control as `AlgorithmConfig.check`, and that a contrastive loss trains
-        convolutions of the policy.
-
-        Raises:
-            ConfigError: the two do not go together.
-        """
-        super().check(network, control)
-        if self.contrastive_weight and not getattr(network, "shares_encoder", False):
-            known = [name for name in NETWORKS if getattr(NETWORKS[name], "shares_encoder", False)]
-            raise ConfigError(
-                f"contrastive_weight: the policy of {type(network).__name__} has an encoder of its "
-                f"own, which the contrastive loss does not train; use network: {', '.join(known)}"
-            )
 
     def build(self, network: NetworkConfig, problem: Problem) -> SAC:
         """Return a freshly initialised learner."""

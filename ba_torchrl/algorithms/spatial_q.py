@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar
 
-from pydantic import Field, model_validator
+from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -16,7 +16,7 @@ from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
-from ba_torchrl.config import refuse_without_effect
+from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.modules.base import NetworkConfig
@@ -68,20 +68,21 @@ class SpatialQConfig(LearnerConfig):
     """Updates over which that probability changes linearly, those on the demonstrations alone
     included."""
 
-    @model_validator(mode="after")
-    def _check_options(self) -> Self:
+    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
+        """As for `AlgorithmConfig`: fields of another replay, of other terms on demonstrations, and
+        of other augmentations."""
+        yield from super().without_effect(network)
         kind = f"with demonstrations={self.demonstrations!r}"
         if self.demonstrations == "none":
-            refuse_without_effect(self, ["demonstration_weight"], kind)
+            yield from changed(self, ["demonstration_weight"], kind)
         if self.demonstrations not in ("dqfd", "sdqfd"):
-            refuse_without_effect(self, ["margin"], kind)
+            yield from changed(self, ["margin"], kind)
         if self.demonstrations != "adet":
-            refuse_without_effect(self, ["first_beta", "later_beta"], kind)
+            yield from changed(self, ["first_beta", "later_beta"], kind)
         if self.augmentation == "none":
-            refuse_without_effect(self, ["augmentation_probability"], "without augmentation")
+            yield from changed(self, ["augmentation_probability"], "without augmentation")
         if self.augmentation != "cn":
-            refuse_without_effect(self, ["augmentation_order"], "without augmentation='cn'")
-        return self
+            yield from changed(self, ["augmentation_order"], "without augmentation='cn'")
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
         """Return a freshly initialised learner.
@@ -110,6 +111,11 @@ class SpatialQ(Learner):
     def __init__(self, config: SpatialQConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)
         self._set_epsilon()
+
+    @property
+    def imitates_demonstrations(self) -> bool:
+        """Whether the loss has a term on demonstrations."""
+        return self.config.demonstrations != "none"
 
     def make_networks(self, network: NetworkConfig) -> SpatialValues:
         """Return the network, wrapped as values of the environment's actions."""

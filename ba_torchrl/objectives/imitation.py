@@ -12,6 +12,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
+from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.dqn import LevelValues
@@ -99,14 +100,17 @@ class BehaviourCloningLoss(LossModule):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             observation = tensordict.select(*self.actor_network.in_keys)
             distribution = self.actor_network.get_dist(observation)
-            sample = distribution.rsample()
+            if self.entropy_weight:
+                sample, log_prob = compute_rsample_log_prob(distribution)
+            else:
+                sample = distribution.rsample()
         action = tensordict[self.tensor_keys.action]
         if sample.ndim > action.ndim:
             action = action.unsqueeze(-2).expand_as(sample)
         loss = action_distance(sample, action, self.distance).mean()
         if not self.entropy_weight:
             return TensorDict({"loss_bc": loss})
-        log_prob = distribution.log_prob(sample).mean()
+        log_prob = log_prob.mean()
         return TensorDict(
             {"loss_bc": loss + self.entropy_weight * log_prob, "entropy": -log_prob.detach()}
         )

@@ -104,7 +104,7 @@ class ArticulatedLink(Body):
 
         Raises:
             ValueError: this is the sliding link.
-            SimulationError: the pose is fixed, see `World.fixed_poses`.
+            RuntimeError: the pose is fixed, see `World.fixed_poses`.
         """
         self._check_can_move()
         if not self.is_static:

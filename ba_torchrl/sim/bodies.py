@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 import pybullet
 
-from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
@@ -94,7 +93,7 @@ class Body:
 
     def _check_can_move(self) -> None:
         if self._fixed_pose is not None:
-            raise SimulationError(f"{self.name} cannot move here: its pose is fixed")
+            raise RuntimeError(f"{self.name} cannot move here: its pose is fixed")
 
     def fix_pose(self, is_fixed: bool) -> None:
         """Read the pose once and return it until this is called with False.
@@ -136,7 +135,7 @@ class Body:
             orientation: unit quaternion (x, y, z, w).
 
         Raises:
-            SimulationError: the pose is fixed, see `World.fixed_poses`.
+            RuntimeError: the pose is fixed, see `World.fixed_poses`.
         """
         self._check_can_move()
         if self._center is not None:

@@ -201,8 +201,8 @@ class World:
         """Restore a snapshot of this world; the caller must repeat the motor commands.
 
         Raises:
-            SimulationError: the snapshot belongs to another or a closed world, or within
-                `fixed_poses`.
+            SimulationError: the snapshot belongs to another or a closed world.
+            RuntimeError: within `fixed_poses`.
         """
         self._check_not_fixed()
         # PyBullet reuses client ids, so that the connection identifies the world
@@ -219,7 +219,7 @@ class World:
         """Advance the physics by ``count`` time steps.
 
         Raises:
-            SimulationError: within `fixed_poses`.
+            RuntimeError: within `fixed_poses`.
         """
         self._check_not_fixed()
         for _ in range(count):
@@ -234,12 +234,13 @@ class World:
     def fixed_poses(self) -> Iterator[None]:
         """A context in which no body moves, so that the pose of each is read once.
 
-        In it, steps, restored states and teleported bodies raise a `SimulationError`.
+        Experts act in it. Steps, restored states and teleported bodies raise a `RuntimeError`.
         """
-        for body in self.bodies:
-            body.fix_pose(True)
+        self._check_not_fixed()
         self._has_fixed_poses = True
         try:
+            for body in self.bodies:
+                body.fix_pose(True)
             yield
         finally:
             self._has_fixed_poses = False
@@ -318,8 +319,8 @@ class World:
         self.moving_bodies.extend(body for body in bodies if not body.is_static)
 
     def _check_not_fixed(self) -> None:
-        if self._has_fixed_poses:
-            raise SimulationError("bodies cannot move here: their poses are fixed")
+        if self._has_fixed_poses:  # no fault of the simulator, which would be counted
+            raise RuntimeError("bodies cannot move here, for example in an expert: poses are fixed")
 
     def _check_not_sealed(self, name: str) -> None:
         if self._pristine is not None:

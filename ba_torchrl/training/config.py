@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +12,7 @@ from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
-from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, parse, refuse_without_effect
+from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, changed, parse
 from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import (
     Source,
@@ -39,7 +40,6 @@ _OF_DEMONSTRATIONS = (
     "demonstrations_turn_noise",
     "demonstrations_source",
     "only_successful_demonstrations",
-    "demonstrations_path",
 )
 """Fields that describe the demonstrations."""
 
@@ -98,7 +98,8 @@ class ExperimentConfig(StrictModel):
     """Probability of a random action in place of the expert's in each step of a demonstration that
     is played for the run (Laskey et al., 2017). The expert recovers. In these steps, the
     behaviour term of SAC, behaviour cloning and DAgger imitate the action that it would have
-    executed; to spatial Q-learning, they are no demonstrations. None in the appendix."""
+    executed. To spatial Q-learning with a term on demonstrations, they are no demonstrations; RLPD,
+    IQL and DQN take them as they are. None in the appendix."""
     demonstrations_turn_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random turn beside the expert's other components, likewise. An expert turns
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
@@ -274,9 +275,14 @@ class ExperimentConfig(StrictModel):
         sequence = resolve(self.task, **self.env).action_sequence
         return primitive_component(TASKS[self.task].control, sequence)
 
-    def _check_demonstrations(self) -> None:
+    def without_effect(self) -> Iterator[str]:
+        """Yield a message for each value that has no effect together with the others."""
         if not self.demonstrations:
-            refuse_without_effect(self, _OF_DEMONSTRATIONS, "with demonstrations=0")
+            yield from changed(self, _OF_DEMONSTRATIONS, "with demonstrations=0")
+        for message in self.algorithm_config.without_effect(self.network_config):
+            yield f"algorithm.{message}"
+
+    def _check_demonstrations(self) -> None:
         source = source_config(self.demonstrations_source)
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
         check_turn_noise(
@@ -290,6 +296,8 @@ class ExperimentConfig(StrictModel):
                 self.task, parse_env_config(self.task, {**self.env, **source}, "env")
             )
         if self.demonstrations_path is not None:
+            if not self.demonstrations:
+                raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")
             check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
 
 

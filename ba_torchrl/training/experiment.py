@@ -80,6 +80,8 @@ class Experiment:
             RunStopped: SIGINT or SIGTERM was received, and the state is saved.
         """
         self._started = self._last_save = time.perf_counter()
+        for message in self.config.without_effect():
+            logger.warning(message)
         with self._signals:  # which last until the state is saved
             try:
                 if not (self.config.resume and self._resume()):

@@ -60,7 +60,6 @@ PAIRS = [
     for network in SMALL
     if network_class(network).control in ALGORITHMS[values["name"]].controls
     and (preset, network) != ("rlpd", "ferm")  # it builds no ensemble of critics
-    and (not preset.startswith("ferm") or network == "ferm")
 ]
 
 

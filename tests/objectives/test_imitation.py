@@ -54,8 +54,9 @@ def test_the_error_is_that_of_the_drawn_action(distance):
     assert (actor.log_scale.grad != 0).all()
 
 
-def test_the_entropy_term_is_that_of_the_drawn_action():
-    actor = Constant([0.3, -0.4], [0.5, 0.2])
+@pytest.mark.parametrize("loc", [[0.3, -0.4], [7.0, -8.0]], ids=["centre", "ends of the range"])
+def test_the_entropy_term_is_that_of_the_drawn_action(loc):
+    actor = Constant(loc, [0.5, 0.2])
     policy = squashed_gaussian_policy(actor, OBSERVATION)
     plain, loss = BehaviourCloningLoss(policy), BehaviourCloningLoss(policy, entropy_weight=0.3)
     assert list(plain.out_keys) == ["loss_bc"]

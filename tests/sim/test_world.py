@@ -85,8 +85,11 @@ def test_bodies_with_fixed_poses_cannot_move():
             assert body.pose is body.pose
             assert body.pose == pose
             for move in (world.step, world.restore_pristine, lambda: body.place((0.0, 0.0, 1.0))):
-                with pytest.raises(SimulationError, match="fixed"):
+                with pytest.raises(RuntimeError, match="fixed"):
                     move()
+            with pytest.raises(RuntimeError, match="fixed"), world.fixed_poses():
+                pass
+            assert body.pose is body.pose
         world.step(5)
         assert body.position[2] < pose.position[2]
 

@@ -132,7 +132,7 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
             "report": "best",
         },
     ),
-    "quickstart": (CLOSE_LOOP_TASK, "sacfd_per_so2", "equi_small", {"file": "quickstart"}),
+    "quickstart": (CLOSE_LOOP_TASK, "sacfd_per_so2_quick", "equi_small", {"file": "quickstart"}),
     "quickstart_open_loop": (
         OPEN_LOOP_TASK,
         "sdqfd",
