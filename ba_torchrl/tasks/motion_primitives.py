@@ -263,8 +263,15 @@ def push(
     is_obstacle = not is_behind and _distance_to_segment(
         (bx, by), (x, y), behind
     ) < OBSTACLE_SHARE * math.dist(behind, (bx, by))
+    is_around = math.dist((x, y), (bx, by)) < footprint_radius_m(body)
+    moves_away = (behind[0] - x) * (bx - x) + (behind[1] - y) * (by - y) <= 0
+    if is_obstacle and not is_around and moves_away:
+        # The tool keeps its height until it is further out. If it rose here, where it descends
+        # further out, a learner's mean of the two would hover in between.
+        is_above = z + robot.gripper.lowest_tip_m >= body.position[2] + half
+        target_z = min(max(z, low_z), over_z)
+        return move_toward(robot, (*behind, target_z), target_yaw if is_above else yaw, opening)
     if is_obstacle and z < over_z - 1e-3:
-        is_around = math.dist((x, y), (bx, by)) < footprint_radius_m(body)
         stays_open = is_around and robot.commanded_opening >= IS_OPEN
         return lift(over_z - z, OPEN if stays_open else opening)
     return move_toward(robot, (*behind, over_z if is_obstacle else low_z), target_yaw, opening)
