@@ -115,3 +115,32 @@ def test_a_piece_beside_the_supports_of_a_bridge_is_removed_first(make_env):
     bodies["cuboid 1"].place((0.3, -0.1, z))
     env.scene.world.settle()
     assert play(env, idle(env, state))
+
+
+@pytest.mark.parametrize("task", ["close_loop/block_pushing", "close_loop/block_pulling"])
+def test_a_tool_that_moves_away_from_the_block_keeps_its_height(make_env, task):
+    """It does not rise where it descends a few millimetres further out."""
+    env = make_env(task)
+    env.reset(seed=0)
+    scene = env.scene
+    block = scene.task.objects[0]
+    block.place((0.45, 0.0, -block.shape.bounds_m[0][2]), 0.0)
+    is_pulling = task == "close_loop/block_pulling"
+    other = scene.task.objects[1] if is_pulling else scene.task.goal
+    other.place((0.58, 0.0, other.position[2]), 0.0)
+    top_m = 2 * block.position[2]
+
+    def command(distance_m, above_top_m):
+        height = top_m + above_top_m - scene.robot.gripper.lowest_tip_m
+        scene.controller.reset(((0.45 - distance_m, 0.02, height), 0.0))
+        return scene.task.expert_command()
+
+    for distance_m in (0.062, 0.069):
+        above, below = (command(distance_m, height) for height in (2e-3, -2e-3))
+        assert max(above.dz_m, below.dz_m) <= 1e-6
+        assert max(above.dx_m, below.dx_m) < -5e-3
+        assert abs(above.dyaw_rad) > 0.5
+        assert below.dyaw_rad == 0.0
+    further = command(0.075, -2e-3)
+    assert further.dz_m < -5e-3
+    assert further.dx_m < 0
