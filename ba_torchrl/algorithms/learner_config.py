@@ -67,7 +67,8 @@ class LearnerConfig(AlgorithmConfig):
     """Added to the priority of demonstrations."""
     init: Init = "random"
     """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
-    updates are behaviour cloning of the demonstrations instead of updates of the algorithm."""
+    updates are behaviour cloning of the demonstrations instead of updates of the algorithm. Critics
+    are not trained meanwhile: without a behaviour term, SAC then unlearns the policy."""
 
     @model_validator(mode="after")
     def _check_halves(self) -> Self:

@@ -188,9 +188,9 @@ def test_a_cloned_policy_explores(name):
     """Without the entropy term, its standard deviation tends to zero."""
 
     def entropy(weight):
-        learner = build(name, init="bc", learning_rate=3e-3, alpha_init=weight)
+        learner = build(name, init="bc", batch_size=24, learning_rate=3e-3, alpha_init=weight)
         learner.extend(transitions(learner))
-        return [float(learner.pretrain_update()["entropy"]) for _ in range(150)][-1]
+        return [float(learner.pretrain_update()["entropy"]) for _ in range(60)][-1]
 
     explores, collapses = entropy(0.03), entropy(1e-9)
     assert explores > collapses + 3
