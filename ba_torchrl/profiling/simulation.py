@@ -121,6 +121,41 @@ def step_and_reset(bench: Bench, task: str) -> list[Row]:
     ]
 
 
+@measurement("simulation/physics", over=lambda: zip(list_tasks()))
+def physics_share(bench: Bench, task: str) -> list[Row]:
+    """Times of steps of a task under the expert's actions, and of their physics alone."""
+    unit = SimulationUnit()
+    env = make(task, seed=SEED)
+    steps, physics, units = [], [], []
+    episodes = _expert_actions(task, bench.repeats)
+    for number in bench.rounds():
+        state = env.reset()
+        world = env.scene.world
+        taken: list[float] = []
+
+        def timed_step(count: int = 1, taken: list[float] = taken, world: World = world) -> None:
+            taken.append(seconds(lambda: World.step(world, count)))
+
+        world.step = timed_step
+        for action in episodes[number]:
+            state[keys.ACTION] = action
+            taken.clear()
+            start = time.perf_counter()
+            state = env.step(state)[keys.NEXT]
+            steps.append(time.perf_counter() - start)
+            physics.append(sum(taken))
+            units.append(seconds(unit))
+        del world.step
+    env.close()
+    unit.world.close()
+    mean_ms = 1e3 * float(np.mean(steps))
+    notes = f"{np.sum(physics) / np.sum(steps):.0%} of the mean step of {mean_ms:.2f} ms"
+    return [
+        timed_row(f"{task}, step", "ms", steps, units),
+        timed_row(f"{task}, its physics", "ms", physics, units, notes=notes),
+    ]
+
+
 @measurement("simulation/seeded_reset", over=lambda: zip(list_tasks()))
 def seeded_reset(bench: Bench, task: str) -> list[Row]:
     """Times of resets with a seed, which start from the task's initial objects."""

@@ -114,6 +114,15 @@ def test_each_timed_image_is_drawn(monkeypatch):
     assert len(drawn) > len(compiled.values) == 20
 
 
+def test_the_physics_of_a_step_is_a_part_of_it(monkeypatch):
+    task = "close_loop/block_reaching"
+    monkeypatch.setattr(simulation, "list_tasks", lambda: [task])
+    step, physics = measure("simulation/physics", repeats=2, progress=False)
+    assert physics.work == f"{task}, its physics"
+    assert len(step.values) == len(physics.values) > 2
+    assert all(0 < part < whole for part, whole in zip(physics.values, step.values, strict=True))
+
+
 def test_resets_with_a_seed_are_timed(monkeypatch):
     monkeypatch.setattr(simulation, "list_tasks", lambda: ["close_loop/object_grasping"])
     seeds = []

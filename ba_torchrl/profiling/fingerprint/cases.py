@@ -135,7 +135,7 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "quickstart": (CLOSE_LOOP_TASK, "sacfd_per_so2_quick", "equi_small", {"file": "quickstart"}),
     "quickstart_open_loop": (
         OPEN_LOOP_TASK,
-        "sdqfd",
+        "sdqfd_quick",
         "equi_asr",
         {"file": "quickstart_open_loop", "env__num_objects": 2},
     ),
