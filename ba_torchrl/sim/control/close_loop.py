@@ -8,25 +8,33 @@ which depend only on contacts:
 - Nothing is held, and something is near: the rest of the path is simulated at a bounded speed. The
   deceleration is below that of the floor's friction, so that a pushed body stays at the finger.
 - A body is held: the path is simulated with quintic time scaling, whose acceleration the friction
-  of the grasp can transmit.
+  of the grasp can transmit. A body that has not slipped in such a motion is teleported with the
+  arm along the free part of the next path, and the rest is simulated (with `fast_mode`).
 """
 
 from __future__ import annotations
 
 import math
 
-from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import (
     Contact,
+    is_any_within,
     lateral_direction,
     lateral_force_n,
     outer_contacts,
     vertical_direction,
     vertical_force_n,
 )
+from ba_torchrl.sim.control.held_body import (
+    place_in_tool_frame,
+    pose_in_tool_frame,
+    rebuild_grasp_contacts,
+    slip,
+)
 from ba_torchrl.sim.control.limits import MotionLimits
-from ba_torchrl.sim.geometry import Vector, YawPose, downward
+from ba_torchrl.sim.control.paths import Path, quintic_time_scaling
+from ba_torchrl.sim.geometry import Pose, Vector, YawPose, downward
 from ba_torchrl.sim.robots.base import Robot
 
 OPENING_TOLERANCE = 0.02
@@ -52,6 +60,8 @@ class CloseLoopController:
         self.teleport = teleport
         self.limits = limits or MotionLimits()
         self._target_opening = 1.0
+        self._firmly_held: Body | None = None
+        """The body that was held, and did not slip, in the last motion."""
         self.is_out_of_reach = False
         """Whether the last motion ended where its path left the reach of the arm."""
 
@@ -71,14 +81,15 @@ class CloseLoopController:
         self.robot.teleport(joints)
         self.robot.set_opening(opening)
         self._target_opening = opening
+        self._firmly_held = None
 
-    def get_state(self) -> float:
-        """Return the target opening of the last `grip`."""
-        return self._target_opening
+    def get_state(self) -> tuple[float, Body | None]:
+        """Return the target opening of the last `grip`, and the body that is firmly held."""
+        return self._target_opening, self._firmly_held
 
-    def set_state(self, state: float) -> None:
-        """Restore the target opening of the last `grip`."""
-        self._target_opening = state
+    def set_state(self, state: tuple[float, Body | None]) -> None:
+        """Restore a state of `get_state`."""
+        self._target_opening, self._firmly_held = state
 
     def move_to(self, position: Vector, yaw_rad: float) -> None:
         """Move the tool along a straight line to a pose.
@@ -91,26 +102,14 @@ class CloseLoopController:
             position: target of the tool point, metres.
             yaw_rad: target yaw of the tool.
         """
-        robot, limits = self.robot, self.limits
         self.is_out_of_reach = False
         self._unwind_wrist()
-        path = _Path(robot, robot.tool_pose(), (position, yaw_rad))
-        held = robot.held_body()
-        if held is not None:
-            fraction = max(path.length_m / 0.05, 0.6 * path.angle_rad / (math.pi / 4), 0.15)
-            duration = limits.held_time_s * math.sqrt(fraction)
-            count = max(4, round(duration / self.world.physics.time_step_s))
-            self._simulate_path(
-                path, [quintic_time_scaling(i / count) for i in range(1, count + 1)], held
-            )
+        path = Path(self.robot, self.robot.tool_pose(), (position, yaw_rad))
+        held = self.robot.held_body()
+        if held is None:
+            self._move_empty(path)
         else:
-            done = self._teleport_free_part(path) if self.teleport else 0.0
-            if done == 0.0 and path.goes_down and self._is_in_contact_below(held):
-                done = self._press_down(path)
-            if done < 1.0:
-                rest = [done + (1 - done) * u for u in self._contact_profile(path, 1 - done)]
-                self._simulate_path(path, rest, None)
-        self.world.step()
+            self._move_held(path, held)
 
     def grip(self, opening: float) -> None:
         """Open or close the fingers until they reach an opening or are stopped by a contact.
@@ -121,9 +120,62 @@ class CloseLoopController:
         if abs(opening - self._target_opening) < 1e-3:
             return
         self._target_opening = opening
+        self._firmly_held = None
         move_fingers(self.robot, opening, self.limits.max_gripper_steps)
 
     # ----------------------------------------------------------------------------------------
+
+    def _move_empty(self, path: Path) -> None:
+        """Move an empty gripper along the path, and simulate one step at its end."""
+        self._firmly_held = None
+        done = self._teleport_free_part(path, None) if self.teleport else 0.0
+        if done == 0.0 and path.goes_down and self._is_in_contact_below():
+            done = self._press_down(path)
+        if done < 1.0:
+            rest = [done + (1 - done) * u for u in self._contact_profile(path, 1 - done)]
+            self._simulate_path(path, rest, None)
+        self.world.step()
+
+    def _move_held(self, path: Path, held: Body) -> None:
+        """Move a held body along the path, and simulate one step at its end."""
+        limits = self.limits
+        before = pose_in_tool_frame(self.robot, held)
+        done = 0.0
+        if self.teleport and held is self._firmly_held:
+            done = self._teleport_free_part(path, held)
+            self._step_in_grasp(held, before)
+        if done < 1.0:
+            left = 1 - done
+            fraction = left * max(path.length_m / 0.05, 0.6 * path.angle_rad / (math.pi / 4))
+            duration = limits.held_time_s * math.sqrt(max(fraction, 0.15))
+            count = max(4, round(duration / self.world.physics.time_step_s))
+            scaling = [quintic_time_scaling(i / count) for i in range(1, count + 1)]
+            self._simulate_path(path, [done + left * u for u in scaling], held)
+            self.world.step()
+        self._firmly_held = held if self._is_firm(before, held) else None
+
+    def _step_in_grasp(self, held: Body, grasp: Pose) -> None:
+        """Simulate one step after a teleport of a held body.
+
+        A body that turns has too few contacts with the fingers. Those at its new pose are added,
+        and the step is repeated from the pose before.
+
+        Args:
+            held: the held body.
+            grasp: its pose in the tool frame.
+        """
+        self.world.step()
+        for _ in range(self.limits.max_regrasp_steps):
+            if self._is_firm(grasp, held):
+                break
+            self.world.detect_collisions()
+            place_in_tool_frame(self.robot, held, grasp)
+            self.world.step()
+
+    def _is_firm(self, before: Pose, held: Body) -> bool:
+        """Whether a held body has not slipped from a pose in the tool frame."""
+        slip_m, turn_rad = slip(before, pose_in_tool_frame(self.robot, held))
+        return slip_m <= self.limits.max_slip_m and turn_rad <= self.limits.max_turn_rad
 
     def _unwind_wrist(self) -> None:
         """Change the last joint by a multiple of 2 pi, which keeps it within its limits."""
@@ -133,8 +185,17 @@ class CloseLoopController:
             joints[-1] -= revolutions * 2 * math.pi
             self.robot.teleport(joints)
 
-    def _teleport_free_part(self, path: _Path) -> float:
-        """Teleport to the last sample before the first contact; return its fraction of the path."""
+    def _teleport_free_part(self, path: Path, held: Body | None) -> float:
+        """Teleport to the last sample before the first contact.
+
+        Args:
+            path: the path.
+            held: the held body, which keeps its pose in the tool frame.
+
+        Returns:
+            The fraction of the path at that sample.
+        """
+        grasp = None if held is None else pose_in_tool_frame(self.robot, held)
         count = max(
             1,
             math.ceil(
@@ -151,13 +212,18 @@ class CloseLoopController:
             if joints is None:
                 break
             self.robot.place_arm(joints)
-            if self.robot.is_near_anything():
+            if held is not None:
+                place_in_tool_frame(self.robot, held, grasp)
+            self.world.detect_collisions()
+            if is_any_within(self._outer_contacts(held), self.limits.path_margin_m):
                 break
             free, done = joints, i / count
         self.robot.teleport(free)
+        if held is not None:
+            rebuild_grasp_contacts(self.robot, held, grasp)
         return done
 
-    def _press_down(self, path: _Path) -> float:
+    def _press_down(self, path: Path) -> float:
         """Start a downward motion in contact with small displacements.
 
         Returns:
@@ -173,14 +239,14 @@ class CloseLoopController:
                 break
         return fraction
 
-    def _is_in_contact_below(self, held: Body | None) -> bool:
-        """Whether the hand or the held body has a vertical contact, or is close to one."""
+    def _is_in_contact_below(self) -> bool:
+        """Whether the hand has a vertical contact, or is close to one."""
         return any(
             point.is_vertical and point.distance_m < 2 * self.limits.press_stride_m
-            for point in self._outer_contacts(held)
+            for point in self._outer_contacts(None)
         )
 
-    def _contact_profile(self, path: _Path, remaining: float) -> list[float]:
+    def _contact_profile(self, path: Path, remaining: float) -> list[float]:
         """Return the time scaling for a constant speed followed by a constant deceleration.
 
         Args:
@@ -210,7 +276,7 @@ class CloseLoopController:
 
         return [fraction(i / count) for i in range(1, count + 1)]
 
-    def _simulate_path(self, path: _Path, fractions: list[float], held: Body | None) -> bool:
+    def _simulate_path(self, path: Path, fractions: list[float], held: Body | None) -> bool:
         """Simulate a motion along the path.
 
         The motion ends where the path is out of reach. If a force limit is exceeded, the last
@@ -260,65 +326,6 @@ class CloseLoopController:
         """Return the contacts of the hand and the held body with other bodies."""
         inner = () if held is None else (held.id,)
         return outer_contacts(self.world.client, self.robot.id, *inner)
-
-
-class _Path:
-    """A straight line of the tool point with a proportional rotation about the vertical.
-
-    Args:
-        robot: the robot.
-        start: position and yaw of the tool at the start.
-        end: position and yaw of the tool at the end.
-    """
-
-    def __init__(self, robot: Robot, start: YawPose, end: YawPose) -> None:
-        self._robot = robot
-        self._start, self._start_yaw = start
-        self._rotation_rad = wrap_angle(end[1] - start[1])
-        self.angle_rad = abs(self._rotation_rad)
-        self._set_delta(tuple(e - s for s, e in zip(self._start, end[0], strict=True)))
-
-    def _set_delta(self, delta: Vector) -> None:
-        self._delta = delta
-        self.length_m = math.hypot(*delta)
-        self.goes_down = delta[2] < -1e-4
-        self.goes_up = delta[2] > 1e-4
-
-    def yield_to(self, direction: Vector, fraction: float, distance_m: float) -> None:
-        """Displace the rest of the path, and remove its motion against the displacement.
-
-        Args:
-            direction: of the displacement: horizontal and vertical unit vectors, or zeros.
-            fraction: of the path that has been covered.
-            distance_m: length of the displacement.
-        """
-        x, y, z = self._robot.tool_pose()[0]
-        dx, dy, dz = self._delta
-        away_x, away_y, up = direction
-        against, down = min(dx * away_x + dy * away_y, 0.0), min(dz * up, 0.0)
-        delta = dx - against * away_x, dy - against * away_y, dz - down * up
-        tool = x + distance_m * away_x, y + distance_m * away_y, z + distance_m * up
-        self._start = tuple(t - fraction * d for t, d in zip(tool, delta, strict=True))
-        self._set_delta(delta)
-
-    def remaining_m(self, fraction: float) -> float:
-        """Return the length of the rest of the path, metres."""
-        return (1 - fraction) * self.length_m
-
-    def joints_at(self, fraction: float) -> list[float] | None:
-        """Return the arm joints at a fraction of the path, 0 to 1; None if out of reach."""
-        x, y, z = (s + fraction * d for s, d in zip(self._start, self._delta, strict=True))
-        rotation = downward(self._start_yaw + fraction * self._rotation_rad)
-        return self._robot.inverse_kinematics((x, y, z), rotation, self._robot.joints)
-
-
-def quintic_time_scaling(u: float) -> float:
-    """Return the quintic polynomial from 0 to 1 with zero velocity and acceleration at both ends.
-
-    Args:
-        u: fraction of the duration, 0 to 1.
-    """
-    return u * u * u * (10 - 15 * u + 6 * u * u)
 
 
 def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:

@@ -31,6 +31,16 @@ class MotionLimits:
     path_sample_m: float = 0.01
     """Distance between the samples at which a path is checked for contacts."""
     path_sample_rad: float = 0.14
+    path_margin_m: float = 1e-3
+    """Distance to other bodies below which a sample is not free."""
+    max_slip_m: float = 5e-4
+    """Displacement of a held body in the tool frame, perpendicular to the closing axis and in one
+    motion, above which the next motion is simulated from its start. A cube has up to 0.2 mm in its
+    first lift; a body without friction falls by 0.7 mm in the last physics step of a motion."""
+    max_turn_rad: float = 0.02
+    """The same for the rotation of a held body in the tool frame."""
+    max_regrasp_steps: int = 4
+    """Maximum number of further physics steps in which a teleported body is grasped firmly."""
     max_gripper_steps: int = 60
     """Maximum number of physics steps for opening or closing the gripper."""
 

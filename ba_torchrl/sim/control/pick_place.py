@@ -17,6 +17,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.control.approach import approach_point, plan_approach
 from ba_torchrl.sim.control.close_loop import OPENING_TOLERANCE, move_fingers
+from ba_torchrl.sim.control.held_body import place_in_tool_frame, pose_in_tool_frame
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.control.support_surface import Floor, SupportSurface
 from ba_torchrl.sim.control.tool_motion import ToolMotion
@@ -24,8 +25,6 @@ from ba_torchrl.sim.geometry import (
     Matrix,
     Pose,
     Vector,
-    bullet_compose,
-    bullet_inverse,
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
@@ -161,16 +160,13 @@ class PickPlace:
         """Make a grasped body the held body."""
         self.held = body
         body.is_hidden = True
-        self.grasp = self._pose_in_tool_frame(self.held)
+        self.grasp = pose_in_tool_frame(self.robot, self.held)
 
     def _detach(self) -> None:
         """Make the held body an ordinary body, without moving it."""
         if self.held is not None:
             self.held.is_hidden = False
         self.held = self.grasp = None
-
-    def _pose_in_tool_frame(self, body: Body) -> Pose:
-        return bullet_compose(bullet_inverse(self.robot.tool_frame()), body.pose)
 
     def _touched_poses(self) -> dict[Body, Pose]:
         """Return the poses in the tool frame of the bodies that the hand touches.
@@ -181,7 +177,9 @@ class PickPlace:
             return {}
         touched = {contact.other_id for contact in contacts(self.world.client, self.robot.id)}
         return {
-            body: self._pose_in_tool_frame(body) for body in self.world.bodies if body.id in touched
+            body: pose_in_tool_frame(self.robot, body)
+            for body in self.world.bodies
+            if body.id in touched
         }
 
     def _has_slipped(self, before: Pose | None) -> bool:
@@ -202,7 +200,7 @@ class PickPlace:
         if self.held is not None:
             # deletes the contacts of the fingers: Bullet does not rotate their normals
             self.world.detect_collisions()
-            self.held.set_pose(*bullet_compose(self.robot.tool_frame(), self.grasp))
+            place_in_tool_frame(self.robot, self.held, self.grasp)
 
     def update_grasp(self) -> None:
         """Measure the grasp again, or release the held body if it is no longer grasped.
@@ -213,7 +211,7 @@ class PickPlace:
             return
         for _ in range(self.limits.max_regrasp_steps):
             if self.robot.held_body() is self.held:
-                self.grasp = self._pose_in_tool_frame(self.held)
+                self.grasp = pose_in_tool_frame(self.robot, self.held)
                 return
             self.world.step()
         self._detach()

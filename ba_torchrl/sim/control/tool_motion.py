@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import Contact, nearest_points, outer_contacts, vertical_force_n
-from ba_torchrl.sim.control.close_loop import quintic_time_scaling
 from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.paths import quintic_time_scaling
 from ba_torchrl.sim.geometry import Matrix, Vector
 from ba_torchrl.sim.robots.base import Robot
 

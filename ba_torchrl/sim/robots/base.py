@@ -393,8 +393,3 @@ class Robot(ABC):
             for a in left
             for b in right
         )
-
-    def is_near_anything(self, margin_m: float = 1e-3) -> bool:
-        """Whether the hand is closer than ``margin_m`` to a body or the floor."""
-        self.world.detect_collisions()
-        return is_any_within(contacts(self.client, self.id), margin_m)

@@ -12,7 +12,8 @@ from ba_torchrl.sim.contacts import (
     vertical_direction,
     vertical_force_n,
 )
-from ba_torchrl.sim.control.close_loop import CloseLoopController, _Path
+from ba_torchrl.sim.control.close_loop import CloseLoopController
+from ba_torchrl.sim.control.paths import Path
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
@@ -121,7 +122,7 @@ def test_a_path_yields_by_a_distance_and_loses_its_motion_against_it(direction, 
         def inverse_kinematics(self, position, *_):
             return position
 
-    path = _Path(Robot(), ((0.43, -0.02, 0.18), 0.0), ((0.47, 0.02, 0.22), 0.0))
+    path = Path(Robot(), ((0.43, -0.02, 0.18), 0.0), ((0.47, 0.02, 0.22), 0.0))
     path.yield_to(direction, 0.5, 1e-3)
     assert path.joints_at(1.0) == pytest.approx(end, abs=1e-9)
     tool = path.joints_at(0.5)

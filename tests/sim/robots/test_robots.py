@@ -7,6 +7,7 @@ import pybullet
 import pytest
 
 import ba_torchrl
+from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
@@ -182,10 +183,10 @@ def test_floor_clearance_and_opening_width(world, name, robot_class):
     for opening in (1.0, 0.5, 0.0):
         robot.teleport(robot.inverse_kinematics((0.45, 0.0, 0.01), downward(0.3)))
         robot.set_opening(opening)
-        assert not robot.is_near_anything(-FLOOR_OVERLAP_M.get(name, 0.0))
+        world.detect_collisions()
+        assert not is_any_within(contacts(world.client, robot.id), -FLOOR_OVERLAP_M.get(name, 0.0))
         assert robot.opening() == pytest.approx(opening, abs=1e-3)
         if opening == 1.0:
-            world.detect_collisions()
             assert 0.07 < gap_width(robot, 0.012) < 0.087
     # the closed fingertips are slightly below the tool point
     gap = min(
