@@ -378,8 +378,8 @@ class ManipulationEnv(EnvBase):
         out[keys.STEP_COUNT] = torch.tensor([self._step_count])
         if reward is not None:
             out[keys.REWARD] = torch.tensor([reward])
-        for key in (keys.SUCCESS, keys.FAULT, keys.DONE, keys.TERMINATED, keys.TRUNCATED):
-            out[key] = torch.tensor([ends.get(key, False)])
+        flags = torch.tensor([[ends.get(key, False)] for key in keys.STEP_FLAGS])
+        out |= zip(keys.STEP_FLAGS, flags.unbind(), strict=True)
         return TensorDict(out, batch_size=[], device=self.device)
 
     def _begin_episode(self, *, with_new_objects: bool) -> dict[str, torch.Tensor]:

@@ -38,6 +38,8 @@ SUCCESS = "success"
 """[1] bool: the goal holds."""
 FAULT = "fault"
 """[1] bool: the simulator or its process failed; such a transition never enters the replay."""
+STEP_FLAGS = (SUCCESS, FAULT, DONE, TERMINATED, TRUNCATED)
+"""The flags in the result of every step and reset, besides ``holding``."""
 IS_OUT_OF_REACH = "is_out_of_reach"
 """In Gymnasium's ``info``: the arm could not reach the pose of the last action."""
 STEP_COUNT = "step_count"
