@@ -7,7 +7,7 @@ sign. Reflecting the scene's y axis reverses the columns of the image, dy and th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -162,6 +162,9 @@ class EquivariantConfig(ImageNetworkConfig):
             at 128 px, and a quarter at 64 px, where the first stage is left out.
     """
 
+    max_pools: ClassVar[bool] = True
+    """Whether a stage that halves the image ends with a max pool."""
+
     group_order: int = Field(default=8, ge=2)
     reflections: bool = False
     n_hidden: int = Field(default=64, ge=4)
@@ -213,8 +216,13 @@ class EquivariantConfig(ImageNetworkConfig):
         regular = gspace.regular_repr
         fields: FieldTypes = [(gspace.trivial_repr, self.input_channels(spec.image_channels))]
         convs = []
-        for width, padding, _ in stages:
+        for width, padding, pools in stages:
             out = [(regular, int(width))]
-            convs.append(SteerableConv2d(gspace, fields, out, 3, padding=padding))
+            convs.append(self._convolution(gspace, fields, out, padding, pools))
             fields = out
-        return self.image_trunk(convs, [pools for _, _, pools in stages])
+        return self.image_trunk(convs, [self.max_pools and pools for _, _, pools in stages])
+
+    def _convolution(
+        self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool
+    ) -> SteerableConv2d:
+        return SteerableConv2d(gspace, inputs, outputs, 3, padding=padding)

@@ -123,7 +123,8 @@ class SteerableConv2d(nn.Module):
     """A convolution whose filter is a learnt combination of steerable kernels.
 
     Numerically it is escnn's ``R2Conv`` with default bands. Equivariant under the rotations of
-    ``gspace``, exactly so for multiples of 90 degrees.
+    ``gspace``, exactly so for multiples of 90 degrees if the pixels that ``stride`` reads have that
+    symmetry.
 
     Args:
         gspace: images and their symmetry group.
@@ -131,6 +132,7 @@ class SteerableConv2d(nn.Module):
         out_types: output fields likewise.
         kernel_size: pixels.
         padding: zeros added on each side, pixels.
+        stride: distance between output pixels, in input pixels.
         bias: one bias per trivial irrep of the output.
 
     Raises:
@@ -146,6 +148,7 @@ class SteerableConv2d(nn.Module):
         kernel_size: int,
         *,
         padding: int = 0,
+        stride: int = 1,
         bias: bool = True,
     ) -> None:
         super().__init__()
@@ -158,6 +161,7 @@ class SteerableConv2d(nn.Module):
                 )
         self.kernel_size = kernel_size
         self.padding = padding
+        self.stride = stride
         self._in = [(rep.size, count) for rep, count in in_types]
         self._out = [(rep.size, count) for rep, count in out_types]
         found = {
@@ -180,7 +184,7 @@ class SteerableConv2d(nn.Module):
             }
         )
         self._irrep_kernels = None
-        if list(self._blocks) == [(0, 0)] and kernel_size == 3 and padding <= 2:
+        if list(self._blocks) == [(0, 0)] and (kernel_size, stride) == (3, 1) and padding <= 2:
             ((in_repr, _), *others), ((out_repr, _), *other_outputs) = in_types, out_types
             is_small = in_repr.size <= 8  # kernels of large groups take seconds to convert
             if in_repr is out_repr and is_small and not others and not other_outputs:
@@ -249,7 +253,7 @@ class SteerableConv2d(nn.Module):
             (coefficients,) = self.coefficients.values()
             return irrep_convolution(x, kernels, coefficients, self.expand_bias(), self.padding)
         weight, bias = self.filters(x.dtype)
-        return F.conv2d(x, weight, bias, padding=self.padding)
+        return F.conv2d(x, weight, bias, self.stride, self.padding)
 
     def _faster_kernels(self, x: Tensor) -> IrrepKernels | None:
         """Return the kernels in the basis of irreps where they compute the convolution faster."""
