@@ -13,9 +13,9 @@ from tests.specs import actor_critic_spec
 SEQUENCES = ["pxyzr", "pxyz"]
 
 
-def build(size, sequence="pxyzr", n_hidden=8, seed=0, precision="float32", **group):
+def build(size, sequence="pxyzr", n_hidden=8, seed=0, precision="float32", name="equi", **group):
     torch.manual_seed(seed)
-    config = NETWORKS["equi"](n_hidden=n_hidden, precision=precision, **group)
+    config = NETWORKS[name](n_hidden=n_hidden, precision=precision, **group)
     return config.build(actor_critic_spec(size, sequence))
 
 
@@ -58,6 +58,8 @@ def steps(networks, size, action_size, n=3):
         (64, "zypx", 4, {}),
         (64, "pxyz", 2, {}),
         (64, "pxyzr", 8, {"depth_reference": "floor", "negative_slope": 0.1}),
+        (64, "pxyzr", 8, {"name": "equi_strided"}),
+        (128, "pxyz", 4, {"name": "equi_strided"}),
     ],
 )
 def test_every_quarter_turn_is_exact(size, sequence, group_order, options, trained):

@@ -18,7 +18,12 @@ pytest.importorskip("escnn")
 
 ACTOR_CRITICS = [name for name in NETWORKS if NETWORKS[name].control == "close_loop"]
 
-SMALL = {"cnn": {"width": 0.25}, "equi": {"n_hidden": 8, "group_order": 4}}
+SMALL_EQUIVARIANT = {"n_hidden": 8, "group_order": 4}
+SMALL = {
+    "cnn": {"width": 0.25},
+    "equi": SMALL_EQUIVARIANT,
+    "equi_strided": SMALL_EQUIVARIANT,
+}
 
 
 def small(name, size=64, sequence="pxyzr", **fields):

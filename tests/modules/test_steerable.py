@@ -43,6 +43,7 @@ def escnn_twin(ours, gspace, in_types, out_types):
         flat(out_types),
         ours.kernel_size,
         padding=ours.padding,
+        stride=ours.stride,
         initialize=False,
     )
     # escnn orders the blocks by the names of their representations, in then out.
@@ -73,6 +74,7 @@ CASES = [
     ("D4", [("trivial", 1)], [("regular", 2)], 3),
     ("D4", [("regular", 3)], [("regular", 2)], 3),
     ("D4", [("regular", 2)], [("axial", 1), ("trivial", 3)], 3),
+    (8, [("regular", 3)], [("regular", 2)], 4),
 ]
 
 
@@ -80,7 +82,8 @@ def build(case):
     order, inputs, outputs, kernel_size = case
     gspace = planar_rotations_and_flips(4) if order == "D4" else planar_rotations(order)
     types = field_types(gspace, inputs), field_types(gspace, outputs)
-    ours = SteerableConv2d(gspace, *types, kernel_size, padding=kernel_size // 2)
+    stride = 2 if kernel_size == 4 else 1
+    ours = SteerableConv2d(gspace, *types, kernel_size, padding=kernel_size // 2, stride=stride)
     with torch.no_grad():
         for bias in [ours.bias] if ours.bias is not None else []:
             bias.normal_()
