@@ -163,6 +163,18 @@ def quickstart_update(bench: Bench) -> list[Row]:
     )
 
 
+@measurement("learning/strided_sacfd_update", over=lambda: [(128, 64), (64, 16)])
+def strided_update(bench: Bench, obs_size: int, fields: int) -> list[Row]:
+    """Update of an equivariant learner with strided convolutions instead of max pools."""
+    return measure_update(
+        bench,
+        f"Equi SACfD update, strided, batch 64, {obs_size} px, C8, {fields} fields",
+        CLOSE_LOOP,
+        {"name": "equi_strided", "group_order": 8, "n_hidden": fields},
+        obs_size,
+    )
+
+
 @measurement("learning/cnn_sacfd_update")
 def plain_update(bench: Bench) -> list[Row]:
     """Update of the reference's plain close-loop learner."""
