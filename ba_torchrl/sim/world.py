@@ -247,8 +247,16 @@ class World:
             for body in self.bodies:
                 body.fix_pose(False)
 
-    def is_still(self) -> bool:
-        """Whether no visible body exceeds the speeds of a body at rest."""
+    def is_still(self, except_for: Body | None = None) -> bool:
+        """Whether no visible body exceeds the speeds of a body at rest.
+
+        Args:
+            except_for: a body that may move.
+        """
+        if except_for is not None:
+            return not any(
+                body is not except_for and self._moves(body) for body in self.moving_bodies
+            )
         # the body that moved at the last call is probably the one that still moves
         if self._moved_last is not None and self._moves(self._moved_last):
             return False

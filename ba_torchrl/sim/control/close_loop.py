@@ -1,15 +1,15 @@
 """Close-loop control of a tool that points straight down.
 
-The number of physics steps of a motion is bounded and known when it starts. There are three cases,
-which depend only on contacts:
+The number of physics steps of a motion is bounded. There are three cases:
 
 - Nothing is held, and the path is free: the arm is teleported along the free part of the path,
   which is checked at samples (with `fast_mode`; otherwise this part is simulated, too).
 - Nothing is held, and something is near: the rest of the path is simulated at a bounded speed. The
   deceleration is below that of the floor's friction, so that a pushed body stays at the finger.
 - A body is held: the path is simulated with quintic time scaling, whose acceleration the friction
-  of the grasp can transmit. A body that has not slipped in such a motion is teleported with the
-  arm along the free part of the next path, and the rest is simulated (with `fast_mode`).
+  of the grasp can transmit. With `fast_mode`, a body that did not slip in such a motion, and that
+  nothing but the gripper supported at its end, is teleported with the arm along the free part of
+  the next paths until it slips, while all other bodies are at rest and do not touch it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import math
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import (
     Contact,
+    contacts,
     is_any_within,
     lateral_direction,
     lateral_force_n,
@@ -27,6 +28,7 @@ from ba_torchrl.sim.contacts import (
     vertical_force_n,
 )
 from ba_torchrl.sim.control.held_body import (
+    FirmGrasp,
     place_in_tool_frame,
     pose_in_tool_frame,
     rebuild_grasp_contacts,
@@ -48,7 +50,8 @@ class CloseLoopController:
 
     Args:
         robot: the robot.
-        teleport: teleport the arm along the free part of a path instead of simulating it.
+        teleport: teleport the arm, and a firmly held body, along the free part of a path instead of
+            simulating it.
         limits: speeds and forces.
     """
 
@@ -60,8 +63,8 @@ class CloseLoopController:
         self.teleport = teleport
         self.limits = limits or MotionLimits()
         self._target_opening = 1.0
-        self._firmly_held: Body | None = None
-        """The body that was held, and did not slip, in the last motion."""
+        self._grasp: FirmGrasp | None = None
+        """The grasp that a simulated motion has tested, until the body slips."""
         self.is_out_of_reach = False
         """Whether the last motion ended where its path left the reach of the arm."""
 
@@ -81,15 +84,15 @@ class CloseLoopController:
         self.robot.teleport(joints)
         self.robot.set_opening(opening)
         self._target_opening = opening
-        self._firmly_held = None
+        self._grasp = None
 
-    def get_state(self) -> tuple[float, Body | None]:
-        """Return the target opening of the last `grip`, and the body that is firmly held."""
-        return self._target_opening, self._firmly_held
+    def get_state(self) -> tuple[float, FirmGrasp | None]:
+        """Return the target opening of the last `grip`, and the grasp that has been tested."""
+        return self._target_opening, self._grasp
 
-    def set_state(self, state: tuple[float, Body | None]) -> None:
+    def set_state(self, state: tuple[float, FirmGrasp | None]) -> None:
         """Restore a state of `get_state`."""
-        self._target_opening, self._firmly_held = state
+        self._target_opening, self._grasp = state
 
     def move_to(self, position: Vector, yaw_rad: float) -> None:
         """Move the tool along a straight line to a pose.
@@ -120,14 +123,15 @@ class CloseLoopController:
         if abs(opening - self._target_opening) < 1e-3:
             return
         self._target_opening = opening
-        self._firmly_held = None
         move_fingers(self.robot, opening, self.limits.max_gripper_steps)
+        if self._grasp is not None and self.robot.held_body() is not self._grasp.body:
+            self._grasp = None
 
     # ----------------------------------------------------------------------------------------
 
     def _move_empty(self, path: Path) -> None:
         """Move an empty gripper along the path, and simulate one step at its end."""
-        self._firmly_held = None
+        self._grasp = None
         done = self._teleport_free_part(path, None) if self.teleport else 0.0
         if done == 0.0 and path.goes_down and self._is_in_contact_below():
             done = self._press_down(path)
@@ -137,45 +141,70 @@ class CloseLoopController:
         self.world.step()
 
     def _move_held(self, path: Path, held: Body) -> None:
-        """Move a held body along the path, and simulate one step at its end."""
-        limits = self.limits
+        """Move a held body along the path, and simulate at least one step at its end."""
         before = pose_in_tool_frame(self.robot, held)
-        done = 0.0
-        if self.teleport and held is self._firmly_held:
+        tested = self._grasp.pose if self._grasp and self._grasp.body is held else None
+        done, is_steady = 0.0, True
+        if self.teleport and tested is not None and self._is_undisturbed(held):
             done = self._teleport_free_part(path, held)
-            self._step_in_grasp(held, before)
+            is_steady = done == 0.0 or self._step_in_grasp(held, before)
         if done < 1.0:
-            left = 1 - done
-            fraction = left * max(path.length_m / 0.05, 0.6 * path.angle_rad / (math.pi / 4))
-            duration = limits.held_time_s * math.sqrt(max(fraction, 0.15))
-            count = max(4, round(duration / self.world.physics.time_step_s))
-            scaling = [quintic_time_scaling(i / count) for i in range(1, count + 1)]
-            self._simulate_path(path, [done + left * u for u in scaling], held)
+            self._simulate_held(path, done, held)
             self.world.step()
-        self._firmly_held = held if self._is_firm(before, held) else None
+            tested = None if self._is_supported(held) else before
+        after = pose_in_tool_frame(self.robot, held)
+        is_firm = is_steady and tested is not None and self._is_within_slip(tested, after)
+        self._grasp = FirmGrasp(held, after if done < 1.0 else tested) if is_firm else None
 
-    def _step_in_grasp(self, held: Body, grasp: Pose) -> None:
-        """Simulate one step after a teleport of a held body.
+    def _simulate_held(self, path: Path, done: float, held: Body) -> None:
+        """Simulate the rest of the path, after a fraction ``done``, with a held body."""
+        left = 1 - done
+        fraction = left * max(path.length_m / 0.05, 0.6 * path.angle_rad / (math.pi / 4))
+        duration = self.limits.held_time_s * math.sqrt(max(fraction, 0.15))
+        count = max(4, round(duration / self.world.physics.time_step_s))
+        scaling = [quintic_time_scaling(i / count) for i in range(1, count + 1)]
+        self._simulate_path(path, [done + left * u for u in scaling], held)
 
-        A body that turns has too few contacts with the fingers. Those at its new pose are added,
-        and the step is repeated from the pose before.
+    def _step_in_grasp(self, held: Body, grasp: Pose) -> bool:
+        """Simulate a step after a teleport of a held body, until the body rests in the gripper.
+
+        A body that turns in this step has too few contacts with the fingers. Those at its new pose
+        are added, the body is placed at its pose in the tool frame again, and another step is
+        simulated.
 
         Args:
             held: the held body.
             grasp: its pose in the tool frame.
+
+        Returns:
+            Whether the body rests in the gripper after at most `max_regrasp_steps` further steps.
         """
+        physics, limits = self.world.physics, self.limits
+        max_slip_m = limits.max_fall_fraction * physics.gravity_m_s2 * physics.time_step_s**2
         self.world.step()
-        for _ in range(self.limits.max_regrasp_steps):
-            if self._is_firm(grasp, held):
-                break
+        for _ in range(limits.max_regrasp_steps):
+            slip_m, turn_rad = slip(grasp, pose_in_tool_frame(self.robot, held))
+            if slip_m <= max_slip_m and turn_rad <= limits.max_turn_rad:
+                return True
             self.world.detect_collisions()
             place_in_tool_frame(self.robot, held, grasp)
             self.world.step()
+        return False
 
-    def _is_firm(self, before: Pose, held: Body) -> bool:
-        """Whether a held body has not slipped from a pose in the tool frame."""
-        slip_m, turn_rad = slip(before, pose_in_tool_frame(self.robot, held))
+    def _is_within_slip(self, before: Pose, after: Pose) -> bool:
+        slip_m, turn_rad = slip(before, after)
         return slip_m <= self.limits.max_slip_m and turn_rad <= self.limits.max_turn_rad
+
+    def _is_supported(self, held: Body) -> bool:
+        """Whether a held body was in contact with another body than the robot in the last step."""
+        touching = contacts(self.world.client, held.id)
+        return is_any_within(point for point in touching if point.other_id != self.robot.id)
+
+    def _is_undisturbed(self, held: Body) -> bool:
+        """Whether all other bodies are at rest, and none that can move touched the hand or it."""
+        movable = {body.id for body in self.world.moving_bodies}
+        touching = (point for point in self._outer_contacts(held) if point.other_id in movable)
+        return not is_any_within(touching) and self.world.is_still(except_for=held)
 
     def _unwind_wrist(self) -> None:
         """Change the last joint by a multiple of 2 pi, which keeps it within its limits."""
@@ -188,6 +217,8 @@ class CloseLoopController:
     def _teleport_free_part(self, path: Path, held: Body | None) -> float:
         """Teleport to the last sample before the first contact.
 
+        A held body, and the arm with it, stay where they are if the first sample is in contact.
+
         Args:
             path: the path.
             held: the held body, which keeps its pose in the tool frame.
@@ -195,6 +226,7 @@ class CloseLoopController:
         Returns:
             The fraction of the path at that sample.
         """
+        start = self.robot.measured_joints()
         grasp = None if held is None else pose_in_tool_frame(self.robot, held)
         count = max(
             1,
@@ -218,6 +250,10 @@ class CloseLoopController:
             if is_any_within(self._outer_contacts(held), self.limits.path_margin_m):
                 break
             free, done = joints, i / count
+        if held is not None and done == 0.0:
+            self.robot.place_arm(start)
+            place_in_tool_frame(self.robot, held, grasp)
+            return 0.0
         self.robot.teleport(free)
         if held is not None:
             rebuild_grasp_contacts(self.robot, held, grasp)

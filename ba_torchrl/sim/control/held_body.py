@@ -2,6 +2,7 @@
 
 import math
 from itertools import product
+from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Pose, bullet_compose, bullet_inverse
@@ -14,6 +15,14 @@ _TILTS = [
     for a, b in product((1, -1), repeat=2)
 ]
 """Rotations of the tool frame about the axes perpendicular to the closing axis."""
+
+
+class FirmGrasp(NamedTuple):
+    """A grasp in which a simulated motion did not move the body."""
+
+    body: Body
+    pose: Pose
+    """Pose of the body in the tool frame at the end of that motion."""
 
 
 def pose_in_tool_frame(robot: Robot, body: Body) -> Pose:

@@ -32,15 +32,20 @@ class MotionLimits:
     """Distance between the samples at which a path is checked for contacts."""
     path_sample_rad: float = 0.14
     path_margin_m: float = 1e-3
-    """Distance to other bodies below which a sample is not free."""
+    """Distance of a contact point below which a sample is not free. Bullet has contact points of
+    two boxes when they touch, and of other shapes from a distance of up to 0.8 mm."""
     max_slip_m: float = 5e-4
-    """Displacement of a held body in the tool frame, perpendicular to the closing axis and in one
-    motion, above which the next motion is simulated from its start. A cube has up to 0.2 mm in its
-    first lift; a body without friction falls by 0.7 mm in the last physics step of a motion."""
+    """Displacement of a held body in the tool frame, perpendicular to the closing axis, above which
+    it has slipped: in one simulated motion, or since then in all teleports. A cube has up to 0.2 mm
+    in its first lift."""
     max_turn_rad: float = 0.02
     """The same for the rotation of a held body in the tool frame."""
+    max_fall_fraction: float = 0.25
+    """Displacement of a held body in the step after a teleport above which it slips, as a fraction
+    of a falling body's."""
     max_regrasp_steps: int = 4
-    """Maximum number of further physics steps in which a teleported body is grasped firmly."""
+    """Maximum number of further physics steps in which a teleported body comes to rest in the
+    gripper."""
     max_gripper_steps: int = 60
     """Maximum number of physics steps for opening or closing the gripper."""
 

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pybullet
 import pytest
 
 from ba_torchrl.sim.control.close_loop import CloseLoopController
@@ -10,7 +11,7 @@ from ba_torchrl.sim.control.held_body import pose_in_tool_frame, slip
 from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
-from ba_torchrl.sim.world import World
+from ba_torchrl.sim.world import FINE_PHYSICS, World
 
 SIZE_M = 0.04
 HEIGHT_M = 0.2
@@ -19,10 +20,20 @@ HEIGHT_M = 0.2
 class Scene:
     """A cube under the open gripper, and other boxes."""
 
-    def __init__(self, robot="kuka", *, teleport=True, friction=1.0, mass_kg=0.1, boxes=()):
-        self.world = World()
+    def __init__(
+        self,
+        robot="kuka",
+        *,
+        teleport=True,
+        physics=None,
+        size_m=(SIZE_M,) * 3,
+        friction=1.0,
+        mass_kg=0.1,
+        boxes=(),
+    ):
+        self.world = World(physics)
         self.robot = ROBOTS[robot](self.world)
-        cube = Box(size_m=(SIZE_M,) * 3, mass_kg=mass_kg, friction=friction)
+        cube = Box(size_m=size_m, mass_kg=mass_kg, friction=friction)
         self.cube = self.world.add(cube, "cube")
         self.others = [self.world.add(shape, "box") for shape, _ in boxes]
         self.world.seal()
@@ -110,27 +121,91 @@ def test_without_teleports_every_motion_is_simulated_and_ends_alike():
     assert poses[0].yaw_rad == pytest.approx(poses[1].yaw_rad, abs=0.02)
 
 
-@pytest.mark.parametrize("friction", [0.06, 0.1])
-def test_a_body_that_slips_is_not_teleported(friction):
-    with Scene(friction=friction, mass_kg=0.6) as scene:
+@pytest.mark.parametrize(
+    ("robot", "physics", "friction", "mass_kg"),
+    [
+        ("kuka", None, 0.21, 0.6),
+        ("kuka", FINE_PHYSICS, 0.05, 0.3),
+        ("panda", FINE_PHYSICS, 0.06, 0.6),
+        ("ur5", None, 0.18, 0.6),
+    ],
+)
+def test_a_body_that_friction_cannot_hold_stays_on_the_floor(robot, physics, friction, mass_kg):
+    with Scene(robot, physics=physics, friction=friction, mass_kg=mass_kg) as scene:
+        assert scene.robot.held_body() is scene.cube
+        scene.move(0.45, -0.1, 0.015)  # supported by the floor, the body does not slip
+        for z in (0.065, 0.115, 0.165):
+            scene.move(0.45, -0.1, z)
+            assert scene.cube.position[2] < 0.03
+
+
+@pytest.mark.parametrize("physics", [None, FINE_PHYSICS])
+@pytest.mark.parametrize("friction", [0.0, 0.15])
+def test_a_teleported_body_falls_when_friction_does_not_hold_it_any_more(physics, friction):
+    with Scene(physics=physics, mass_kg=0.6) as scene:
         scene.lift()
-        heights_m = [scene.cube.position[2]]
+        assert scene.move(0.45, 0.0, HEIGHT_M) == 1
+        pybullet.changeDynamics(
+            scene.cube.id, -1, lateralFriction=friction, physicsClientId=scene.world.client
+        )
         for i in range(6):
-            if scene.robot.held_body() is not scene.cube:
-                break
-            assert scene.move(0.45, -0.1 + 0.01 * (i % 2), HEIGHT_M) > 3
-            heights_m.append(scene.cube.position[2])
-        assert heights_m[-1] < 0.1 or heights_m[-1] < heights_m[0] - 5e-3
+            scene.move(0.45, 0.02 * (i % 2), HEIGHT_M)
+        assert scene.robot.held_body() is not scene.cube
+        scene.world.settle()
+        assert scene.cube.position[2] < 0.05
 
 
-def test_a_held_body_does_not_pass_through_a_wall():
-    wall = (Box(size_m=(0.3, 0.02, 0.3), mass_kg=0.0), (0.45, 0.0, 0.15))
-    with Scene(boxes=[wall]) as scene:
+def test_targets_of_the_fingers_below_the_width_of_the_body_keep_the_grasp():
+    with Scene() as scene:
         scene.lift()
+        for opening in (0.02, 0.1, 0.0):
+            scene.controller.grip(opening)
+            assert scene.move(0.45, opening, HEIGHT_M) == 1
+        scene.controller.grip(1.0)
+        scene.world.settle()
+        assert scene.cube.position[2] == pytest.approx(SIZE_M / 2, abs=1e-3)
+
+
+def test_a_reset_forgets_the_grasp():
+    with Scene() as scene:
+        scene.lift()
+        scene.controller.reset(((0.45, -0.1, HEIGHT_M), 0.0), opening=0.0)
+        assert scene.controller.get_state() == (0.0, None)
+
+
+def test_the_end_of_a_held_bar_does_not_pass_through_a_wall():
+    wall = (Box(size_m=(0.3, 0.02, 0.3), mass_kg=0.0), (0.45, 0.13, 0.15))
+    with Scene(size_m=(SIZE_M, 0.16, SIZE_M), boxes=[wall]) as scene:
+        scene.lift()
+        assert scene.move(0.45, 0.0, HEIGHT_M) == 1
         for _ in range(3):
             assert scene.move(0.45, 0.1, HEIGHT_M) > 1
-            assert scene.cube.position[1] < -SIZE_M / 2
+            assert scene.cube.position[1] + 0.08 < 0.13
         assert not scene.controller.is_out_of_reach
+
+
+def test_a_body_on_top_of_the_held_one_is_carried_and_never_left_in_the_air():
+    top = (Box(size_m=(0.03,) * 3, mass_kg=0.1), (0.45, -0.02, 0.055))
+    for z in (HEIGHT_M - 0.05, HEIGHT_M - 0.1):
+        with Scene(size_m=(SIZE_M, 0.2, SIZE_M), mass_kg=0.2, boxes=[top]) as scene:
+            for height in (0.05, 0.1, 0.15, HEIGHT_M):
+                scene.move(0.45, -0.1, height)
+            scene.world.step(60)
+            body = scene.others[0]
+            gap_m = body.position[2] - scene.cube.position[2]
+            assert scene.move(0.45, -0.1, z) > 3
+            assert body.position[2] - scene.cube.position[2] < gap_m + 2e-3
+
+
+def test_no_body_is_teleported_while_another_one_moves():
+    ball = (Box(size_m=(0.03,) * 3, mass_kg=0.1), (0.6, 0.2, 0.015))
+    with Scene(boxes=[ball]) as scene:
+        scene.lift()
+        scene.others[0].place((0.6, 0.2, 0.3))  # it falls
+        scene.world.step(5)
+        assert scene.move(0.45, -0.05, HEIGHT_M) > 3
+        scene.world.settle()
+        assert scene.move(0.45, 0.0, HEIGHT_M) == 1
 
 
 def test_a_held_body_pushes_another_as_without_teleports():
