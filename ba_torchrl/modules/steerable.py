@@ -279,7 +279,8 @@ class SteerableConv2d(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the sizes for ``print``."""
-        return f"in={self._in}, out={self._out}, kernel_size={self.kernel_size}"
+        sizes = f"kernel_size={self.kernel_size}, stride={self.stride}"
+        return f"in={self._in}, out={self._out}, {sizes}"
 
 
 class SteerableLinear(SteerableConv2d):

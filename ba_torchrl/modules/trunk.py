@@ -46,9 +46,10 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
 
 
 def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int, bool]]:
-    """Return (width, padding, pools) of each 3x3 stage of a trunk that ends at one pixel.
+    """Return (width, padding, pools) of each stage of a trunk that ends at one pixel.
 
-    128 px shrink to 8 in four pooled stages, then 8 -> 8 -> 6, pool 3 -> 1. At 64 px the first
+    The sizes are those of 3x3 convolutions, of which some pool; a convolution with stride 2 can take
+    the place of one that pools. 128 px shrink to 8 in four pooled stages, then 8 -> 8 -> 6, pool 3 -> 1. At 64 px the first
     stage is left out (design, section 2).
 
     Args:
@@ -136,7 +137,7 @@ class ImageNetworkConfig(StrictModel):
 
 
 class ImageTrunk(nn.Module):
-    """Depth image and holding flag to one feature vector, through 3x3 convolutions.
+    """Depth image and holding flag to one feature vector, through convolutions.
 
     Activations are channels-last in the compute dtype; parameters stay float32 and each
     convolution casts its own filter. The result is float32.
