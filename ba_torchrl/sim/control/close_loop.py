@@ -152,9 +152,15 @@ class CloseLoopController:
             self._simulate_held(path, done, held)
             self.world.step()
             tested = None if self._is_supported(held) else before
-        after = pose_in_tool_frame(self.robot, held)
-        is_firm = is_steady and tested is not None and self._is_within_slip(tested, after)
-        self._grasp = FirmGrasp(held, after if done < 1.0 else tested) if is_firm else None
+        self._grasp = None
+        if (
+            is_steady
+            and tested is not None
+            and self._has_kept(tested, held, self.limits.max_slip_m)
+        ):
+            was_teleported = done == 1.0
+            pose = tested if was_teleported else pose_in_tool_frame(self.robot, held)
+            self._grasp = FirmGrasp(held, pose)
 
     def _simulate_held(self, path: Path, done: float, held: Body) -> None:
         """Simulate the rest of the path, after a fraction ``done``, with a held body."""
@@ -183,17 +189,17 @@ class CloseLoopController:
         max_slip_m = limits.max_fall_fraction * physics.gravity_m_s2 * physics.time_step_s**2
         self.world.step()
         for _ in range(limits.max_regrasp_steps):
-            slip_m, turn_rad = slip(grasp, pose_in_tool_frame(self.robot, held))
-            if slip_m <= max_slip_m and turn_rad <= limits.max_turn_rad:
+            if self._has_kept(grasp, held, max_slip_m):
                 return True
             self.world.detect_collisions()
             place_in_tool_frame(self.robot, held, grasp)
             self.world.step()
-        return False
+        return self._has_kept(grasp, held, max_slip_m)
 
-    def _is_within_slip(self, before: Pose, after: Pose) -> bool:
-        slip_m, turn_rad = slip(before, after)
-        return slip_m <= self.limits.max_slip_m and turn_rad <= self.limits.max_turn_rad
+    def _has_kept(self, grasp: Pose, held: Body, max_slip_m: float) -> bool:
+        """Whether a held body has kept its pose in the tool frame."""
+        slip_m, turn_rad = slip(grasp, pose_in_tool_frame(self.robot, held))
+        return slip_m <= max_slip_m and turn_rad <= self.limits.max_turn_rad
 
     def _is_supported(self, held: Body) -> bool:
         """Whether a held body was in contact with another body than the robot in the last step."""
