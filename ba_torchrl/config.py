@@ -139,7 +139,8 @@ class EnvConfig(StrictModel):
     top_down_approach: bool = Field(default=False, json_schema_extra=_OPEN_LOOP)
     """Open loop: approach vertically also with a tilted gripper."""
     fast_mode: bool = True
-    """Teleport the arm along collision-free paths; if False, all motion is simulated."""
+    """Teleport the arm, and a body that does not slip, along free paths; if False, all motion is
+    simulated."""
     render: bool = False
     """Show the simulation in PyBullet's window."""
     random_orientation: bool = True
