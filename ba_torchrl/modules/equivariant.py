@@ -7,7 +7,7 @@ sign. Reflecting the scene's y axis reverses the columns of the image, dy and th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -162,9 +162,6 @@ class EquivariantConfig(ImageNetworkConfig):
             at 128 px, and a quarter at 64 px, where the first stage is left out.
     """
 
-    max_pools: ClassVar[bool] = True
-    """Whether a stage that halves the image ends with a max pool."""
-
     group_order: int = Field(default=8, ge=2)
     reflections: bool = False
     n_hidden: int = Field(default=64, ge=4)
@@ -220,7 +217,10 @@ class EquivariantConfig(ImageNetworkConfig):
             out = [(regular, int(width))]
             convs.append(self._convolution(gspace, fields, out, padding, pools))
             fields = out
-        return self.image_trunk(convs, [self.max_pools and pools for _, _, pools in stages])
+        pools = [  # a stride halves the image as a pool does
+            pools and conv.stride == 1 for (_, _, pools), conv in zip(stages, convs, strict=True)
+        ]
+        return self.image_trunk(convs, pools)
 
     def _convolution(
         self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool

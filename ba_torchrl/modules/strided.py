@@ -7,7 +7,7 @@ products per input pixel and pair of channels where a 3x3 kernel before a max po
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.equivariant import EquivariantConfig
@@ -23,8 +23,6 @@ class StridedEquivariantConfig(EquivariantConfig):
 
     The stages, their numbers of fields and the arguments are those of `EquivariantConfig`.
     """
-
-    max_pools: ClassVar[bool] = False
 
     def _convolution(
         self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool

@@ -253,14 +253,12 @@ class World:
         Args:
             except_for: a body that may move.
         """
-        if except_for is not None:
-            return not any(
-                body is not except_for and self._moves(body) for body in self.moving_bodies
-            )
         # the body that moved at the last call is probably the one that still moves
-        if self._moved_last is not None and self._moves(self._moved_last):
+        last = self._moved_last
+        if last is not None and last is not except_for and self._moves(last):
             return False
-        self._moved_last = next(filter(self._moves, self.moving_bodies), None)
+        others = (body for body in self.moving_bodies if body is not except_for)
+        self._moved_last = next(filter(self._moves, others), None)
         return self._moved_last is None
 
     def settle(self, max_steps: int = 200) -> bool:

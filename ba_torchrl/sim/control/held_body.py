@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Pose, bullet_compose, bullet_inverse
-from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.robots.base import DISTANT_M, Robot
 
 TILT_RAD = 0.001
 """Angle about each axis at which a corner of a face is the deepest point in the opposite face."""
@@ -54,8 +54,7 @@ def rebuild_grasp_contacts(robot: Robot, body: Body, pose: Pose) -> None:
         body: the held body.
         pose: of the body in the tool frame.
     """
-    distant = 10.0, 10.0, 10.0
-    body.set_pose(distant, pose.orientation)
+    body.set_pose((DISTANT_M,) * 3, pose.orientation)
     robot.world.detect_collisions()
     for tilt in _TILTS:
         place_in_tool_frame(robot, body, bullet_compose(tilt, pose))

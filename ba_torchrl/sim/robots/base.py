@@ -37,7 +37,7 @@ slope. The normals of an edge that is wedged between the fingers differ by more.
 GRASP_QUERY_M = 2e-3
 """Maximum distance of the closest points whose normals are examined for a grasp."""
 
-_DISTANT_M = 10.0
+DISTANT_M = 10.0
 """Coordinates outside of every workspace."""
 
 
@@ -325,7 +325,7 @@ class Robot(ABC):
             velocity = pybullet.getBaseVelocity(body, physicsClientId=self.client)
             states.append((body, pose, velocity))
             pybullet.resetBasePositionAndOrientation(
-                body, (_DISTANT_M, i * _DISTANT_M, _DISTANT_M), pose[1], physicsClientId=self.client
+                body, (DISTANT_M, i * DISTANT_M, DISTANT_M), pose[1], physicsClientId=self.client
             )
         if states:
             self.world.detect_collisions()
