@@ -184,8 +184,7 @@ class EnvConfig(StrictModel):
     solver_iterations: int | None = Field(default=None, ge=1)
     """Custom physics: iterations of the contact solver in each step."""
     solver_residual: float | None = Field(default=None, ge=0)
-    """Custom physics: residual at which the solver stops early; 0, the default, keeps episodes and
-    restored states exact to the last bit."""
+    """Custom physics: residual at which the solver stops early; 0 for all iterations."""
     expert: bool = False
     """Add the expert's action to every observation."""
     seed: int | None = Field(default=None, ge=0)

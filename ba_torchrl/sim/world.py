@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Self
+from typing import Protocol, Self
 
 import pybullet
 import pybullet_data
@@ -37,9 +37,7 @@ class Physics:
     time_step_s: float = 1 / 120
     solver_iterations: int = 50
     solver_residual: float = 0.0
-    """Residual below which the solver stops early. It must be zero for exact resets: otherwise the
-    number of iterations depends on motor impulses of earlier steps, which no saved state contains.
-    """
+    """Residual below which the solver stops early; 0 for always `solver_iterations`."""
     gravity_m_s2: float = 10.0
     floor_friction: float = 0.5  # at 1.0 a pushed cube tips over its leading edge and jams
     settle_speed_m_s: float = 0.01
@@ -50,6 +48,16 @@ class Physics:
 
 FINE_PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=200)
 """Half the time step and four times the solver iterations of the default."""
+
+
+class Sleeper(Protocol):
+    """A mechanism that may not be simulated while it is at rest, such as a robot."""
+
+    def is_possible(self) -> bool:
+        """Whether it is at rest and touches nothing."""
+
+    def set_asleep(self, is_asleep: bool) -> None:
+        """Set whether it is simulated, from the end of the next step on."""
 
 
 class Snapshot:
@@ -104,6 +112,8 @@ class World:
         self.bodies: list[Body] = []
         self.moving_bodies: list[Body] = []
         """The bodies that are not static."""
+        self.sleepers: list[Sleeper] = []
+        """Mechanisms that `settle` does not simulate while they are at rest."""
         self._moved_last: Body | None = None
         self._has_fixed_poses = False
         self.steps = 0
@@ -270,13 +280,22 @@ class World:
         Returns:
             Whether the bodies came to rest within ``max_steps``.
         """
-        still = 0
-        for _ in range(max_steps):
-            self.step()
-            still = still + 1 if self.is_still() else 0
-            if still == 2:
-                return True
-        return False
+        sleepers = [sleeper for sleeper in self.sleepers if sleeper.is_possible()]
+        still, are_asleep = 0, False
+        try:
+            for number in range(1, max_steps + 1):
+                may_be_last = still == 1 or number == max_steps
+                if are_asleep == may_be_last:  # they are awake at the end of the last step
+                    are_asleep = not may_be_last
+                    _set_asleep(sleepers, are_asleep)
+                self.step()
+                still = still + 1 if self.is_still() else 0
+                if still == 2:
+                    return True
+            return False
+        finally:
+            if are_asleep:  # an exception
+                _set_asleep(sleepers, False)
 
     def close(self) -> None:
         """Disconnect the client; repeated calls have no effect."""
@@ -331,6 +350,11 @@ class World:
     def _check_not_sealed(self, name: str) -> None:
         if self._pristine is not None:
             raise SimulationError(f"cannot add {name!r}: the world is sealed")
+
+
+def _set_asleep(sleepers: Iterable[Sleeper], are_asleep: bool) -> None:
+    for sleeper in sleepers:
+        sleeper.set_asleep(are_asleep)
 
 
 def _enable_collisions(client: int, body: int, is_static: bool) -> None:

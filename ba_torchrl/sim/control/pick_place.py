@@ -28,6 +28,7 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.robots.sleep import RobotSleep
 
 
 class HeldState(NamedTuple):
@@ -75,6 +76,8 @@ class PickPlace:
         """Pose of the held body in the tool frame."""
         self.is_out_of_reach = False
         """Whether the last pick or place was out of reach, so that the arm did not move."""
+        if teleport:
+            self.world.sleepers.append(RobotSleep(robot, lambda: self.held is None))
         self.on_contact: Callable[[], None] = lambda: None
         """Called when the fingers have closed for a pick and before they open for a release."""
 
