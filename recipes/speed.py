@@ -44,7 +44,7 @@ def main(settings: DictConfig) -> None:
     check_known(settings)
     load_plugins(settings.plugins)
     check_texts(settings, "which", "device", "precision")
-    check_texts(settings, "output", "compare", optional=True)
+    check_texts(settings, "compile_mode", "output", "compare", optional=True)
     check_counts(settings, "repeats")
     check_flags(settings, "profile")
     device = usable_device(settings.device)
@@ -60,17 +60,23 @@ def main(settings: DictConfig) -> None:
         profiles=profiles,
         device=device,
         precision=settings.precision,
+        compile_mode=settings.compile_mode,
     )
     if settings.output is not None:
-        content = SpeedFile(machine=where, precision=settings.precision, rows=rows)
+        content = SpeedFile(
+            machine=where,
+            precision=settings.precision,
+            compile_mode=settings.compile_mode,
+            rows=rows,
+        )
         write_speed_file(settings.output, content)
     for work, operations in (profiles or {}).items():
         print(f"{work}\n{operations}")
     changes = {} if old is None else columns_of_changes(old.rows, rows)
     print(as_markdown(rows, {**COLUMNS, **changes}))
-    print(f"\n{where}, precision {settings.precision}")
+    print(f"\n{where}, precision {settings.precision}, compile_mode {settings.compile_mode}")
     if old is not None:
-        print(f"old: {old.machine}, precision {old.precision}")
+        print(f"old: {old.machine}, precision {old.precision}, compile_mode {old.compile_mode}")
 
 
 if __name__ == "__main__":

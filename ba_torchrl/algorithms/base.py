@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import StrictModel
 from ba_torchrl.envs.images import ImageSpec
@@ -104,6 +105,17 @@ class Algorithm(ABC):
     @abstractmethod
     def replay_size(self) -> int:
         """Number of transitions in the replay."""
+
+    def compile(self, mode: CompileMode) -> None:
+        """Compile the updates with `torch.compile`; by default not possible.
+
+        Args:
+            mode: of `torch.compile`.
+
+        Raises:
+            ConfigError: the algorithm cannot be compiled.
+        """
+        raise ConfigError(f"compile_mode: {type(self).__name__} cannot be compiled")
 
     @abstractmethod
     def update(self) -> TensorDict:

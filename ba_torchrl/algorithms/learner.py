@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from torchrl.objectives.utils import TargetNetUpdater
 
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.base import Algorithm, NetworkConfig, Problem
+from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.optimizer_state import fits
@@ -76,12 +77,11 @@ class Learner(Algorithm):
         policy = self.make_policy(networks)
         self.loss = self.make_loss(networks).to(problem.device)
         self.trained_policy = policy.to(problem.device)
-        self.averaged_policy = self.make_averaged_policy()
-        averaged = self.averaged_policy
+        self.averaged_policy = averaged = self.make_averaged_policy()
         acting = self.trained_policy if averaged is None else averaged.module
-        self.policy = ActingPolicy(
-            acting, self.make_acting_transforms(), self.make_exploration()
-        ).to(problem.device)
+        acting = ActingPolicy(acting, self.make_acting_transforms(), self.make_exploration())
+        self.policy = acting.to(problem.device)
+        self.compute_losses: Callable[[TensorDictBase], TensorDictBase] = self.loss
         self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
@@ -260,11 +260,15 @@ class Learner(Algorithm):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.minimize(self.loss(batch))
+        scalars = self.minimize(self.compute_losses(batch))
         if self._prioritized_sampler() is not None:  # whose trees are on the CPU
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
             self.host_tasks.submit(errors, self._set_priorities)
         return scalars
+
+    def compile(self, mode: CompileMode) -> None:
+        """Compile the loss and its gradient, except those of updates of ``init="bc"``."""
+        self.compute_losses = CompiledLoss(self.loss, mode)
 
     def own_updates(self, updates: int) -> int:
         """Return how many of the first updates of a run minimise the algorithm's own loss."""
@@ -361,8 +365,7 @@ class Learner(Algorithm):
         for name, part in self._stateful_parts().items():
             if isinstance(part, torch.optim.Optimizer) and not fits(part, state[name]):
                 logger.warning(
-                    "%s: the moments are those of other parameters, of another version of the "
-                    "library; they are not restored",
+                    "%s: not restored, since another version of the library wrote it",
                     name,
                 )
                 continue

@@ -133,7 +133,11 @@ class SpatialActions:
 
     def unravel(self, flat: Tensor, level: int) -> Tensor:
         """Return the indices [..., m] of a choice [...] among a level's flattened values."""
-        return torch.stack(torch.unravel_index(flat, self.levels[level].shape), dim=-1)
+        indices = []
+        for size in reversed(self.levels[level].shape):  # `unravel_index` copies from the host
+            indices.append(flat.remainder(size))
+            flat = flat.div(size, rounding_mode="floor")
+        return torch.stack(indices[::-1], dim=-1)
 
 
 def _nearest_step(values: Tensor, axis: GridAxis) -> Tensor:

@@ -21,7 +21,12 @@ def widened(value: Tensor) -> Tensor:
     return value.to(widest_float(value.device))
 
 
-@cache
+@torch.compiler.assume_constant_result
 def constants(values: tuple[float, ...], device: torch.device) -> Tensor:
     """Return numbers [n] in the widest floating type of a device; they are copied to it once."""
+    return _constants(values, device)
+
+
+@cache
+def _constants(values: tuple[float, ...], device: torch.device) -> Tensor:
     return torch.tensor(values, dtype=widest_float(device), device=device)

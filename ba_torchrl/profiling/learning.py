@@ -126,6 +126,8 @@ def measure_update(
     dtype = network_dtype(config.network_config, bench.device)
     product = MatrixProduct(dtype, bench.device)
     multiply_adds = count_multiply_adds(learner.update)
+    if bench.compile_mode is not None:  # after the count, in which nothing is compiled
+        learner.compile(bench.compile_mode)
     times = bench.time_against(
         {"unit": LearningUnit(bench.device), "product": product}, {work: learner.update}
     )

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from pydantic import ValidationError
 
+from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.state_files import write_text
 from ba_torchrl.errors import ConfigError
@@ -79,6 +80,8 @@ class SpeedFile(StrictModel):
     machine: Machine
     precision: Precision = "auto"
     """Asked for the learners' networks."""
+    compile_mode: CompileMode | None = None
+    """Of the learners."""
     rows: list[Row]
 
 

@@ -13,6 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as validated
 from tqdm import tqdm
 
+from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.trunk import Precision
@@ -89,6 +90,7 @@ class Bench:
         profiles: receives a profile of each timed call, by name; None for no profiles.
         device: of the learners.
         precision: of the learners' networks.
+        compile_mode: of the learners, see `ExperimentConfig`.
     """
 
     def __init__(
@@ -98,10 +100,12 @@ class Bench:
         profiles: dict[str, str] | None = None,
         device: torch.device = CPU,
         precision: Precision = "auto",
+        compile_mode: CompileMode | None = None,
     ) -> None:
         self.repeats = repeats
         self.device = device
         self.precision: Precision = precision
+        self.compile_mode: CompileMode | None = compile_mode
         self._bar = bar
         self._profiles = profiles
 
@@ -203,6 +207,7 @@ def measure(
     profiles: dict[str, str] | None = None,
     device: torch.device = CPU,
     precision: Precision = "auto",
+    compile_mode: CompileMode | None = None,
 ) -> list[Row]:
     """Measure one group of the table, a single measurement, or "all".
 
@@ -213,16 +218,21 @@ def measure(
         profiles: receives a profile of each timed call, by name; None for no profiles.
         device: of the learners.
         precision: of the learners' networks.
+        compile_mode: of the learners, see `ExperimentConfig`.
 
     Raises:
-        ConfigError: ``which`` or ``precision`` is unknown, or ``repeats`` is below 1.
+        ConfigError: ``which``, ``precision`` or ``compile_mode`` is unknown, or ``repeats`` is
+            below 1.
     """
     known = (*GROUPS, "all", *MEASUREMENTS)
     if which not in known:
         raise ConfigError(f"which: {which!r} is none of {', '.join(known)}")
-    if precision not in get_args(Precision):
-        allowed = ", ".join(get_args(Precision))
-        raise ConfigError(f"precision: {precision!r} is none of {allowed}")
+    for name, value, type_ in (
+        ("precision", precision, Precision),
+        ("compile_mode", compile_mode, CompileMode),
+    ):
+        if value is not None and value not in get_args(type_):
+            raise ConfigError(f"{name}: {value!r} is none of {', '.join(get_args(type_))}")
     if repeats < 1:
         raise ConfigError(f"repeats must be 1 or more, got {repeats}")
     jobs = [
@@ -235,7 +245,8 @@ def measure(
     rows: list[Row] = []
     with tqdm(total=len(jobs) * repeats, disable=not progress, unit="round") as bar:
         for function, arguments in jobs:
-            rows += function(Bench(repeats, bar, profiles, device, precision), *arguments)
+            bench = Bench(repeats, bar, profiles, device, precision, compile_mode)
+            rows += function(bench, *arguments)
     return rows
 
 

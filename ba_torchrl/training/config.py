@@ -11,6 +11,7 @@ import torch
 from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
+from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, changed, parse
 from ba_torchrl.data.demo_files import check_demonstrations
@@ -71,6 +72,9 @@ class ExperimentConfig(StrictModel):
     tf32: bool | None = None
     """TensorFloat-32 in float32 convolutions and matrix products of a GPU; None leaves torch's
     choice, which is convolutions only."""
+    compile_mode: CompileMode | None = None
+    """Mode of `torch.compile` for the loss and its gradient; None does not compile them. Needs a
+    compiler of the system, and minutes at the first update; random draws are others."""
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool | None = None

@@ -53,6 +53,8 @@ class Experiment:
             torch.backends.cuda.matmul.allow_tf32 = config.tf32
             torch.backends.cudnn.allow_tf32 = config.tf32
         self.algorithm = build_algorithm(config)
+        if config.compile_mode is not None:
+            self.algorithm.compile(config.compile_mode)
         self._lock = RunLock(config.folder)
         open_run_folder(config)
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)

@@ -1,0 +1,174 @@
+"""Learners whose loss is compiled by `torch.compile`."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+from ba_torchrl.algorithms.compilation import CompiledLoss
+from ba_torchrl.config import parse
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
+from tests.algorithms.tiny import (
+    SIZES,
+    make_experiment,
+    problem,
+    run,
+    spatial_problem,
+    spatial_transitions,
+    transitions,
+)
+
+SACFD = {"demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
+SDQFD = {"demonstrations": "sdqfd", "replay": "prioritized"}
+
+
+@pytest.fixture(autouse=True)
+def static_shapes():
+    """Compile for the shapes of the first call, as learners do, and forget earlier tests."""
+    torch.compiler.reset()
+    with torch._dynamo.config.patch(automatic_dynamic_shapes=False):
+        yield
+    torch.compiler.reset()
+
+
+@pytest.fixture
+def eager_backend(monkeypatch):
+    """Trace graphs, without the compiler of the system."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
+
+
+def build(algorithm, network, **settings):
+    torch.manual_seed(0)
+    is_spatial = algorithm == "spatial_q"
+    sizes = {**SIZES[network], "precision": "float32"}
+    config = parse(ALGORITHMS[algorithm], {**settings, "batch_size": 8}, algorithm)
+    learner = config.build(
+        parse(NETWORKS[network], sizes, network), spatial_problem() if is_spatial else problem()
+    )
+    learner.extend((spatial_transitions if is_spatial else transitions)(learner))
+    return learner
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "network", "settings"),
+    [("sac", "cnn", SACFD), ("sac", "equi", SACFD), ("bc", "cnn", {}), ("dagger", "cnn", {})],
+)
+def test_a_loss_is_one_graph(algorithm, network, settings):
+    learner = build(algorithm, network, **settings)
+    found = torch._dynamo.explain(learner.loss)(learner.sample())
+    assert (found.graph_count, found.graph_break_count) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("network", "channels"),
+    [
+        ("asr", 3),
+        ("equi_fcn", 1),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("asr", 1), ("equi_asr", 1), ("equi_deictic_asr", 3), ("rot_fcn", 1))
+        ),
+    ],
+)
+def test_a_loss_of_a_spatial_network_is_one_graph_unless_on_a_cpu(network, channels):
+    """On the device "meta", whose tensors have no values; on a CPU the number of rows of each
+    primitive is read."""
+    pytest.importorskip("escnn")
+    sizes = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
+    if channels == 3:
+        sizes |= {"num_z": 5, "num_tilts": 3}
+    spec = parse(NETWORKS[network], sizes, network)
+    config = parse(ALGORITHMS["spatial_q"], SDQFD, "spatial_q")
+    learner = config.build(spec, spatial_problem("pxyzrrr" if channels == 3 else "pxyr", channels))
+    loss = learner.make_loss(learner.make_networks(spec).to("meta"))
+    found = torch._dynamo.explain(loss)(spatial_transitions(learner).to("meta"))
+    assert (found.graph_count, found.graph_break_count) == (1, 0)
+
+
+def updates_equal_those_of_an_eager_learner(algorithm, network, settings):
+    plain, compiled = (build(algorithm, network, **settings) for _ in range(2))
+    compiled.compile("default")
+    before = {key: value.clone() for key, value in compiled.loss.named_parameters()}
+    for number in range(3):
+        results = []
+        for learner in (plain, compiled):
+            torch.manual_seed(number)
+            results.append(learner.update())
+        assert set(results[0].keys()) == set(results[1].keys())
+        for key, value in results[0].items():
+            torch.testing.assert_close(results[1][key], value, rtol=1e-3, atol=1e-4)
+            assert not results[1][key].requires_grad
+    moved = [not torch.equal(value, before[key]) for key, value in compiled.loss.named_parameters()]
+    assert all(moved)
+    assert plain.state_dict().keys() == compiled.state_dict().keys()
+    assert plain.loss.state_dict().keys() == compiled.loss.state_dict().keys()
+
+
+CASES = pytest.mark.parametrize(
+    ("algorithm", "network", "settings"),
+    [("sac", "cnn", SACFD), ("spatial_q", "asr", SDQFD)],
+    ids=["sacfd cnn", "sdqfd asr"],
+)
+
+
+@CASES
+@pytest.mark.usefixtures("eager_backend")
+def test_updates_of_a_traced_loss_equal_those_of_an_eager_learner(algorithm, network, settings):
+    updates_equal_those_of_an_eager_learner(algorithm, network, settings)
+
+
+@pytest.mark.slow
+@CASES
+def test_updates_of_a_compiled_loss_equal_those_of_an_eager_learner(
+    algorithm, network, settings, monkeypatch
+):
+    monkeypatch.setattr("torch._inductor.config.fallback_random", True)  # draws as in eager mode
+    updates_equal_those_of_an_eager_learner(algorithm, network, settings)
+
+
+@pytest.mark.usefixtures("eager_backend")
+def test_results_are_copies_and_priorities_are_written():
+    learner = build("sac", "cnn", **SACFD)
+    loss = CompiledLoss(learner.loss, "default")
+    batch = learner.sample()
+    returned = {}
+    inner = learner.loss.forward
+
+    def forward(data):
+        returned["losses"] = inner(data)
+        returned["priority"] = data[keys.TD_ERROR]
+        return returned["losses"]
+
+    loss.loss = forward
+    scalars = loss(batch)
+    for key, value in returned["losses"].items():
+        assert torch.equal(scalars[key], value)
+        assert scalars[key].data_ptr() != value.data_ptr()
+    assert torch.equal(batch[keys.TD_ERROR], returned["priority"])
+    assert batch[keys.TD_ERROR].data_ptr() != returned["priority"].data_ptr()
+    assert isinstance(scalars, TensorDict)
+
+
+@pytest.mark.usefixtures("eager_backend")
+def test_a_run_with_compile_mode(tmp_path):
+    learner = run(tmp_path, "cnn", {"name": "sac"}, compile_mode="default")
+    assert isinstance(learner.compute_losses, CompiledLoss)
+
+
+def test_a_run_without_it_is_not_compiled(tmp_path):
+    learner = make_experiment(tmp_path, "cnn", {"name": "sac"}).algorithm
+    assert learner.compute_losses is learner.loss
+
+
+def test_an_algorithm_that_cannot_be_compiled_says_so_before_the_run(tmp_path):
+    algorithm = {"name": "rlpd", "replay": "symmetric"}
+    with pytest.raises(ConfigError, match="compile_mode: RLPD"):
+        make_experiment(tmp_path, "cnn", algorithm, compile_mode="default")
+
+
+def test_an_unknown_mode_lists_the_known_ones(tmp_path):
+    with pytest.raises(ConfigError, match=r"compile_mode.*reduce-overhead"):
+        make_experiment(tmp_path, "cnn", {"name": "sac"}, compile_mode="fast")
