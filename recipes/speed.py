@@ -74,9 +74,11 @@ def main(settings: DictConfig) -> None:
         print(f"{work}\n{operations}")
     changes = {} if old is None else columns_of_changes(old.rows, rows)
     print(as_markdown(rows, {**COLUMNS, **changes}))
-    print(f"\n{where}, precision {settings.precision}, compile_mode {settings.compile_mode}")
+    compiled = f", compile_mode {settings.compile_mode}" if settings.compile_mode else ""
+    print(f"\n{where}, precision {settings.precision}{compiled}")
     if old is not None:
-        print(f"old: {old.machine}, precision {old.precision}, compile_mode {old.compile_mode}")
+        compiled = f", compile_mode {old.compile_mode}" if old.compile_mode else ""
+        print(f"old: {old.machine}, precision {old.precision}{compiled}")
 
 
 if __name__ == "__main__":

@@ -139,8 +139,12 @@ def test_a_new_box_appears_after_a_correct_place_only(make_env):
     assert not state["holding"]
     assert not state["done"]
     assert len(task.objects) == 1
-    # the expert corrects it, and then a new box appears
-    state = follow(env, state, 2)[-1]
+    # the expert corrects it, also if a pick of the box on the edge fails, and then a new one appears
+    for _ in range(8):
+        if len(task.objects) == 2:
+            break
+        assert not task.stacked()
+        state = follow(env, state, 1)[-1]
     assert not state["holding"]
     assert len(task.objects) == 2
     assert len(task.stacked()) == 1
