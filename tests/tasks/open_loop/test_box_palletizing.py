@@ -139,7 +139,7 @@ def test_a_new_box_appears_after_a_correct_place_only(make_env):
     assert not state["holding"]
     assert not state["done"]
     assert len(task.objects) == 1
-    # the expert corrects it, also if a pick of the box on the edge fails, and then a new one appears
+    # the expert corrects it, also if a pick on the edge fails, and then a new box appears
     for _ in range(8):
         if len(task.objects) == 2:
             break
