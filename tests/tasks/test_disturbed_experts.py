@@ -85,22 +85,17 @@ def test_a_hand_whose_fingertips_press_on_the_floor_moves_up(make_env):
     assert env.scene.robot.tool_pose()[0][2] > height_m + 0.03
 
 
-@pytest.mark.parametrize(
-    ("task", "seed"),
-    [
-        ("house_building_4", 19),
-        ("improvise_house_building_2", 12),
-        ("improvise_house_building_2", 11),
-        ("improvise_house_building_2", 14),
-    ],
-)
-def test_a_piece_flush_with_the_roof_is_picked(make_env, task, seed):
+@pytest.mark.parametrize("task", ["house_building_4", "improvise_house_building_2"])
+def test_a_piece_flush_with_the_roof_is_picked(make_env, task):
     env = make_env(f"open_loop/{task}", obs_size=128, max_steps=30)
-    state = env.reset(seed=seed)
-    roof, piece, *_ = sorted(env.scene.task.objects, key=lambda body: body.name != "roof 1")
-    put_beside(piece, roof)
-    env.scene.world.settle()
-    assert play(env, idle(env, state))
+    solved = 0
+    for seed in range(12):  # a finger may push both pieces, so that not every episode is solved
+        state = env.reset(seed=seed)
+        roof, piece, *_ = sorted(env.scene.task.objects, key=lambda body: body.name != "roof 1")
+        put_beside(piece, roof)
+        env.scene.world.settle()
+        solved += play(env, idle(env, state))
+    assert solved >= 9
 
 
 def test_a_piece_beside_the_supports_of_a_bridge_is_removed_first(make_env):
