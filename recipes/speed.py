@@ -62,23 +62,21 @@ def main(settings: DictConfig) -> None:
         precision=settings.precision,
         compile_mode=settings.compile_mode,
     )
+    content = SpeedFile(
+        machine=where,
+        precision=settings.precision,
+        compile_mode=settings.compile_mode,
+        rows=rows,
+    )
     if settings.output is not None:
-        content = SpeedFile(
-            machine=where,
-            precision=settings.precision,
-            compile_mode=settings.compile_mode,
-            rows=rows,
-        )
         write_speed_file(settings.output, content)
     for work, operations in (profiles or {}).items():
         print(f"{work}\n{operations}")
     changes = {} if old is None else columns_of_changes(old.rows, rows)
     print(as_markdown(rows, {**COLUMNS, **changes}))
-    compiled = f", compile_mode {settings.compile_mode}" if settings.compile_mode else ""
-    print(f"\n{where}, precision {settings.precision}{compiled}")
+    print(f"\n{content}")
     if old is not None:
-        compiled = f", compile_mode {old.compile_mode}" if old.compile_mode else ""
-        print(f"old: {old.machine}, precision {old.precision}{compiled}")
+        print(f"old: {old}")
 
 
 if __name__ == "__main__":

@@ -79,8 +79,9 @@ class Learner(Algorithm):
         self.trained_policy = policy.to(problem.device)
         self.averaged_policy = averaged = self.make_averaged_policy()
         acting = self.trained_policy if averaged is None else averaged.module
-        acting = ActingPolicy(acting, self.make_acting_transforms(), self.make_exploration())
-        self.policy = acting.to(problem.device)
+        self.policy = ActingPolicy(
+            acting, self.make_acting_transforms(), self.make_exploration()
+        ).to(problem.device)
         self.compute_losses: Callable[[TensorDictBase], TensorDictBase] = self.loss
         self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
@@ -364,10 +365,7 @@ class Learner(Algorithm):
         """Restore the learner from a `state_dict` of any device."""
         for name, part in self._stateful_parts().items():
             if isinstance(part, torch.optim.Optimizer) and not fits(part, state[name]):
-                logger.warning(
-                    "%s: not restored, since another version of the library wrote it",
-                    name,
-                )
+                logger.warning("%s: moments of another version; they are not restored", name)
                 continue
             part.load_state_dict(state[name])
         rates = self.scheduler.get_last_lr()  # the optimiser's, unless its state was left out

@@ -7,11 +7,10 @@ voxels close to halfway between two cells can belong to the other one.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import torch
 from torch import Tensor
 
+from ba_torchrl.modules.cached_constant import cached_constant
 from ba_torchrl.modules.widest_float import widened
 
 TIE_TOLERANCE = 1e-9
@@ -61,7 +60,7 @@ def _nearest_cell(offset: Tensor, size: int) -> Tensor:
     return (offset + (size - 1) / 2 + 0.5 + TIE_TOLERANCE).floor_().int()
 
 
-@torch.compiler.assume_constant_result
+@cached_constant(maxsize=8)
 def cell_table(
     yaws_rad: tuple[float, ...],
     ry_rad: tuple[float, ...],
@@ -82,17 +81,6 @@ def cell_table(
         int32 [yaws, ry, rx, size, size, size]: 43 MB for 16 x 7 x 7 rotations of 24 voxels, 200 MB
         for 40 voxels. With both orders of the fingers, a process holds twice this.
     """
-    return _cell_table(yaws_rad, ry_rad, rx_rad, size, device)
-
-
-@lru_cache(maxsize=8)
-def _cell_table(
-    yaws_rad: tuple[float, ...],
-    ry_rad: tuple[float, ...],
-    rx_rad: tuple[float, ...],
-    size: int,
-    device: torch.device,
-) -> Tensor:
     angles = (torch.tensor(values, dtype=torch.float64) for values in (yaws_rad, ry_rad, rx_rad))
     rotations = tool_rotations(*torch.meshgrid(*angles, indexing="ij"))
     # one yaw at a time bounds the memory of the computation

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import torch
 from torch import Tensor
+
+from ba_torchrl.modules.cached_constant import cached_constant
 
 WITHOUT_FLOAT64 = {"mps"}
 """Types of devices that have no float64."""
@@ -21,12 +21,7 @@ def widened(value: Tensor) -> Tensor:
     return value.to(widest_float(value.device))
 
 
-@torch.compiler.assume_constant_result
+@cached_constant()
 def constants(values: tuple[float, ...], device: torch.device) -> Tensor:
     """Return numbers [n] in the widest floating type of a device; they are copied to it once."""
-    return _constants(values, device)
-
-
-@cache
-def _constants(values: tuple[float, ...], device: torch.device) -> Tensor:
     return torch.tensor(values, dtype=widest_float(device), device=device)

@@ -84,6 +84,10 @@ class SpeedFile(StrictModel):
     """Of the learners."""
     rows: list[Row]
 
+    def __str__(self) -> str:
+        compiled = "" if self.compile_mode is None else f", compile_mode {self.compile_mode}"
+        return f"{self.machine}, precision {self.precision}{compiled}"
+
 
 def write_speed_file(path: str | Path, content: SpeedFile) -> Path:
     """Write rows to a file, which appears when it is complete."""

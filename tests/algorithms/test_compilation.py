@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+import torch._inductor.config
 from tensordict import TensorDict
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
@@ -122,11 +123,9 @@ def test_updates_of_a_traced_loss_equal_those_of_an_eager_learner(algorithm, net
 
 @pytest.mark.slow
 @CASES
-def test_updates_of_a_compiled_loss_equal_those_of_an_eager_learner(
-    algorithm, network, settings, monkeypatch
-):
-    monkeypatch.setattr("torch._inductor.config.fallback_random", True)  # draws as in eager mode
-    updates_equal_those_of_an_eager_learner(algorithm, network, settings)
+def test_updates_of_a_compiled_loss_equal_those_of_an_eager_learner(algorithm, network, settings):
+    with torch._inductor.config.patch(fallback_random=True):  # draws as in eager mode
+        updates_equal_those_of_an_eager_learner(algorithm, network, settings)
 
 
 @pytest.mark.usefixtures("eager_backend")

@@ -29,10 +29,10 @@ def learn_and_act(learner, batch):
 def without_float64(monkeypatch):
     def declare():
         monkeypatch.setattr(widest_float, "WITHOUT_FLOAT64", {"cpu"})
-        widest_float._constants.cache_clear()
+        widest_float.constants.cache_clear()
 
     yield declare
-    widest_float._constants.cache_clear()
+    widest_float.constants.cache_clear()
 
 
 def check(learner, without_float64, transitions):

@@ -1,0 +1,34 @@
+"""Tensors that are computed once per process, also in compiled graphs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache, wraps
+
+import torch
+from torch import Tensor
+
+
+def cached_constant(
+    maxsize: int | None = None,
+) -> Callable[[Callable[..., Tensor]], Callable[..., Tensor]]:
+    """Return a decorator for functions of hashable arguments, which `torch.compile` does not trace.
+
+    `torch.compile` ignores the cache of `functools.lru_cache` and would compute the result in each
+    call of a graph.
+
+    Args:
+        maxsize: number of results that are kept; None for all.
+    """
+
+    def decorate(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        cached = lru_cache(maxsize)(function)
+
+        @wraps(function)
+        def call(*args: object) -> Tensor:
+            return cached(*args)
+
+        call.cache_clear = cached.cache_clear
+        return torch.compiler.assume_constant_result(call)
+
+    return decorate
