@@ -36,6 +36,8 @@ def check_bodies(scene: Scene) -> None:
     if not math.isfinite(sum(scene.robot.measured_joints())):
         raise SimulationError("a joint of the robot is not finite")
     for body in scene.world.moving_bodies:
+        if body.is_inactive:
+            continue
         position, orientation = body.pose
         if not math.isfinite(sum(position) + sum(orientation)):
             raise SimulationError(f"the pose of {body.name!r} is not finite")

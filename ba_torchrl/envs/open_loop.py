@@ -137,7 +137,7 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
     def _place_robot(self, scene: Scene) -> None:
         held = scene.controller.held
         scene.controller.reset()
-        if held is not None and held not in scene.task.objects:
+        if held is not None and held.is_inactive:
             held.is_hidden = True  # the task has deactivated it
         self._memory = {}
 

@@ -47,6 +47,8 @@ class SceneState:
     task: Any
     terrain: Any
     hidden: tuple[bool, ...]
+    """Whether each body is hidden."""
+    inactive: tuple[bool, ...]
     """Whether each body is inactive."""
 
 
@@ -69,6 +71,7 @@ class Scene:
             self.task.get_state(),
             self.task.terrain.get_state(),
             tuple(body.is_hidden for body in self.world.bodies),
+            tuple(body.is_inactive for body in self.world.bodies),
         )
 
     def set_state(self, state: SceneState) -> None:
@@ -82,7 +85,10 @@ class Scene:
         self.task.set_state(state.task)
         self.robot.set_state(state.robot)
         self.controller.set_state(state.controller)
-        for body, is_hidden in zip(self.world.bodies, state.hidden, strict=True):
+        for body, is_hidden, is_inactive in zip(
+            self.world.bodies, state.hidden, state.inactive, strict=True
+        ):
+            body.set_inactive(is_inactive)
             body.is_hidden = is_hidden
 
 

@@ -8,10 +8,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d
 from ba_torchrl.modules.irrep_convolution import irrep_convolution
 from ba_torchrl.modules.kernel_blocks import regular_irrep_kernels
 from ba_torchrl.modules.max_pool import relu_of_max_pool
-from ba_torchrl.modules.steerable import SteerableConv2d, planar_rotations
+from ba_torchrl.modules.steerable import (
+    SteerableConv2d,
+    planar_rotations,
+    planar_rotations_and_flips,
+)
 from ba_torchrl.objectives.dqn import strict_large_margin
 from ba_torchrl.profiling.learning import LearningUnit
 from ba_torchrl.profiling.table import Bench, Row, measurement, timed_row
@@ -23,6 +28,10 @@ LAYOUTS = {"contiguous": torch.contiguous_format, "channels-last": torch.channel
 MARGIN_VALUES = 128 * 128 * 16
 """Pixels times rotations."""
 MARGIN = 0.1
+HELD_BATCH = 8
+"""Samples with an object in the gripper, for which a dynamic filter is computed."""
+HELD_FIELDS = 16
+HELD_PIXELS = 128
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -117,6 +126,50 @@ def measure_margin(bench: Bench) -> list[Row]:
         ),
     }
     return _rows(bench, {work: _with_gradient(call, q) for work, call in calls.items()})
+
+
+def convolution_by_products(x: Tensor, filters: Tensor) -> Tensor:
+    """Return the convolution of each sample with its own filter, by batched matrix products.
+
+    Args:
+        x: [B, C, H, W].
+        filters: [B, C_out, C, K, K]; K is odd, and the map keeps its size.
+    """
+    batch, _, height, width = x.shape
+    kernel = filters.shape[-1]
+    padded = F.pad(x, [kernel // 2] * 4)
+    y = x.new_zeros(batch, filters.shape[1], height * width)
+    for i in range(kernel):
+        for j in range(kernel):
+            shifted = padded[:, :, i : i + height, j : j + width].flatten(2)
+            y = torch.baddbmm(y, filters[..., i, j], shifted)
+    return y.unflatten(2, (height, width))
+
+
+@measurement("learning/dynamic_filter")
+def measure_dynamic_filter(bench: Bench) -> list[Row]:
+    """The dynamic 3x3 filter of D_4 in Equi ASR: a grouped convolution and matrix products."""
+    gspace = planar_rotations_and_flips(4)
+    layer = DynamicSteerableConv2d(gspace, gspace.regular_repr, HELD_FIELDS, 3).to(bench.device)
+    coefficients = layer.scales().to(bench.device) * torch.randn(
+        HELD_BATCH, layer.num_coefficients, device=bench.device
+    )
+    coefficients.requires_grad_()
+    x = torch.randn(HELD_BATCH, 8 * HELD_FIELDS, HELD_PIXELS, HELD_PIXELS, device=bench.device)
+
+    def products(x: Tensor) -> Tensor:
+        filters, biases = layer.filters(coefficients)
+        return convolution_by_products(x, filters) + biases[:, :, None, None]
+
+    name = f"D4 dynamic filter, {HELD_FIELDS} fields, {HELD_PIXELS} px, batch {HELD_BATCH}"
+    channels_last = x.to(memory_format=torch.channels_last)
+    calls = {
+        f"{name}, grouped convolution": _with_gradient(
+            lambda x: layer(x, coefficients), channels_last
+        ),
+        f"{name}, matrix products": _with_gradient(products, x),
+    }
+    return _rows(bench, calls)
 
 
 @measurement("learning/convolution_dtype")

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import pybullet
 
+from ba_torchrl.sim.activation import set_asleep
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
@@ -39,6 +40,10 @@ class Body:
     """The surface at the pose at which it was last measured."""
     _fixed_pose: Pose | None = None
     """The pose while it cannot change, see `World.fixed_poses`; None otherwise."""
+    is_inactive = False
+    """Whether the body is not in the scene; see `set_inactive`."""
+    has_slept = False
+    """Whether the body was ever inactive."""
 
     def __init__(self, client: int, shape: Shape, name: str) -> None:
         self.client = client
@@ -159,6 +164,20 @@ class Body:
             abs(v[0]) + abs(v[1]) + abs(v[2]) <= speed_m_s
             and abs(w[0]) + abs(w[1]) + abs(w[2]) <= spin_rad_s
         )
+
+    def set_inactive(self, is_inactive: bool) -> None:
+        """Set whether the body is out of the scene: hidden, and in Bullet's sleeping state.
+
+        The caller places it where nothing touches it.
+        """
+        self.is_hidden = self.is_inactive = is_inactive
+        self.has_slept |= is_inactive
+        self.apply_activity()
+
+    def apply_activity(self) -> None:
+        """Let the engine not simulate the body while it is inactive."""
+        if self.has_slept and not self.is_static:
+            set_asleep(self.client, self.id, self.is_inactive)
 
     def touches(self, other: Body) -> bool:
         """Whether the two bodies were in contact in the last physics step."""

@@ -1,10 +1,15 @@
-"""The X display that PyBullet's window needs."""
+"""PyBullet's window, and the X display that it needs."""
 
 from __future__ import annotations
 
 import os
 import re
 import socket
+import sys
+
+import pybullet
+
+from ba_torchrl.errors import SimulationError
 
 _TIMEOUT_S = 3.0
 _FIRST_TCP_PORT = 6000
@@ -33,6 +38,29 @@ def why_no_display() -> str | None:
     except OSError as error:
         return f"DISPLAY={name} does not answer: {error}"
     return f"DISPLAY={name} closed the connection"
+
+
+def connect_window() -> int:
+    """Open PyBullet's window and return its client.
+
+    Raises:
+        SimulationError: there is no display, or the process already has a window.
+    """
+    reason = why_no_display() if sys.platform.startswith("linux") else None
+    if reason is not None:
+        raise SimulationError(
+            f"render=True opens a window, but there is no display ({reason}): use "
+            "env.render() for images, or run under a virtual display such as xvfb-run"
+        )
+    try:
+        client = pybullet.connect(pybullet.GUI, options="--width=960 --height=720")
+    except pybullet.error as error:
+        raise SimulationError(
+            f"PyBullet cannot open a window ({error}): a process can have only one"
+        ) from None
+    if client >= 0:
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+    return client
 
 
 def _connect(host: str, number: int) -> socket.socket:

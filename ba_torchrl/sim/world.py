@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -13,9 +12,10 @@ import pybullet
 import pybullet_data
 
 from ba_torchrl.errors import SimulationError
+from ba_torchrl.sim.activation import set_asleep
 from ba_torchrl.sim.articulated import ArticulatedBody, ArticulatedLink, PrismaticJoint
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.display import why_no_display
+from ba_torchrl.sim.display import connect_window
 from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.shapes import Color, Shape
 
@@ -101,7 +101,7 @@ class World:
         floor_color: Color | None = None,
     ) -> None:
         self.physics = physics or Physics()
-        self.client = _connect_window() if window else pybullet.connect(pybullet.DIRECT)
+        self.client = connect_window() if window else pybullet.connect(pybullet.DIRECT)
         if self.client < 0:
             raise SimulationError("PyBullet has no free client: close environments not in use")
         self._disconnect = weakref.finalize(self, _disconnect, self.client)
@@ -220,10 +220,13 @@ class World:
             raise SimulationError(
                 "the snapshot belongs to another world: its own was closed or rebuilt"
             )
+        self._wake_inactive_bodies()
         # the first call restores the poses at which the pairs are rebuilt, the second all the rest
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
         self._rebuild_collision_pairs()
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
+        for body in self.bodies:
+            body.apply_activity()
 
     def step(self, count: int = 1) -> None:
         """Advance the physics by ``count`` time steps.
@@ -250,7 +253,8 @@ class World:
         self._has_fixed_poses = True
         try:
             for body in self.bodies:
-                body.fix_pose(True)
+                if not body.is_inactive:
+                    body.fix_pose(True)
             yield
         finally:
             self._has_fixed_poses = False
@@ -312,6 +316,14 @@ class World:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _wake_inactive_bodies(self) -> None:
+        """Take a step with all bodies awake, since no saved state contains which of them sleep."""
+        sleepers = [body for body in self.bodies if body.has_slept and not body.is_static]
+        for body in sleepers:
+            set_asleep(self.client, body.id, False)
+        if sleepers:
+            pybullet.stepSimulation(physicsClientId=self.client)
+
     def _rebuild_collision_pairs(self) -> None:
         """Remove all collision pairs from the engine and detect them again.
 
@@ -361,25 +373,6 @@ def _enable_collisions(client: int, body: int, is_static: bool) -> None:
     # PyBullet's default collision groups: static bodies do not collide with each other
     group, mask = (2, ~2) if is_static else (1, -1)
     pybullet.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=client)
-
-
-def _connect_window() -> int:
-    """Open PyBullet's window and return its client."""
-    reason = why_no_display() if sys.platform.startswith("linux") else None
-    if reason is not None:
-        raise SimulationError(
-            f"render=True opens a window, but there is no display ({reason}): use "
-            "env.render() for images, or run under a virtual display such as xvfb-run"
-        )
-    try:
-        client = pybullet.connect(pybullet.GUI, options="--width=960 --height=720")
-    except pybullet.error as error:
-        raise SimulationError(
-            f"PyBullet cannot open a window ({error}): a process can have only one"
-        ) from None
-    if client >= 0:
-        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
-    return client
 
 
 def count_clients() -> int:

@@ -9,7 +9,7 @@ from ba_torchrl.sim.shapes import Shape
 from ba_torchrl.sim.world import World
 
 INACTIVE_Z_M = 1e6
-"""Height at which inactive bodies start to fall."""
+"""Height of inactive bodies, which fall for a step before they sleep."""
 INACTIVE_X_M = 5.0
 """Least x of inactive bodies, outside every workspace; of static ones, least -x."""
 INACTIVE_SPACING_M = 0.3
@@ -21,11 +21,9 @@ COLUMNS = 10
 class BodyPool:
     """Bodies of which only some are in the scene at a time.
 
-    Inactive bodies are hidden and fall freely from a great height, for at least seven simulated
-    minutes. A falling body costs less simulation time than a resting one. Only its pose changes:
-    a change of its mass or collision filter would change the order of PyBullet's internal lists, so
-    that the simulation from a restored state would differ. Inactive static bodies are away from the
-    falling ones, which would otherwise collide with them.
+    Inactive bodies are hidden and at a great height, in Bullet's sleeping state, in which they are
+    not simulated. Their masses and collision filters are as before: a change would change the order
+    of PyBullet's internal lists, so that the simulation from a restored state would differ.
 
     Args:
         world: not sealed yet.
@@ -48,7 +46,7 @@ class BodyPool:
 
     def activate(self, body: Body) -> None:
         """Add a body to the scene; the caller sets its pose."""
-        body.is_hidden = False
+        body.set_inactive(False)
         self.active.append(body)
 
     def deactivate(self, body: Body) -> None:
@@ -66,7 +64,7 @@ class BodyPool:
 
 
 def deactivate_body(body: Body, index: int) -> None:
-    """Hide a body outside the workspace, where it falls if it is not static; see `BodyPool`.
+    """Take a body out of the scene; see `BodyPool`.
 
     Args:
         body: the body.
@@ -75,4 +73,4 @@ def deactivate_body(body: Body, index: int) -> None:
     row, column = divmod(index, COLUMNS)
     x_m, y_m = INACTIVE_X_M + INACTIVE_SPACING_M * column, INACTIVE_SPACING_M * row
     body.place((-x_m if body.is_static else x_m, y_m, INACTIVE_Z_M))
-    body.is_hidden = True
+    body.set_inactive(True)

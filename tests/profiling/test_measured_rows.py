@@ -137,10 +137,23 @@ def test_the_measured_loop_computes_the_margin():
     torch.testing.assert_close(found, layers.strict_large_margin(values, chosen, 0.1))
 
 
+def test_the_measured_products_compute_the_dynamic_convolution():
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(3, 4, 6, 7, generator=generator)
+    filters = torch.randn(3, 5, 4, 3, 3, generator=generator)
+    found = layers.convolution_by_products(x, filters)
+    expected = [
+        F.conv2d(image[None], weight, padding=1) for image, weight in zip(x, filters, strict=True)
+    ]
+    torch.testing.assert_close(found, torch.cat(expected))
+
+
 def test_layers_are_measured_in_pairs(monkeypatch):
     pytest.importorskip("escnn")
     monkeypatch.setattr(layers, "BATCH", 2)
     monkeypatch.setattr(layers, "MARGIN_VALUES", 64)
+    monkeypatch.setattr(layers, "HELD_FIELDS", 2)
+    monkeypatch.setattr(layers, "HELD_PIXELS", 8)
     monkeypatch.setattr(layers, "LearningUnit", lambda _: lambda: None)
     with tqdm(disable=True) as bar:
         bench = Bench(1, bar)
@@ -148,7 +161,8 @@ def test_layers_are_measured_in_pairs(monkeypatch):
         pools = layers.measure_max_pool(bench, "channels-last")
         dtypes = layers.measure_dtypes(bench)
         margins = layers.measure_margin(bench)
-    rows = (*convolutions, *pools, *dtypes, *margins)
+        dynamic = layers.measure_dynamic_filter(bench)
+    rows = (*convolutions, *pools, *dtypes, *margins, *dynamic)
     assert [row.work.rpartition(", ")[2] for row in rows] == [
         "expanded filter",
         "basis of irreps",
@@ -160,5 +174,7 @@ def test_layers_are_measured_in_pairs(monkeypatch):
         "all samples",
         "8 demonstrations",
         "8 demonstrations in a loop",
+        "grouped convolution",
+        "matrix products",
     ]
     assert all(row.values[0] > 0 for row in rows)

@@ -13,15 +13,86 @@ def make_pool(world, mass_kg):
     return BodyPool(world, shapes, [f"{mass_kg} kg, {i}" for i in range(12)])
 
 
-def test_inactive_bodies_fall_freely_beside_inactive_static_ones():
+def test_inactive_bodies_are_not_simulated():
     with World() as world:
         static, moving = make_pool(world, 0.0), make_pool(world, 0.1)
-        heights = [body.position[2] for body in moving.bodies]
+        world.step()
+        before = [body.pose for body in moving.bodies]
         world.step(12)
-        assert not any(contacts(world.client, body.id) for body in static.bodies)
-        fall_m = world.physics.gravity_m_s2 * 0.1**2 / 2
-        for body, height in zip(moving.bodies, heights, strict=True):
-            assert height - body.position[2] == pytest.approx(fall_m, rel=0.1)
+        assert [body.pose for body in moving.bodies] == before
+        world.snapshot()  # wakes them for a step
+        world.step()
+        before = [body.pose for body in moving.bodies]
+        world.step(12)
+        assert [body.pose for body in moving.bodies] == before
+        touching = [contacts(world.client, body.id) for body in static.bodies + moving.bodies]
+        assert not any(touching)
+
+
+def test_an_activated_body_is_simulated():
+    with World() as world:
+        pool = make_pool(world, 0.1)
+        world.step(3)
+        body = pool.bodies[3]
+        pool.activate(body)
+        body.place((0.5, 0.0, 0.3))
+        world.step(11)  # it is simulated from the second step on
+        fall_m = world.physics.gravity_m_s2 * (10 * world.physics.time_step_s) ** 2 / 2
+        assert 0.3 - body.position[2] == pytest.approx(fall_m, rel=0.15)
+        assert world.settle()
+        assert body.position[2] == pytest.approx(0.025, abs=1e-3)
+        pool.deactivate(body)
+        world.step()
+        height = body.position[2]
+        world.step(5)
+        assert body.position[2] == height > 1e5
+
+
+def drop(world, pool):
+    """Let a body fall on another one and return their poses after some steps."""
+    first, second = pool.bodies[2], pool.bodies[7]
+    pool.activate(first)
+    first.place((0.5, 0.0, 0.025))
+    pool.activate(second)
+    second.set_pose((0.51, 0.02, 0.15), (0.1, 0.2, 0.0, 0.9746794344808963))
+    poses = []
+    for _ in range(60):
+        world.step()
+        poses += [first.pose, second.pose]
+    return poses
+
+
+def test_the_past_activity_of_bodies_does_not_affect_a_restored_world():
+    with World() as world:
+        pool = make_pool(world, 0.1)
+        world.seal()
+        played = []
+        for active, steps in [((), 0), ((2,), 4), ((7, 2), 8), ((), 3)]:  # in an earlier episode
+            pool.clear()
+            for number in active:
+                pool.activate(pool.bodies[number])
+                pool.bodies[number].place((0.5, 0.3 * number, 0.2))
+            world.step(steps)
+            world.restore_pristine()
+            pool.clear()
+            played.append(drop(world, pool))
+        assert all(poses == played[0] for poses in played[1:])  # bit for bit
+
+
+def test_bodies_continue_from_a_snapshot_as_after_it_was_taken():
+    with World() as world:
+        pool = make_pool(world, 0.1)
+        world.seal()
+        world.step(5)
+        snapshot, state = world.snapshot(), pool.get_state()
+        expected = drop(world, pool)
+        pool.clear()
+        world.step(3)
+        for _ in range(2):
+            world.restore(snapshot)
+            pool.clear()
+            pool.set_state(state)
+            assert drop(world, pool) == expected
 
 
 def test_a_body_is_visible_while_it_is_active():

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pybullet
 
+from ba_torchrl.sim.activation import set_asleep
 from ba_torchrl.sim.contacts import contacts
 from ba_torchrl.sim.robots.base import Robot
 
@@ -13,9 +14,6 @@ REST_JOINT_RAD = 1e-3
 """Largest deviation from the commanded joints, and largest velocity (rad/s), of an arm at rest."""
 REST_OPENING = 1e-3
 """Largest deviation from the commanded opening of fingers at rest."""
-
-_ASLEEP = pybullet.ACTIVATION_STATE_ENABLE_SLEEPING | pybullet.ACTIVATION_STATE_SLEEP
-_AWAKE = pybullet.ACTIVATION_STATE_DISABLE_SLEEPING | pybullet.ACTIVATION_STATE_WAKE_UP
 
 
 class RobotSleep:
@@ -50,7 +48,4 @@ class RobotSleep:
 
     def set_asleep(self, is_asleep: bool) -> None:
         """Set the state, which takes effect at the end of the next physics step."""
-        state = _ASLEEP if is_asleep else _AWAKE
-        pybullet.changeDynamics(
-            self.robot.id, -1, activationState=state, physicsClientId=self.robot.client
-        )
+        set_asleep(self.robot.client, self.robot.id, is_asleep)

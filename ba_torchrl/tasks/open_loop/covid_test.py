@@ -129,7 +129,7 @@ class CovidTest(OpenLoopTask):
         new_box = self.layout.new_box
         for bodies, row in zip((self.tubes, self.swabs), self._rows(), strict=True):
             for column, body in zip(new_columns(self.rounds), bodies, strict=True):
-                body.is_hidden = False
+                body.set_inactive(False)
                 body_yaw = new_box.yaw_rad if is_random else 0.0
                 body_yaw += math.pi / 2 + self.random_yaw(rng, 2 * self.skew_rad)
                 if is_random:
