@@ -26,7 +26,9 @@ def cached_constant(
 
         @wraps(function)
         def call(*args: object) -> Tensor:
-            return cached(*args)
+            # a tensor of inference mode could not be used in a later training step
+            with torch.inference_mode(False):
+                return cached(*args)
 
         call.cache_clear = cached.cache_clear
         return torch.compiler.assume_constant_result(call)

@@ -23,8 +23,13 @@ Precision = Literal["auto", "float32", "bfloat16"]
 SUPPORTED_IMAGE_SIZES = (64, 128)
 
 
-@cache
+@torch.compiler.assume_constant_result
 def _bfloat16_is_fast(device_type: str) -> bool:
+    return _has_fast_bfloat16(device_type)
+
+
+@cache
+def _has_fast_bfloat16(device_type: str) -> bool:
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     if device_type == "cpu":

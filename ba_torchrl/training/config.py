@@ -74,7 +74,9 @@ class ExperimentConfig(StrictModel):
     choice, which is convolutions only."""
     compile_mode: CompileMode | None = None
     """Mode of `torch.compile` for the loss and its gradient; None does not compile them. Needs a
-    compiler of the system, and minutes at the first update; random draws are others."""
+    compiler of the system, and minutes at the first update; random draws differ from those of a
+    run that is not compiled. On a CPU, spatial losses are compiled again for each number of
+    demonstrations in a batch, eight times at most."""
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool | None = None

@@ -41,10 +41,10 @@ def eager_backend(monkeypatch):
     monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))
 
 
-def build(algorithm, network, **settings):
+def build(algorithm, network, precision="float32", **settings):
     torch.manual_seed(0)
     is_spatial = algorithm == "spatial_q"
-    sizes = {**SIZES[network], "precision": "float32"}
+    sizes = {**SIZES[network], "precision": precision}
     config = parse(ALGORITHMS[algorithm], {**settings, "batch_size": 8}, algorithm)
     learner = config.build(
         parse(NETWORKS[network], sizes, network), spatial_problem() if is_spatial else problem()
@@ -57,8 +57,9 @@ def build(algorithm, network, **settings):
     ("algorithm", "network", "settings"),
     [("sac", "cnn", SACFD), ("sac", "equi", SACFD), ("bc", "cnn", {}), ("dagger", "cnn", {})],
 )
-def test_a_loss_is_one_graph(algorithm, network, settings):
-    learner = build(algorithm, network, **settings)
+@pytest.mark.parametrize("precision", ["auto", "float32"])
+def test_a_loss_is_one_graph(algorithm, network, settings, precision):
+    learner = build(algorithm, network, precision, **settings)
     found = torch._dynamo.explain(learner.loss)(learner.sample())
     assert (found.graph_count, found.graph_break_count) == (1, 0)
 

@@ -19,7 +19,8 @@ REST_OPENING = 1e-3
 class RobotSleep:
     """Puts a robot at rest into Bullet's sleeping state, in which its joints are not simulated.
 
-    Bodies that do not touch the robot move as they do beside one that is awake. Bullet simulates a
+    Bodies that do not touch the robot move as they do beside one that is awake, except for the
+    number of solver iterations where a residual ends them early. Bullet simulates a
     sleeping robot again as soon as a moving body touches it.
 
     Args:
