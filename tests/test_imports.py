@@ -118,7 +118,7 @@ def test_imports_go_one_way(module):
 
 SIM = (
     {"geometry", "display", "model_files"},
-    {"contacts", "meshes"},
+    {"activation", "contacts", "meshes"},
     {"mesh_lists"},
     {"shapes"},
     {"assets", "bodies"},
