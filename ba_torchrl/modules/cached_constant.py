@@ -1,17 +1,19 @@
-"""Tensors that are computed once per process, also in compiled graphs."""
+"""Values that are computed once per process, also in compiled graphs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, wraps
+from typing import TypeVar
 
 import torch
-from torch import Tensor
+
+Value = TypeVar("Value")
 
 
 def cached_constant(
     maxsize: int | None = None,
-) -> Callable[[Callable[..., Tensor]], Callable[..., Tensor]]:
+) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
     """Return a decorator for functions of hashable arguments, which `torch.compile` does not trace.
 
     `torch.compile` ignores the cache of `functools.lru_cache` and would compute the result in each
@@ -21,11 +23,11 @@ def cached_constant(
         maxsize: number of results that are kept; None for all.
     """
 
-    def decorate(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def decorate(function: Callable[..., Value]) -> Callable[..., Value]:
         cached = lru_cache(maxsize)(function)
 
         @wraps(function)
-        def call(*args: object) -> Tensor:
+        def call(*args: object) -> Value:
             # a tensor of inference mode could not be used in a later training step
             with torch.inference_mode(False):
                 return cached(*args)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from functools import cache
 from typing import ClassVar, Literal
 
 import torch
@@ -16,6 +15,7 @@ from ba_torchrl import hardware
 from ba_torchrl.config import StrictModel
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
+from ba_torchrl.modules.cached_constant import cached_constant
 from ba_torchrl.modules.max_pool import relu_of_max_pool
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -23,13 +23,8 @@ Precision = Literal["auto", "float32", "bfloat16"]
 SUPPORTED_IMAGE_SIZES = (64, 128)
 
 
-@torch.compiler.assume_constant_result
+@cached_constant()
 def _bfloat16_is_fast(device_type: str) -> bool:
-    return _has_fast_bfloat16(device_type)
-
-
-@cache
-def _has_fast_bfloat16(device_type: str) -> bool:
     if device_type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     if device_type == "cpu":

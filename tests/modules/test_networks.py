@@ -145,10 +145,10 @@ def test_auto_precision_follows_the_hardware(monkeypatch):
         ({"avx512_bf16": True, "cpu_name": "Intel Xeon"}, torch.float32),
         ({"avx2": True, "amx_bf16": False}, torch.float32),
     ]:
-        trunk._has_fast_bfloat16.cache_clear()
+        trunk._bfloat16_is_fast.cache_clear()
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags)
         assert compute_dtype("auto", cpu) is expected
-    trunk._has_fast_bfloat16.cache_clear()
+    trunk._bfloat16_is_fast.cache_clear()
     assert compute_dtype("float32", cpu) is torch.float32
     assert compute_dtype("bfloat16", cpu) is torch.bfloat16
     assert compute_dtype("auto", torch.device("meta")) is torch.float32
@@ -177,10 +177,10 @@ def test_auto_precision_uses_the_instructions_that_onednn_may_use(
     intel = {"amx_bf16": True, "avx512_bf16": True, "cpu_name": "Intel Xeon"}
     amd = {"avx512_bf16": True, "cpu_name": "AMD Zen 4"}
     for flags, expected in [(intel, with_amx), (amd, on_amd)]:
-        trunk._has_fast_bfloat16.cache_clear()
+        trunk._bfloat16_is_fast.cache_clear()
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags)
         assert compute_dtype("auto", torch.device("cpu")) is expected
-    trunk._has_fast_bfloat16.cache_clear()
+    trunk._bfloat16_is_fast.cache_clear()
 
 
 def test_functional_calls_use_the_given_parameters():
