@@ -51,7 +51,7 @@ FINE_PHYSICS = Physics(time_step_s=1 / 240, solver_iterations=200)
 
 
 class Sleeper(Protocol):
-    """A mechanism that may not be simulated while it is at rest, such as a robot."""
+    """A mechanism that need not be simulated while it is at rest, such as a robot."""
 
     def is_possible(self) -> bool:
         """Whether it is at rest and touches nothing."""
@@ -114,6 +114,8 @@ class World:
         """The bodies that are not static."""
         self.sleepers: list[Sleeper] = []
         """Mechanisms that `settle` does not simulate while they are at rest."""
+        self._wakes_late = False
+        """Whether they may not be simulated in the next step, since `settle` was interrupted."""
         self._moved_last: Body | None = None
         self._has_fixed_poses = False
         self.steps = 0
@@ -220,7 +222,7 @@ class World:
             raise SimulationError(
                 "the snapshot belongs to another world: its own was closed or rebuilt"
             )
-        self._wake_inactive_bodies()
+        self._wake_all()
         # the first call restores the poses at which the pairs are rebuilt, the second all the rest
         pybullet.restoreState(snapshot.id, physicsClientId=self.client)
         self._rebuild_collision_pairs()
@@ -297,9 +299,10 @@ class World:
                 if still == 2:
                     return True
             return False
-        finally:
-            if are_asleep:  # an exception
-                _set_asleep(sleepers, False)
+        except BaseException:
+            self._wakes_late = True
+            _set_asleep(sleepers, False)
+            raise
 
     def close(self) -> None:
         """Disconnect the client; repeated calls have no effect."""
@@ -316,13 +319,14 @@ class World:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _wake_inactive_bodies(self) -> None:
-        """Take a step with all bodies awake, since no saved state contains which of them sleep."""
+    def _wake_all(self) -> None:
+        """Take a step after which all are awake: no saved state contains which of them sleep."""
         sleepers = [body for body in self.bodies if body.has_slept and not body.is_static]
         for body in sleepers:
             set_asleep(self.client, body.id, False)
-        if sleepers:
+        if sleepers or self._wakes_late:
             pybullet.stepSimulation(physicsClientId=self.client)
+        self._wakes_late = False
 
     def _rebuild_collision_pairs(self) -> None:
         """Remove all collision pairs from the engine and detect them again.

@@ -158,24 +158,45 @@ def test_a_robot_that_moves_holds_or_touches_something_does_not_sleep():
     world.close()
 
 
-def test_an_interrupted_settle_leaves_the_robot_awake():
-    world, robot, bodies = make_world("kuka", sleeps=True)
-    drop(bodies)
+def interrupt_settle(world, after_step):
+    """Raise an exception after a physics step of `World.settle`."""
     step = world.step
 
     def interrupted_step():
         step()
-        if world.steps == 10:
+        if world.steps == after_step:
             raise KeyboardInterrupt
 
     world.step = interrupted_step
     with pytest.raises(KeyboardInterrupt):
         world.settle()
     del world.step
+
+
+def test_an_interrupted_settle_leaves_the_robot_awake():
+    world, robot, bodies = make_world("kuka", sleeps=True)
+    drop(bodies)
+    interrupt_settle(world, after_step=10)
     robot.command([q + 0.01 for q in robot.home_joints])
     world.step(60)
     assert robot.measured_joints() == pytest.approx(robot.joints, abs=1e-3)
     world.close()
+
+
+def test_a_state_restored_after_an_interrupted_settle_continues_as_before_it():
+    played = []
+    for is_interrupted in (False, True):
+        world, robot, bodies = make_world("kuka", sleeps=True)
+        world.seal()
+        if is_interrupted:
+            drop(bodies)
+            interrupt_settle(world, after_step=10)
+        world.restore_pristine()
+        robot.command([q + 0.01 for q in robot.home_joints])
+        world.step()
+        played.append(robot.measured_joints())
+        world.close()
+    assert played[0] == played[1]
 
 
 @pytest.mark.parametrize("fast_mode", [True, False])
