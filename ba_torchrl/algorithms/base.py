@@ -113,9 +113,10 @@ class Algorithm(ABC):
             mode: of `torch.compile`.
 
         Raises:
-            ConfigError: the algorithm cannot be compiled.
+            ConfigError: the algorithm cannot be compiled, the mode is unknown, or the system has no
+                compiler.
         """
-        raise ConfigError(f"compile_mode: {type(self).__name__} cannot be compiled")
+        raise ConfigError(f"compile_mode: {type(self).__name__} cannot be compiled; leave it out")
 
     @abstractmethod
     def update(self) -> TensorDict:
@@ -165,6 +166,8 @@ class AlgorithmConfig(StrictModel, ABC):
     """Controls of the tasks that the algorithm supports."""
     collects: ClassVar[bool] = True
     """Whether the policy collects transitions; if not, all updates are on the demonstrations."""
+    is_compilable: ClassVar[bool] = False
+    """Whether `Algorithm.compile` is possible."""
 
     @property
     def pretraining_option(self) -> str | None:

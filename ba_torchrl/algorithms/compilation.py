@@ -2,37 +2,77 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.utils import set_exploration_type
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
+
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 
 CompileMode = Literal["default", "reduce-overhead", "max-autotune"]
 """Mode of `torch.compile`; all but the first replay CUDA graphs on a GPU."""
 
 
-class CompiledLoss:
-    """A loss module whose forward and backward pass are compiled at the first call.
+def check_compiler(device: torch.device) -> None:
+    """Check that the system has the compiler of `torch.compile`'s code for a device.
 
-    Compilation is for the shapes of this call. The results are copies, since a CUDA graph writes
-    those of the next call to the same memory.
+    Raises:
+        ConfigError: it has none.
+    """
+    if device.type != "cpu":  # Triton, which PyTorch's packages for a GPU bring along
+        return
+    # a slow import, needed by compiled runs only
+    from torch._inductor.cpp_builder import get_cpp_compiler
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler:
+        raise ConfigError(
+            "compile_mode: this needs a C++ compiler (Debian: apt install g++); install one, or "
+            "leave compile_mode out"
+        ) from None
+
+
+class CompiledLoss:
+    """A loss module whose forward and backward pass are compiled at the second call.
+
+    The first call fills the networks' caches of constants, which would be missing in the graph.
+    Compilation is for the shapes of the second call. The results are copies, since a CUDA graph
+    writes those of the next call to the same memory.
 
     Args:
         loss: the module, which is compiled in place.
         mode: of `torch.compile`.
+
+    Raises:
+        ConfigError: the mode is unknown, or the system has no compiler.
     """
 
     def __init__(self, loss: LossModule, mode: CompileMode) -> None:
+        known = get_args(CompileMode)
+        if mode not in known:
+            raise ConfigError(f"compile_mode: {mode!r} is unknown; known: {', '.join(known)}")
+        check_compiler(next(loss.parameters()).device)
         self.loss = loss
-        _ = loss.in_keys  # determined at their first use, which would be compiled
-        loss.compile(mode=mode, dynamic=False)
+        self.mode = mode
+        self._is_first = True
 
     def __call__(self, batch: TensorDictBase) -> TensorDict:
         """Return the losses and diagnostics of a batch, into which the loss writes priorities."""
+        if self._is_first:
+            self._is_first = False
+            scalars = self.loss(batch)
+            self.loss.compile(mode=self.mode, dynamic=False)
+            return scalars
         torch.compiler.cudagraph_mark_step_begin()
-        known = set(batch.keys(True, True))
-        scalars = self.loss(batch).clone()
-        written = [key for key in batch.keys(True, True) if key not in known]
-        batch.update({key: batch[key].clone() for key in written})
+        # the compiled loss sets both modes, and does not reset them
+        with set_exploration_type(self.loss.deterministic_sampling_mode), set_recurrent_mode(True):
+            scalars = self.loss(batch).clone()
+        if keys.TD_ERROR in batch:
+            batch[keys.TD_ERROR] = batch[keys.TD_ERROR].clone()
         return scalars

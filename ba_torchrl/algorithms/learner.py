@@ -268,7 +268,9 @@ class Learner(Algorithm):
         return scalars
 
     def compile(self, mode: CompileMode) -> None:
-        """Compile the loss and its gradient, except those of updates of ``init="bc"``."""
+        """As for `Algorithm`: the loss and its gradient, except those of ``pretraining_option``."""
+        if not self.config.is_compilable:
+            super().compile(mode)
         self.compute_losses = CompiledLoss(self.loss, mode)
 
     def own_updates(self, updates: int) -> int:

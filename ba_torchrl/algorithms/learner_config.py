@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -31,6 +31,8 @@ class LearnerConfig(AlgorithmConfig):
     Learning rate, batch, capacity, exponents and bonus are those of appendix G.2. Each other field
     says where its default is from.
     """
+
+    is_compilable: ClassVar[bool] = True
 
     learning_rate: float = Field(default=1e-3, gt=0, le=1e3)
     """Learning rate of Adam."""

@@ -19,7 +19,6 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
@@ -43,6 +42,8 @@ class RLPDConfig(LearnerConfig):
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
+    is_compilable: ClassVar[bool] = False
+    """False: the host draws members of the ensemble in each update."""
 
     replay: Literal["symmetric"] = "symmetric"
     critics: int = Field(default=10, ge=2)
@@ -166,14 +167,6 @@ class RLPD(Learner):
     def network_parameters(self) -> list[nn.Parameter]:
         """Return all parameters but the entropy temperature."""
         return [p for p in self.loss.parameters() if p is not self.loss.log_alpha]
-
-    def compile(self, mode: CompileMode) -> None:
-        """Not possible: the host draws members of the ensemble in each update.
-
-        Raises:
-            ConfigError: always.
-        """
-        raise ConfigError("compile_mode: RLPD's updates draw on the host and cannot be compiled")
 
     def update(self) -> TensorDict:
         """Take the critic updates, the last one together with that of policy and temperature.

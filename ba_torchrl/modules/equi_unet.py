@@ -132,7 +132,7 @@ class EquivariantPixelValues(nn.Module):
             positions rotate with the image.
         """
         is_holding = holding.reshape(-1).bool()
-        if holding.device.type == "cpu":
+        if holding.device.type == "cpu" and not torch.compiler.is_compiling():
             return self._sorted_values(pixels, in_hand, is_holding)
         return self._selected_values(pixels, in_hand, is_holding)
 

@@ -49,7 +49,8 @@ class KernelBlock:
         """Return the kernels as [D, O*K*K*I] on the device and in the dtype of ``like``."""
         key = (like.device, like.dtype)
         if key not in self._copies:
-            self._copies[key] = self.kernels.flatten(1).to(like)
+            with torch.inference_mode(False):  # for later training steps
+                self._copies[key] = self.kernels.flatten(1).to(like)
         return self._copies[key]
 
 

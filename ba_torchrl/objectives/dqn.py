@@ -249,7 +249,7 @@ class LevelDQNLoss(TransitionLoss):
         if self.demonstrations == "none":
             return losses, torch.zeros_like(losses, dtype=torch.bool)
         is_expert = tensordict[self.tensor_keys.is_expert].reshape(-1)
-        if is_expert.device.type != "cpu":  # the number of demonstrations is not known on the CPU
+        if is_expert.device.type != "cpu" or torch.compiler.is_compiling():  # for static shapes
             terms = torch.stack([self._term(i, *level) for i, level in enumerate(levels)])
             return torch.where(is_expert, terms.sum(dim=0), 0.0), is_expert
         rows = is_expert.nonzero()[:, 0]

@@ -11,7 +11,7 @@ import torch
 from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
-from ba_torchrl.algorithms.compilation import CompileMode
+from ba_torchrl.algorithms.compilation import CompileMode, check_compiler
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, changed, parse
 from ba_torchrl.data.demo_files import check_demonstrations
@@ -75,8 +75,7 @@ class ExperimentConfig(StrictModel):
     compile_mode: CompileMode | None = None
     """Mode of `torch.compile` for the loss and its gradient; None does not compile them. Needs a
     compiler of the system, and minutes at the first update; random draws differ from those of a
-    run that is not compiled. On a CPU, spatial losses are compiled again for each number of
-    demonstrations in a batch, eight times at most."""
+    run that is not compiled."""
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool | None = None
@@ -247,6 +246,13 @@ class ExperimentConfig(StrictModel):
                 f"collected ones ({capacity}); the run would never start to learn"
             )
         config.collector_config.check(config.num_envs)
+        if config.compile_mode is not None:
+            if not config.algorithm_config.is_compilable:
+                raise ConfigError(
+                    f"compile_mode: algorithm {config.algorithm['name']!r} cannot be compiled; "
+                    "leave it out"
+                )
+            check_compiler(usable_device(config.device))
         config._check_demonstrations()
         if not is_available(config.logger):
             raise ConfigError(
@@ -285,6 +291,9 @@ class ExperimentConfig(StrictModel):
         """Yield a message for each value that has no effect together with the others."""
         if not self.demonstrations:
             yield from changed(self, _OF_DEMONSTRATIONS, "with demonstrations=0")
+        option = self.algorithm_config.pretraining_option
+        if option is not None and self.pretrain_updates == self.total_updates:
+            yield from changed(self, ["compile_mode"], f"without updates after those of {option}")
         for message in self.algorithm_config.without_effect(self.network_config):
             yield f"algorithm.{message}"
 
