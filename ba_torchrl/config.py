@@ -184,7 +184,8 @@ class EnvConfig(StrictModel):
     solver_iterations: int | None = Field(default=None, ge=1)
     """Custom physics: iterations of the contact solver in each step."""
     solver_residual: float | None = Field(default=None, ge=0)
-    """Custom physics: residual at which the solver stops early; 0 for all iterations."""
+    """Custom physics: residual at which the solver stops early; 0 for all iterations. As for the
+    two fields above, None is the value of "fast", here 1e-5 in open loop and 0 in close loop."""
     expert: bool = False
     """Add the expert's action to every observation."""
     seed: int | None = Field(default=None, ge=0)
