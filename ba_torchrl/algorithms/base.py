@@ -109,6 +109,8 @@ class Algorithm(ABC):
     def compile(self, mode: CompileMode) -> None:
         """Compile the updates with `torch.compile`; by default not possible.
 
+        An algorithm that implements this sets `AlgorithmConfig.is_compilable`.
+
         Args:
             mode: of `torch.compile`.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from typing import Literal, get_args
 
 import torch
@@ -23,7 +25,12 @@ def check_compiler(device: torch.device) -> None:
     Raises:
         ConfigError: it has none.
     """
-    if device.type != "cpu":  # Triton, which PyTorch's packages for a GPU bring along
+    if device.type == "cuda":  # Triton compiles the code that starts its kernels
+        if not (os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")):
+            raise ConfigError(
+                "compile_mode: this needs a C compiler (Debian: apt install gcc); install one, or "
+                "leave compile_mode out"
+            )
         return
     # a slow import, needed by compiled runs only
     from torch._inductor.cpp_builder import get_cpp_compiler
@@ -39,11 +46,12 @@ def check_compiler(device: torch.device) -> None:
 
 
 class CompiledLoss:
-    """A loss module whose forward and backward pass are compiled at the second call.
+    """A loss module whose forward and backward pass are compiled at the first call.
 
-    The first call fills the networks' caches of constants, which would be missing in the graph.
-    Compilation is for the shapes of the second call. The results are copies, since a CUDA graph
-    writes those of the next call to the same memory.
+    Compilation is for the shapes of this call. Before it, a forward pass that is not compiled fills
+    the networks' caches of constants; where it does not need one of them, the second graph that
+    does is compiled when it is needed. The results are copies, since a CUDA graph writes those of
+    the next call to the same memory.
 
     Args:
         loss: the module, which is compiled in place.
@@ -66,9 +74,10 @@ class CompiledLoss:
         """Return the losses and diagnostics of a batch, into which the loss writes priorities."""
         if self._is_first:
             self._is_first = False
-            scalars = self.loss(batch)
+            device = next(self.loss.parameters()).device
+            with torch.random.fork_rng([device] if device.type == "cuda" else []):
+                self.loss(batch.copy())
             self.loss.compile(mode=self.mode, dynamic=False)
-            return scalars
         torch.compiler.cudagraph_mark_step_begin()
         # the compiled loss sets both modes, and does not reset them
         with set_exploration_type(self.loss.deterministic_sampling_mode), set_recurrent_mode(True):

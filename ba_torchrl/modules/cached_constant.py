@@ -21,7 +21,7 @@ def cached_constant(
     again in whose first call an entry was missing.
 
     Args:
-        maxsize: number of results that are kept; None for all.
+        maxsize: number of results that are kept, the newest ones; None for all.
     """
 
     def decorate(function: Callable[..., Value]) -> Callable[..., Value]:
@@ -33,9 +33,10 @@ def cached_constant(
                 # a tensor of inference mode could not be used in a later training step
                 with torch.inference_mode(False):
                     result = function(*args)
-                if len(results) == maxsize:
+                if maxsize is not None and len(results) >= maxsize:
                     del results[next(iter(results))]
                 results[args] = result
+                return result
             return results[args]
 
         call.cache_clear = results.clear

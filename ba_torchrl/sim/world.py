@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import weakref
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol, Self
 
@@ -245,7 +245,7 @@ class World:
         """Update the contact points without advancing time."""
         pybullet.performCollisionDetection(physicsClientId=self.client)
 
-    @contextmanager
+    @contextlib.contextmanager
     def fixed_poses(self) -> Iterator[None]:
         """A context in which no body moves, so that the pose of each is read once.
 
@@ -301,7 +301,8 @@ class World:
             return False
         except BaseException:
             self._wakes_late = True
-            _set_asleep(sleepers, False)
+            with contextlib.suppress(pybullet.error):  # without a connection: raise the first error
+                _set_asleep(sleepers, False)
             raise
 
     def close(self) -> None:
@@ -324,6 +325,8 @@ class World:
         sleepers = [body for body in self.bodies if body.has_slept and not body.is_static]
         for body in sleepers:
             set_asleep(self.client, body.id, False)
+        if self._wakes_late:
+            _set_asleep(self.sleepers, False)
         if sleepers or self._wakes_late:
             pybullet.stepSimulation(physicsClientId=self.client)
         self._wakes_late = False

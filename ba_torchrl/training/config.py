@@ -11,7 +11,7 @@ import torch
 from pydantic import Field
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
-from ba_torchrl.algorithms.compilation import CompileMode, check_compiler
+from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, changed, parse
 from ba_torchrl.data.demo_files import check_demonstrations
@@ -246,13 +246,9 @@ class ExperimentConfig(StrictModel):
                 f"collected ones ({capacity}); the run would never start to learn"
             )
         config.collector_config.check(config.num_envs)
-        if config.compile_mode is not None:
-            if not config.algorithm_config.is_compilable:
-                raise ConfigError(
-                    f"compile_mode: algorithm {config.algorithm['name']!r} cannot be compiled; "
-                    "leave it out"
-                )
-            check_compiler(usable_device(config.device))
+        if config.compile_mode is not None and not config.algorithm_config.is_compilable:
+            name = config.algorithm["name"]
+            raise ConfigError(f"compile_mode: algorithm {name!r} cannot be compiled; leave it out")
         config._check_demonstrations()
         if not is_available(config.logger):
             raise ConfigError(

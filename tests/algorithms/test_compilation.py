@@ -14,6 +14,7 @@ from ba_torchrl.algorithms.compilation import CompiledLoss
 from ba_torchrl.config import parse
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.training.checkpoint import read_config
 from tests.algorithms.tiny import (
     SIZES,
     make_experiment,
@@ -109,8 +110,7 @@ def test_the_number_of_demonstrations_does_not_change_the_graph(network, channel
     learner, _ = build_spatial(network, channels)
     batch = spatial_transitions(learner)[:8]
     learner.compile("default")
-    for _ in range(2):  # eager and compiled
-        learner.compute_losses(batch.copy())
+    learner.compute_losses(batch.copy())
     with torch.compiler.set_stance("fail_on_recompile"):
         for experts, held in ((0, 8), (3, 5), (8, 0)):
             for key, count in ((keys.IS_EXPERT, experts), (keys.HOLDING, held)):
@@ -162,8 +162,7 @@ def test_updates_of_a_compiled_loss_equal_those_of_an_eager_learner(algorithm, n
 def test_updates_leave_the_modes_and_are_compiled_once():
     learner = build("sac", "cnn", **SACFD)
     learner.compile("default")
-    for _ in range(2):  # eager and compiled
-        learner.update()
+    learner.update()
     with torch.compiler.set_stance("fail_on_recompile"):
         for mode in (ExplorationType.RANDOM, None):
             with set_exploration_type(mode), set_recurrent_mode(None):
@@ -236,3 +235,25 @@ def test_a_missing_compiler_is_found_before_the_run(tmp_path):
     ):
         make_experiment(tmp_path / "run", "cnn", {"name": "sac"}, compile_mode="default")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_compiled_run_is_read_without_a_compiler(tmp_path):
+    made = make_experiment(tmp_path, "cnn", {"name": "sac"}, compile_mode="default")
+    with torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",)}):
+        assert read_config(tmp_path / "run").compile_mode == made.config.compile_mode
+
+
+@pytest.mark.usefixtures("eager_backend")
+def test_the_first_update_draws_the_random_numbers_of_a_later_one():
+    """A resumed run compiles the loss again at its first update."""
+    learner = build("sac", "cnn", **SACFD)
+    learner.compile("default")
+    learner.sample()
+    batch, state = learner.sample(), torch.get_rng_state()
+    first = learner.compute_losses(batch.copy())
+    after = torch.get_rng_state()
+    torch.set_rng_state(state)
+    second = learner.compute_losses(batch.copy())
+    assert torch.equal(torch.get_rng_state(), after)
+    for key, value in second.items():
+        assert torch.equal(first[key], value)

@@ -22,9 +22,14 @@ def test_a_constant_is_computed_once_for_the_same_arguments():
     assert powers(2.0, 3) is first
     assert powers(3.0, 2).tolist() == [1.0, 3.0]
     assert calls == [(2.0, 3), (3.0, 2)]
+    powers(3.0, 3)  # in place of the oldest
+    powers(3.0, 2)
+    assert len(calls) == 3
+    powers(2.0, 3)
+    assert calls[3:] == [(2.0, 3)]
     powers.cache_clear()
     powers(2.0, 3)
-    assert len(calls) == 3
+    assert len(calls) == 5
 
 
 def test_a_constant_of_inference_mode_can_be_used_in_training():

@@ -158,6 +158,10 @@ def test_a_robot_that_moves_holds_or_touches_something_does_not_sleep():
     world.close()
 
 
+def interrupt():
+    raise KeyboardInterrupt
+
+
 def interrupt_settle(world, after_step):
     """Raise an exception after a physics step of `World.settle`."""
     step = world.step
@@ -165,7 +169,7 @@ def interrupt_settle(world, after_step):
     def interrupted_step():
         step()
         if world.steps == after_step:
-            raise KeyboardInterrupt
+            interrupt()
 
     world.step = interrupted_step
     with pytest.raises(KeyboardInterrupt):
@@ -185,18 +189,24 @@ def test_an_interrupted_settle_leaves_the_robot_awake():
 
 def test_a_state_restored_after_an_interrupted_settle_continues_as_before_it():
     played = []
-    for is_interrupted in (False, True):
+    for interrupts in (0, 1, 2):
         world, robot, bodies = make_world("kuka", sleeps=True)
         world.seal()
-        if is_interrupted:
+        if interrupts:
             drop(bodies)
+            (sleeper,) = world.sleepers
+            if interrupts == 2:  # the second one as the robot is woken
+                sleeper.set_asleep = lambda is_asleep, sleeper=sleeper: (
+                    RobotSleep.set_asleep(sleeper, True) if is_asleep else interrupt()
+                )
             interrupt_settle(world, after_step=10)
+            vars(sleeper).pop("set_asleep", None)
         world.restore_pristine()
         robot.command([q + 0.01 for q in robot.home_joints])
         world.step()
         played.append(robot.measured_joints())
         world.close()
-    assert played[0] == played[1]
+    assert played[0] == played[1] == played[2]
 
 
 @pytest.mark.parametrize("fast_mode", [True, False])
