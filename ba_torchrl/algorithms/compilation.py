@@ -49,9 +49,8 @@ class CompiledLoss:
     """A loss module whose forward and backward pass are compiled at the first call.
 
     Compilation is for the shapes of this call. Before it, a forward pass that is not compiled fills
-    the networks' caches of constants; where it does not need one of them, the second graph that
-    does is compiled when it is needed. The results are copies, since a CUDA graph writes those of
-    the next call to the same memory.
+    the networks' caches of constants. A graph that needs another constant is compiled twice. The
+    results are copies, since a CUDA graph writes those of the next call to the same memory.
 
     Args:
         loss: the module, which is compiled in place.
@@ -68,12 +67,12 @@ class CompiledLoss:
         check_compiler(next(loss.parameters()).device)
         self.loss = loss
         self.mode = mode
-        self._is_first = True
+        self._is_compiled = False
 
     def __call__(self, batch: TensorDictBase) -> TensorDict:
         """Return the losses and diagnostics of a batch, into which the loss writes priorities."""
-        if self._is_first:
-            self._is_first = False
+        if not self._is_compiled:
+            self._is_compiled = True
             device = next(self.loss.parameters()).device
             with torch.random.fork_rng([device] if device.type == "cuda" else []):
                 self.loss(batch.copy())
