@@ -26,12 +26,18 @@ def check_compiler(device: torch.device) -> None:
         ConfigError: it has none.
     """
     if device.type == "cuda":  # Triton compiles the code that starts its kernels
-        if not (os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")):
-            raise ConfigError(
-                "compile_mode: this needs a C compiler (Debian: apt install gcc); install one, or "
-                "leave compile_mode out"
-            )
-        return
+        language, package = "C", "gcc"
+        is_found = bool(os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang"))
+    else:
+        language, package, is_found = "C++", "g++", _has_cpp_compiler()
+    if not is_found:
+        raise ConfigError(
+            f"compile_mode: this needs a {language} compiler (Debian: apt install {package}); "
+            "install one, or leave compile_mode out"
+        )
+
+
+def _has_cpp_compiler() -> bool:
     # a slow import, needed by compiled runs only
     from torch._inductor.cpp_builder import get_cpp_compiler
     from torch._inductor.exc import InvalidCxxCompiler
@@ -39,10 +45,8 @@ def check_compiler(device: torch.device) -> None:
     try:
         get_cpp_compiler()
     except InvalidCxxCompiler:
-        raise ConfigError(
-            "compile_mode: this needs a C++ compiler (Debian: apt install g++); install one, or "
-            "leave compile_mode out"
-        ) from None
+        return False
+    return True
 
 
 class CompiledLoss:

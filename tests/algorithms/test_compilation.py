@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from torchrl.modules import recurrent_mode, set_recurrent_mode
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.algorithms.compilation import CompiledLoss
+from ba_torchrl.algorithms.compilation import CompiledLoss, check_compiler
 from ba_torchrl.config import parse
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -235,6 +235,15 @@ def test_a_missing_compiler_is_found_before_the_run(tmp_path):
     ):
         make_experiment(tmp_path / "run", "cnn", {"name": "sac"}, compile_mode="default")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_gpu_needs_a_c_compiler(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CC", raising=False)
+    with pytest.raises(ConfigError, match="compile_mode: .* C compiler"):
+        check_compiler(torch.device("cuda"))
+    monkeypatch.setenv("CC", "some-compiler")
+    check_compiler(torch.device("cuda"))
 
 
 def test_a_compiled_run_is_read_without_a_compiler(tmp_path):
