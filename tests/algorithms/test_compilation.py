@@ -240,7 +240,7 @@ def test_a_missing_compiler_is_found_before_the_run(tmp_path):
 def test_a_gpu_needs_a_c_compiler(monkeypatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)
-    with pytest.raises(ConfigError, match="compile_mode: .* C compiler"):
+    with pytest.raises(ConfigError, match=r"compile_mode: .* C compiler"):
         check_compiler(torch.device("cuda"))
     monkeypatch.setenv("CC", "some-compiler")
     check_compiler(torch.device("cuda"))
