@@ -117,7 +117,7 @@ def test_imports_go_one_way(module):
 
 
 SIM = (
-    {"geometry", "display", "model_files"},
+    {"geometry", "display", "model_files", "snapshots"},
     {"activation", "contacts", "meshes"},
     {"mesh_lists"},
     {"shapes"},

@@ -16,6 +16,7 @@ from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.checks import checked_action
+from ba_torchrl.envs.copying import CopiesWithState
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_observation
 from ba_torchrl.envs.images import ImageSpec
@@ -34,7 +35,7 @@ from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torchrl.envs")
 
 
-class ManipulationEnv(EnvBase):
+class ManipulationEnv(CopiesWithState, EnvBase):
     """A manipulation task as an unbatched TorchRL environment on the CPU.
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any
@@ -74,7 +75,8 @@ class ManipulationEnv(EnvBase):
         low, high = config.object_scale_range or self.task_class.scale_range
         scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._episodes = Episodes(scales, self._build_scene, self._place_robot)
-        self._identity = object()
+        self.identity = object()
+        """Marks the states of this environment."""
         self._observation: dict[str, torch.Tensor] = {}
         self._observations = enabled_observations(config, self.workspace)
         self._memory: dict[str, Any] = {}  # of observations; it is replaced, never modified
@@ -175,7 +177,7 @@ class ManipulationEnv(EnvBase):
     def conditions(self) -> dict[str, bool]:
         """The task's named conditions of success, such as ``is_grasped``; see `Task.evaluate`.
 
-        Empty after a simulator fault.
+        All are False after a simulator fault.
         """
         if self._conditions is None:
             self._conditions = self.scene.task.conditions()
@@ -206,7 +208,7 @@ class ManipulationEnv(EnvBase):
         """
         scene = self.scene
         return EnvState(
-            owner=self._identity,
+            owner=self.identity,
             scale=self._episodes.scale(),
             scene=scene.get_state(),
             observation=self._observation,
@@ -231,7 +233,7 @@ class ManipulationEnv(EnvBase):
             SimulationError: the state is of another environment, or of a world that was closed
                 after a fault.
         """
-        if state.owner is not self._identity:
+        if state.owner is not self.identity:
             raise SimulationError("the state is of another environment")
         self._episodes.scene = self._episodes.scene_for(state.scale)
         self.scene.set_state(state.scene)
@@ -277,7 +279,7 @@ class ManipulationEnv(EnvBase):
             success = valid and all(self._conditions.values())
             self._observation = self._observe(scene)
         except Exception:
-            fault, self._conditions = True, {}
+            fault, self._conditions = True, dict.fromkeys(self._condition_names, False)
             self._on_fault()
         else:
             self._fault_counter.count_step()
@@ -310,7 +312,7 @@ class ManipulationEnv(EnvBase):
 
     def _make_specs(self) -> None:
         def flag() -> Binary:
-            return Binary(n=1, shape=(1,), dtype=torch.bool)
+            return Binary(1, device="cpu", dtype=torch.bool)
 
         action = self._make_action_spec()
         images = self._declare_images() if self.config.obs_type == "pixel" else {}
@@ -318,20 +320,17 @@ class ManipulationEnv(EnvBase):
         """Declaration of each image that is observed, by key."""
         seen = {key: image.to_tensor_spec() for key, image in self.images.items()}
         largest = self._episodes.largest_scene
-        general = {
-            keys.HOLDING: flag(),
-            keys.SUCCESS: flag(),
-            keys.FAULT: flag(),
-            keys.STEP_COUNT: Unbounded(shape=(1,), dtype=torch.int64),
-        }
+        general = {key: flag() for key in (keys.HOLDING, keys.SUCCESS, keys.FAULT)}
+        general[keys.STEP_COUNT] = Unbounded((1,), device="cpu", dtype=torch.int64)
         if self.config.expert:
             general[keys.EXPERT_ACTION] = action.clone()
         extras = (extra.specs(largest) for extra in self._observations)
-        self.observation_spec = Composite(merge_entries([seen, *extras, general]))
+        self.observation_spec = Composite(merge_entries([seen, *extras, general]), device="cpu")
         self.action_spec = action
-        self.reward_spec = Bounded(0.0, 1.0, shape=(1,), dtype=torch.float32)
+        # unbounded, since TorchRL's transforms of rewards take no other specification
+        self.reward_spec = Unbounded((1,), device="cpu", dtype=torch.float32)
         self.full_done_spec = Composite(
-            {key: flag() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
+            {key: flag() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}, device="cpu"
         )
 
     def _check_feasible(self) -> None:
@@ -342,6 +341,7 @@ class ManipulationEnv(EnvBase):
             self._episodes.check_starts()
         except PlacementError as error:
             raise ConfigError(f"{self.task_id}: {error}") from None
+        self._condition_names = tuple(largest.task.conditions())
 
     def _build_scene(self, scale: float, **changes: Any) -> Scene:
         return build_scene(
@@ -355,7 +355,7 @@ class ManipulationEnv(EnvBase):
         )
 
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
-        observation = {keys.HOLDING: torch.tensor([self._is_holding(scene)])}
+        observation = {keys.HOLDING: torch.tensor([self._is_holding(scene)], device="cpu")}
         if self.config.obs_type == "pixel":
             for key, image in self._images(scene).items():
                 observation[key] = torch.from_numpy(image.astype(np.float32))
@@ -375,10 +375,10 @@ class ManipulationEnv(EnvBase):
         **ends: bool,
     ) -> TensorDict:
         out = {key: value.clone() for key, value in observation.items()}
-        out[keys.STEP_COUNT] = torch.tensor([self._step_count])
+        out[keys.STEP_COUNT] = torch.tensor([self._step_count], device="cpu")
         if reward is not None:
-            out[keys.REWARD] = torch.tensor([reward])
-        flags = torch.tensor([[ends.get(key, False)] for key in keys.STEP_FLAGS])
+            out[keys.REWARD] = torch.tensor([reward], device="cpu", dtype=torch.float32)
+        flags = torch.tensor([[ends.get(key, False)] for key in keys.STEP_FLAGS], device="cpu")
         out |= zip(keys.STEP_FLAGS, flags.unbind(), strict=True)
         return TensorDict(out, batch_size=[], device=self.device)
 

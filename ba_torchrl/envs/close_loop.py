@@ -65,7 +65,7 @@ class CloseLoopEnv(RecordedPosition, ManipulationEnv):
         return self.workspace.z
 
     def _make_action_spec(self) -> Bounded:
-        return Bounded(-1.0, 1.0, shape=(self.actions.size,), dtype=torch.float32)
+        return Bounded(-1.0, 1.0, (self.actions.size,), device="cpu", dtype=torch.float32)
 
     def _declare_images(self) -> dict[str, ImageSpec]:
         low, high = self._view.range_m(self._view_setup)

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
-from ba_torchrl.envs.observations import OBSERVATIONS
+from ba_torchrl.envs.copying import registering_modules
 from ba_torchrl.envs.settings import parse_env_config
 from ba_torchrl.envs.vector.make import make_vector_env, processes_save_time
 from ba_torchrl.plugins import (
@@ -20,7 +20,6 @@ from ba_torchrl.plugins import (
     import_modules,
     module_names,
 )
-from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 
 
@@ -96,13 +95,10 @@ def _plugins_of(task: str, settings: EnvConfig) -> tuple[str, ...]:
         ConfigError: one of them is defined where no other process can import it.
     """
     modules = []
-    needed = [(TASKS, task), (ROBOTS, settings.robot)]
-    needed += [(OBSERVATIONS, name) for name in settings.observations]
-    for registry, name in needed:
-        module = registry.plugin_module(name)
+    for registry, name, module in registering_modules(task, settings):
         if module in MAIN:
             check_spawned_process_knows(registry.kind, name)
-        elif module is not None:
+        else:
             modules.append(module)
     return tuple(modules)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import gymnasium
 import numpy as np
@@ -113,6 +114,9 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         """Close the simulator; further calls have no effect."""
         self.torchrl_env.close(raise_if_closed=False)
 
+    def __copy__(self) -> Self:
+        return copy.deepcopy(self)  # both would step the same simulator
+
     def _split(self, state: TensorDictBase) -> tuple[Observation, dict[str, Any]]:
         """Return the observation and the info of a state of the TorchRL environment."""
         observation = {
@@ -148,7 +152,7 @@ def space_of(spec: TensorSpec) -> spaces.Space:
 
 
 def _numpy_dtype(spec: TensorSpec) -> np.dtype:
-    return torch.empty(0, dtype=spec.dtype).numpy().dtype
+    return torch.empty(0, device="cpu", dtype=spec.dtype).numpy().dtype
 
 
 def _as_tensordict(action: Any) -> TensorDict:

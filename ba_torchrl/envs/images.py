@@ -57,7 +57,7 @@ class ImageSpec:
 
     def to_tensor_spec(self) -> Bounded:
         """Return the image's TorchRL specification."""
-        return Bounded(self.low, self.high, shape=self.shape, dtype=self.dtype)
+        return Bounded(self.low, self.high, self.shape, device="cpu", dtype=self.dtype)
 
     def reverse_axes(self, images: Tensor, axes: str) -> Tensor:
         """Return images in the gripper's axes with some of these axes reversed.

@@ -103,7 +103,7 @@ class PoseVector(Observation):
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specification of the vector."""
         length = 1 + 4 * (1 + len(scene.task.landmarks))
-        return {keys.OBSERVATION: Unbounded(shape=(length,), dtype=torch.float32)}
+        return {keys.OBSERVATION: Unbounded((length,), device="cpu", dtype=torch.float32)}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the vector, positions scaled to [-1, 1] by the workspace."""
@@ -115,7 +115,7 @@ class PoseVector(Observation):
                 for value, (low, high) in zip(position, axes, strict=True)
             ]
             values.append(yaw / math.pi)
-        return {keys.OBSERVATION: torch.tensor(values, dtype=torch.float64).to(torch.float32)}
+        return {keys.OBSERVATION: torch.from_numpy(np.array(values, dtype=np.float32))}
 
 
 @OBSERVATIONS.register("rgb")
@@ -151,7 +151,7 @@ class PointCloud(Observation):
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specification of the points."""
         shape = (self.config.point_cloud, 3)
-        return {keys.POINT_CLOUD: Unbounded(shape=shape, dtype=torch.float32)}
+        return {keys.POINT_CLOUD: Unbounded(shape, device="cpu", dtype=torch.float32)}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the points, metres."""

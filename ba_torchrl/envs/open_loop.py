@@ -107,17 +107,17 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         return floor + 0.01, floor + PickPlaceLimits().approach_distance_m + 0.01
 
     def _make_action_spec(self) -> Bounded:
-        low, high = zip(*self.actions.ranges, strict=True)
-        return Bounded(
-            torch.tensor(low), torch.tensor(high), shape=(self.actions.size,), dtype=torch.float32
-        )
+        low, high = torch.from_numpy(np.array(self.actions.ranges, dtype=np.float32).T)
+        return Bounded(low, high, (self.actions.size,), device="cpu", dtype=torch.float32)
 
     def _make_specs(self) -> None:
         super()._make_specs()
         if self.config.deconstruct:
             undo = {
-                keys.UNDO_ACTION: Unbounded(shape=self.action_spec.shape, dtype=torch.float32),
-                keys.CAN_UNDO: Binary(n=1, shape=(1,), dtype=torch.bool),
+                keys.UNDO_ACTION: Unbounded(
+                    self.action_spec.shape, device="cpu", dtype=torch.float32
+                ),
+                keys.CAN_UNDO: Binary(1, device="cpu", dtype=torch.bool),
             }
             if self.config.obs_type == "pixel":
                 undo[keys.UNDO_IN_HAND] = self.observation_spec[keys.IN_HAND].clone()
@@ -178,10 +178,9 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         observation = super()._observe(scene)
         if self.config.deconstruct:
             undo, image = self._memory.get("undo", (None, None))
-            observation[keys.CAN_UNDO] = torch.tensor([undo is not None])
-            observation[keys.UNDO_ACTION] = torch.zeros(self.actions.size)
-            if undo is not None:
-                observation[keys.UNDO_ACTION] = torch.from_numpy(undo)
+            observation[keys.CAN_UNDO] = torch.tensor([undo is not None], device="cpu")
+            action = np.zeros(self.actions.size, dtype=np.float32) if undo is None else undo
+            observation[keys.UNDO_ACTION] = torch.from_numpy(action)
             if self.config.obs_type == "pixel":
                 observation[keys.UNDO_IN_HAND] = torch.zeros_like(observation[keys.IN_HAND])
                 if image is not None:

@@ -13,8 +13,9 @@ from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.shapes import Decal
+from ba_torchrl.sim.snapshots import PortableSnapshot, Snapshot
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.sim.world import FINE_PHYSICS, Physics, Snapshot, World
+from ba_torchrl.sim.world import FINE_PHYSICS, Physics, World
 from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
 from ba_torchrl.tasks.clutter.tray import Tray
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
@@ -41,7 +42,7 @@ class Controller(Protocol):
 class SceneState:
     """The full state of a scene."""
 
-    world: Snapshot
+    world: Snapshot | PortableSnapshot
     robot: Any
     controller: Any
     task: Any

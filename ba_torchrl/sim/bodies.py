@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from typing import NoReturn
 
 import numpy as np
 import pybullet
@@ -76,6 +77,9 @@ class Body:
 
     def __repr__(self) -> str:
         return f"Body({self.name!r})"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(f"{self!r} cannot be copied without its world: copy the environment")
 
     @property
     def is_static(self) -> bool:

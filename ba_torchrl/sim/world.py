@@ -6,7 +6,7 @@ import contextlib
 import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import NoReturn, Protocol, Self
 
 import pybullet
 import pybullet_data
@@ -18,6 +18,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.display import connect_window
 from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.shapes import Color, Shape
+from ba_torchrl.sim.snapshots import PortableSnapshot, Snapshot
 
 MAX_CLIENTS = 1024
 """Number of worlds that a process can have, a limit of PyBullet."""
@@ -58,21 +59,6 @@ class Sleeper(Protocol):
 
     def set_asleep(self, is_asleep: bool) -> None:
         """Set whether it is simulated, from the end of the next step on."""
-
-
-class Snapshot:
-    """A state of a world in PyBullet's memory, freed when this object is deleted.
-
-    Args:
-        client: PyBullet's client id.
-        connection: finalizer of the world that owns the client.
-    """
-
-    def __init__(self, client: int, connection: weakref.finalize) -> None:
-        self.client = client
-        self.connection = connection
-        self.id = pybullet.saveState(physicsClientId=client)
-        weakref.finalize(self, _remove_state, self.id, client, connection)
 
 
 class World:
@@ -209,8 +195,15 @@ class World:
         self.restore(snapshot)
         return snapshot
 
-    def restore(self, snapshot: Snapshot) -> None:
-        """Restore a snapshot of this world; the caller must repeat the motor commands.
+    def portable_snapshot(self) -> PortableSnapshot:
+        """Return the present state in a form that another world with the same bodies can restore.
+
+        The trajectory of that world equals the one of this world after a `snapshot` that follows.
+        """
+        return PortableSnapshot.of(self.client)
+
+    def restore(self, snapshot: Snapshot | PortableSnapshot) -> None:
+        """Restore a snapshot; the caller must repeat the motor commands.
 
         Raises:
             SimulationError: the snapshot belongs to another or a closed world.
@@ -218,15 +211,16 @@ class World:
         """
         self._check_not_fixed()
         # PyBullet reuses client ids, so that the connection identifies the world
-        if snapshot.connection is not self._disconnect or self.is_closed:
+        is_foreign = isinstance(snapshot, Snapshot) and snapshot.connection is not self._disconnect
+        if is_foreign or self.is_closed:
             raise SimulationError(
                 "the snapshot belongs to another world: its own was closed or rebuilt"
             )
         self._wake_all()
         # the first call restores the poses at which the pairs are rebuilt, the second all the rest
-        pybullet.restoreState(snapshot.id, physicsClientId=self.client)
+        snapshot.load(self.client)
         self._rebuild_collision_pairs()
-        pybullet.restoreState(snapshot.id, physicsClientId=self.client)
+        snapshot.load(self.client)
         for body in self.bodies:
             body.apply_activity()
 
@@ -314,6 +308,9 @@ class World:
         """Whether the client is disconnected."""
         return not self._disconnect.alive
 
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("a world cannot be copied: copy the environment, or use its get_state")
+
     def __enter__(self) -> Self:
         return self
 
@@ -385,11 +382,6 @@ def _enable_collisions(client: int, body: int, is_static: bool) -> None:
 def count_clients() -> int:
     """Return the number of open connections to PyBullet in this process."""
     return sum(map(pybullet.isConnected, range(MAX_CLIENTS)))
-
-
-def _remove_state(state: int, client: int, connection: weakref.finalize) -> None:
-    if connection.alive:  # otherwise the client id may already belong to another world
-        pybullet.removeState(state, physicsClientId=client)
 
 
 def _disconnect(client: int) -> None:

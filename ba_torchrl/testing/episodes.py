@@ -51,7 +51,7 @@ def play_expert(env: ManipulationEnv, episodes: int) -> list[TensorDict]:
 def action_at(env: ManipulationEnv, fractions: Sequence[float]) -> torch.Tensor:
     """Return the action at fractions, 0 to 1, of the components' ranges; they are cycled."""
     low, high = env.action_spec.space.low, env.action_spec.space.high
-    place = torch.tensor([fractions[i % len(fractions)] for i in range(len(low))])
+    place = torch.tensor([fractions[i % len(fractions)] for i in range(len(low))]).to(low)
     return low + place * (high - low)
 
 

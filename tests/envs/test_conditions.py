@@ -1,6 +1,7 @@
 """The named conditions of success, their conjunction, and their entries in Gymnasium's info."""
 
 import gymnasium
+import pybullet
 import pytest
 import torch
 
@@ -13,6 +14,7 @@ from ba_torchrl.tasks.close_loop.block_picking import BlockPicking
 def test_success_is_the_conjunction_of_the_conditions(task):
     env = ba_torchrl.make(task, seed=3, obs_size=32, expert=True)
     state = env.reset()
+    names = env.conditions.keys()
     assert not all(env.conditions.values())
     seen = []
     for _ in range(env.max_steps):
@@ -21,12 +23,17 @@ def test_success_is_the_conjunction_of_the_conditions(task):
         assert all(
             name.startswith("is_") and type(holds) is bool for name, holds in conditions.items()
         )
+        assert conditions.keys() == names
         assert bool(state[keys.SUCCESS]) == (env.scene.task.is_valid() and all(conditions.values()))
         seen.append(tuple(conditions.values()))
         if state[keys.DONE]:
             break
     assert bool(state[keys.SUCCESS])
     assert all(seen[-1])
+    state = env.reset()
+    pybullet.disconnect(physicsClientId=env.scene.world.client)
+    assert env.step(state.set(keys.ACTION, env.action_spec.zero()))[keys.NEXT][keys.FAULT]
+    assert env.conditions == dict.fromkeys(names, False)
     env.close()
 
 

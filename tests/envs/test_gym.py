@@ -195,12 +195,16 @@ def test_a_simulator_fault_truncates_and_is_in_info(make, monkeypatch, caplog):
     def fail(*_):
         raise RuntimeError("the solver exploded")
 
-    env = make()
-    env.reset()
+    env = make(expert=True)
+    _, expected = env.reset()
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
         patch.setattr(env.unwrapped.torchrl_env.scene.controller, "move_to", fail)
         _, reward, terminated, truncated, info = env.step(NOTHING)
     assert (reward, terminated, truncated, info["fault"]) == (0.0, False, True, True)
+    assert {key: type(value) for key, value in info.items()} == {
+        key: type(value) for key, value in expected.items()
+    }
+    assert not info["is_grasped"]
     env.reset()
     assert not env.step(NOTHING)[-1]["fault"]
 

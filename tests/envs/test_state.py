@@ -1,10 +1,32 @@
 """get_state and set_state: the same state and the same actions give the same steps."""
 
+import copy
+import pickle
+import subprocess
+import sys
+
+import gymnasium
+import pybullet
 import pytest
 import torch
 
 import ba_torchrl
 from ba_torchrl.errors import SimulationError
+
+COPIED = [
+    "bump/box_palletizing",
+    "close_loop/block_in_bowl",
+    "close_loop/drawer_opening",
+    "close_loop/object_grasping",
+    "open_loop/bin_packing",
+    "open_loop/covid_test",
+    "ramp/improvise_house_building_3",
+]
+COPIES = {
+    "copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+}
 
 
 def play(env, state, actions):
@@ -176,4 +198,154 @@ def test_deleted_states_free_their_memory():
     del kept
     with pytest.raises(pybullet.error):
         pybullet.restoreState(number, physicsClientId=client)
+    env.close()
+
+
+# -- copies ----------------------------------------------------------------------------------
+
+
+def assert_independent_and_equal(env, other, state, steps):
+    """Step a copy alone, which must not move the original, then the original with its actions."""
+    poses = [body.pose for body in env.scene.world.bodies]
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    generator = torch.Generator().manual_seed(0)
+    taken, there = [], state.clone()
+    for number in range(steps):
+        action = there["expert_action"].clone()
+        if number % 3 == 0:
+            action = torch.rand(len(low), generator=generator) * (high - low) + low
+        following = other.step(there.set("action", action))["next"]
+        taken.append((action, following.clone()))
+        there = other.reset() if following["done"] else following
+    ends = [body.pose for body in other.scene.world.bodies]
+    assert [body.pose for body in env.scene.world.bodies] == poses
+    here = state.clone()
+    for action, expected in taken:
+        following = env.step(here.set("action", action))["next"]
+        assert set(following.keys()) == set(expected.keys())
+        assert all(torch.equal(following[key], expected[key]) for key in expected.keys())  # noqa: SIM118
+        here = env.reset() if following["done"] else following
+    assert [body.pose for body in env.scene.world.bodies] == ends
+    assert env.conditions == other.conditions
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        task if task in COPIED else pytest.param(task, marks=pytest.mark.slow)
+        for task in ba_torchrl.list_tasks()
+    ],
+)
+def test_a_copy_is_an_independent_environment_in_the_same_state(task):
+    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=50)
+    for before, make_copy in zip((2, 3, 5), COPIES.values(), strict=True):
+        state = expert_steps(env, env.reset(), before)
+        other = make_copy(env)
+        assert other.scene.world.client != env.scene.world.client
+        assert_independent_and_equal(env, other, state, 8)
+        other.close()
+    env.close()
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_copies_without_a_scene_play_the_same_episodes(name):
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=32)  # with a random seed
+    other = COPIES[name](env)
+    assert torch.equal(env.reset()["pixels"], other.reset()["pixels"])
+    env.step(env.reset().set("action", torch.zeros(5)))
+    env.close()
+    last = COPIES[name](env)
+    other.reset()
+    first = env.reset()["pixels"]
+    for copied in (last, other):
+        assert torch.equal(copied.reset()["pixels"], first)
+        copied.close()
+    env.close()
+
+
+def test_a_copy_after_a_fault_plays_the_next_episode():
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
+    state = env.reset()
+    pybullet.disconnect(physicsClientId=env.scene.world.client)
+    assert env.step(state.set("action", torch.zeros(5)))["next", "fault"]
+    other = copy.deepcopy(env)
+    assert other.conditions == env.conditions
+    assert torch.equal(other.reset()["pixels"], env.reset()["pixels"])
+    env.close()
+    other.close()
+
+
+def test_a_copy_has_the_parameters_of_the_original():
+    config = {"obs_size": 32, "robot": "panda", "object_set": "random", "num_objects": 3}
+    env = ba_torchrl.make("close_loop/object_grasping", seed=3, **config)
+    env.reset()
+    other = copy.deepcopy(env)
+    assert other.config == env.config
+    assert other.base_seed == 3
+    env.close()
+    other.close()
+
+
+def test_another_process_continues_a_pickled_environment(tmp_path):
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
+    state = expert_steps(env, env.reset(), 4)
+    (tmp_path / "env.pickle").write_bytes(pickle.dumps((env, state)))
+    code = (
+        "import pathlib, pickle, sys; folder = pathlib.Path(sys.argv[1])\n"
+        "env, state = pickle.loads((folder / 'env.pickle').read_bytes())\n"
+        "following = env.step(state.set('action', state['expert_action']))['next']\n"
+        "(folder / 'next.pickle').write_bytes(pickle.dumps(following))"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
+    there = pickle.loads((tmp_path / "next.pickle").read_bytes())
+    here = env.step(state.set("action", state["expert_action"]))["next"]
+    assert (here == there).all()
+    env.close()
+
+
+@pytest.mark.parametrize("name", ["copy", "deepcopy"])
+def test_a_copy_of_a_gymnasium_environment_is_independent(name):
+    env = gymnasium.make("BulletArm/CloseLoopBlockPicking-v0", obs_size=32).unwrapped
+    env.reset(seed=0)
+    other = COPIES[name](env)
+    down = torch.tensor([1.0, 0.0, 0.0, -1.0, 0.0]).numpy()
+    first = other.step(down)[0]["pixels"]
+    assert (other.step(down)[0]["pixels"] != first).any()
+    assert (env.step(down)[0]["pixels"] == first).all()
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_a_copy_of_a_vector_is_independent(name):
+    options = {"parallel": False, "obs_size": 32, "seed": 0}
+    env = ba_torchrl.make_vector_env("close_loop/block_picking", 2, **options)
+    state = env.reset().set("action", torch.tensor([[1.0, 0.0, 0.0, -1.0, 0.0]] * 2))
+    other = COPIES[name](env)
+    first = other.step(state.clone())["next", "pixels"]
+    other.step(state.clone())
+    assert torch.equal(env.step(state.clone())["next", "pixels"], first)
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_worker_processes_are_not_copied(name, make_fakes):
+    env = make_fakes(2)
+    with pytest.raises(TypeError, match=r"get_positions.*get_state"):
+        COPIES[name](env)
+
+
+def test_parts_of_an_environment_cannot_be_copied():
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
+    pixels = env.reset()["pixels"]
+    state = copy.deepcopy(env.get_state())  # a state never changes: the same one
+    for part in (env.scene, env.scene.world, env.scene.robot, env.scene.task.objects[0]):
+        for make_copy in (copy.deepcopy, pickle.dumps):
+            with pytest.raises(TypeError, match="copy the environment"):
+                make_copy(part)
+    with pytest.raises(TypeError, match="of one process"):
+        pickle.dumps(state)
+    env.step(env.reset().set("action", torch.zeros(5)))
+    assert torch.equal(env.set_state(state)["pixels"], pixels)
     env.close()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self, SupportsIndex
 
 import numpy as np
 from tensordict import TensorDictBase
+from torchrl.envs import ParallelEnv
 
 from ba_torchrl.envs.checks import check_actions
 from ba_torchrl.envs.positions import Position
@@ -49,6 +51,18 @@ class SeededVector:
             WorkerError: a worker has failed.
         """
         raise NotImplementedError
+
+    def __copy__(self) -> Self:
+        return copy.deepcopy(self)  # both would step the same environments
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+        if isinstance(self, ParallelEnv) and not self.is_closed:  # TorchRL would close it
+            raise TypeError(
+                "the processes of a vector cannot be copied: copy one with parallel=False, let "
+                "another vector continue the episodes, other.continue_from(envs.get_positions()), "
+                "or use get_state and set_state of a single environment"
+            )
+        return super().__reduce_ex__(protocol)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any

@@ -86,13 +86,15 @@ class CloseLoopController:
         self._target_opening = opening
         self._grasp = None
 
-    def get_state(self) -> tuple[float, FirmGrasp | None]:
-        """Return the target opening of the last `grip`, and the grasp that has been tested."""
-        return self._target_opening, self._grasp
+    def get_state(self) -> tuple[float, int | None, Pose | None]:
+        """Return the target opening of `grip`, and index and pose of the body of `FirmGrasp`."""
+        body, pose = self._grasp or (None, None)
+        return self._target_opening, None if body is None else self.world.bodies.index(body), pose
 
-    def set_state(self, state: tuple[float, FirmGrasp | None]) -> None:
-        """Restore a state of `get_state`."""
-        self._target_opening, self._grasp = state
+    def set_state(self, state: tuple[float, int | None, Pose | None]) -> None:
+        """Restore the state of `get_state`, of a world with the same bodies."""
+        self._target_opening, index, pose = state
+        self._grasp = None if index is None else FirmGrasp(self.world.bodies[index], pose)
 
     def move_to(self, position: Vector, yaw_rad: float) -> None:
         """Move the tool along a straight line to a pose.

@@ -170,7 +170,7 @@ def test_a_reset_forgets_the_grasp():
     with Scene() as scene:
         scene.lift()
         scene.controller.reset(((0.45, -0.1, HEIGHT_M), 0.0), opening=0.0)
-        assert scene.controller.get_state() == (0.0, None)
+        assert scene.controller.get_state() == (0.0, None, None)
 
 
 def test_the_end_of_a_held_bar_does_not_pass_through_a_wall():

@@ -1,0 +1,140 @@
+"""TorchRL's transforms of images, vectors, rewards, counts and actions, on both controls.
+
+Those that need torchvision (Crop, CenterCrop, Resize) are left out.
+"""
+
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+from torchrl.envs import transforms as tr
+from torchrl.envs.utils import check_env_specs
+
+import ba_torchrl
+from ba_torchrl.envs import keys
+
+TASKS = {"close_loop/block_reaching": {}, "open_loop/block_stacking": {"num_objects": 2}}
+
+OF_IMAGES = {
+    "CatFrames": lambda: tr.CatFrames(3, dim=-3, in_keys=["pixels"]),
+    "ClipTransform": lambda: tr.ClipTransform(in_keys=["pixels"], low=0.0, high=0.1),
+    "DTypeCastTransform": lambda: tr.DTypeCastTransform(
+        torch.float32, torch.float64, in_keys=["pixels", "reward"]
+    ),
+    "FlattenObservation": lambda: tr.FlattenObservation(-3, -1, in_keys=["pixels"]),
+    "GrayScale": lambda: tr.Compose(
+        tr.ToTensorImage(in_keys=["rgb"], shape_tolerant=True), tr.GrayScale(in_keys=["rgb"])
+    ),
+    "Hash": lambda: tr.Hash(in_keys=["pixels"], out_keys=["hash"]),
+    "ObservationNorm": lambda: tr.ObservationNorm(0.1, 2.0, in_keys=["pixels"]),
+    "PermuteTransform": lambda: tr.PermuteTransform((-1, -2, -3), in_keys=["pixels"]),
+    "SignTransform": lambda: tr.SignTransform(in_keys=["pixels"]),
+    "SqueezeTransform": lambda: tr.SqueezeTransform(-3, in_keys=["pixels"], in_keys_inv=[]),
+    "TimeMaxPool": lambda: tr.TimeMaxPool(in_keys=["pixels"], T=2),
+    "ToTensorImage": lambda: tr.ToTensorImage(in_keys=["rgb"], shape_tolerant=True),
+    "UnaryTransform": lambda: tr.UnaryTransform(["pixels"], ["doubled"], fn=lambda x: 2 * x),
+    "UnsqueezeTransform": lambda: tr.UnsqueezeTransform(-1, in_keys=["pixels"], in_keys_inv=[]),
+    "VecNormV2": lambda: tr.VecNormV2(in_keys=["pixels"]),
+}
+OF_VECTORS = {
+    "CatFrames": lambda: tr.CatFrames(3, dim=-1, in_keys=["observation"]),
+    "CatTensors": lambda: tr.CatTensors(
+        in_keys=["observation", "expert_action"], out_key="both", del_keys=False
+    ),
+    "ClipTransform": lambda: tr.ClipTransform(in_keys=["observation"], low=0.0, high=0.1),
+    "ObservationNorm": lambda: tr.ObservationNorm(0.1, 2.0, in_keys=["observation"]),
+    "UnsqueezeTransform": lambda: tr.UnsqueezeTransform(
+        -1, in_keys=["observation"], in_keys_inv=[]
+    ),
+    "VecNormV2": lambda: tr.VecNormV2(in_keys=["observation"]),
+}
+OF_REWARDS = {
+    "BinarizeReward": lambda: tr.BinarizeReward(),
+    "LineariseRewards": lambda: tr.LineariseRewards(in_keys=["reward"]),
+    "RewardClipping": lambda: tr.RewardClipping(-0.5, 0.5),
+    "RewardScaling": lambda: tr.RewardScaling(loc=-1.0, scale=10.0),
+    "RewardScaling, normal": lambda: tr.RewardScaling(0.5, 2.0, standard_normal=True),
+    "RewardSum": lambda: tr.RewardSum(),
+    "SignTransform": lambda: tr.SignTransform(in_keys=["reward"]),
+    "SuccessReward": lambda: tr.SuccessReward(),
+    "TargetReturn": lambda: tr.TargetReturn(1.0),
+    "VecNormV2": lambda: tr.VecNormV2(in_keys=["reward"]),
+}
+OF_COUNTS_AND_ACTIONS = {
+    "ActionDiscretizer": lambda: tr.ActionDiscretizer(3),
+    "ActionScaling": lambda: tr.ActionScaling(),
+    "DeviceCastTransform": lambda: tr.DeviceCastTransform("cpu"),
+    "ExcludeTransform": lambda: tr.ExcludeTransform("holding"),
+    "FiniteTensorDictCheck": lambda: tr.FiniteTensorDictCheck(),
+    "FlattenAction": lambda: tr.FlattenAction(-1, -1),
+    "FrameSkipTransform": lambda: tr.FrameSkipTransform(2),
+    "InitTracker": lambda: tr.InitTracker(),
+    "MultiAction": lambda: tr.MultiAction(),
+    "NoopResetEnv": lambda: tr.NoopResetEnv(2),
+    "RandomTruncationTransform": lambda: tr.RandomTruncationTransform(1, 3),
+    "RenameTransform": lambda: tr.RenameTransform(["pixels"], ["image"]),
+    "SelectTransform": lambda: tr.SelectTransform("pixels"),
+    "StepCounter": lambda: tr.StepCounter(max_steps=2),
+    "StepCounter, other key": lambda: tr.StepCounter(max_steps=2, step_count_key="count"),
+    "TerminateTransform": lambda: tr.TerminateTransform(lambda data: data["fault"]),
+    "Timer": lambda: tr.Timer(),
+    "TrajCounter": lambda: tr.TrajCounter(),
+}
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def pixel_env(request):
+    config = {"obs_size": 16, "seed": 0, "max_steps": 5, "expert": True, **TASKS[request.param]}
+    env = ba_torchrl.make(request.param, rgb=True, **config)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def vector_env(request):
+    config = {"obs_type": "vec", "seed": 0, "max_steps": 5, "expert": True, **TASKS[request.param]}
+    env = ba_torchrl.make(request.param, **config)
+    yield env
+    env.close()
+
+
+def check(env, transform):
+    transformed = TransformedEnv(env, transform)
+    check_env_specs(transformed, break_when_any_done="both", seed=0)
+    return transformed
+
+
+@pytest.mark.parametrize("name", OF_IMAGES)
+def test_images_can_be_transformed(pixel_env, name):
+    check(pixel_env, OF_IMAGES[name]())
+
+
+@pytest.mark.parametrize("name", OF_VECTORS)
+def test_vectors_can_be_transformed(vector_env, name):
+    check(vector_env, OF_VECTORS[name]())
+
+
+@pytest.mark.parametrize("name", OF_REWARDS)
+def test_rewards_can_be_transformed(pixel_env, name):
+    check(pixel_env, OF_REWARDS[name]())
+
+
+@pytest.mark.parametrize("name", OF_COUNTS_AND_ACTIONS)
+def test_counts_and_actions_can_be_transformed(pixel_env, name):
+    check(pixel_env, OF_COUNTS_AND_ACTIONS[name]())
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("RewardClipping", (0.0, 0.5)),
+        ("RewardScaling", (-1.0, 9.0)),
+        ("RewardScaling, normal", (-0.25, 0.25)),
+    ],
+)
+def test_a_transformed_reward_has_the_values_of_its_formula(pixel_env, name, expected):
+    env = check(pixel_env, OF_REWARDS[name]())
+    pixel_env.set_seed(0)
+    episode = env.rollout(5, lambda td: td.set(keys.ACTION, td[keys.EXPERT_ACTION]))
+    assert episode["next", keys.SUCCESS][-1]
+    rewards = episode["next", keys.REWARD].flatten().tolist()
+    assert rewards == pytest.approx([expected[0]] * (len(rewards) - 1) + [expected[1]])
