@@ -154,6 +154,7 @@ def test_algorithms_have_their_own_values_in_every_quick_start(name, algorithm):
 def test_the_open_loop_quick_start_composes():
     config = experiment("quickstart_open_loop", "seed=1")
     assert config.task == "open_loop/block_stacking"
+    assert config.network_config.scene_head == "pool"
     assert config.env_config.num_objects == 3
 
 

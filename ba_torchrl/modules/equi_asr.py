@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -17,7 +19,12 @@ from ba_torchrl.modules.equi_unet import EquivariantPixelValues
 from ba_torchrl.modules.in_hand_encoders import InHandVector
 from ba_torchrl.modules.max_pool import relu_of_max_pool
 from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, require_yaw, select_primitive
+from ba_torchrl.modules.spatial_inputs import (
+    UNET_STRIDE,
+    SpatialImageConfig,
+    require_yaw,
+    select_primitive,
+)
 from ba_torchrl.modules.steerable import (
     SteerableConv2d,
     SteerableLinear,
@@ -58,6 +65,15 @@ _TRUNKS = {
 which exact equivariance under quarter turns requires."""
 
 
+SceneHead = Literal["pool", "flatten"]
+"""How the later levels read the scene feature map: pooled to an invariant vector, or with the
+positions of its features, as in the reference implementation."""
+
+SCENE_COPIES = 2
+"""Copies of each invariant channel in the reference implementation's scene feature map, whose
+later levels then have the 256 input channels of the plain networks."""
+
+
 class InvariantSceneVector(nn.Sequential):
     """A vector that does not change when the scene feature map rotates with the scene.
 
@@ -81,11 +97,33 @@ class InvariantSceneVector(nn.Sequential):
         )
 
 
+class FlattenedSceneVector(nn.Sequential):
+    """A vector of the scene feature map with its positions, which changes when the map rotates.
+
+    Two linear layers on the flattened map, as in the reference implementation.
+
+    Args:
+        channels: of the map.
+        image_size: rows and columns of the heightmap.
+        width: factor on the layers' widths, 1024 and 512.
+    """
+
+    def __init__(self, channels: int, image_size: int, width: float) -> None:
+        wide, narrow = scaled_width(1024, width), scaled_width(512, width)
+        inputs = SCENE_COPIES * channels * (image_size // UNET_STRIDE) ** 2
+        super().__init__(nn.Linear(inputs, wide), nn.ReLU(), nn.Linear(wide, narrow))
+        self.out_features = narrow
+
+    def forward(self, scene: Tensor) -> Tensor:
+        """Return float32 [B, out_features] of a map [B, C, h, w]."""
+        return super().forward(scene.float().repeat(1, SCENE_COPIES, 1, 1).flatten(1))
+
+
 class EquivariantYawValues(nn.Module):
     """Q values of yaws, equivariant under rotations of the patch.
 
-    Invariant vectors of the scene feature map and the in-hand image determine the coefficients of a
-    dynamic filter.
+    Vectors of the scene feature map and the in-hand image determine the coefficients of a dynamic
+    filter. The values are equivariant under rotations of the whole scene if these are invariant.
 
     Args:
         gspace: images and their symmetry group.
@@ -93,7 +131,8 @@ class EquivariantYawValues(nn.Module):
         spec: shapes of the images.
         config: width, precision, units.
         patch_size: rows and columns of the patch.
-        scene_channels: channels of the scene map, each invariant.
+        make_scene: returns the layers from the scene feature map to a vector, with
+            ``out_features``.
 
     Raises:
         ValueError: the patch size is not 24 or 40, or the size of the in-hand image is not
@@ -107,7 +146,7 @@ class EquivariantYawValues(nn.Module):
         spec: SpatialSpec,
         config: SpatialImageConfig,
         patch_size: int,
-        scene_channels: int,
+        make_scene: Callable[[], nn.Module],
     ) -> None:
         super().__init__()
         if patch_size not in _TRUNKS:
@@ -134,9 +173,9 @@ class EquivariantYawValues(nn.Module):
         narrow = scaled_width(512, config.width)
         self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width)
         self.hand_linear = nn.Linear(self.hand.out_features, narrow)
-        self.scene = InvariantSceneVector(scene_channels, config.width)
+        self.scene = make_scene()
         self.apply(initialise_plain)
-        self.coefficients = filter_generator(2 * narrow, self.held)
+        self.coefficients = filter_generator(narrow + self.scene.out_features, self.held)
 
     def forward(self, patch: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
         """Return values [B, yaws].
@@ -159,6 +198,22 @@ class EquivariantYawValues(nn.Module):
         return self.coefficients(F.relu(torch.cat([self.scene(scene), hand], dim=1)))
 
 
+def yaw_scene_vector(
+    head: SceneHead, channels: int, image_size: int, width: float
+) -> InvariantSceneVector | FlattenedSceneVector:
+    """Return the layers from the scene feature map to the vector that the yaw values use.
+
+    Args:
+        head: how the map is read.
+        channels: of the map, each invariant except for the positions.
+        image_size: rows and columns of the heightmap.
+        width: factor on the layers' widths.
+    """
+    if head == "flatten":
+        return FlattenedSceneVector(channels, image_size, width)
+    return InvariantSceneVector(channels, width)
+
+
 @NETWORKS.register("equi_asr")
 class EquiASRConfig(ASRNetworkConfig):
     """Hyper-parameters of the equivariant network that chooses a pixel, then a yaw.
@@ -169,9 +224,13 @@ class EquiASRConfig(ASRNetworkConfig):
     Args:
         group_order: number of rotations of the dihedral group of the pixel values; the default is
             that of the reference implementation.
+        scene_head: how the yaw values read the scene feature map: "pool" keeps them equivariant
+            under rotations of the scene; "flatten", of the reference implementation, keeps the
+            positions of the features, so only the patch's part of the values is equivariant.
     """
 
     group_order: int = Field(default=4, ge=2)
+    scene_head: SceneHead = "pool"
 
     def build(self, spec: SpatialSpec) -> ASR:
         """Return a freshly initialised network.
@@ -188,7 +247,12 @@ class EquiASRConfig(ASRNetworkConfig):
         gspace = planar_rotations_and_flips(self.group_order)
         positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
         gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
-        yaws = EquivariantYawValues(
-            gspace, yaw_repr, spec, self, patch_size, positions.scene_channels
+        scene = partial(
+            yaw_scene_vector,
+            self.scene_head,
+            positions.scene_channels,
+            spec.image_size,
+            self.width,
         )
+        yaws = EquivariantYawValues(gspace, yaw_repr, spec, self, patch_size, scene)
         return ASR(positions, [(PatchView(patch_size), yaws)], levels)

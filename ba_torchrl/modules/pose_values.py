@@ -31,23 +31,27 @@ class SceneMapVector(nn.Module):
         channels: of the map.
         image_size: rows and columns of the heightmap.
         width: factor on the layers' widths, 128, 1024 and 512.
+        copies: number of copies of each channel that the convolution sees.
 
     Raises:
         ValueError: the image is smaller than 32 pixels.
     """
 
-    def __init__(self, channels: int, image_size: int, width: float) -> None:
+    def __init__(self, channels: int, image_size: int, width: float, copies: int = 1) -> None:
         super().__init__()
         side = image_size // UNET_STRIDE // 2
         if side < 1:
             raise ValueError(f"six degrees of freedom need 32 pixels or more, got {image_size}")
         inner, wide, self.out_features = (scaled_width(w, width) for w in (128, 1024, 512))
-        self.conv = CastConv2d(channels, inner, 3, padding=1)
+        self.copies = copies
+        self.conv = CastConv2d(copies * channels, inner, 3, padding=1)
         self.first = nn.Linear(inner * side * side, wide)
         self.second = nn.Linear(wide, self.out_features)
 
     def forward(self, scene: Tensor) -> Tensor:
         """Return float32 [B, out_features] of a map [B, C, h, w]."""
+        if self.copies > 1:
+            scene = scene.repeat(1, self.copies, 1, 1)
         x = relu_of_max_pool(self.conv(scene))
         return self.second(F.relu(self.first(x.flatten(1).float())))
 

@@ -107,6 +107,26 @@ def test_rotating_the_scene_turns_pixels_shifts_yaws_and_keeps_the_other_values(
             assert_different(actual, expected)
 
 
+@pytest.mark.parametrize("trained", [False, True])
+def test_values_of_a_flattened_scene_are_invariant_for_fixed_features_only(trained):
+    network = build(scene_head="flatten")
+    if trained:
+        train(network)
+    *observation, chosen = batch()
+    scene, moved = turned(observation, chosen, 1, 2)
+    with torch.no_grad():
+        _, state = network.first(*observation)
+        _, rotated = network.first(*scene)
+        for level in range(1, 5):
+            expected = network.later(level, state, chosen[:, : level + 1])
+            if level == 1:
+                expected = expected.roll(2, dims=1)
+            fixed = rotated._replace(scene=state.scene)
+            assert_equal(network.later(level, fixed, moved[:, : level + 1]), expected)
+            found = network.later(level, rotated, moved[:, : level + 1])
+            assert (found - expected).abs().max() > 0.01 * spread(expected)
+
+
 def wrapped(observation, chosen):
     """The same poses with the fingers swapped where the yaw has left half a turn."""
     pixels, in_hand, holding = observation

@@ -44,6 +44,7 @@ def count(module):
 # Weights and biases layer by layer, added up by hand.
 SCENE_MAP = (256 * 9 + 1) * 128 + (128 * 16 + 1) * 1024 + 1025 * 512
 SCENE_VECTOR = (256 + 1) * 1024 + 1025 * 512  # maximum and mean of 128 channels
+FLATTENED_SCENE = (256 * 8 * 8 + 1) * 1024 + 1025 * 512
 
 
 def pose_head(channels, last_map, outputs, scene):
@@ -62,8 +63,22 @@ def test_parameter_counts_of_the_plain_heads_match_the_reference(size, last_map,
     ]
     assert [count(head) for head in heads] == expected
     assert all(round(number / 1e6, 1) == pytest.approx(millions, abs=0.05) for number in expected)
-    heads = build("equi_deictic_asr", 128, size, **paper).heads
-    assert {count(head) for head in heads[1:]} == {pose_head(6, last_map, 2, SCENE_VECTOR)}
+
+
+@pytest.mark.parametrize(("size", "last_map", "millions"), [(24, 3, 36.7), (40, 5, 33.8)])
+@pytest.mark.parametrize(
+    ("scene_head", "of_yaws", "of_poses"),
+    [("flatten", FLATTENED_SCENE, SCENE_MAP), ("pool", SCENE_VECTOR, SCENE_VECTOR)],
+)
+def test_parameter_counts_of_the_equivariant_heads(
+    size, last_map, millions, scene_head, of_yaws, of_poses
+):
+    paper = {"width": 1.0, "num_rotations": 16, "num_z": 36, "num_tilts": 7}
+    yaws, *poses = build("equi_deictic_asr", 128, size, **paper, scene_head=scene_head).heads
+    assert {count(head) for head in poses} == {pose_head(6, last_map, 2, of_poses)}
+    assert count(yaws.scene) == of_yaws
+    reference = count(yaws) - of_yaws + FLATTENED_SCENE
+    assert round(reference / 1e6, 1) == millions
 
 
 @pytest.mark.parametrize("half", [True, False])

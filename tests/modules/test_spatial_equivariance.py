@@ -112,6 +112,22 @@ def test_a_quarter_turn_turns_pixels_and_shifts_yaws(name, components, half, fie
 
 
 @pytest.mark.parametrize("trained", [False, True])
+def test_yaws_of_a_flattened_scene_are_equivariant_for_fixed_features_only(trained):
+    network = build("equi_asr", num_rotations=6, scene_head="flatten")
+    if trained:
+        train(network)
+    pixels, in_hand, holding, chosen = batch()
+    with torch.no_grad():
+        state = network.first(pixels, in_hand, holding)[1]
+        expected = network.later(1, state, chosen).roll(3, dims=1)
+        turned = network.first(torch.rot90(pixels, 1, (-2, -1)), in_hand, holding)[1]
+        moved = turned_pixels(chosen, SIZE)
+        assert_equal(network.later(1, turned._replace(scene=state.scene), moved), expected)
+        difference = network.later(1, turned, moved) - expected
+    assert difference.std() > 0.01 * expected.std()  # a hundred times the tolerance
+
+
+@pytest.mark.parametrize("trained", [False, True])
 @pytest.mark.parametrize(("name", "components", "half", "fields"), CASES)
 def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(
     name, components, half, fields, trained

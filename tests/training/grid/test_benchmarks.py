@@ -142,6 +142,8 @@ def test_open_loop_benchmarks_have_the_values_of_the_appendix_or_the_reference(n
         assert len(runs) == 12 * (5 + 3) * 4
         assert {run.env_config.obs_size for run in runs if "rot_fcn" in run.label} == {90}
         assert config.per_network["rot_fcn"] == {"env": {"obs_size": 90}}
+        equi = [run.network_config for run in runs if run.network["name"] == "equi_asr"]
+        assert {network.scene_head for network in equi} == {"flatten"}
         assert config.skips(task=PICK, algorithm="dqn", network="fcn")
         assert not config.skips(task=PICK, algorithm="dqn", network="equi_asr")
         assert not config.skips(task=PICK, algorithm="sdqfd", network="fcn")
@@ -164,6 +166,8 @@ def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_
         assert (network.num_rotations, network.num_z, network.num_tilts) == (16, 36, 7)
         assert (network.min_z_m, network.max_z_m, network.patch_size) == (0.02, 0.20, None)
         assert network.max_tilt_rad == pytest.approx(math.pi / 8)
+        if run.network["name"] == "equi_deictic_asr":
+            assert (network.scene_head, network.swap_fingers) == ("flatten", False)
         assert (algorithm.learning_rate, algorithm.weight_decay) == (1e-4, 1e-5)
         assert (algorithm.gamma, algorithm.batch_size) == (0.95, 16)
     labels = {run.label for run in runs}
