@@ -80,17 +80,11 @@ def test_a_script_trains_and_prints_its_evaluation(run, recorded, capsys):
     ((made, before),) = weights
     changed = [not torch.equal(p, q) for p, q in zip(made.parameters(), before, strict=True)]
     assert sum(changed) > len(changed) / 2
-    is_expert = torch.cat(
-        [part.storage.column(keys.IS_EXPERT) for part in parts(found["replay"]) if len(part)]
-    )
+    is_expert = found["replay"].storage.column(keys.IS_EXPERT)
     assert is_expert.any()
     assert (~is_expert).sum() == 4  # two updates with a step of two environments each
     assert found["explorations"].count(ExplorationType.RANDOM) == 2
     assert ExplorationType.DETERMINISTIC in found["explorations"]
-
-
-def parts(replay):
-    return [replay.expert, replay.online] if hasattr(replay, "expert") else [replay]
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)

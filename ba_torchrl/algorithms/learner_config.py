@@ -52,7 +52,7 @@ class LearnerConfig(AlgorithmConfig):
     replay: ReplayKind = "uniform"
     """Sampling of transitions: "uniform", "prioritized" or "symmetric"."""
     buffer_size: int = Field(default=100_000, ge=1)
-    """Transitions in the replay; in each half of a symmetric one."""
+    """Transitions in the replay, demonstrations and others together."""
     priority_exponent: float = Field(default=0.6, ge=0)
     """Exponent alpha of the priorities of a prioritised replay."""
     importance_exponent: float = Field(default=0.4, ge=0, le=1)
@@ -98,6 +98,5 @@ class LearnerConfig(AlgorithmConfig):
 
     @property
     def collected_capacity(self) -> int:
-        """Number of collected transitions that always fit; a symmetric replay holds as many
-        demonstrations beside them."""
+        """Number of collected transitions that fit if there are no demonstrations."""
         return self.buffer_size

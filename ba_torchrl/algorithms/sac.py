@@ -29,7 +29,6 @@ from ba_torchrl.data.augmentation.views import (
     cropped_images,
 )
 from ba_torchrl.data.episode_assembler import EpisodeAssembler
-from ba_torchrl.data.replay.symmetric import count_demonstrations
 from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
@@ -305,7 +304,7 @@ class SAC(Learner):
             return super().to_transitions(data, is_expert=is_expert)
         data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
         copies = 1 + self.config.stored_copies
-        stored = count_demonstrations(self.replay) + copies * int(data[keys.IS_EXPERT].sum())
+        stored = self.replay.num_demonstrations + copies * int(data[keys.IS_EXPERT].sum())
         if stored > self.config.buffer_size // 2:  # demonstrations are never overwritten
             data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
         return super().to_transitions(data, is_expert=True)

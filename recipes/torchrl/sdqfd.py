@@ -27,8 +27,9 @@ from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.episodes import collect_episodes, success_rate
+from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.codecs import make_codecs
-from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.asr import ASRConfig
@@ -82,9 +83,9 @@ def make_environment(config: Config, seed: int, expert: bool = False) -> EnvBase
     )
 
 
-def make_replay_buffer(config: Config, codecs: dict, seed: int) -> SymmetricReplay:
+def make_replay_buffer(config: Config, codecs: dict, seed: int) -> FrameReplayBuffer:
     """Return a replay whose batches are half demonstrations."""
-    return SymmetricReplay(config.buffer_size, config.batch_size, codecs=codecs, seed=seed)
+    return make_replay("symmetric", config.buffer_size, config.batch_size, codecs=codecs, seed=seed)
 
 
 def make_networks(config: Config, images: dict, actions: OpenLoopActions) -> SpatialValues:

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ba_torchrl.data.replay.symmetric import count_demonstrations
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
@@ -179,7 +178,7 @@ def test_what_of_demonstrations_with_noise_counts_as_demonstrated(
         return
     assert keys.EXPERT_ACTION not in learner.replay.stored_keys
     number = len(played) if counted == "all" else int(expert.sum())
-    assert count_demonstrations(learner.replay) == number
+    assert learner.replay.num_demonstrations == number
     assert len(learner.replay) == len(played)
 
 

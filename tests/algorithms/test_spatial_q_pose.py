@@ -113,7 +113,7 @@ def test_a_yaw_that_wraps_negates_the_tilts_and_reverses_the_projections(yaw):
     for key in ("done", "terminated", "truncated", "fault"):
         episode["next", key] = torch.zeros(2, 1, dtype=torch.bool)
     algorithm.on_demonstrations([episode])
-    stored = algorithm.replay.expert.storage[:2]
+    stored = algorithm.replay.storage[:2]
     sign = -1 if yaw > 3 else 1
     pick, place = stored["action"]
     expected = [0.0 if yaw > 3 else math.pi / 2, sign * tilt, -sign * tilt]

@@ -14,7 +14,7 @@ from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
-from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.replay.symmetric import SymmetricSampler
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.config import ExperimentConfig
@@ -284,8 +284,8 @@ def test_the_replay_has_the_configured_size_batch_and_priorities():
     assert (sampler.alpha, sampler.beta, sampler.expert_bonus) == (0.9, 0.2, 2.5)
     assert (sac.replay.storage.max_size, sac.replay.batch_size) == (77, 6)
     spatial = build("spatial_q")
-    assert isinstance(spatial.replay, SymmetricReplay)
-    assert (spatial.replay.expert.storage.max_size, spatial.replay.batch_size) == (55, 6)
+    assert isinstance(spatial.replay.sampler, SymmetricSampler)
+    assert (spatial.replay.storage.max_size, spatial.replay.batch_size) == (55, 6)
 
 
 @pytest.mark.parametrize("name", ["sac", "spatial_q"])
@@ -358,10 +358,9 @@ def test_collection_explores_and_evaluation_is_greedy(tmp_path):
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
 def test_no_two_uses_of_randomness_draw_the_same_numbers(replay):
     spatial = build("spatial_q", replay=replay)
-    buffers = [spatial.replay]
+    generators = {"replay": spatial.replay._rng}
     if replay == "symmetric":
-        buffers = [spatial.replay.expert, spatial.replay.online]
-    generators = {f"replay {i}": buffer._rng for i, buffer in enumerate(buffers)}
+        generators = dict(spatial.replay.sampler.generators)
     generators["augmentation"] = spatial.augmentation._generator
     generators["exploration"] = spatial.explorer._generator
     torch.manual_seed(spatial.problem.seed)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
+from torchrl.data.replay_buffers.samplers import Sampler
 
-from ba_torchrl.data.replay.codecs import ImageCodec
-from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.schema import Schema, differences
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
@@ -108,6 +104,11 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
         """Entries of the stored transitions; empty before the first."""
         return frozenset(self._schema() or ())
 
+    @property
+    def num_demonstrations(self) -> int:
+        """Number of stored transitions with the flag ``is_expert``."""
+        return int(self.storage.column(keys.IS_EXPERT).sum()) if len(self) else 0
+
     def _check_schema(self, data: TensorDictBase) -> None:
         found = {key: (value.dtype, value.shape[1:]) for key, value in data.items(True, True)}
         expected = self._schema()
@@ -135,46 +136,3 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
         for key, image_type in storage.image_types.items():
             schema |= dict.fromkeys((key, (keys.NEXT, key)), image_type)
         return schema
-
-
-def make_replay_buffer(
-    capacity: int,
-    batch_size: int | None,
-    *,
-    codecs: Mapping[str, ImageCodec],
-    seed: int,
-    prioritized: bool = True,
-    priority_exponent: float = 0.6,
-    weight_exponent: float = 0.4,
-    expert_bonus: float = 1.0,
-    returns_codes: bool = False,
-) -> FrameReplayBuffer:
-    """Return an empty replay buffer with uniform or prioritised sampling (appendix G.2).
-
-    Args:
-        capacity: number of transitions.
-        batch_size: of a sample; None if each call of ``sample`` passes it.
-        codecs: codec of each image by key; the acting policy must use the same.
-        seed: of the draws.
-        prioritized: sample by TD error with a bonus for demonstrations, else uniformly.
-        priority_exponent: alpha.
-        weight_exponent: beta at the start of the run; ``buffer.sampler.anneal`` raises it.
-        expert_bonus: added to the priority of demonstrations.
-        returns_codes: samples hold the images' codes instead of decoded images.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    sampler: Sampler = RandomSampler()
-    if prioritized:
-        sampler = ExpertPrioritizedSampler(
-            capacity,
-            generator=generator,
-            alpha=priority_exponent,
-            beta=weight_exponent,
-            expert_bonus=expert_bonus,
-        )
-    return FrameReplayBuffer(
-        storage=FrameStorage(capacity, codecs, returns_codes=returns_codes),
-        sampler=sampler,
-        batch_size=batch_size,
-        generator=generator,
-    )

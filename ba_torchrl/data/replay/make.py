@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-from ba_torchrl.data.replay.buffer import FrameReplayBuffer, make_replay_buffer
+import torch
+from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
+
+from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.codecs import ImageCodec
-from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.data.replay.storage import FrameStorage
+from ba_torchrl.data.replay.symmetric import SymmetricSampler
 
 ReplayKind = Literal["uniform", "prioritized", "symmetric"]
 """How a batch is drawn: uniformly; by TD error with a bonus for demonstrations; or half of it
@@ -17,7 +22,7 @@ uniformly from the demonstrations and half uniformly from the other transitions.
 def make_replay(
     kind: ReplayKind,
     capacity: int,
-    batch_size: int,
+    batch_size: int | None,
     *,
     codecs: Mapping[str, ImageCodec],
     seed: int,
@@ -25,32 +30,35 @@ def make_replay(
     weight_exponent: float = 0.4,
     expert_bonus: float = 1.0,
     returns_codes: bool = False,
-) -> FrameReplayBuffer | SymmetricReplay:
-    """Return an empty replay.
+) -> FrameReplayBuffer:
+    """Return an empty replay (appendix G.1, G.2).
 
     Args:
         kind: how a batch is drawn.
-        capacity: number of transitions; for a symmetric replay, in each half.
-        batch_size: of a sample.
-        codecs: codec of each image by key.
+        capacity: number of transitions, demonstrations and others together.
+        batch_size: of a sample; None if each call of ``sample`` passes it.
+        codecs: codec of each image by key; the acting policy must use the same.
         seed: of the draws.
         priority_exponent: alpha of a prioritised replay.
-        weight_exponent: initial beta of a prioritised replay.
+        weight_exponent: initial beta of a prioritised replay; ``replay.sampler.anneal`` raises it.
         expert_bonus: added to the priority of demonstrations.
         returns_codes: samples hold the images' codes instead of decoded images.
     """
+    generator = torch.Generator().manual_seed(seed)
+    sampler: Sampler = RandomSampler()
     if kind == "symmetric":
-        return SymmetricReplay(
-            capacity, batch_size, codecs=codecs, seed=seed, returns_codes=returns_codes
+        sampler = SymmetricSampler(seed)
+    elif kind == "prioritized":
+        sampler = ExpertPrioritizedSampler(
+            capacity,
+            generator=generator,
+            alpha=priority_exponent,
+            beta=weight_exponent,
+            expert_bonus=expert_bonus,
         )
-    return make_replay_buffer(
-        capacity,
-        batch_size,
-        codecs=codecs,
-        seed=seed,
-        prioritized=kind == "prioritized",
-        priority_exponent=priority_exponent,
-        weight_exponent=weight_exponent,
-        expert_bonus=expert_bonus,
-        returns_codes=returns_codes,
+    return FrameReplayBuffer(
+        storage=FrameStorage(capacity, codecs, returns_codes=returns_codes),
+        sampler=sampler,
+        batch_size=batch_size,
+        generator=generator,
     )

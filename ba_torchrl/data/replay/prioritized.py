@@ -19,10 +19,11 @@ segment_tree.install()
 class ExpertPrioritizedSampler(PrioritizedSampler):
     """Prioritised sampling that prefers demonstrations (appendix G.2).
 
-    A transition is drawn in proportion to (|td| + eps + bonus * is_expert) ^ alpha. New transitions
-    get the largest |td| so far. That maximum excludes the bonus, since it would otherwise grow by
-    one bonus per insertion. Each draw has the importance weight ``priority_weight`` = (p / p_min) ^
-    -beta, in (0, 1]; the loss normalises it over the batch.
+    A transition is drawn in proportion to p ^ alpha, with p = |td| + eps + bonus * is_expert. A new
+    one, demonstration or not, has the largest p that an update has set so far, one before the first
+    update, as in Schaul et al. (2016) and the reference implementation. Each draw has the
+    importance weight ``priority_weight`` = (p / p_min) ^ (-alpha beta), in (0, 1]; the loss
+    normalises it over the batch.
 
     Args:
         max_capacity: number of transitions of the storage, over all its dimensions.
@@ -125,10 +126,28 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         if not error.isfinite().all():
             raise ValueError("a TD error is not finite: the run has diverged")
         error = error.expand(index.shape)
-        largest = float(error.max())
+        raw = error + self._eps + self._bonus(index, storage)
+        largest = float(raw.max())
         if self._max_priority[0] is None or largest > self._max_priority[0]:
-            self._max_priority = (largest, int(index[error.argmax()]))
-        leaf = (error + self._eps + self._bonus(index, storage)).pow(self.alpha)
+            self._max_priority = (largest, int(index[raw.argmax()]))
+        self._set_leaves(index, raw)
+
+    @torch.no_grad()
+    def mark_update(
+        self, index: int | Tensor | tuple[Tensor, ...], *, storage: Storage | None = None
+    ) -> None:
+        """Give new transitions the largest priority so far, without a further bonus.
+
+        Args:
+            index: as of `update_priority`.
+            storage: as of `update_priority`; needed if it has several dimensions.
+        """
+        index = _flat_index(index, storage)
+        self._set_leaves(index, torch.full(index.shape, self.default_priority, dtype=self.dtype))
+
+    def _set_leaves(self, index: Tensor, raw: Tensor) -> None:
+        """Set priorities before the exponent, float64 [N], at flat indices [N]."""
+        leaf = raw.pow(self.alpha)
         self._sum_tree[index] = leaf
         self._min_tree[index] = leaf
 

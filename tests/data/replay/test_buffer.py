@@ -13,9 +13,9 @@ from torchrl.checkpoint import Checkpoint
 
 import ba_torchrl
 from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.replay.buffer import make_replay_buffer
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.frames import FrameTable
+from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError
@@ -23,9 +23,9 @@ from ba_torchrl.errors import ReplaySchemaError
 QUANTIZER = DepthQuantizer(0.32)
 
 
-def buffer(capacity=50, batch_size=8, seed=0, **settings):
-    return make_replay_buffer(
-        capacity, batch_size, codecs={keys.PIXELS: QUANTIZER}, seed=seed, **settings
+def buffer(capacity=50, batch_size=8, seed=0, kind="prioritized", **settings):
+    return make_replay(
+        kind, capacity, batch_size, codecs={keys.PIXELS: QUANTIZER}, seed=seed, **settings
     )
 
 
@@ -204,7 +204,7 @@ def test_memory_of_expert_episodes(task):
     quantizer = DepthQuantizer(float(pixels.space.high.max()))
     episodes = collect_demonstrations(env, 3, seed=0)
     env.close()
-    rb = make_replay_buffer(200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
+    rb = make_replay("uniform", 200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
     for data in episodes:
         rb.extend(as_transitions(data, ["pixels"], is_expert=True))
     assert rb.storage.nbytes / len(rb) <= 5_000
@@ -239,20 +239,20 @@ def test_overwriting_reuses_frames():
     assert rb.storage._frames[keys.PIXELS].nbytes < 30 * (100 + 64 + 60)  # slots are used again
 
 
-@pytest.mark.parametrize("prioritized", [True, False])
-def test_samples_are_float_metres_with_an_index(prioritized):
-    rb, rng = buffer(prioritized=prioritized), np.random.default_rng(7)
+@pytest.mark.parametrize("kind", ["uniform", "prioritized", "symmetric"])
+def test_samples_are_float_metres_with_an_index(kind):
+    rb, rng = buffer(kind=kind), np.random.default_rng(7)
     data = torch.cat([episode(6, rng, expert=True), episode(6, rng)])
     rb.extend(data)
     sample = rb.sample()
     assert sample.batch_size == (8,)
     assert_same(sample, data[sample["index"]])
     assert (keys.NEXT, keys.FAULT) not in sample.keys(True)
-    assert ("priority_weight" in sample) == prioritized
-    if prioritized:
+    assert ("priority_weight" in sample) == (kind == "prioritized")
+    if kind == "prioritized":
         sample[keys.TD_ERROR] = torch.rand(8, 1)
         rb.update_tensordict_priority(sample)
-    again = buffer(prioritized=prioritized)
+    again = buffer(kind=kind)
     again.extend(data)
     assert torch.equal(again.sample()["index"], sample["index"])
     sample[keys.PIXELS].zero_()  # a sample is a copy
@@ -262,6 +262,7 @@ def test_samples_are_float_metres_with_an_index(prioritized):
 def test_experts_are_preferred():
     rb, rng = buffer(100), np.random.default_rng(8)
     rb.extend(torch.cat([episode(50, rng, size=2, expert=True), episode(50, rng, size=2)]))
+    rb.update_priority(torch.arange(100), torch.ones(100))
     expert = torch.cat([rb.sample(500)[keys.IS_EXPERT] for _ in range(10)])
     wanted = 2**0.6 / (2**0.6 + 1)
     assert expert.float().mean().item() == pytest.approx(wanted, abs=0.03)

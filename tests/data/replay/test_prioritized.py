@@ -149,30 +149,36 @@ def leaves(sampler, n):
     return np.asarray(sampler._sum_tree[torch.arange(n)])
 
 
-def test_new_transitions_get_largest_error_and_bonus():
+def test_new_transitions_get_the_largest_priority_of_the_updates():
+    """Before the first update it is one; the bonus of a demonstration counts."""
     buffer, sampler = make([True, False], capacity=10)
-    assert leaves(sampler, 2) == pytest.approx(formula([1, 1], [1, 0], 1.0))
-    buffer.update_priority(torch.tensor([0, 1]), torch.tensor([3.0, 0.5]))
+    assert leaves(sampler, 2).tolist() == [1.0, 1.0]
+    buffer.update_priority(torch.tensor([0, 1]), torch.tensor([0.1, 0.5]))
     buffer.extend(transitions([False, True]))
-    expected = formula([3.0, 0.5, 3.0, 3.0], [1, 0, 0, 1], 1.0)
-    assert leaves(sampler, 4) == pytest.approx(expected)
+    new = 1.100001**0.6
+    assert new == pytest.approx(1.06, abs=2e-3)
+    assert leaves(sampler, 4) == pytest.approx([new, 0.500001**0.6, new, new])
+    buffer.update_priority(torch.tensor([2, 3]), torch.tensor([2.0, 0.05]))
+    buffer.extend(transitions([True]))
+    assert leaves(sampler, 5)[2:] == pytest.approx([2.000001**0.6, 1.050001**0.6, 2.000001**0.6])
 
 
-def test_the_largest_error_excludes_the_bonus():
+def test_the_largest_priority_does_not_grow_by_a_bonus_per_insertion():
     buffer, sampler = make([True] * 4, bonus=1.0, capacity=16)
     for i in range(200):
         buffer.extend(transitions([i % 2 == 0]))
         sample = buffer.sample(4)
         sample["td_error"] = torch.full((4, 1), 0.2)
         buffer.update_tensordict_priority(sample)
-    assert sampler.default_priority == pytest.approx(1.0)
-    assert leaves(sampler, 16).max() <= (1 + EPS + 1) ** 0.6 + 1e-9
+    assert sampler.default_priority == pytest.approx(1.2 + EPS)
+    assert leaves(sampler, 16).max() == pytest.approx((1.2 + EPS) ** 0.6)
 
 
-def test_an_overwritten_transition_has_the_bonus_of_the_new_flag():
+def test_an_overwritten_transition_has_the_priority_of_a_new_one():
     buffer, sampler = make([True, True], capacity=2)
+    buffer.update_priority(torch.tensor([0, 1]), torch.tensor([0.1, 0.3]))
     buffer.extend(transitions([False]))
-    assert leaves(sampler, 2) == pytest.approx(formula([1, 1], [0, 1], 1.0))
+    assert leaves(sampler, 2) == pytest.approx([(1.3 + EPS) ** 0.6] * 2)
 
 
 def test_draws_do_not_touch_global_generators():
@@ -204,7 +210,7 @@ def test_a_restored_sampler_continues_the_same_draws(on_disk, tmp_path):
     actual = other.sample()
     assert torch.equal(actual["x"], expected["x"])
     assert torch.equal(actual["priority_weight"], expected["priority_weight"])
-    assert restored.default_priority == sampler.default_priority == 2.0
+    assert restored.default_priority == sampler.default_priority == pytest.approx(2.0 + EPS)
     _, wrong = make(FLAGS)
     with pytest.raises(ValueError, match="capacity"):
         wrong.load_state_dict(state)
@@ -275,4 +281,8 @@ def test_the_bonus_in_a_storage_of_two_dimensions_is_that_of_the_experts():
     is_expert = torch.zeros(2, 3, 1, dtype=torch.bool)
     is_expert[1, 2] = True
     rb.extend(TensorDict({"number": torch.arange(6).reshape(2, 3), "is_expert": is_expert}, [2, 3]))
+    batch = rb.sample()
+    assert set(batch["number"].tolist()) == set(range(6))  # new ones have the same priority
+    batch["td_error"] = torch.ones(200)
+    rb.update_tensordict_priority(batch)
     assert set(rb.sample()["number"].tolist()) == {5}

@@ -4,7 +4,7 @@ from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 
 from ba_torchrl.data.replay.codecs import HalfPrecision
-from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.errors import ConfigError
 
 CODEC = HalfPrecision(0.25)
@@ -43,7 +43,7 @@ def transitions(numbers, is_expert):
 
 def replay(capacity=100, batch_size=8, seed=0):
     codecs = {"pixels": CODEC, "in_hand": CODEC}
-    return SymmetricReplay(capacity, batch_size, codecs=codecs, seed=seed)
+    return make_replay("symmetric", capacity, batch_size, codecs=codecs, seed=seed)
 
 
 def filled(**settings):
@@ -73,7 +73,7 @@ def test_it_is_a_torchrl_replay_buffer():
     assert isinstance(made, ReplayBuffer)
     batch, info = made.sample(6, return_info=True)
     assert batch.batch_size == (6,)
-    assert info == {}
+    assert set(info) == {"index"}
     made.add(transitions([91], False)[0])
     assert len(made) == 51
     other = replay(seed=3)
@@ -86,27 +86,45 @@ def test_a_batch_of_odd_size_has_one_demonstration_more():
 
 
 @pytest.mark.parametrize("is_expert", [True, False])
-def test_one_buffer_fills_the_batch_while_the_other_is_empty(is_expert):
+def test_one_side_fills_the_batch_while_the_other_is_empty(is_expert):
     made = replay()
     made.extend(transitions(range(5), is_expert))
     assert (made.sample()["is_expert"] == is_expert).all()
     assert made.sample().batch_size == (8,)
 
 
-def test_demonstrations_are_never_overwritten():
+def test_the_capacity_is_that_of_both_sides_and_demonstrations_are_never_overwritten():
     made = filled(capacity=20)
     for start in range(0, 300, 30):
+        assert len(made) == 20
         made.extend(transitions(range(100 + start, 130 + start), False))
-    assert len(made) == 10 + 20
+    assert (len(made), made.num_demonstrations) == (20, 10)
     numbers = {int(n) for _ in range(100) for n in made.sample()["action"]}
-    assert numbers == {*range(10), *range(380, 400)}
+    assert numbers == {*range(10), *range(390, 400)}
+    made.extend(transitions(range(20, 24), True))  # in place of the oldest others
+    assert (len(made), made.num_demonstrations) == (20, 14)
+    numbers = {int(n) for _ in range(200) for n in made.sample()["action"]}
+    assert numbers == {*range(10), *range(20, 24), *range(394, 400)}
 
 
-def test_mixed_transitions_are_added_to_their_buffers():
+def test_each_side_is_drawn_uniformly_by_its_own_generator():
+    made = replay(seed=3)
+    made.extend(transitions(range(4), True))
+    made.extend(transitions(range(50, 60), False))
+    made.extend(transitions(range(4, 9), True))
+    expert, online = (torch.Generator().manual_seed(seed) for seed in (6, 7))
+    for _ in range(5):
+        expected = torch.randint(9, (4,), generator=expert).tolist()
+        expected += (50 + torch.randint(10, (4,), generator=online)).tolist()
+        assert made.sample()["action"].flatten().tolist() == expected
+
+
+def test_mixed_transitions_are_told_apart_by_their_flags():
     made = replay()
     mixed = torch.cat([transitions([1], True), transitions([2, 3], False), transitions([4], True)])
     made.extend(mixed)
-    assert len(made.expert) == len(made.online) == 2
+    assert (len(made), made.num_demonstrations) == (4, 2)
+    assert set(made.sample(200)["action"][:100].flatten().tolist()) == {1, 4}
 
 
 def test_images_are_restored_within_the_error_of_the_codec():
@@ -143,11 +161,11 @@ def test_an_empty_or_a_full_replay_raises():
         replay().sample()
     made = replay(capacity=6)
     made.extend(transitions(range(5), True))
-    with pytest.raises(ConfigError, match="2 more demonstrations do not fit: 1 places of 6"):
+    with pytest.raises(ConfigError, match=r"fill the replay of 6 .*2 more do not fit"):
         made.extend(transitions(range(2), True))
 
 
 def test_shared_frames_are_kept_once():
     made = replay()
     made.extend(transitions([7] * 6, False))
-    assert made.online.storage.frame_count == 4  # one per kind and moment
+    assert made.storage.frame_count == 4  # one per kind and moment
