@@ -127,6 +127,40 @@ def test_the_table_holds_the_cells_of_every_combination_of_angles():
     assert cell_table(*axes, 6, torch.device("cpu")) is table
 
 
+# -- the centre of rotation --------------------------------------------------------------------
+
+
+def symmetric_heights(size):
+    """A rough surface that quarter turns about the centre of the patch do not change."""
+    rough = np.random.default_rng(0).uniform(0.03, 0.065, (size, size))
+    return np.max([np.rot90(rough, k) for k in range(4)], axis=0)
+
+
+QUARTERS = [k * math.pi / 2 for k in range(4)]
+
+
+@pytest.mark.parametrize("size", [8, 11, 24, 40])
+def test_tools_at_quarter_turns_see_the_same_of_a_scene_with_that_symmetry(size):
+    z = torch.full((1, 4), 0.055, dtype=torch.float64)
+    for yaw, ry, rx in ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (1.1, -0.2, 0.3)):
+        angles = torch.tensor([[(yaw + quarter, ry, rx) for quarter in QUARTERS]]).double()
+        images = encode(torch.from_numpy(symmetric_heights(size))[None], z, angles)[0]
+        assert all(torch.equal(image, images[0]) for image in images)
+        assert images[0].std() > 0.3
+
+
+@pytest.mark.parametrize(("middle", "lowest", "is_equal"), [(3.5, 0, True), (4.0, 1, False)])
+def test_a_rotation_about_half_the_size_does_not_keep_that_symmetry(middle, lowest, is_equal):
+    """A cube of 8 voxels has its centre at 3.5; the reference implementation rotates about 4 and
+    leaves cell 0 empty."""
+    heights = symmetric_heights(8).round(5)
+    images = [
+        project_by_loops(heights, PIXEL_M, 0.055, quarter, 0.0, 0.0, middle, lowest)
+        for quarter in QUARTERS
+    ]
+    assert all((image == images[0]).all() for image in images) is is_equal
+
+
 # -- a scene that is rotated in the simulator -------------------------------------------------
 
 PIXEL = (52, 71)

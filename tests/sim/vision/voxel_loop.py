@@ -5,10 +5,14 @@ import math
 import numpy as np
 
 
-def project_by_loops(heights, pixel_m, z_m, rz, ry, rx):
-    """Return the projections [3, n, n] of a heightmap [n, n] in the frame of a tool."""
+def project_by_loops(heights, pixel_m, z_m, rz, ry, rx, middle=None, lowest=0):
+    """Return the projections [3, n, n] of a heightmap [n, n] in the frame of a tool.
+
+    ``middle`` is the index about which voxels are rotated, by default that of the cube's centre;
+    cells below ``lowest`` stay empty.
+    """
     n = len(heights)
-    middle = (n - 1) / 2
+    middle = (n - 1) / 2 if middle is None else middle
 
     def turn(axis, angle):
         cos, sin = math.cos(angle), math.sin(angle)
@@ -25,7 +29,7 @@ def project_by_loops(heights, pixel_m, z_m, rz, ry, rx):
             inside = tool.T @ (np.array([i, j, k]) - middle) + middle
             # at 45 degrees some centres are halfway between two cells: the upper one
             cell = tuple(math.floor(value + 0.5 + 1e-9) for value in inside)
-            if all(0 <= index < n for index in cell):
+            if all(lowest <= index < n for index in cell):
                 cells.add(cell)
     image = np.zeros((3, n, n))
     for i, j, k in np.ndindex(n, n, n):
