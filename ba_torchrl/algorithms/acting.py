@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.steerable import reuse_filters
@@ -28,8 +29,8 @@ class ActingPolicy(TensorDictModuleBase):
     Args:
         policy: from the observation to ``action``.
         transforms: transform of each image, by key.
-        exploration: changes the action under TorchRL's exploration type RANDOM, such as by noise;
-            None for the policy's own action.
+        exploration: changes the action, such as by noise; called under TorchRL's exploration type
+            RANDOM only. None for the policy's own action.
     """
 
     def __init__(
@@ -51,6 +52,6 @@ class ActingPolicy(TensorDictModuleBase):
         for key, transform in self.transforms.items():
             seen.set(key, transform(seen[key]))
         out = self.policy(seen)
-        if self.exploration is not None:
+        if self.exploration is not None and exploration_type() is ExplorationType.RANDOM:
             out = self.exploration(out)
         return tensordict.set(keys.ACTION, out[keys.ACTION])

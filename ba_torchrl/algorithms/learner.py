@@ -132,8 +132,8 @@ class Learner(Algorithm):
         return self.codecs
 
     def make_exploration(self) -> TensorDictModuleBase | None:
-        """Return what changes the actions of the acting policy when it explores; by default None,
-        which leaves exploration to the policy's distribution."""
+        """Return what changes the actions of the acting policy, called only when it explores; by
+        default None, which leaves exploration to the policy's distribution."""
         return None
 
     def make_target_updater(self) -> TargetNetUpdater | None:
