@@ -16,7 +16,16 @@ PACKAGE = "ba_torchrl"
 PAGE = ROOT / "docs" / "architecture.md"
 BEGIN, END = "<!-- imports: begin -->\n", "<!-- imports: end -->\n"
 
-BASE = ("errors", "config", "registry", "plugins", "actions", "hardware", "_malloc")
+BASE = (
+    "errors",
+    "config",
+    "registry",
+    "plugins",
+    "actions",
+    "hardware",
+    "_malloc",
+    "_segment_tree",
+)
 """Single files; one box in the picture."""
 
 

@@ -24,7 +24,7 @@ EXTRA = {
     "profiling": {"__init__", "record", "modules", "objectives", "hardware"},
     "recipes": {"__init__", "record"},
 }
-SHARED = {"_malloc"}
+SHARED = {"_malloc", "_segment_tree"}
 APART = {
     "__init__": BASE | {"tasks", "envs"},
     "testing": BASE | {"testing", "sim", "tasks", "envs", "__init__"},
@@ -32,6 +32,7 @@ APART = {
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
     "_malloc": set(),
+    "_segment_tree": set(),
     "hardware": set(),
     # whole algorithms as scripts: no learner and no experiment
     "recipes.torchrl": BASE

@@ -10,10 +10,10 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from ba_torchrl.data.replay import segment_tree
+from ba_torchrl import _segment_tree
 from ba_torchrl.envs import keys
 
-segment_tree.install()
+_segment_tree.install()
 
 
 class ExpertPrioritizedSampler(PrioritizedSampler):

@@ -1,10 +1,13 @@
 """NumPy replacements of TorchRL's native segment trees.
 
-Prioritised replay needs the trees of TorchRL's native extension, and no published torchrl wheel has
-an extension that loads with torch 2.13. ``install`` replaces only trees that did not load.
+TorchRL's prioritised samplers need the trees of its native extension, and no published torchrl
+wheel has an extension that loads with torch 2.13; that of 0.14.1 loads with torch 2.14.1. The
+import of the environments calls `install`, which replaces only trees that did not load.
 """
 
 from __future__ import annotations
+
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -42,11 +45,14 @@ class SegmentTree:
     def __setitem__(
         self, index: int | np.ndarray | torch.Tensor, value: float | np.ndarray | torch.Tensor
     ) -> None:
+        if isinstance(index, int):
+            self._set_leaf(index, float(value))
+            return
         node = np.atleast_1d(np.asarray(index)).astype(np.int64)
         if node.size == 0:
             return
         if node.min() < 0 or node.max() >= self.capacity:
-            raise IndexError(f"leaf outside [0, {self.capacity})")
+            self._refuse_leaf()
         nodes = self._nodes
         node = node + self._leaves
         nodes[node] = np.asarray(value, dtype=np.float64).reshape(-1)
@@ -61,6 +67,20 @@ class SegmentTree:
         while node[0] > 1:  # all paths have the same length
             node = node >> 1
             nodes[node] = self.reduce(nodes[2 * node], nodes[2 * node + 1])
+
+    def _set_leaf(self, index: int, value: float) -> None:
+        """Set one leaf; TorchRL's samplers read a file leaf by leaf."""
+        if not 0 <= index < self.capacity:
+            self._refuse_leaf()
+        nodes = self._nodes
+        node = index + self._leaves
+        nodes[node] = value
+        while node > 1:
+            node >>= 1
+            nodes[node] = self.reduce(nodes[2 * node], nodes[2 * node + 1])
+
+    def _refuse_leaf(self) -> NoReturn:
+        raise IndexError(f"leaf outside [0, {self.capacity})")
 
     def query(self, start: int, stop: int) -> float:
         """Return the reduction over the leaves [start, stop).
