@@ -17,6 +17,10 @@ class UnknownNameError(ConfigError, KeyError):
         return str(self.args[0])
 
 
+class MissingPackageError(ConfigError, ImportError):
+    """An optional package that is not installed; the message says how to install it."""
+
+
 class DamagedFilesError(ConfigError):
     """Files that are incomplete or altered; the message names the first one."""
 

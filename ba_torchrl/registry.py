@@ -71,6 +71,11 @@ class Registry(Generic[T]):
 
         return decorate
 
+    def name_of(self, entry: T) -> str:
+        """Return the name of an entry, for error messages; its own if it is not registered."""
+        known = (name for name in self if self._entries[name] is entry)
+        return next(known, getattr(entry, "__name__", repr(entry)))
+
     def plugin_module(self, name: str) -> str | None:
         """Return the module outside the package that registered ``name``; None if it is built in.
 

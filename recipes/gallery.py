@@ -1,6 +1,7 @@
 """Draw the tasks: an episode of each expert, and one picture of all tasks.
 
-python recipes/gallery.py                       # docs/gallery/*.png and docs/gallery.png
+python recipes/gallery.py                       # pictures in runs/gallery
+python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png  # those of the README
 python recipes/gallery.py tasks=[close_loop/block_picking] folder=pictures overview=null
 """
 

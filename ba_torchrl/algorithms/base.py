@@ -118,7 +118,7 @@ class Algorithm(ABC):
             ConfigError: the algorithm cannot be compiled, the mode is unknown, or the system has no
                 compiler.
         """
-        raise ConfigError(f"compile_mode: {type(self).__name__} cannot be compiled; leave it out")
+        raise ConfigError("compile_mode: this algorithm cannot be compiled; leave it out")
 
     @abstractmethod
     def update(self) -> TensorDict:
@@ -193,14 +193,16 @@ class AlgorithmConfig(StrictModel, ABC):
             ConfigError: the algorithm or the network does not support this control.
         """
         if control not in self.controls:
+            known = [name for name in ALGORITHMS if control in ALGORITHMS[name].controls]
             raise ConfigError(
-                f"{type(self).__name__} learns {' and '.join(sorted(self.controls))} tasks, not "
-                f"{control} ones"
+                f"algorithm {ALGORITHMS.name_of(type(self))!r} learns "
+                f"{' and '.join(sorted(self.controls))} tasks, not {control} ones; {control} tasks "
+                f"take algorithm: {', '.join(known)}"
             )
         if network.control != control:
             known = [name for name in NETWORKS if NETWORKS[name].control == control]
             raise ConfigError(
-                f"{type(network).__name__} is a network for {network.control} tasks; "
+                f"network {NETWORKS.name_of(type(network))!r} is for {network.control} tasks; "
                 f"{control} tasks take network: {', '.join(known)}"
             )
 

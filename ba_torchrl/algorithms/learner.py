@@ -20,7 +20,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
 from ba_torchrl.algorithms.acting import ActingPolicy
-from ba_torchrl.algorithms.base import Algorithm, NetworkConfig, Problem
+from ba_torchrl.algorithms.base import ALGORITHMS, Algorithm, NetworkConfig, Problem
 from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.learner_config import LearnerConfig
@@ -121,7 +121,8 @@ class Learner(Algorithm):
         policy = self.trained_policy
         if not isinstance(policy, ProbabilisticTensorDictSequential):
             raise ConfigError(
-                f"init: {type(self).__name__} has no actor that behaviour cloning could initialise"
+                f"init: algorithm {ALGORITHMS.name_of(type(self.config))!r} has no actor that "
+                "behaviour cloning could initialise"
             )
         loss = BehaviourCloningLoss(policy, "kl", self.config.init_entropy_weight)
         loss.set_keys(action=keys.EXPERT_ACTION if self.has_expert_action else keys.ACTION)

@@ -26,7 +26,7 @@ from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.ensembles import EnsembleCritic
 from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.rlpd import RLPDLoss
@@ -114,7 +114,8 @@ class RLPD(Learner):
         sequence = self.problem.actions.sequence
         networks = network.build(ActorCriticSpec(self.images, sequence, self.config.critics))
         if not isinstance(networks.critic, EnsembleCritic):
-            raise ConfigError(f"{type(network).__name__} builds no ensemble of critics")
+            name = NETWORKS.name_of(type(network))
+            raise ConfigError(f"network {name!r} builds no ensemble of critics; take another one")
         return ActorCritic(*(module.to(self.problem.device) for module in networks))
 
     def make_policy(self, networks: ActorCritic) -> ProbabilisticActor:

@@ -32,7 +32,7 @@ from ba_torchrl.data.episode_assembler import EpisodeAssembler
 from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, NetworkConfig
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.contrastive import BilinearInfoNCE
 from ba_torchrl.objectives.imitation import ActionDistance
@@ -134,8 +134,8 @@ class SACConfig(LearnerConfig):
             if self.replay == "uniform":
                 yield from changed(self, ["imitate_successes"], f"{why} and uniform replay")
         if self.contrastive_weight and getattr(network, "shares_encoder", None) is False:
-            name = type(network).__name__
-            yield f"contrastive_weight has no effect on the policy's own encoder in {name}"
+            name = NETWORKS.name_of(type(network))
+            yield f"contrastive_weight has no effect on the own encoder of the policy of {name!r}"
 
     @property
     def init_entropy_weight(self) -> float:

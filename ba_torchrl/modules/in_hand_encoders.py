@@ -28,7 +28,7 @@ class InHandMap(nn.Module):
         super().__init__()
         self.out_size = (size - 4) // 2 - 2
         if self.out_size < 1:
-            raise ValueError(f"the in-hand image needs at least 10 pixels, got {size}")
+            raise ValueError(f"this network needs an in_hand_size of at least 10, got {size}")
         first, second, self.out_channels = (scaled_width(w, width) for w in (64, 128, 256))
         self.first = CastConv2d(channels, first, 3)
         self.second = CastConv2d(first, second, 3)
@@ -60,7 +60,7 @@ class InHandVector(nn.Module):
         pools = 2 if size // 4 <= _LARGEST_LAST_MAP else 3
         last = size >> pools
         if not 1 <= last <= _LARGEST_LAST_MAP:
-            raise ValueError(f"the in-hand image needs 4 to 55 pixels, got {size}")
+            raise ValueError(f"this network needs an in_hand_size from 4 to 55, got {size}")
         widths = [scaled_width(w, width) for w in (32, 64, 128, 256)]
         self.convs = nn.ModuleList(
             CastConv2d(a, b, 3, padding=1)

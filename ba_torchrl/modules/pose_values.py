@@ -41,7 +41,9 @@ class SceneMapVector(nn.Module):
         super().__init__()
         side = image_size // UNET_STRIDE // 2
         if side < 1:
-            raise ValueError(f"six degrees of freedom need 32 pixels or more, got {image_size}")
+            raise ValueError(
+                f"six degrees of freedom need an obs_size of at least 32, got {image_size}"
+            )
         inner, wide, self.out_features = (scaled_width(w, width) for w in (128, 1024, 512))
         self.copies = copies
         self.conv = CastConv2d(copies * channels, inner, 3, padding=1)

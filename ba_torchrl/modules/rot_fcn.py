@@ -74,7 +74,7 @@ class RotFCNConfig(SpatialImageConfig):
         if spec.image_size % 2:
             raise ValueError(
                 f"network 'rot_fcn' pads the image equally on all sides, which needs an even "
-                f"image_size; got {spec.image_size}"
+                f"obs_size; got {spec.image_size}"
             )
         values = PlainPixelValues(spec, self, maps=1)
         return RotFCN(values, spec.image_size, self.num_rotations, spec.half_rotation)

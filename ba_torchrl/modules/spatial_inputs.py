@@ -120,7 +120,7 @@ def require_unet_size(name: str, image_size: int) -> None:
     """
     if image_size % UNET_STRIDE:
         raise ValueError(
-            f"network {name!r} needs an image_size that is a multiple of {UNET_STRIDE}, got "
+            f"network {name!r} needs an obs_size that is a multiple of {UNET_STRIDE}, got "
             f"{image_size}; 'rot_fcn' takes any even one"
         )
 

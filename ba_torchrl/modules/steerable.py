@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ba_torchrl.errors import MissingPackageError
 from ba_torchrl.modules.cpu_threads import is_plain_float32
 from ba_torchrl.modules.irrep_convolution import IrrepKernels, irrep_convolution, saves_time
 from ba_torchrl.modules.kernel_blocks import (
@@ -69,7 +70,7 @@ def _gspaces() -> ModuleType:
             warnings.filterwarnings("ignore", message=".*py3nj")
             from escnn import gspaces
     except ImportError as error:
-        raise ImportError(ESCNN_FIX) from error
+        raise MissingPackageError(ESCNN_FIX) from error
     return gspaces
 
 

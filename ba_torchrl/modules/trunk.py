@@ -61,7 +61,8 @@ def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int,
     """
     if image_size not in SUPPORTED_IMAGE_SIZES:
         raise ValueError(
-            f"image_size must be one of {SUPPORTED_IMAGE_SIZES} for this network, got {image_size}"
+            f"this network takes images of {' or '.join(map(str, SUPPORTED_IMAGE_SIZES))} px, got "
+            f"{image_size}; set obs_size, or crop_size where views are crops"
         )
     stages = list(
         zip(

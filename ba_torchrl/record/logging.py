@@ -15,6 +15,8 @@ import numpy as np
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
+from ba_torchrl.errors import MissingPackageError
+
 Backend = Literal["csv", "tensorboard", "wandb"]
 
 SCALARS_FILE = "scalars.csv"
@@ -51,7 +53,7 @@ def make_logger(
     if backend not in ("tensorboard", "wandb"):
         raise ValueError(f"unknown logger {backend!r}; known are csv, tensorboard and wandb")
     if not is_available(backend):
-        raise ImportError(
+        raise MissingPackageError(
             f"the logger {backend!r} needs a package that is not installed: "
             f"pip install 'ba-torchrl[{backend}]'"
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ba_torchrl.envs.base import ManipulationEnv
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, MissingPackageError
 
 _SUFFIXES = (".mp4", ".gif")
 MIN_FPS, MAX_FPS = 1, 240
@@ -90,7 +90,8 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
         import imageio
         import imageio_ffmpeg  # noqa: F401  imageio reports it later and with less detail
     except ImportError as error:
-        raise ImportError("writing videos needs pip install 'ba-torchrl[recipes]'") from error
+        fix = "writing videos needs pip install 'ba-torchrl[recipes]'"
+        raise MissingPackageError(fix) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".gif":
         imageio.mimwrite(path, _with_common_colors(pictures), duration=1000 / fps, loop=0)

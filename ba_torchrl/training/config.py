@@ -136,7 +136,7 @@ class ExperimentConfig(StrictModel):
     save_minutes: float = Field(default=10.0, gt=0)
     """Minutes after which the state for ``resume`` is saved, besides at every evaluation."""
     log_every: int = Field(default=50, ge=1)
-    """Updates between rows of the losses."""
+    """Updates between rows of the losses; a shorter run has one row, that of its last update."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"
     """Logger of scalars in addition to the run folder's CSV file."""
     video_episodes: int = Field(default=3, ge=0)

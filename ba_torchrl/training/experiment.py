@@ -235,27 +235,33 @@ class Experiment:
 
     def _update(self, take_update: Callable[[], TensorDict]) -> None:
         """Take one update; log and evaluate if they are due."""
-        config = self.config
         self._is_between_updates = False
         scalars = take_update()
         self._is_between_updates = True
         updates = self.algorithm.updates
         self._bar.update()
         self._log_duration(self._timer.tick())
-        if updates % config.log_every == 0:
-            names = [f"train/{key}" for key in scalars.keys()]  # noqa: SIM118, a TensorDict
-            found = [value.reshape(()).float() for value in scalars.values()]
-            # in one copy, since each copy from a GPU waits for it
-            values = dict(zip(names, torch.stack(found).tolist(), strict=True)) if found else {}
-            progress = self._progress
-            values |= {"train/env_steps": progress.env_steps, "train/faults": progress.faults}
-            collector = {} if self._collection is None else self._collection.scalars
-            values |= {f"collector/{key}": value for key, value in collector.items()}
-            if progress.recent:
-                values["train/success_rate"] = sum(progress.recent) / len(progress.recent)
-            self.log.write(updates, values)
+        is_due = updates % self.config.log_every == 0
+        if is_due:
+            self._log_update(scalars)
         self._evaluate_if_due()
+        if not is_due and updates < self.config.log_every and self._is_complete:
+            self._log_update(scalars)  # the only row of a shorter run
         self._stop_or_save()
+
+    def _log_update(self, scalars: TensorDict) -> None:
+        """Log the scalars of an update, and counts and success of the collection."""
+        names = [f"train/{key}" for key in scalars.keys()]  # noqa: SIM118, a TensorDict
+        found = [value.reshape(()).float() for value in scalars.values()]
+        # in one copy, since each copy from a GPU waits for it
+        values = dict(zip(names, torch.stack(found).tolist(), strict=True)) if found else {}
+        progress = self._progress
+        values |= {"train/env_steps": progress.env_steps, "train/faults": progress.faults}
+        collector = {} if self._collection is None else self._collection.scalars
+        values |= {f"collector/{key}": value for key, value in collector.items()}
+        if progress.recent:
+            values["train/success_rate"] = sum(progress.recent) / len(progress.recent)
+        self.log.write(self.algorithm.updates, values)
 
     def _log_duration(self, seconds_per_update: float | None) -> None:
         """Log the expected duration of the remaining updates, if it has just been measured."""

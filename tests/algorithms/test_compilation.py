@@ -224,7 +224,7 @@ def test_the_learner_names_the_known_modes():
 
 
 def test_a_learner_that_cannot_be_compiled_says_so():
-    with pytest.raises(ConfigError, match="compile_mode: RLPD cannot be compiled"):
+    with pytest.raises(ConfigError, match="compile_mode: this algorithm cannot be compiled"):
         build("rlpd", "cnn").compile("default")
 
 

@@ -217,7 +217,7 @@ def demonstration_error(learner):
         ("cnn", {"name": "sac", "init": "bc"}, {}, "pretrain_updates"),
         ("asr", {"name": "spatial_q", "init": "bc"}, {**OPEN, "pretrain_updates": 1}, "no actor"),
         ("cnn", {"name": "bc", "replay": "prioritized"}, {}, "replay"),
-        ("asr", {"name": "bc"}, {}, "network for open_loop"),
+        ("asr", {"name": "bc"}, {}, "network 'asr' is for open_loop"),
     ],
 )
 def test_what_cannot_run_is_refused(tmp_path, network, algorithm, changes, message):

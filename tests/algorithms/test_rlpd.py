@@ -121,7 +121,7 @@ def test_a_network_without_an_ensemble_is_refused():
         def build(self, spec):
             return super().build(dataclasses.replace(spec, critics=None))
 
-    with pytest.raises(ConfigError, match="Twins builds no ensemble"):
+    with pytest.raises(ConfigError, match="network 'Twins' builds no ensemble"):
         ALGORITHMS["rlpd"]().build(Twins(width=0.25), problem())
     learner = ALGORITHMS["iql"]().build(Twins(width=0.25), problem())  # takes one of the twins
     learner.extend(transitions(learner))

@@ -228,7 +228,7 @@ def test_config_errors():
     with pytest.raises(ValueError, match="needs x and y"):
         NETWORKS["equi"](n_hidden=8).build(actor_critic_spec(64, "pz"))
     for name in ACTOR_CRITICS:
-        with pytest.raises(ValueError, match="image_size"):
+        with pytest.raises(ValueError, match=r"64 or 128 px, got 90; set obs_size"):
             NETWORKS[name]().build(actor_critic_spec(90, "pxyzr"))
 
 
@@ -243,6 +243,7 @@ def test_missing_escnn_names_the_fix():
     code = """
 import sys
 sys.modules["escnn"] = None
+from ba_torchrl.errors import MissingPackageError
 from ba_torchrl.modules.base import NETWORKS
 from tests.specs import actor_critic_spec, spatial_spec
 actor_critic, spatial = actor_critic_spec(), spatial_spec()
@@ -252,7 +253,7 @@ for name in ("fcn", "rot_fcn", "asr"):
 for name, spec in (("equi", actor_critic), ("equi_fcn", spatial), ("equi_asr", spatial)):
     try:
         NETWORKS[name]().build(spec)
-    except ImportError as error:
+    except MissingPackageError as error:
         assert "pip install --no-deps escnn==1.0.11" in str(error), error
         assert "make setup" in str(error), error
     else:

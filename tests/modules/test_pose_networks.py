@@ -214,7 +214,7 @@ def test_heights_of_later_levels_are_in_voxels():
 
 
 def test_sizes_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="need 32 pixels or more, got 16"):
+    with pytest.raises(ValueError, match="obs_size of at least 32, got 16"):
         build("asr", 16)
     with pytest.raises(ValueError, match="patch_size of 24 or 40"):
         build("equi_deictic_asr", in_hand_size=32)

@@ -381,7 +381,9 @@ def test_unsupported_images_and_actions_are_refused(name):
         NETWORKS[name](widht=2)
     with pytest.raises(ValidationError):
         NETWORKS[name](width=0.0)
-    size, message = (91, "even image_size") if name == "rot_fcn" else (90, "multiple of 16")
+    size, message = (
+        (91, "even obs_size") if name == "rot_fcn" else (90, "obs_size that is a multiple of 16")
+    )
     with pytest.raises(ValueError, match=message):
         build(name, size)
     if name not in ("fcn", "equi_fcn"):

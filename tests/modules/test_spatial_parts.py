@@ -102,7 +102,7 @@ def test_in_hand_encoders_refuse_unsupported_sizes():
         encoder = InHandVector(1, size, 0.25)
         assert encoder.linear.in_features == 64 * last * last
         assert encoder(torch.rand(3, 1, size, size)).shape == (3, 256)
-    with pytest.raises(ValueError, match="at least 10 pixels"):
+    with pytest.raises(ValueError, match="in_hand_size of at least 10"):
         InHandMap(1, 9, 0.1)
     with pytest.raises(ValueError, match="4 to 55"):
         InHandVector(1, 56, 0.1)

@@ -89,7 +89,7 @@ def test_skip_leaves_out_matching_runs(tmp_path):
         ({"common": {"network": {"widht": 1.0}}}, "with sac small: .*Did you mean 'width'"),
         ({"common": {"env": {"in_hand_size": 30}}}, f"{REACH}.*: 'in_hand_size' is for open-loop"),
         ({"common": {"env": {"robot": "sawyer"}}}, "kuka"),
-        ({"tasks": [PLACE]}, "SACConfig learns close_loop tasks"),
+        ({"tasks": [PLACE]}, "algorithm 'sac' learns close_loop tasks"),
         ({"per_task": {REACH: {"env": {"obs_sise": 64}}}}, "Did you mean 'obs_size'"),
     ],
 )
