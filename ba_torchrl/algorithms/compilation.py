@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import torch
@@ -50,27 +51,35 @@ def _has_cpp_compiler() -> bool:
 
 
 class CompiledLoss:
-    """A loss module whose forward and backward pass are compiled at the first call.
+    """A loss whose forward and backward pass are compiled at the first call.
 
     Compilation is for the shapes of this call. Before it, a forward pass that is not compiled fills
     the networks' caches of constants. A graph that needs another constant is compiled twice. The
     results are copies, since a CUDA graph writes those of the next call to the same memory.
 
     Args:
-        loss: the module, which is compiled in place.
+        loss: the loss module.
         mode: of `torch.compile`.
+        function: the loss of a batch: a method of the module, or by default the module itself,
+            which is then compiled in place.
 
     Raises:
         ConfigError: the mode is unknown, or the system has no compiler.
     """
 
-    def __init__(self, loss: LossModule, mode: CompileMode) -> None:
+    def __init__(
+        self,
+        loss: LossModule,
+        mode: CompileMode,
+        function: Callable[[TensorDictBase], TensorDictBase] | None = None,
+    ) -> None:
         known = get_args(CompileMode)
         if mode not in known:
             raise ConfigError(f"compile_mode: {mode!r} is unknown; known: {', '.join(known)}")
         check_compiler(next(loss.parameters()).device)
         self.loss = loss
         self.mode = mode
+        self._function = loss if function is None else function
         self._is_compiled = False
 
     def __call__(self, batch: TensorDictBase) -> TensorDict:
@@ -79,12 +88,15 @@ class CompiledLoss:
             self._is_compiled = True
             device = next(self.loss.parameters()).device
             with torch.random.fork_rng([device] if device.type == "cuda" else []):
-                self.loss(batch.copy())
-            self.loss.compile(mode=self.mode, dynamic=False)
+                self._function(batch.copy())
+            if self._function is self.loss:
+                self.loss.compile(mode=self.mode, dynamic=False)
+            else:
+                self._function = torch.compile(self._function, mode=self.mode, dynamic=False)
         torch.compiler.cudagraph_mark_step_begin()
         # the compiled loss sets both modes, and does not reset them
         with set_exploration_type(self.loss.deterministic_sampling_mode), set_recurrent_mode(True):
-            scalars = self.loss(batch).clone()
+            scalars = self._function(batch).clone()
         if keys.TD_ERROR in batch:
             batch[keys.TD_ERROR] = batch[keys.TD_ERROR].clone()
         return scalars

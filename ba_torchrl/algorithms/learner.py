@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
@@ -24,7 +24,7 @@ from ba_torchrl.algorithms.base import ALGORITHMS, Algorithm, NetworkConfig, Pro
 from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.learner_config import LearnerConfig
-from ba_torchrl.algorithms.optimizer_state import fits
+from ba_torchrl.algorithms.optimizers import Optimizers, make_adam
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
@@ -35,19 +35,20 @@ from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
 
-logger = logging.getLogger(__name__)
+LossFunction = Callable[[TensorDictBase], TensorDictBase]
+"""Losses, whose names begin with "loss_", and diagnostics of a batch."""
 
 
 class Learner(Algorithm):
     """Networks, a loss, an optimiser and a replay.
 
     The constructor calls the ``make_...`` methods in the order of their definition. An algorithm
-    implements the first three and can override the others. An update minimises the sum of the
-    ``loss_...`` entries of the loss module.
+    implements the first three and can override the others. An update minimises the sums of the
+    ``loss_...`` entries of its stages one after the other, by default that of the loss module.
 
     On a CUDA device the host does not wait for an update: batches are copied as uint8 codes from
-    pinned memory, and priorities are set, and losses checked, at the end of the next update. An
-    update with a loss that is not finite changes no parameter.
+    pinned memory, and priorities are set, and losses checked, at the end of the next update. From a
+    loss that is not finite on, an update changes no parameter.
 
     Args:
         config: hyper-parameters.
@@ -82,14 +83,20 @@ class Learner(Algorithm):
         self.policy = ActingPolicy(
             acting, self.make_acting_transforms(), self.make_exploration()
         ).to(problem.device)
-        self.compute_losses: Callable[[TensorDictBase], TensorDictBase] = self.loss
+        self.stages = self.make_stages()
         self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
         self.stored_augmentation = self.make_stored_augmentation()
         self.augmentation = self.make_augmentation()
         self.optimizer = self.make_optimizer()
-        self.scheduler = self.make_scheduler()
+        self.optimizers = Optimizers(
+            self.optimizer,
+            self.make_term_optimizers(),
+            self.make_scheduler,
+            clamp=config.gradient_clamp,
+            clamped=self.network_parameters(),
+        )
 
     # -- parts -------------------------------------------------------------------------------
 
@@ -104,6 +111,11 @@ class Learner(Algorithm):
     @abstractmethod
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
+
+    def make_stages(self) -> list[LossFunction]:
+        """Return the losses of an update in the order in which they are minimised, each after the
+        optimisers' step on the one before; by default the loss module alone."""
+        return [self.loss]
 
     def make_averaged_policy(self) -> AveragedModel | None:
         """Return the moving average of the policy that acts; None if the policy itself acts."""
@@ -165,29 +177,24 @@ class Learner(Algorithm):
         """Return the augmentation of sampled batches; by default the identity."""
         return nn.Identity()
 
-    def make_optimizer(self) -> torch.optim.Optimizer:
-        """Return Adam, with weight decay on the parameters of the networks only."""
-        networks = self.network_parameters()
-        known = set(map(id, networks))
-        others = [p for p in self.loss.parameters() if id(p) not in known]
-        groups = [
-            {"params": networks, "weight_decay": self.config.weight_decay},
-            {"params": others, "weight_decay": 0.0},
-        ]
-        return torch.optim.Adam(
-            [group for group in groups if group["params"]],
-            lr=self.config.learning_rate,
-            fused=True,
-        )
+    def make_optimizer(self) -> Optimizer:
+        """Return the optimiser of all terms of the loss but those of `make_term_optimizers`."""
+        return self.adam(self.loss.parameters())
 
-    def make_scheduler(self) -> LRScheduler:
-        """Return the schedule of the learning rate, which steps once per update."""
-        return LinearLR(
-            self.optimizer,
-            start_factor=1.0,
-            end_factor=self.config.learning_rate_end_factor,
-            total_iters=self.problem.total_updates,
-        )
+    def make_term_optimizers(self) -> Mapping[str, Mapping[str, Optimizer]]:
+        """Return the optimisers of single terms of the loss, by the names of term and optimiser;
+        by default none. Their terms are in a stage without others."""
+        return {}
+
+    def make_scheduler(self, optimizer: Optimizer) -> LRScheduler:
+        """Return the schedule of an optimiser's learning rate, which steps once per update."""
+        end, updates = self.config.learning_rate_end_factor, self.problem.total_updates
+        return LinearLR(optimizer, start_factor=1.0, end_factor=end, total_iters=updates)
+
+    def adam(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
+        """Return Adam for some parameters, with weight decay on those of the networks only."""
+        config, decayed = self.config, self.network_parameters()
+        return make_adam(parameters, decayed, config.learning_rate, config.weight_decay)
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return the parameters to which weight decay and the gradient's bound apply."""
@@ -256,13 +263,13 @@ class Learner(Algorithm):
     # -- updates -----------------------------------------------------------------------------
 
     def update(self) -> TensorDict:
-        """Take one gradient step on a batch, and update the target network and the priorities.
+        """Take the gradient steps on a batch, and update the target network and the priorities.
 
         Raises:
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.minimize(self.compute_losses(batch))
+        scalars = self.minimize(stage(batch) for stage in self.stages)
         if self._prioritized_sampler() is not None:  # whose trees are on the CPU
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
             self.host_tasks.submit(errors, self._set_priorities)
@@ -272,7 +279,7 @@ class Learner(Algorithm):
         """As for `Algorithm`: the loss and its gradient, except those of ``pretraining_option``."""
         if not self.config.is_compilable:
             super().compile(mode)
-        self.compute_losses = CompiledLoss(self.loss, mode)
+        self.stages = [CompiledLoss(self.loss, mode, stage) for stage in self.stages]
 
     def own_updates(self, updates: int) -> int:
         """Return how many of the first updates of a run minimise the algorithm's own loss."""
@@ -295,52 +302,47 @@ class Learner(Algorithm):
         """
         if self.init_loss is None:
             return self.update()
-        return self.minimize(self.init_loss(self.sample(demonstrations_only=True)))
+        return self.minimize([self.init_loss(self.sample(demonstrations_only=True))])
 
-    def minimize(self, scalars: TensorDictBase) -> TensorDict:
-        """Take one gradient step on a sum of losses, update target and average, and count it.
-
-        Args:
-            scalars: losses, whose names begin with "loss_", and diagnostics.
-
-        Returns:
-            The scalars without gradient.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+    def minimize(self, stages: Iterable[TensorDictBase]) -> TensorDict:
+        """Take the steps of `step`, update the average, and count the update; see there for
+        argument, result and errors."""
         before = len(self.host_tasks)
-        self.step(scalars)
+        scalars = self.step(stages)
         if self.averaged_policy is not None:
             self.averaged_policy.update_parameters(self.trained_policy)
         self.updates += 1
         self.host_tasks.run(before)
-        return scalars.detach()
+        return scalars
 
-    def step(self, scalars: TensorDictBase) -> None:
-        """Take one step of optimiser, schedule and target network.
+    def step(self, stages: Iterable[TensorDictBase]) -> TensorDict:
+        """Take a gradient step on each of several sums of losses, then one step of schedules and
+        target network.
 
         Args:
-            scalars: losses, whose names begin with "loss_", and diagnostics.
+            stages: losses, whose names begin with "loss_", and diagnostics. An iterator computes
+                each stage after the step on the one before.
+
+        Returns:
+            The scalars of all stages, without gradient.
 
         Raises:
             FloatingPointError: a loss is not finite.
+            ValueError: the losses of a stage have different optimisers.
         """
-        loss = sum(value for name, value in scalars.items() if name.startswith("loss_"))
-        is_finite = torch.isfinite(loss)
-        self.host_tasks.submit(
-            {**scalars, IS_FINITE: is_finite}, partial(check_finite, self.updates)
-        )
-        if self.host_tasks.is_deferred:
-            self.optimizer.found_inf = (~is_finite).float()  # skips the step, as a GradScaler does
-        self.optimizer.zero_grad()
-        loss.backward()
-        if self.config.gradient_clamp is not None:
-            nn.utils.clip_grad_value_(self.network_parameters(), self.config.gradient_clamp)
-        self.optimizer.step()
-        self.scheduler.step()
+        taken, is_finite, is_deferred = TensorDict(), True, self.host_tasks.is_deferred
+        for scalars in stages:
+            terms = {name: value for name, value in scalars.items() if name.startswith("loss_")}
+            loss = sum(terms.values())
+            is_finite = is_finite & torch.isfinite(loss)
+            values = {**scalars, IS_FINITE: is_finite}
+            self.host_tasks.submit(values, partial(check_finite, self.updates))
+            self.optimizers.minimize(loss, terms, is_finite if is_deferred else None)
+            taken.update(scalars.detach())
+        self.optimizers.step_schedules()
         if self.target_updater is not None:
             self.target_updater.step()
+        return taken
 
     def _prioritized_sampler(self) -> ExpertPrioritizedSampler | None:
         sampler = self.replay.sampler
@@ -349,7 +351,7 @@ class Learner(Algorithm):
     # -- state -------------------------------------------------------------------------------
 
     def _stateful_parts(self) -> dict[str, Any]:
-        names = ["loss", "optimizer", "scheduler", "stored_augmentation", "augmentation"]
+        names = ["loss", "stored_augmentation", "augmentation"]
         if self.averaged_policy is not None:
             names.append("averaged_policy")
         return {name: getattr(self, name) for name in names}
@@ -362,18 +364,13 @@ class Learner(Algorithm):
         """
         self.host_tasks.run()
         state = {name: part.state_dict() for name, part in self._stateful_parts().items()}
-        return {**state, "updates": self.updates}
+        return {**state, **self.optimizers.state_dict(), "updates": self.updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
         for name, part in self._stateful_parts().items():
-            if isinstance(part, torch.optim.Optimizer) and not fits(part, state[name]):
-                logger.warning("%s: moments of another version; they are not restored", name)
-                continue
             part.load_state_dict(state[name])
-        rates = self.scheduler.get_last_lr()  # the optimiser's, unless its state was left out
-        for group, rate in zip(self.optimizer.param_groups, rates, strict=False):
-            group["lr"] = rate
+        self.optimizers.load_state_dict(state)
         self.updates = state["updates"]
 
     def save_replay(self, folder: Path) -> None:

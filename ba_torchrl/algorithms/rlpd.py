@@ -14,6 +14,7 @@ from pydantic import Field
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SoftUpdate
@@ -154,12 +155,12 @@ class RLPD(Learner):
             seed=self.problem.derived_seed(SeedUse.AUGMENTATION),
         )
 
-    def make_scheduler(self) -> LinearLR:
+    def make_scheduler(self, optimizer: Optimizer) -> LinearLR:
         """Return the schedule of the learning rate, which steps once per critic update."""
         problem = self.problem
         own = self.own_updates(problem.total_updates)
         return LinearLR(
-            self.optimizer,
+            optimizer,
             start_factor=1.0,
             end_factor=self.config.learning_rate_end_factor,
             total_iters=problem.total_updates + own * (self.config.critic_updates - 1),
@@ -176,7 +177,7 @@ class RLPD(Learner):
             FloatingPointError: a loss is not finite.
         """
         for _ in range(self.config.critic_updates - 1):
-            self.step(self.loss.critic_loss(self.sample()))
+            self.step([self.loss.critic_loss(self.sample())])
         return super().update()
 
     def state_dict(self) -> dict[str, Any]:

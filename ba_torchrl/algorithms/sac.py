@@ -11,12 +11,13 @@ from pydantic import Field, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torch.optim import Optimizer
 from torchrl.data import Bounded
 from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner
+from ba_torchrl.algorithms.learner import Learner, LossFunction
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.config import changed
@@ -99,20 +100,21 @@ class SACConfig(LearnerConfig):
     """Views of each observation, over which the losses are averaged."""
     target_views: int = Field(default=1, ge=1)
     """Views of each next observation, over which the target is averaged."""
-    contrastive_weight: float = Field(default=0.0, ge=0)
-    """Weight of the encoder's contrastive loss on pairs of views; 0 for none. The FERM presets have
-    1; the appendix gives no weight."""
+    contrastive: bool = False
+    """Whether each update also takes two steps on the contrastive loss of pairs of views, as in the
+    reference implementation: one with Adam on the encoder, one with Adam on encoder and similarity.
+    The appendix names the loss only."""
     pretraining: Literal["all", "contrastive"] = "all"
     """Losses that updates before the first collection minimise: all, or the contrastive one alone,
     with ``init="bc"`` together with that of behaviour cloning."""
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
-        needs_views = self.views > 1 or self.target_views > 1 or self.contrastive_weight > 0
+        needs_views = self.views > 1 or self.target_views > 1 or self.contrastive
         if needs_views and self.view_transform == "none":
             raise ValueError("several views or a contrastive loss need view_transform")
-        if self.pretraining == "contrastive" and not self.contrastive_weight:
-            raise ValueError("pretraining 'contrastive' needs contrastive_weight")
+        if self.pretraining == "contrastive" and not self.contrastive:
+            raise ValueError("pretraining 'contrastive' needs contrastive=true")
         if self.stored_copies and self.augmentation == "none":
             raise ValueError("stored_copies needs augmentation")
         return self
@@ -133,9 +135,9 @@ class SACConfig(LearnerConfig):
             yield from changed(self, ["demonstration_distance"], why)
             if self.replay == "uniform":
                 yield from changed(self, ["imitate_successes"], f"{why} and uniform replay")
-        if self.contrastive_weight and getattr(network, "shares_encoder", None) is False:
+        if self.contrastive and getattr(network, "shares_encoder", None) is False:
             name = NETWORKS.name_of(type(network))
-            yield f"contrastive_weight has no effect on the own encoder of the policy of {name!r}"
+            yield f"contrastive has no effect on the own encoder of the policy of {name!r}"
 
     @property
     def init_entropy_weight(self) -> float:
@@ -230,7 +232,6 @@ class SAC(Learner):
             views=config.views,
             target_views=config.target_views,
             contrastive=self._make_contrastive(networks.encoder),
-            contrastive_weight=config.contrastive_weight,
         )
         loss.set_keys(expert_action=keys.EXPERT_ACTION)
         if not config.bootstrap_truncated:
@@ -238,13 +239,36 @@ class SAC(Learner):
         return loss.make_value_estimator(gamma=config.gamma)
 
     def _make_contrastive(self, encoder: nn.Module) -> BilinearInfoNCE | None:
-        if not self.config.contrastive_weight:
+        if not self.config.contrastive:
             return None
         device = self.problem.device
         images = (torch.zeros(image.shape, device=device) for image in self.seen_images.values())
         with torch.no_grad():
             features = encoder(*images, torch.zeros(1, device=device))
         return BilinearInfoNCE(features.shape[-1])
+
+    def make_stages(self) -> list[LossFunction]:
+        """Return the loss of actor, critics and temperature and, if configured, then that of the
+        encoder."""
+        return [self.loss, *([self.loss.contrastive_loss] if self.config.contrastive else [])]
+
+    def make_optimizer(self) -> Optimizer:
+        """Return Adam for all parameters but the contrastive loss's similarity."""
+        contrastive = self.loss.contrastive
+        if contrastive is None:
+            return super().make_optimizer()
+        own = set(map(id, contrastive.parameters()))
+        return self.adam(p for p in self.loss.parameters() if id(p) not in own)
+
+    def make_term_optimizers(self) -> dict[str, dict[str, Optimizer]]:
+        """Return the two optimisers of the contrastive loss, if configured."""
+        contrastive = self.loss.contrastive
+        if contrastive is None:
+            return {}
+        encoder = list(self.loss.encoder_network_params.parameters())
+        both = [*encoder, *contrastive.parameters()]
+        optimizers = {"encoder": self.adam(encoder), "contrastive": self.adam(both)}
+        return {"loss_contrastive": optimizers}
 
     def make_target_updater(self) -> SoftUpdate:
         """Return the soft update of the targets of critic and encoder."""
@@ -276,7 +300,7 @@ class SAC(Learner):
                     padding=0 if is_crop else config.shift_pixels,
                     views=config.views,
                     target_views=config.target_views,
-                    has_positive=config.contrastive_weight > 0,
+                    has_positive=config.contrastive,
                     seed=self.problem.derived_seed(SeedUse.VIEWS),
                 )
             )
@@ -335,7 +359,7 @@ class SAC(Learner):
         if self.config.pretraining == "all":
             return super().pretrain_update()
         batch = self.sample(demonstrations_only=self.init_loss is not None)
-        scalars = self.loss.contrastive_loss(batch)
+        stages = [self.loss.contrastive_loss]
         if self.init_loss is not None:
-            scalars.update(self.init_loss(batch))
-        return self.minimize(scalars)
+            stages.insert(0, self.init_loss)
+        return self.minimize(stage(batch) for stage in stages)

@@ -47,15 +47,14 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
     ones.
 
     With several views of an observation, every term of a sample is the mean over its views, and y
-    over the views of the next observation (DrQ: Kostrikov et al., 2021, equation 3). With a
-    contrastive term, loss_contrastive is contrastive_weight times the mean of its losses, with the
-    encoder's features as anchors and those of the target encoder, of another view, as positives
-    (CURL: Srinivas et al., 2020; FERM: Zhan et al., 2020).
+    over the views of the next observation (DrQ: Kostrikov et al., 2021, equation 3).
 
-    The first three are computed with the current parameters and have gradients with respect to
-    disjoint parameters, so one backward pass on the sum of all losses suffices. The encoder is
-    trained by loss_qvalue and loss_contrastive only; loss_actor uses its detached features. The
-    target bootstraps on truncated steps and not on terminated ones.
+    The three are computed with the current parameters and have gradients with respect to disjoint
+    parameters, so one backward pass on the sum of all losses suffices. The encoder is trained by
+    loss_qvalue only; loss_actor uses its detached features. The target bootstraps on truncated
+    steps and not on terminated ones.
+
+    `contrastive_loss` trains the encoder with another loss, for optimisers of its own.
 
     ``forward`` also writes the priority, mean_k |q_k - y| of shape [..., 1], into its input.
 
@@ -75,9 +74,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         views: number of views of the observation. If there are several, the entries of the
             observation have a dimension of views after the batch.
         target_views: number of views of the next observation, likewise.
-        contrastive: from anchors and positives [B, F] to losses [B]; None for no contrastive term,
-            else the batch has another view of the observation under "positive".
-        contrastive_weight: weight of the contrastive term.
+        contrastive: of `contrastive_loss`: from anchors and positives [B, F] to losses [B].
 
     Raises:
         ValueError: ``alpha_init`` is not positive, ``demonstration_distance`` is unknown, or the
@@ -140,7 +137,6 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         views: int = 1,
         target_views: int = 1,
         contrastive: nn.Module | None = None,
-        contrastive_weight: float = 1.0,
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
@@ -167,9 +163,6 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         self.views = views
         self.target_views = target_views
         self.contrastive = None if contrastive is None else contrastive.to(device)
-        self.contrastive_weight = contrastive_weight
-        if contrastive is not None:
-            self.out_keys = (*self.out_keys, "loss_contrastive")
         # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=device)
 
@@ -188,8 +181,6 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         names = [*self._transition_keys(observation), self._label_key]
         if self._needs_expert_flag:
             names.append(self.tensor_keys.is_expert)
-        if self.contrastive is not None:
-            names += [(keys.POSITIVE, *_as_path(key)) for key in self.encoder_network.in_keys]
         return list(dict.fromkeys(names))
 
     @dispatch
@@ -197,12 +188,10 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         """Return the losses and detached diagnostics of a batch of transitions.
 
         Args:
-            tensordict: transitions [..., B], or [B] with a contrastive term; gets the priority
-                written into it.
+            tensordict: transitions [..., B]; gets the priority written into it.
 
         Returns:
-            ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, with a contrastive term,
-            ``loss_contrastive``, scalars or, with the reduction
+            ``loss_actor``, ``loss_qvalue`` and ``loss_alpha``, scalars or, with the reduction
             "none", of shape [..., B]; and without gradient the scalars ``alpha``, ``entropy``,
             ``demonstration_error`` (the unweighted behaviour term) and ``q_value`` (mean of the
             twin values of the stored actions).
@@ -237,7 +226,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         log_prob = self._over_views(log_prob.detach())
         temperature_term = self.log_alpha * (log_prob + self.target_entropy)
         loss_alpha = -self._reduced(temperature_term, weights.of("all"))
-        out = TensorDict(
+        return TensorDict(
             {
                 "loss_actor": loss_actor,
                 "loss_qvalue": loss_qvalue,
@@ -248,13 +237,12 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 "q_value": q.detach().mean(),
             }
         )
-        if self.contrastive is not None:
-            anchors = features[:, 0] if self.views > 1 else features
-            out.set("loss_contrastive", self._contrastive_loss(anchors, tensordict))
-        return out
 
     def contrastive_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return ``loss_contrastive`` alone, for training the encoder before the policy.
+        """Return ``loss_contrastive``, the contrastive loss of the encoder.
+
+        The encoder's features are anchors, and those of the target encoder, of another view of the
+        same observations, are positives (CURL: Srinivas et al., 2020; FERM: Zhan et al., 2020).
 
         Args:
             tensordict: observations [B], of which only the first of several views is used, and
@@ -264,14 +252,11 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         anchors = self._features(
             state[:, 0] if self.views > 1 else state, self.encoder_network_params
         )
-        return TensorDict({"loss_contrastive": self._contrastive_loss(anchors, tensordict)})
-
-    def _contrastive_loss(self, anchors: Tensor, tensordict: TensorDictBase) -> Tensor:
         with torch.no_grad():
             other = tensordict.get(keys.POSITIVE)
             positives = self._features(other, self.target_encoder_network_params)
         losses = self.contrastive(anchors, positives)
-        return self.contrastive_weight * reduce_loss(losses, self.reduction)
+        return TensorDict({"loss_contrastive": reduce_loss(losses, self.reduction)})
 
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
@@ -330,7 +315,3 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
 
     def _reduced(self, losses: Tensor, weights: Tensor | None) -> Tensor:
         return reduce_loss(weighted(losses, weights), self.reduction)
-
-
-def _as_path(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key

@@ -110,12 +110,12 @@ def test_the_number_of_demonstrations_does_not_change_the_graph(network, channel
     learner, _ = build_spatial(network, channels)
     batch = spatial_transitions(learner)[:8]
     learner.compile("default")
-    learner.compute_losses(batch.copy())
+    learner.stages[0](batch.copy())
     with torch.compiler.set_stance("fail_on_recompile"):
         for experts, held in ((0, 8), (3, 5), (8, 0)):
             for key, count in ((keys.IS_EXPERT, experts), (keys.HOLDING, held)):
                 batch[key] = (torch.arange(8) < count).reshape(batch[key].shape).to(batch[key])
-            learner.compute_losses(batch.copy())
+            learner.stages[0](batch.copy())
 
 
 def updates_equal_those_of_an_eager_learner(algorithm, network, settings, rtol):
@@ -199,12 +199,12 @@ def test_results_are_copies_and_priorities_are_written():
 @pytest.mark.usefixtures("eager_backend")
 def test_a_run_with_compile_mode(tmp_path):
     learner = run(tmp_path, "cnn", {"name": "sac"}, compile_mode="default")
-    assert isinstance(learner.compute_losses, CompiledLoss)
+    assert isinstance(learner.stages[0], CompiledLoss)
 
 
 def test_a_run_without_it_is_not_compiled(tmp_path):
     learner = make_experiment(tmp_path, "cnn", {"name": "sac"}).algorithm
-    assert learner.compute_losses is learner.loss
+    assert learner.stages == [learner.loss]
 
 
 def test_an_algorithm_that_cannot_be_compiled_says_so_before_the_run(tmp_path):
@@ -259,10 +259,10 @@ def test_the_first_update_draws_the_random_numbers_of_a_later_one():
     learner.compile("default")
     learner.sample()
     batch, state = learner.sample(), torch.get_rng_state()
-    first = learner.compute_losses(batch.copy())
+    first = learner.stages[0](batch.copy())
     after = torch.get_rng_state()
     torch.set_rng_state(state)
-    second = learner.compute_losses(batch.copy())
+    second = learner.stages[0](batch.copy())
     assert torch.equal(torch.get_rng_state(), after)
     for key, value in second.items():
         assert torch.equal(first[key], value)

@@ -150,11 +150,11 @@ class ReadsOnTheHost(TorchDispatchMode):
 def test_the_host_reads_no_result_during_an_update(algorithm, network, settings):
     learner = deferred(algorithm, network, **settings)
     for _ in range(2):  # the optimiser's state exists afterwards
-        learner.minimize(learner.loss(learner.sample()))
+        learner.minimize([learner.loss(learner.sample())])
     learner.state_dict()
     batch = learner.sample()
     with ReadsOnTheHost() as reads:
-        learner.minimize(learner.loss(batch))
+        learner.minimize([learner.loss(batch)])
     # AveragedModel reads its own counter, which is on the CPU for any device
     counter = 2 * ["aten::_local_scalar_dense"] if learner.averaged_policy is not None else []
     assert reads.found == counter

@@ -148,11 +148,10 @@ def test_the_options_reach_augmentation_loss_and_target_update():
     assert (augmentation.padding, augmentation.views, augmentation.target_views) == (3, 3, 2)
     assert (drq.loss.views, drq.loss.target_views) == (3, 2)
     assert drq.loss.contrastive is None
-    ferm = build("ferm_sacfd", "ferm", contrastive_weight=0.3, encoder_tau=0.2, tau=0.1)
+    ferm = build("ferm_sacfd", "ferm", encoder_tau=0.2, tau=0.1)
     assert ferm.augmentation.has_positive
     assert ferm.augmentation.padding == 0
     assert ferm.loss.contrastive.weight.shape == (8, 8)
-    assert ferm.loss.contrastive_weight == 0.3
     assert isinstance(ferm.target_updater, SoftUpdateByNetwork)
     assert ferm.target_updater.tau == 0.1
     assert ferm.target_updater.taus == {"encoder_network_params": 0.2}
@@ -161,7 +160,7 @@ def test_the_options_reach_augmentation_loss_and_target_update():
 
 
 def test_contrastive_pretraining_trains_the_encoder_only():
-    ferm = build("ferm_sacfd", "ferm")
+    ferm = build("ferm_sacfd", "ferm", learning_rate=3e-4)
     ferm.extend(transitions(ferm))
     before = parameters(ferm)
     scalars = ferm.pretrain_update()
@@ -319,8 +318,8 @@ def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
     ("changes", "message"),
     [
         ({"views": 2}, "need view_transform"),
-        ({"contrastive_weight": 1.0}, "need view_transform"),
-        ({"pretraining": "contrastive"}, "needs contrastive_weight"),
+        ({"contrastive": True}, "need view_transform"),
+        ({"pretraining": "contrastive"}, "needs contrastive=true"),
         ({"stored_copies": 4}, "stored_copies needs augmentation"),
     ],
 )

@@ -104,7 +104,7 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
     whole = run(config_for(tmp_path / "whole"))
 
     assert result.updates == whole.updates == 9
-    assert experiment.algorithm.scheduler.last_epoch == 9
+    assert experiment.algorithm.optimizers.state_dict()["scheduler"]["last_epoch"] == 9
     a, b = (read_result(run.record.parent) for run in (result, whole))
     assert [point.updates for point in a.curve] == [3, 6, 9]
     # two updates on demonstrations, then one for each step of both environments

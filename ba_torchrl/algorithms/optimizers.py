@@ -1,0 +1,166 @@
+"""Optimisers of the terms of a loss."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any
+
+from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+logger = logging.getLogger(__name__)
+
+
+class Optimizers:
+    """The optimisers of a learner and the schedules of their learning rates.
+
+    Args:
+        main: of all terms of the loss that have no optimiser of their own.
+        of_terms: the other optimisers: by the name of a term, those that minimise it, by name. A
+            parameter can be in several optimisers, each of which has moments of its own.
+        make_scheduler: returns the schedule of an optimiser's learning rate.
+        clamp: bound of each element of some gradients; None for no bound.
+        clamped: their parameters.
+    """
+
+    def __init__(
+        self,
+        main: Optimizer,
+        of_terms: Mapping[str, Mapping[str, Optimizer]],
+        make_scheduler: Callable[[Optimizer], LRScheduler],
+        *,
+        clamp: float | None = None,
+        clamped: Collection[nn.Parameter] = (),
+    ) -> None:
+        self._main = main
+        self._of_terms = of_terms
+        self._clamp, self._clamped = clamp, clamped
+        self._stepped: set[Optimizer] = set()
+        prefixed = {
+            f"{name}_": optimizer
+            for optimizers in of_terms.values()
+            for name, optimizer in optimizers.items()
+        }
+        self._named = {"": main, **prefixed}
+        self.schedulers = {name: make_scheduler(each) for name, each in self._named.items()}
+
+    def of(self, terms: Collection[str]) -> list[Optimizer]:
+        """Return the optimisers that minimise a sum of terms.
+
+        Args:
+            terms: names of the terms.
+
+        Raises:
+            ValueError: the terms have different optimisers.
+        """
+        own = [list(self._of_terms[term].values()) for term in terms if term in self._of_terms]
+        if not own:
+            return [self._main]
+        if len(own) < len(terms) or any(each != own[0] for each in own):
+            raise ValueError(
+                f"the terms {', '.join(terms)} have different optimisers; minimise them one after "
+                "the other"
+            )
+        return own[0]
+
+    def minimize(
+        self, loss: Tensor, terms: Collection[str], condition: Tensor | None = None
+    ) -> None:
+        """Take one step of each optimiser of a sum of terms, along the gradient of this sum.
+
+        Args:
+            loss: the sum.
+            terms: names of the terms.
+            condition: bool scalar on the parameters' device, False for a step that changes nothing;
+                None for True.
+
+        Raises:
+            ValueError: the terms have different optimisers.
+        """
+        optimizers = self.of(terms)
+        for optimizer in optimizers:
+            if condition is not None:
+                optimizer.found_inf = (~condition).float()  # as a GradScaler does
+            optimizer.zero_grad()
+        loss.backward()
+        if self._clamp is not None:
+            nn.utils.clip_grad_value_(self._clamped, self._clamp)
+        for optimizer in optimizers:
+            optimizer.step()
+        self._stepped.update(optimizers)
+
+    def step_schedules(self) -> None:
+        """Take one step of every learning rate."""
+        for name, scheduler in self.schedulers.items():
+            optimizer = self._named[name]
+            if optimizer not in self._stepped:  # torch warns of a schedule without steps
+                optimizer.zero_grad()
+                optimizer.step()  # without a gradient: changes nothing
+                self._stepped.add(optimizer)
+            scheduler.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states of optimisers and schedules, by name."""
+        return {
+            **{f"{name}optimizer": each.state_dict() for name, each in self._named.items()},
+            **{f"{name}scheduler": each.state_dict() for name, each in self.schedulers.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the states from those of a `state_dict` of any device.
+
+        Moments that do not fit the parameters are left out, and a warning says so.
+        """
+        for name, optimizer in self._named.items():
+            saved = state[f"{name}optimizer"]
+            if fits(optimizer, saved):
+                optimizer.load_state_dict(saved)
+            else:
+                logger.warning(
+                    "%soptimizer: moments of another version; they are not restored", name
+                )
+            scheduler = self.schedulers[name]
+            scheduler.load_state_dict(state[f"{name}scheduler"])
+            # the optimiser's rates, unless its state was left out
+            for group, rate in zip(optimizer.param_groups, scheduler.get_last_lr(), strict=False):
+                group["lr"] = rate
+
+
+def make_adam(
+    parameters: Iterable[nn.Parameter],
+    decayed: Iterable[nn.Parameter],
+    learning_rate: float,
+    weight_decay: float,
+) -> Adam:
+    """Return Adam with weight decay on a part of its parameters.
+
+    Args:
+        parameters: all of them.
+        decayed: those with weight decay, and possibly others.
+        learning_rate: of all.
+        weight_decay: factor of the L2 term.
+    """
+    others = {id(parameter): parameter for parameter in parameters}
+    chosen = [p for p in decayed if others.pop(id(p), None) is not None]
+    groups = [
+        {"params": chosen, "weight_decay": weight_decay},
+        {"params": list(others.values()), "weight_decay": 0.0},
+    ]
+    return Adam([group for group in groups if group["params"]], lr=learning_rate, fused=True)
+
+
+def fits(optimizer: Optimizer, state: Mapping[str, Any]) -> bool:
+    """Return whether the moments in a ``state_dict`` have the shapes of the parameters."""
+    groups = state["param_groups"]
+    if len(groups) != len(optimizer.param_groups):
+        return False
+    for group, saved in zip(optimizer.param_groups, groups, strict=True):
+        if len(group["params"]) != len(saved["params"]):
+            return False
+        for parameter, index in zip(group["params"], saved["params"], strict=True):
+            moments = state["state"].get(index, {}).get("exp_avg")
+            if moments is not None and moments.shape != parameter.shape:
+                return False
+    return True
