@@ -79,7 +79,7 @@ class CompiledLoss:
         check_compiler(next(loss.parameters()).device)
         self.loss = loss
         self.mode = mode
-        self._function = loss if function is None else function
+        self.function = loss if function is None else function
         self._is_compiled = False
 
     def __call__(self, batch: TensorDictBase) -> TensorDict:
@@ -88,15 +88,15 @@ class CompiledLoss:
             self._is_compiled = True
             device = next(self.loss.parameters()).device
             with torch.random.fork_rng([device] if device.type == "cuda" else []):
-                self._function(batch.copy())
-            if self._function is self.loss:
+                self.function(batch.copy())
+            if self.function is self.loss:
                 self.loss.compile(mode=self.mode, dynamic=False)
             else:
-                self._function = torch.compile(self._function, mode=self.mode, dynamic=False)
+                self.function = torch.compile(self.function, mode=self.mode, dynamic=False)
         torch.compiler.cudagraph_mark_step_begin()
         # the compiled loss sets both modes, and does not reset them
         with set_exploration_type(self.loss.deterministic_sampling_mode), set_recurrent_mode(True):
-            scalars = self._function(batch).clone()
+            scalars = self.function(batch).clone()
         if keys.TD_ERROR in batch:
             batch[keys.TD_ERROR] = batch[keys.TD_ERROR].clone()
         return scalars

@@ -16,6 +16,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training.checkpoint import read_config
 from tests.algorithms.tiny import (
+    FERM,
     SIZES,
     make_experiment,
     problem,
@@ -77,12 +78,19 @@ def assert_one_graph(loss, batch):
 
 @pytest.mark.parametrize(
     ("algorithm", "network", "settings"),
-    [("sac", "cnn", SACFD), ("sac", "equi", SACFD), ("bc", "cnn", {}), ("dagger", "cnn", {})],
+    [
+        ("sac", "cnn", SACFD),
+        ("sac", "equi", SACFD),
+        ("sac", "ferm", FERM),
+        ("bc", "cnn", {}),
+        ("dagger", "cnn", {}),
+    ],
 )
 @pytest.mark.parametrize("precision", ["auto", "float32"])
 def test_a_loss_is_one_graph(algorithm, network, settings, precision):
     learner = build(algorithm, network, precision, **settings)
-    assert_one_graph(learner.loss, learner.sample())
+    for stage in learner.stages:
+        assert_one_graph(stage, learner.sample())
 
 
 @pytest.mark.parametrize(
@@ -139,8 +147,8 @@ def updates_equal_those_of_an_eager_learner(algorithm, network, settings, rtol):
 
 CASES = pytest.mark.parametrize(
     ("algorithm", "network", "settings"),
-    [("sac", "cnn", SACFD), ("spatial_q", "asr", SDQFD)],
-    ids=["sacfd cnn", "sdqfd asr"],
+    [("sac", "cnn", SACFD), ("sac", "ferm", FERM), ("spatial_q", "asr", SDQFD)],
+    ids=["sacfd cnn", "ferm", "sdqfd asr"],
 )
 
 
@@ -185,8 +193,7 @@ def test_results_are_copies_and_priorities_are_written():
         returned["priority"] = data[keys.TD_ERROR]
         return returned["losses"]
 
-    forward.deterministic_sampling_mode = learner.loss.deterministic_sampling_mode
-    loss.loss = forward
+    loss.function = forward
     scalars = loss(batch)
     for key, value in returned["losses"].items():
         assert torch.equal(scalars[key], value)

@@ -8,7 +8,7 @@ from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.host_tasks import HostTasks
 from ba_torchrl.config import parse
 from ba_torchrl.envs import keys
-from tests.algorithms.tiny import build, spatial_problem, spatial_transitions, transitions
+from tests.algorithms.tiny import FERM, build, spatial_problem, spatial_transitions, transitions
 
 CPU = torch.device("cpu")
 SACFD = {"demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
@@ -92,11 +92,21 @@ def test_the_first_update_is_that_of_the_cpu():
     assert torch.equal(priorities(waits), priorities(goes_on))
 
 
-def test_a_loss_that_is_not_finite_changes_nothing_and_is_reported_in_the_next_update(tmp_path):
-    learner = deferred(**SACFD)
+@pytest.mark.parametrize(
+    ("network", "settings"), [("cnn", SACFD), ("ferm", FERM)], ids=["one stage", "two stages"]
+)
+def test_a_loss_that_is_not_finite_changes_nothing_and_is_reported_in_the_next_update(
+    tmp_path, network, settings
+):
+    def steps():
+        states = learner.optimizers.state_dict()
+        names = [name for name in states if name.endswith("optimizer")]
+        return [each["step"].item() for name in names for each in states[name]["state"].values()]
+
+    learner = deferred(network=network, **settings)
     learner.update()
     before = parameters(learner)
-    steps = [state["step"].clone() for state in learner.optimizer.state.values()]
+    steps_before = steps()
     sound = learner.sample
 
     def broken(**options):
@@ -108,8 +118,7 @@ def test_a_loss_that_is_not_finite_changes_nothing_and_is_reported_in_the_next_u
     learner.update()
     for one, two in zip(before, parameters(learner), strict=True):
         assert torch.equal(one, two)
-    for one, state in zip(steps, learner.optimizer.state.values(), strict=True):
-        assert torch.equal(one, state["step"])
+    assert steps() == steps_before
     learner.sample = sound
     with pytest.raises(FloatingPointError, match="not finite at update 1"):
         learner.update()
@@ -142,6 +151,7 @@ class ReadsOnTheHost(TorchDispatchMode):
         ("sac", "cnn", SACFD),
         ("sac", "equi", {**SACFD, "gradient_clamp": 1.0, "policy_average": 0.9}),
         ("sac", "cnn", {"view_transform": "shift", "views": 2, "target_views": 2}),
+        ("sac", "ferm", {**FERM, "gradient_clamp": 1.0}),
         ("rlpd", "cnn", {"replay": "symmetric"}),
         ("bc", "cnn", {}),
         ("dagger", "cnn", {}),
@@ -150,15 +160,16 @@ class ReadsOnTheHost(TorchDispatchMode):
 def test_the_host_reads_no_result_during_an_update(algorithm, network, settings):
     learner = deferred(algorithm, network, **settings)
     for _ in range(2):  # the optimiser's state exists afterwards
-        learner.minimize([learner.loss(learner.sample())])
+        batch = learner.sample()
+        learner.minimize(stage(batch) for stage in learner.stages)
     learner.state_dict()
     batch = learner.sample()
     with ReadsOnTheHost() as reads:
-        learner.minimize([learner.loss(batch)])
+        learner.minimize(stage(batch) for stage in learner.stages)
     # AveragedModel reads its own counter, which is on the CPU for any device
     counter = 2 * ["aten::_local_scalar_dense"] if learner.averaged_policy is not None else []
     assert reads.found == counter
-    assert len(learner.host_tasks) == 1
+    assert len(learner.host_tasks) == len(learner.stages)
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")

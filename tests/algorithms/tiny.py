@@ -14,8 +14,11 @@ from tests.specs import close_loop_images, open_loop_images
 SIZES = {
     "cnn": {"width": 0.25},
     "equi": {"group_order": 4, "n_hidden": 8},
+    "ferm": {"width": 0.125, "features": 8},
     "asr": {"num_rotations": 4, "width": 0.125},
 }
+FERM = {"view_transform": "shift", "contrastive": True}
+"""SAC with optimisers of its own for one of the terms of the loss."""
 OPEN = {"task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects": 2}}
 """Changes of `run` for an open-loop task."""
 

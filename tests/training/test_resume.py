@@ -38,6 +38,17 @@ TINY = {
     "video_episodes": 0,
 }
 UNIFORM = {**TINY["algorithm"], "replay": "uniform"}
+FERM = {
+    "algorithm": {
+        **UNIFORM,
+        "view_transform": "shift",
+        "contrastive": True,
+        "pretraining": "contrastive",
+        "learning_rate_end_factor": 0.1,
+    },
+    "network": {"name": "ferm", "width": 0.1, "features": 8},
+}
+"""Changes for optimisers of single terms of the loss, with a schedule."""
 
 
 class Interrupted(BaseException):
@@ -93,15 +104,16 @@ def resumed(config):
     return experiment
 
 
-def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
-    config = config_for(tmp_path)
+@pytest.mark.parametrize("changes", [{}, FERM], ids=["sac", "ferm"])
+def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path, changes):
+    config = config_for(tmp_path, **changes)
     interrupt(config, after=5)
     assert resumable_updates(config.folder) == 3
     assert not (config.folder / "result.json").exists()
 
-    experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
+    experiment = Experiment(config_for(tmp_path, **changes, resume=True), progress=False)
     result = experiment.run()
-    whole = run(config_for(tmp_path / "whole"))
+    whole = run(config_for(tmp_path / "whole", **changes))
 
     assert result.updates == whole.updates == 9
     assert experiment.algorithm.optimizers.state_dict()["scheduler"]["last_epoch"] == 9
@@ -114,7 +126,8 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
     assert b.resumed_at == []
     assert a.curve[0].seconds < a.curve[1].seconds < a.curve[2].seconds < a.seconds
     scalars = read_scalars(config.folder)
-    assert scalars["train/loss_qvalue"].steps.tolist() == list(range(1, 10))
+    first = 3 if changes else 1
+    assert scalars["train/loss_qvalue"].steps.tolist() == list(range(first, 10))
     assert scalars["demonstrations/success_rate"].steps.tolist() == [0]
     demonstrated = len(experiment.algorithm.replay.storage.column("is_expert").nonzero())
     assert experiment.algorithm.replay_size == demonstrated + 14
@@ -123,9 +136,11 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
     assert find_checkpoint(config.folder, "latest").name.endswith("9")
 
 
-@pytest.mark.parametrize("algorithm", [TINY["algorithm"], UNIFORM], ids=["prioritized", "uniform"])
-def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_path, algorithm):
-    config = config_for(tmp_path, algorithm=algorithm)
+@pytest.mark.parametrize(
+    "changes", [{}, {"algorithm": UNIFORM}, FERM], ids=["prioritized", "uniform", "ferm"]
+)
+def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_path, changes):
+    config = config_for(tmp_path, **changes)
     first = interrupt_between_state_and_checkpoint(config)  # nothing has happened since
     expected = torch.random.get_rng_state()
     torch.manual_seed(12345)
@@ -137,9 +152,16 @@ def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_pa
     assert new.replay_size == old.replay_size
     for key, value in old.loss.state_dict().items():
         assert torch.equal(new.loss.state_dict()[key], value), key
-    for key in ("exp_avg", "exp_avg_sq", "step"):
-        for index, moments in old.optimizer.state_dict()["state"].items():
-            assert torch.equal(new.optimizer.state_dict()["state"][index][key], moments[key])
+    states, restored = old.optimizers.state_dict(), new.optimizers.state_dict()
+    assert states.keys() == restored.keys()
+    for name, state in states.items():
+        if not name.endswith("optimizer"):
+            assert restored[name] == state
+            continue
+        assert restored[name]["param_groups"] == state["param_groups"]
+        for index, moments in state["state"].items():
+            for key in ("exp_avg", "exp_avg_sq", "step"):
+                assert torch.equal(restored[name]["state"][index][key], moments[key])
     if config.algorithm_config.replay == "prioritized":
         a, b = (algorithm.replay.sampler.state_dict() for algorithm in (old, new))
         assert torch.equal(a["leaves"], b["leaves"])

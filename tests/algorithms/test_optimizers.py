@@ -1,0 +1,108 @@
+"""Optimisers of single terms of a loss, against a loop with one optimiser of torch for each."""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+from ba_torchrl.algorithms.optimizers import Optimizers
+from tests.algorithms.tiny import FERM, build, transitions
+
+RATE, TAU, ENCODER_TAU = 3e-3, 0.2, 0.4
+SETTINGS = {**FERM, "learning_rate": RATE, "tau": TAU, "encoder_tau": ENCODER_TAU}
+
+
+def ferm(**settings):
+    learner = build("sac", "ferm", **SETTINGS, **settings)
+    learner.extend(transitions(learner))
+    return learner
+
+
+def update_by_hand(loss, batch, optimizers, clamp, *, pretrains):
+    """CURL's update: a step on the critics' and the policy's loss, two on the contrastive one."""
+
+    def step(total, *chosen):
+        for optimizer in chosen:
+            optimizer.zero_grad()
+        total.backward()
+        for name, parameter in loss.named_parameters():
+            if name != "log_alpha" and parameter.grad is not None:
+                parameter.grad = parameter.grad.clamp(-clamp, clamp)
+        for optimizer in chosen:
+            optimizer.step()
+
+    critic, encoder, contrastive = optimizers
+    if not pretrains:
+        losses = loss(batch)
+        step(losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"], critic)
+    step(loss.contrastive_loss(batch)["loss_contrastive"], encoder, contrastive)
+    with torch.no_grad():
+        for name, tau in (("encoder", ENCODER_TAU), ("qvalue", TAU)):
+            target = getattr(loss, f"target_{name}_network_params")
+            for key, value in getattr(loss, f"{name}_network_params").items(True, True):
+                target[key].mul_(1 - tau).add_(tau * value)
+
+
+@pytest.mark.parametrize("clamp", [None, 0.02])
+def test_ferm_takes_the_steps_of_three_optimisers(clamp):
+    learner, other = (ferm(gradient_clamp=clamp, pretraining="contrastive") for _ in range(2))
+    loss = other.loss
+    named = dict(loss.named_parameters())
+    similarity = named.pop("contrastive.weight")
+    encoder = [p for name, p in named.items() if name.startswith("encoder_network_params")]
+    parameters = (named.values(), encoder, [*encoder, similarity])
+    optimizers = [torch.optim.Adam(each, RATE, fused=True) for each in parameters]
+    for number in range(6):
+        is_first = number < 3
+        torch.manual_seed(number)
+        scalars = learner.pretrain_update() if is_first else learner.update()
+        assert ("loss_qvalue" in scalars) is not is_first
+        torch.manual_seed(number)
+        bound = math.inf if clamp is None else clamp
+        update_by_hand(loss, other.sample(), optimizers, bound, pretrains=is_first)
+        for name, value in loss.state_dict().items():
+            # Adam's first steps magnify rounding errors of small gradients
+            difference = (learner.loss.state_dict()[name] - value).abs().max()
+            assert difference < RATE / 20, (number, name)
+
+
+def test_every_learning_rate_follows_the_schedule_of_the_run():
+    learner = ferm(learning_rate_end_factor=0.1, pretraining="contrastive")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for number, expected in enumerate(torch.linspace(RATE, RATE / 10, 11).tolist()):
+            states = learner.optimizers.state_dict()
+            names = [name for name in states if name.endswith("optimizer")]
+            assert len(names) == 3
+            for name in names:
+                rates = [group["lr"] for group in states[name]["param_groups"]]
+                assert rates == pytest.approx([expected] * len(rates))
+            if number < 10:
+                learner.pretrain_update() if number < 3 else learner.update()
+
+
+def test_weight_decay_of_all_optimisers_is_that_of_the_networks():
+    states = ferm(weight_decay=0.1).optimizers.state_dict()
+    decay = {
+        name: [group["weight_decay"] for group in state["param_groups"]]
+        for name, state in states.items()
+        if name.endswith("optimizer")
+    }
+    assert decay == {
+        "optimizer": [0.1, 0.0],
+        "encoder_optimizer": [0.1],
+        "contrastive_optimizer": [0.1],
+    }
+
+
+def test_terms_with_different_optimisers_are_not_minimised_together():
+    parameters = torch.nn.Linear(2, 2).parameters
+    main, first, second, third = (torch.optim.SGD(parameters(), 0.1) for _ in range(4))
+    of_terms = {"loss_a": {"a": first, "b": second}, "loss_c": {"c": third}}
+    optimizers = Optimizers(main, of_terms, lambda each: torch.optim.lr_scheduler.LinearLR(each))
+    assert optimizers.of(["loss_x", "loss_y"]) == [main]
+    assert optimizers.of(["loss_a"]) == [first, second]
+    for terms in (["loss_x", "loss_a"], ["loss_a", "loss_c"]):
+        with pytest.raises(ValueError, match=f"{terms[0]}, {terms[1]} have different optimisers"):
+            optimizers.of(terms)
