@@ -112,11 +112,6 @@ class Learner(Algorithm):
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
 
-    def make_stages(self) -> list[LossFunction]:
-        """Return the losses of an update in the order in which they are minimised, each after the
-        optimisers' step on the one before; by default the loss module alone."""
-        return [self.loss]
-
     def make_averaged_policy(self) -> AveragedModel | None:
         """Return the moving average of the policy that acts; None if the policy itself acts."""
         if not self.config.policy_average:
@@ -148,6 +143,11 @@ class Learner(Algorithm):
         """Return what changes the actions of the acting policy, called only when it explores; by
         default None, which leaves exploration to the policy's distribution."""
         return None
+
+    def make_stages(self) -> list[LossFunction]:
+        """Return the losses of an update in the order in which they are minimised, each after the
+        optimisers' step on the one before; by default the loss module alone."""
+        return [self.loss]
 
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""

@@ -252,24 +252,6 @@ class SAC(Learner):
         encoder."""
         return [self.loss, *([self.loss.contrastive_loss] if self.config.contrastive else [])]
 
-    def make_optimizer(self) -> Optimizer:
-        """Return Adam for all parameters but the contrastive loss's similarity."""
-        contrastive = self.loss.contrastive
-        if contrastive is None:
-            return super().make_optimizer()
-        own = set(map(id, contrastive.parameters()))
-        return self.adam(p for p in self.loss.parameters() if id(p) not in own)
-
-    def make_term_optimizers(self) -> dict[str, dict[str, Optimizer]]:
-        """Return the two optimisers of the contrastive loss, if configured."""
-        contrastive = self.loss.contrastive
-        if contrastive is None:
-            return {}
-        encoder = list(self.loss.encoder_network_params.parameters())
-        both = [*encoder, *contrastive.parameters()]
-        optimizers = {"encoder": self.adam(encoder), "contrastive": self.adam(both)}
-        return {"loss_contrastive": optimizers}
-
     def make_target_updater(self) -> SoftUpdate:
         """Return the soft update of the targets of critic and encoder."""
         config = self.config
@@ -307,6 +289,24 @@ class SAC(Learner):
         if len(parts) > 1:
             return nn.Sequential(*parts)
         return parts[0] if parts else nn.Identity()
+
+    def make_optimizer(self) -> Optimizer:
+        """Return Adam for all parameters but the contrastive loss's similarity."""
+        contrastive = self.loss.contrastive
+        if contrastive is None:
+            return super().make_optimizer()
+        own = set(map(id, contrastive.parameters()))
+        return self.adam(p for p in self.loss.parameters() if id(p) not in own)
+
+    def make_term_optimizers(self) -> dict[str, dict[str, Optimizer]]:
+        """Return the two optimisers of the contrastive loss, if configured."""
+        contrastive = self.loss.contrastive
+        if contrastive is None:
+            return {}
+        encoder = list(self.loss.encoder_network_params.parameters())
+        both = [*encoder, *contrastive.parameters()]
+        optimizers = {"encoder": self.adam(encoder), "contrastive": self.adam(both)}
+        return {"loss_contrastive": optimizers}
 
     def _make_rotation(self, probability: float, use: SeedUse) -> SO2Augmentation:
         return SO2Augmentation(

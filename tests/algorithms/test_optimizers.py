@@ -1,4 +1,4 @@
-"""Optimisers of single terms of a loss, against a loop with one optimiser of torch for each."""
+"""Optimisers of single terms of a loss, against a loop with torch."""
 
 import math
 import warnings
