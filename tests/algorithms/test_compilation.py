@@ -79,9 +79,8 @@ def assert_one_graph(loss, batch):
 @pytest.mark.parametrize(
     ("algorithm", "network", "settings"),
     [
-        ("sac", "cnn", SACFD),
+        ("sac", "cnn", {**SACFD, **FERM}),
         ("sac", "equi", SACFD),
-        ("sac", "ferm", FERM),
         ("bc", "cnn", {}),
         ("dagger", "cnn", {}),
     ],
@@ -147,8 +146,8 @@ def updates_equal_those_of_an_eager_learner(algorithm, network, settings, rtol):
 
 CASES = pytest.mark.parametrize(
     ("algorithm", "network", "settings"),
-    [("sac", "cnn", SACFD), ("sac", "ferm", FERM), ("spatial_q", "asr", SDQFD)],
-    ids=["sacfd cnn", "ferm", "sdqfd asr"],
+    [("sac", "cnn", {**SACFD, **FERM}), ("spatial_q", "asr", SDQFD)],
+    ids=["sacfd cnn", "sdqfd asr"],
 )
 
 
