@@ -40,7 +40,7 @@ class SegmentTree:
         if isinstance(index, int):
             return float(self._nodes[self._leaves + index])
         index = np.asarray(index)
-        return torch.as_tensor(self._nodes[self._leaves + index]).to(self.dtype)
+        return torch.as_tensor(self._nodes[self._leaves + index], device="cpu").to(self.dtype)
 
     def __setitem__(
         self, index: int | np.ndarray | torch.Tensor, value: float | np.ndarray | torch.Tensor
@@ -122,7 +122,7 @@ class SumTree(SegmentTree):
             rest -= np.where(go_right, left, 0.0)
             node = 2 * node + go_right
         leaf = np.minimum(node - self._leaves, self.capacity)
-        return int(leaf[0]) if np.ndim(mass) == 0 else torch.as_tensor(leaf)
+        return int(leaf[0]) if np.ndim(mass) == 0 else torch.as_tensor(leaf, device="cpu")
 
 
 class MinTree(SegmentTree):

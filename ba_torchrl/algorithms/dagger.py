@@ -84,7 +84,9 @@ class MixedPolicy(TensorDictModuleBase):
         out = self.policy(tensordict)
         if exploration_type() != ExplorationType.RANDOM or self.beta == 0:
             return out
-        draws = torch.rand(*out.batch_size, 1, generator=self._generator)
+        draws = torch.rand(
+            *out.batch_size, 1, generator=self._generator, device="cpu", dtype=torch.float32
+        )
         expert = self._imitator.nearest_action(out[keys.EXPERT_ACTION])
         is_expert = draws.to(expert.device) < self.beta
         return out.set(keys.ACTION, torch.where(is_expert, expert, out[keys.ACTION]))

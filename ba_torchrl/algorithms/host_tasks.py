@@ -47,7 +47,7 @@ class HostTasks:
             self._waiting.append((None, {k: v.clone().cpu() for k, v in values.items()}, task))
             return
         copies = {
-            name: torch.empty(value.shape, dtype=value.dtype, pin_memory=True).copy_(
+            name: torch.empty(value.shape, dtype=value.dtype, device="cpu", pin_memory=True).copy_(
                 value, non_blocking=True
             )
             for name, value in values.items()

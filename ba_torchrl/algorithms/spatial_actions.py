@@ -60,7 +60,7 @@ def demonstration_on_grid(
     if keys.EXPERT_ACTION in episode:
         out.set(keys.EXPERT_ACTION, grid.nearest(episode[keys.EXPERT_ACTION]))
     is_swapped = grid.swaps_fingers(action)
-    is_over = torch.zeros(len(episode) + 1, dtype=torch.bool)
+    is_over = torch.zeros(len(episode) + 1, dtype=torch.bool, device="cpu")
     for t, is_holding in enumerate(episode[keys.HOLDING].flatten().tolist()):
         is_over[t + 1] = is_over[t] if is_holding else is_swapped[t]
     for key, image in images.items():

@@ -53,7 +53,7 @@ def save_demonstrations(
     if path.exists() and any(path.iterdir()):
         raise FileExistsError(f"{path} is not empty; choose another folder")
     numbered = [
-        episode.copy().set(_EPISODE, torch.full((len(episode), 1), number))
+        episode.copy().set(_EPISODE, torch.full((len(episode), 1), number, device="cpu"))
         for number, episode in enumerate(episodes)
     ]
     scratch = path.with_name(f".{path.name}.scratch")

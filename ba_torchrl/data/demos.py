@@ -135,7 +135,7 @@ class RandomActions:
         self._space = env.action_spec.space
         self._probability = probability
         self._turn_probability = turn_probability
-        self._is_turn = torch.zeros(env.action_spec.shape[-1], dtype=torch.bool)
+        self._is_turn = torch.zeros(env.action_spec.shape[-1], dtype=torch.bool, device="cpu")
         self._is_turn[list(turns)] = True
         self._is_drawn = torch.ones_like(self._is_turn)
         if primitive is not None:
@@ -150,14 +150,18 @@ class RandomActions:
         """
         action = tensordict[keys.ACTION]
         low, high = self._space.low, self._space.high
-        drawn = low + (high - low) * torch.rand(action.shape, generator=self._generator)
-        is_random = torch.rand(len(action), 1, generator=self._generator) < self._probability
+        drawn = low + (high - low) * self._draw(*action.shape)
+        is_random = self._draw(len(action), 1) < self._probability
         replaced = is_random & self._is_drawn
         if self._turn_probability:
-            turns = torch.rand(len(action), 1, generator=self._generator) < self._turn_probability
+            turns = self._draw(len(action), 1) < self._turn_probability
             replaced = replaced | (turns & self._is_turn)
         tensordict.set(keys.ACTION, torch.where(replaced, drawn, action))
         return tensordict.set(keys.IS_EXPERT, ~replaced.any(dim=-1, keepdim=True))
+
+    def _draw(self, *shape: int) -> Tensor:
+        """Return uniform random numbers in [0, 1)."""
+        return torch.rand(shape, generator=self._generator, device="cpu", dtype=torch.float32)
 
 
 def check_noise(noise: float, source: Source, name: str) -> None:

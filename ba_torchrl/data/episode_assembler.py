@@ -49,12 +49,16 @@ class EpisodeAssembler:
                 ended.append(self._flagged(index, is_successful=is_successful))
         if ended:
             return torch.cat(ended)
-        return data[:0].clone().set(keys.IS_EXPERT, torch.zeros(0, 1, dtype=torch.bool))
+        return (
+            data[:0].clone().set(keys.IS_EXPERT, torch.zeros(0, 1, dtype=torch.bool, device="cpu"))
+        )
 
     def _flagged(self, index: int, *, is_successful: bool) -> TensorDictBase:
         """Return an environment's episode, which has ended, with its flag."""
         episode = torch.cat(self._running.pop(index))
-        return episode.set(keys.IS_EXPERT, torch.full((len(episode), 1), is_successful))
+        return episode.set(
+            keys.IS_EXPERT, torch.full((len(episode), 1), is_successful, device="cpu")
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return the transitions of the episodes that have not ended, by environment."""

@@ -72,7 +72,7 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
         )
         after[keys.IN_HAND] = shown.flip(0)
         before[keys.IN_HAND] = torch.cat([following[keys.IN_HAND][-1:], shown[1:].flip(0)])
-    count = torch.arange(steps)[:, None]
+    count = torch.arange(steps, device="cpu")[:, None]
     last = count == steps - 1
     never = torch.zeros_like(last)
     for state, number, at_goal in ((before, count, never), (after, count + 1, last)):

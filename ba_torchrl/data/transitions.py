@@ -35,7 +35,7 @@ def as_transitions(
     state = [*images, keys.HOLDING]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
     out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))
-    out[keys.IS_EXPERT] = torch.full((len(flat), 1), is_expert)
+    out[keys.IS_EXPERT] = torch.full((len(flat), 1), is_expert, device="cpu")
     if is_expert and label != keys.EXPERT_ACTION and keys.IS_EXPERT in flat:
         out[keys.IS_EXPERT] = flat[keys.IS_EXPERT].clone()
     if label is not None:

@@ -56,7 +56,7 @@ class SpatialActions:
             for name, count in zip(level.components, level.shape, strict=True)
         ]
         self._positions = [actions.components.index(name) for name in chosen]
-        ends = torch.tensor([len(level.shape) for level in levels]).cumsum(0).tolist()
+        ends = torch.tensor([len(level.shape) for level in levels], device="cpu").cumsum(0).tolist()
         self._parts = [
             slice(end - len(level.shape), end) for end, level in zip(ends, levels, strict=True)
         ]
@@ -245,7 +245,10 @@ class SpatialPolicy(nn.Module):
         holding = holding.reshape(count, 1)
         indices, _ = self.values.greedy(*images, holding)
         if exploration_type() == ExplorationType.RANDOM and self.epsilon > 0:
-            explores = torch.rand(count, generator=self._generator) < self.epsilon.cpu()
+            explores = (
+                torch.rand(count, generator=self._generator, device="cpu", dtype=torch.float32)
+                < self.epsilon.cpu()
+            )
             random = self._random_indices(images[0]).to(indices.device)
             indices = torch.where(explores.to(indices.device)[:, None], random, indices)
         return self.values.actions.to_action(indices, holding).reshape(*leading, -1)
@@ -260,7 +263,9 @@ class SpatialPolicy(nn.Module):
         columns = {"x": pixel // width, "y": pixel % width}
         for name, axis in zip(actions.components, actions.axes, strict=True):
             if name not in columns:
-                columns[name] = torch.randint(axis.count, (count,), generator=self._generator)
+                columns[name] = torch.randint(
+                    axis.count, (count,), generator=self._generator, device="cpu"
+                )
         return torch.stack([columns[name] for name in actions.components], dim=-1)
 
 

@@ -153,7 +153,7 @@ class RLPDLoss(SharedEncoderCritics, TransitionLoss):
         action, log_prob = self._sample_action(following)
         features = self._features(following, self.target_encoder_network_params)
         q = self._values(features, action, self.target_qvalue_network_params)
-        chosen = torch.randperm(q.shape[-1], generator=self._generator)[: self.subset]
+        chosen = torch.randperm(q.shape[-1], generator=self._generator, device="cpu")[: self.subset]
         value = q[..., chosen.to(q.device)].amin(dim=-1, keepdim=True)
         if self.entropy_backup:
             value = value - self.alpha * log_prob.unsqueeze(-1)

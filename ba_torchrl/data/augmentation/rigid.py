@@ -143,7 +143,7 @@ class RigidAugmentation(nn.Module):
         # devices.
         self._generator = torch.Generator().manual_seed(seed)
         self._xy = [actions.components.index(name) for name in "xy"]
-        bounds = torch.tensor(actions.bounds_m[:2], dtype=torch.float64)
+        bounds = torch.tensor(actions.bounds_m[:2], dtype=torch.float64, device="cpu")
         self._center, self._side = bounds.mean(dim=1), bounds[:, 1] - bounds[:, 0]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -179,7 +179,10 @@ class RigidAugmentation(nn.Module):
 
     def _draw_inside(self, action: Tensor) -> tuple[Tensor, RigidTransform]:
         """Return which actions [B, A] are transformed, bool [B], and the drawn transforms."""
-        is_wanted = torch.rand(len(action), generator=self._generator) < self.probability
+        is_wanted = (
+            torch.rand(len(action), generator=self._generator, device="cpu", dtype=torch.float32)
+            < self.probability
+        )
         transform = self._draw(len(action))
         is_found = is_wanted & self._stays_inside(action, transform)
         for _ in range(ATTEMPTS - 1):
@@ -196,13 +199,13 @@ class RigidAugmentation(nn.Module):
 
     def _draw(self, count: int) -> RigidTransform:
         """Return random transforms."""
-        draws = torch.rand(2, count, generator=self._generator, dtype=torch.float64)
-        shift = torch.zeros(count, 2, dtype=torch.float64)
+        draws = torch.rand(2, count, generator=self._generator, dtype=torch.float64, device="cpu")
+        shift = torch.zeros(count, 2, dtype=torch.float64, device="cpu")
         if self.transforms in ("translation", "se2"):
             shift.normal_(0.0, SHIFT_SHARE, generator=self._generator)
         steps = {"cn": self.order, "d4": 4, "translation": 1}.get(self.transforms)
         turn = draws[0] if steps is None else (draws[0] * steps).floor() / steps
-        mirrored = torch.zeros(count, dtype=torch.bool)
+        mirrored = torch.zeros(count, dtype=torch.bool, device="cpu")
         if self.transforms == "d4":
             mirrored = draws[1] < 0.5
         return RigidTransform(mirrored, 2 * math.pi * turn, shift)
@@ -226,7 +229,7 @@ class RigidAugmentation(nn.Module):
         [B]."""
         moved = action.double()
         moved[:, self._xy] = self._positions(action, transform)
-        is_turned_over = torch.zeros(len(action), dtype=torch.bool)
+        is_turned_over = torch.zeros(len(action), dtype=torch.bool, device="cpu")
         if "rz" not in self.actions.components:
             return moved.to(action), is_turned_over
         rz = self.actions.components.index("rz")

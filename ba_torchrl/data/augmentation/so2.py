@@ -162,7 +162,7 @@ class SO2Augmentation(nn.Module):
                 ``expert_action``.
         """
         (batch,) = tensordict.batch_size
-        draws = torch.rand(2, batch, generator=self._generator, dtype=torch.float64)
+        draws = torch.rand(2, batch, generator=self._generator, dtype=torch.float64, device="cpu")
         chosen = (draws[0] < self.probability).nonzero().squeeze(-1)
         angle = 2 * math.pi * draws[1, chosen]
         out = tensordict.copy()
@@ -174,7 +174,7 @@ class SO2Augmentation(nn.Module):
         for key in [keys.ACTION, *labels]:
             action = tensordict[key].clone()
             rows = to_device(chosen, action.device)[:, None]
-            plane = to_device(torch.tensor(self._plane), action.device)
+            plane = to_device(torch.tensor(self._plane, device="cpu"), action.device)
             action[rows, plane] = rotate_displacement(action[rows, plane], angle)
             out.set(key, action)
         return out

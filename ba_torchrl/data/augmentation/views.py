@@ -153,7 +153,9 @@ class RandomViews(nn.Module):
     def _draw(self, key: str, image: Tensor, views: int) -> Tensor:
         """Return uniform offsets [B, views, 2]."""
         choices = image.shape[-1] + 2 * self.padding - self.sizes[key] + 1
-        offsets = torch.randint(choices, (len(image), views, 2), generator=self._generator)
+        offsets = torch.randint(
+            choices, (len(image), views, 2), generator=self._generator, device="cpu"
+        )
         return to_device(offsets, image.device)
 
     def _take(self, key: str, image: Tensor, offsets: Tensor) -> Tensor:

@@ -95,7 +95,7 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
             self.faults_dropped += int((~sound).sum())
             data = data[sound]
         if not len(data):
-            return torch.zeros(0, dtype=torch.long)
+            return torch.zeros(0, dtype=torch.long, device="cpu")
         data = self.writer.select_fitting(data)
         return super().extend(data, update_priority=update_priority)
 

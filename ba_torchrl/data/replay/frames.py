@@ -93,7 +93,7 @@ class FrameTable:
             uint8 [bytes] and int64 [slots]; a free slot has size 0.
         """
         packed = np.frombuffer(bytearray().join(self._packed), np.uint8)
-        return torch.from_numpy(packed), torch.tensor([len(p) for p in self._packed])
+        return torch.from_numpy(packed), torch.tensor([len(p) for p in self._packed], device="cpu")
 
     def load(self, packed: Tensor, sizes: Tensor, uses: Iterable[int]) -> None:
         """Restore frames that ``dump`` returned.

@@ -91,10 +91,12 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         if count == 0:
             raise RuntimeError("cannot sample from an empty replay")
         total, smallest = self._sum_tree.query(0, count), self._min_tree.query(0, count)
-        mass = total * torch.rand(batch_size, generator=self.generator, dtype=torch.float64)
-        index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass)).long()
+        mass = total * torch.rand(
+            batch_size, generator=self.generator, dtype=torch.float64, device="cpu"
+        )
+        index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass), device="cpu").long()
         index = index.clamp_max(count - 1)  # rounding of the total
-        leaf = torch.as_tensor(self._sum_tree[index])
+        leaf = torch.as_tensor(self._sum_tree[index], device="cpu")
         weights = {"priority_weight": (leaf / smallest).pow(-self.beta).float()}
         return (torch.unravel_index(index, storage.shape) if storage.ndim > 1 else index), weights
 
@@ -122,7 +124,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         index = _flat_index(index, storage)
         if not index.numel():
             return
-        error = torch.as_tensor(priority, dtype=self.dtype).detach().cpu().reshape(-1).abs()
+        error = torch.as_tensor(priority, dtype=self.dtype, device="cpu").detach().reshape(-1).abs()
         if not error.isfinite().all():
             raise ValueError("a TD error is not finite: the run has diverged")
         error = error.expand(index.shape)
@@ -143,7 +145,9 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
             storage: as of `update_priority`; needed if it has several dimensions.
         """
         index = _flat_index(index, storage)
-        self._set_leaves(index, torch.full(index.shape, self.default_priority, dtype=self.dtype))
+        self._set_leaves(
+            index, torch.full(index.shape, self.default_priority, dtype=self.dtype, device="cpu")
+        )
 
     def _set_leaves(self, index: Tensor, raw: Tensor) -> None:
         """Set priorities before the exponent, float64 [N], at flat indices [N]."""
@@ -165,9 +169,9 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
 
     def state_dict(self) -> dict[str, Any]:
         """Return priorities, exponents and the generator's state, as tensors and numbers."""
-        everything = torch.arange(self._max_capacity)
+        everything = torch.arange(self._max_capacity, device="cpu")
         return {
-            "leaves": torch.as_tensor(self._sum_tree[everything]).clone(),
+            "leaves": torch.as_tensor(self._sum_tree[everything], device="cpu").clone(),
             "max_priority": self._max_priority,
             "beta": self.beta,
             "generator": self.generator.get_state(),
@@ -202,9 +206,9 @@ def _flat_index(index: int | Tensor | tuple[Tensor, ...], storage: Storage | Non
     """Return indices into the flattened storage, int64 [N] on the CPU."""
     if storage is not None and storage.ndim > 1:
         if not isinstance(index, tuple):
-            index = torch.as_tensor(index).reshape(-1, storage.ndim).unbind(-1)
-        flat = torch.zeros((), dtype=torch.long)
+            index = torch.as_tensor(index, device="cpu").reshape(-1, storage.ndim).unbind(-1)
+        flat = torch.zeros((), dtype=torch.long, device="cpu")
         for part, size in zip(index, storage.shape, strict=True):
-            flat = flat * size + torch.as_tensor(part, dtype=torch.long).cpu()
+            flat = flat * size + torch.as_tensor(part, dtype=torch.long, device="cpu").cpu()
         return flat.reshape(-1)
-    return torch.as_tensor(index, dtype=torch.long).cpu().reshape(-1)
+    return torch.as_tensor(index, dtype=torch.long, device="cpu").cpu().reshape(-1)

@@ -46,7 +46,9 @@ class FrameStorage(StateFolder, LazyTensorStorage):
         ]
         self._frames: dict[str, FrameTable] = {}
         # Slots of (image, next image) by key and transition, -1 where none is stored yet.
-        self._slots = torch.full((len(codecs), self.max_size, 2), -1, dtype=torch.int32)
+        self._slots = torch.full(
+            (len(codecs), self.max_size, 2), -1, dtype=torch.int32, device="cpu"
+        )
 
     def set(
         self,
@@ -64,8 +66,12 @@ class FrameStorage(StateFolder, LazyTensorStorage):
         """
         if isinstance(cursor, int) or (isinstance(cursor, Tensor) and not cursor.ndim):
             cursor, data = [int(cursor)], data.unsqueeze(0)
-        indices = torch.arange(self.max_size)[cursor] if isinstance(cursor, slice) else cursor
-        indices = torch.as_tensor(indices, dtype=torch.long)
+        indices = (
+            torch.arange(self.max_size, device="cpu")[cursor]
+            if isinstance(cursor, slice)
+            else cursor
+        )
+        indices = torch.as_tensor(indices, dtype=torch.long, device="cpu")
         if len(indices) > self.max_size:  # keep the last of each index
             indices, data = indices[-self.max_size :], data[-self.max_size :]
         super().set(indices, data.exclude(*self.frame_keys), set_cursor=set_cursor)
@@ -127,7 +133,7 @@ class FrameStorage(StateFolder, LazyTensorStorage):
     def image_types(self) -> dict[str, tuple[torch.dtype, torch.Size]]:
         """Type and shape of each image by key; empty before the first transition is stored."""
         decoded = {
-            key: self.codecs[key].decode(torch.zeros(table.shape, dtype=torch.uint8))
+            key: self.codecs[key].decode(torch.zeros(table.shape, dtype=torch.uint8, device="cpu"))
             for key, table in self._frames.items()
         }
         return {key: (image.dtype, image.shape) for key, image in decoded.items()}
@@ -202,7 +208,7 @@ class FrameStorage(StateFolder, LazyTensorStorage):
             {tuple(name.split("/")): value for name, value in state_dict["columns"].items()},
             batch_size=[size],
         )
-        super().set(torch.arange(size), columns)
+        super().set(torch.arange(size, device="cpu"), columns)
         self._frames = {}
         for number, key in enumerate(self.codecs):
             saved = state_dict["frames"][key]

@@ -45,7 +45,7 @@ class SymmetricSampler(StateFolder, Sampler):
         count = count if len(online) else 0
         halves = ((expert, batch_size - count), (online, count))
         index = [
-            places[torch.randint(len(places), (n,), generator=generator)]
+            places[torch.randint(len(places), (n,), generator=generator, device="cpu")]
             for (places, n), generator in zip(halves, self.generators.values(), strict=True)
             if n
         ]

@@ -37,7 +37,7 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
                 f"demonstrations fill the replay of {self._storage.max_size} transitions, and "
                 f"{len(data)} more do not fit; raise buffer_size"
             )
-        is_chosen = torch.ones(len(data), dtype=torch.bool)
+        is_chosen = torch.ones(len(data), dtype=torch.bool, device="cpu")
         is_chosen[others[:excess]] = False
         return data[is_chosen]
 
@@ -59,10 +59,13 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         storage = self._storage
         if len(storage) + len(data) <= storage.max_size or keys.IS_EXPERT not in data:
             return None
-        is_kept = torch.zeros(storage.max_size, dtype=torch.bool)
+        is_kept = torch.zeros(storage.max_size, dtype=torch.bool, device="cpu")
         if len(storage):
             is_kept[: len(storage)] = storage.column(keys.IS_EXPERT).reshape(-1)
         if not (is_kept.any() or data[keys.IS_EXPERT].any()):
             return None
-        order = torch.arange(self._cursor, self._cursor + storage.max_size) % storage.max_size
+        order = (
+            torch.arange(self._cursor, self._cursor + storage.max_size, device="cpu")
+            % storage.max_size
+        )
         return order[~is_kept[order]]

@@ -61,7 +61,7 @@ class SingleCollection(Collection):
 
     def __next__(self) -> TensorDict:
         data = next(self._steps)
-        return data.set(keys.ENV_INDEX, torch.arange(len(data)))
+        return data.set(keys.ENV_INDEX, torch.arange(len(data), device="cpu"))
 
     def get_positions(self) -> list[Position] | None:
         """Return the position of each environment; None if one has failed."""

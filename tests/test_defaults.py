@@ -1,0 +1,122 @@
+"""Environments, demonstrations, replay and augmentation do not depend on torch's defaults."""
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+import ba_torchrl
+from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+from ba_torchrl.data.augmentation.views import RandomViews
+from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.replay.codecs import make_codecs
+from ba_torchrl.data.replay.make import make_replay
+from ba_torchrl.data.transitions import as_transitions
+from ba_torchrl.envs import keys
+
+SETTERS = {"dtype": torch.set_default_dtype, "device": torch.set_default_device}
+OTHERS = {"dtype": torch.float64, "device": "meta"}
+"""Tensors on "meta" hold no values, so that each one made without a device fails."""
+CASES = [
+    ("close_loop/block_picking", {}),
+    ("close_loop/block_picking", {"obs_type": "vec"}),
+    ("open_loop/house_building_1", {"rgb": True, "point_cloud": 64}),
+    ("open_loop/house_building_1", {"deconstruct": True}),
+]
+
+
+@pytest.fixture(params=SETTERS)
+def other_default(request):
+    """Set another default dtype or device."""
+    before = {"dtype": torch.float32, "device": None}
+    SETTERS[request.param](OTHERS[request.param])
+    yield request.param
+    SETTERS[request.param](before[request.param])
+
+
+def kinds(data):
+    return {key: (value.dtype, value.device.type) for key, value in data.items(True, True)}
+
+
+@pytest.fixture(scope="module")
+def expected():
+    """Types and devices of the entries of a rollout with torch's defaults."""
+    return {str(case): kinds(rollout(*case)) for case in CASES}
+
+
+def rollout(task, config):
+    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=3, **config)
+    data = env.rollout(4, lambda td: td.set(keys.ACTION, td[keys.EXPERT_ACTION]))
+    env.close()
+    return data
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_environments_fulfil_their_specs(expected, other_default, case):
+    task, config = case
+    assert kinds(rollout(task, config)) == expected[str(case)]
+    options = {"obs_size": 32, "seed": 0, "expert": True, "max_steps": 3, **config}
+    for env in (
+        ba_torchrl.make(task, **options),
+        ba_torchrl.make_vector_env(task, 2, parallel=False, **options),
+    ):
+        check_env_specs(env, break_when_any_done="both", seed=0)
+        env.close()
+
+
+def samples(task):
+    """Return the declared images of a task, and a batch of each kind of replay by its name."""
+    env = ba_torchrl.make_vector_env(
+        task, 2, parallel=False, obs_size=32, seed=0, expert=True, max_steps=3
+    )
+    episodes = collect_demonstrations(env, 3, seed=0, noise=0.3)
+    images = ba_torchrl.make(task, obs_size=32).images
+    env.close()
+    drawn = {}
+    for kind in ("uniform", "prioritized", "symmetric"):
+        replay = make_replay(kind, 50, 6, codecs=make_codecs(images), seed=0)
+        for is_expert in (True, False):
+            for episode in episodes:
+                replay.extend(as_transitions(episode, images, is_expert=is_expert))
+        batch = replay.sample()
+        if kind == "prioritized":  # TorchRL's buffer moves the errors to the default device
+            errors = batch[keys.NEXT, keys.REWARD].flatten()
+            replay.sampler.update_priority(batch["index"], errors, storage=replay.storage)
+        drawn[kind] = replay.sample()
+    return images, drawn
+
+
+@pytest.fixture(scope="module")
+def expected_samples():
+    tasks = ("close_loop/block_picking", "open_loop/house_building_1")
+    return {task: samples(task) for task in tasks}
+
+
+@pytest.mark.parametrize("task", ["close_loop/block_picking", "open_loop/house_building_1"])
+def test_the_replay_holds_the_same_transitions(expected_samples, other_default, task):
+    _, expected = expected_samples[task]
+    _, found = samples(task)
+    for kind, batch in expected.items():
+        assert kinds(found[kind]) == kinds(batch)
+        for key in batch.keys(True, True):
+            assert torch.equal(found[kind][key], batch[key]), (kind, key)
+
+
+def augmented(images, batch):
+    rotation = SO2Augmentation(images, "pxyzr", seed=0)
+    views = RandomViews(images, size=24, views=2, seed=0)
+    return [rotation(batch), views(batch)]
+
+
+@pytest.fixture(scope="module")
+def expected_augmented(expected_samples):
+    images, drawn = expected_samples["close_loop/block_picking"]
+    return augmented(images, drawn["uniform"])
+
+
+def test_augmented_transitions_are_the_same(expected_samples, expected_augmented, other_default):
+    images, drawn = expected_samples["close_loop/block_picking"]
+    found_batches = augmented(images, drawn["uniform"])
+    for found, batch in zip(found_batches, expected_augmented, strict=True):
+        assert kinds(found) == kinds(batch)
+        for key in batch.keys(True, True):
+            assert torch.equal(found[key], batch[key]), key
