@@ -25,6 +25,7 @@ BASE = (
     "hardware",
     "_malloc",
     "_segment_tree",
+    "_jit",
 )
 """Single files; one box in the picture."""
 

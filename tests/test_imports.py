@@ -24,7 +24,7 @@ EXTRA = {
     "profiling": {"__init__", "record", "modules", "objectives", "hardware"},
     "recipes": {"__init__", "record"},
 }
-SHARED = {"_malloc", "_segment_tree"}
+SHARED = {"_malloc", "_segment_tree", "_jit"}
 APART = {
     "__init__": BASE | {"tasks", "envs"},
     "testing": BASE | {"testing", "sim", "tasks", "envs", "__init__"},
@@ -33,6 +33,7 @@ APART = {
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
     "_malloc": set(),
     "_segment_tree": set(),
+    "_jit": set(),
     "hardware": set(),
     # whole algorithms as scripts: no learner and no experiment
     "recipes.torchrl": BASE

@@ -9,13 +9,14 @@ sum of values.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from ba_torchrl._jit import njit
 
 STRIP = 256
 """Pixels whose values are computed together, so that they stay in the first cache."""
 
-_compiled = numba.njit(cache=True, nogil=True, fastmath=True)
+_compiled = njit(nogil=True, fastmath=True)
 
 # Loops over pixels, with unsigned indices and without views of rows: signed indices would have to
 # be checked, and each view counts its references atomically.

@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ba_torchrl._jit import njit
 from ba_torchrl.modules.cpu_threads import in_parts, is_plain_float32, refuse_second_derivatives
 
 _NONE = 8
@@ -18,7 +18,7 @@ _NONE = 8
 _NEGATIVE = 4
 """Added to the position of a maximum that is negative or zero and has a gradient."""
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_compiled = njit(nogil=True, error_model="numpy")
 
 
 def relu_of_max_pool(x: Tensor, negative_slope: float = 0.0) -> Tensor:

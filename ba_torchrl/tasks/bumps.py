@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
 
-import numba
 import numpy as np
 
+from ba_torchrl._jit import njit
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame
@@ -267,7 +267,7 @@ def _cos_sin(angle_rad: float) -> tuple[float, float]:
     return math.cos(angle_rad), math.sin(angle_rad)
 
 
-@numba.njit(cache=True)
+@njit()
 def _surface_heights(points, bumps, slopes, platform, size, bounds, heights):  # noqa: ANN001, ANN202
     """Compute the heights of the bumps and the platform.
 

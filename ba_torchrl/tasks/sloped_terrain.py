@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import ClassVar
 
-import numba
 import numpy as np
 
+from ba_torchrl._jit import njit
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, world_vertices
 from ba_torchrl.sim.geometry import (
@@ -295,7 +295,7 @@ def lowest_plane(
     return slopes, float(a[2] - slopes @ a[:2])
 
 
-@numba.njit(cache=True)
+@njit()
 def _supporting_triangle(rows, center):  # noqa: ANN001, ANN202
     """Return the three of the points [N, 3] on the lowest plane above all of them at the centre.
 

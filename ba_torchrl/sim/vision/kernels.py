@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from ba_torchrl._jit import njit
 
-@numba.njit(cache=True)
+
+@njit()
 def transform(vertices, owner, poses, out):
     """Transform vertices into the world frame.
 
@@ -34,7 +35,7 @@ def transform(vertices, owner, poses, out):
         out[v, 2] = z + c + qw * tz + qx * ty - qy * tx
 
 
-@numba.njit(cache=True)
+@njit()
 def rotate_about(vertices, x0, y0, yaw):
     """Rotate the vertices in place about the vertical line through (x0, y0)."""
     cos, sin = math.cos(yaw), math.sin(yaw)
@@ -44,7 +45,7 @@ def rotate_about(vertices, x0, y0, yaw):
         vertices[v, 1] = y0 + sin * dx + cos * dy
 
 
-@numba.njit(cache=True)
+@njit()
 def rasterize_heights(vertices, faces, x0, y0, pixel, image):
     """Rasterise faces into an orthographic height image: the maximum of old and new heights.
 
@@ -82,7 +83,7 @@ def rasterize_heights(vertices, faces, x0, y0, pixel, image):
                     image[i, j] = max(image[i, j], height)
 
 
-@numba.njit(cache=True)
+@njit()
 def paint_square(
     image: np.ndarray,
     center_px: tuple[float, float],
@@ -114,7 +115,7 @@ def paint_square(
                 image[i, j] = value
 
 
-@numba.njit(cache=True)
+@njit()
 def recess_depth_at(x, y, recesses):
     """Return the depth of the floor's recess at a point; 0 outside of recesses.
 
@@ -132,7 +133,7 @@ def recess_depth_at(x, y, recesses):
     return depth
 
 
-@numba.njit(cache=True)
+@njit()
 def rasterize_floor(eye, axes, focal, far, recesses, depth):
     """Set a perspective depth image to the depth of the floor.
 
@@ -160,7 +161,7 @@ def rasterize_floor(eye, axes, focal, far, recesses, depth):
             depth[i, j] = min(t, far)
 
 
-@numba.njit(cache=True)
+@njit()
 def _rasterize_triangle(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
     """Rasterise a triangle into a depth image: the minimum of old and new depths.
 
@@ -192,7 +193,7 @@ def _rasterize_triangle(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
                 depth[i, j] = min(depth[i, j], 1 / inverse)
 
 
-@numba.njit(cache=True)
+@njit()
 def rasterize_depth(vertices, faces, eye, axes, focal, near, depth):
     """Rasterise faces into a perspective depth image: the minimum of old and new depths.
 
@@ -236,7 +237,7 @@ def rasterize_depth(vertices, faces, eye, axes, focal, near, depth):
             _rasterize_triangle(a0, a1, a2, b0, b1, b2, c0, c1, c2, depth)
 
 
-@numba.njit(cache=True)
+@njit()
 def unproject(depth, eye, axes, focal, recesses, low, high, out, start):
     """Convert a perspective depth image to points in the world frame.
 
@@ -274,7 +275,7 @@ def unproject(depth, eye, axes, focal, recesses, low, high, out, start):
     return count
 
 
-@numba.njit(cache=True)
+@njit()
 def splat(points, count, x0, y0, pixel, image):
     """Set a height image to the greatest height of the points in each pixel.
 

@@ -6,15 +6,16 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from ba_torchrl._jit import njit
 
 TIE_TOLERANCE = 1e-9
 """Voxels. A rotated voxel centre this close to halfway between two cells belongs to the upper one,
 so that rounding errors of the rotation do not decide."""
 
 
-@numba.njit(cache=True)
+@njit()
 def project(heights, levels, rotation):
     """Return the numbers of occupied voxels along the three axes of the tool frame.
 
@@ -69,6 +70,6 @@ def project(heights, levels, rotation):
     return sums
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _cell(position):
     return math.floor(position + 0.5 + TIE_TOLERANCE)

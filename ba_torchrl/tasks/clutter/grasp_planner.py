@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from ba_torchrl._jit import njit
 from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.assets.hulls import surface_samples
 from ba_torchrl.sim.bodies import Body
@@ -209,7 +209,7 @@ _OFFSETS_V = np.array([0.0, -0.012, 0.012, -0.024, 0.024])
 _OFFSETS_U = np.array([0.0, -0.02, 0.02, -0.04, 0.04])
 
 
-@numba.njit(cache=True)
+@njit()
 def _height(heights, corner, x, y):  # noqa: ANN001, ANN202 -- compiled
     i = int((x - corner[0]) / PIXEL_M)
     j = int((y - corner[1]) / PIXEL_M)
@@ -218,7 +218,7 @@ def _height(heights, corner, x, y):  # noqa: ANN001, ANN202 -- compiled
     return heights[i, j]
 
 
-@numba.njit(cache=True)
+@njit()
 def _search(samples, center, yaws, heights, corner, low_z, high_z, jaws):  # noqa: ANN001, ANN202
     """Return the feasible grasps of one body, [N, 6]: x, y, z, yaw, risk, slip.
 
