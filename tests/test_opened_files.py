@@ -11,7 +11,7 @@ from ba_torchrl.profiling.fingerprint.compare import read_record
 from ba_torchrl.profiling.soak import SoakJob, run_soak
 from ba_torchrl.profiling.speed_file import read_speed_file
 from ba_torchrl.record.results import read_failure
-from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, cached_parts
+from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, Decomposition, cached_parts
 from ba_torchrl.sim.assets.graspnet import read_mesh
 from ba_torchrl.sim.meshes import rod_mesh
 from tests.planted import Planted
@@ -61,11 +61,11 @@ def test_damaged_figures_of_a_soak_are_measured_again(plant, tmp_path):
 def test_a_damaged_cache_of_parts_is_computed_again(plant, tmp_path, monkeypatch):
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     mesh = rod_mesh(0.1, 0.02)
-    cached_parts(b"content", "recipe", lambda: [mesh])
+    cached_parts(b"content", "recipe", lambda: Decomposition((mesh,)))
     (file,) = (tmp_path / "cache").rglob("*.npz")
     for damage in (plant, _plant_object(tmp_path / "trace")):
         damage(file)
-        (part,) = cached_parts(b"content", "recipe", lambda: [mesh])
+        (part,) = cached_parts(b"content", "recipe", lambda: Decomposition((mesh,))).parts
         assert np.array_equal(part.vertices, mesh.vertices)
 
 

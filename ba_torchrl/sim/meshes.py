@@ -1,7 +1,8 @@
-"""Procedural triangle meshes, whose faces are counter-clockwise seen from outside."""
+"""Triangle meshes, whose faces are counter-clockwise seen from outside, and OBJ files."""
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -69,6 +70,75 @@ def write_obj(path: Path, parts: Sequence[Mesh]) -> None:
         lines += [f"f {a} {b} {c}" for a, b, c in (faces + start).tolist()]
         start += len(vertices)
     path.write_text("\n".join(lines) + "\n")
+
+
+def read_obj(content: bytes) -> list[Mesh]:
+    """Return the polygons of a Wavefront OBJ file as triangles, one mesh for each of its objects.
+
+    Texture coordinates, normals, colours, materials and groups have no effect; each mesh holds the
+    vertices that its faces use, in their order.
+
+    Args:
+        content: content of the file.
+
+    Raises:
+        ValueError: a vertex or a face cannot be read.
+    """
+    text = content.removeprefix(codecs.BOM_UTF8)
+    for line_end in (b"\\\r\n", b"\\\n", b"\\\r"):
+        text = text.replace(line_end, b" ")  # a backslash continues a line
+    vertices: list[list[float]] = []
+    objects: list[list[list[int]]] = [[]]
+    for line in text.splitlines():
+        kind, *values = line.split(b"#")[0].split() or [b""]
+        try:
+            match kind.lower():
+                case b"v":
+                    x, y, z = map(float, values[:3])
+                    vertices.append([x, y, z])
+                case b"f":
+                    objects[-1].append(_obj_corners(values, len(vertices)))
+                case b"o":
+                    objects.append([])
+        except ValueError as error:
+            raise ValueError(f"{line.decode(errors='replace').strip()!r}: {error}") from None
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    highest = max((corner for polygons in objects for p in polygons for corner in p), default=-1)
+    if highest >= len(points):
+        raise ValueError(f"a face uses vertex {highest + 1} of {len(points)}")
+    meshes = []
+    for polygons in filter(None, objects):
+        used, faces = np.unique(_triangles(points, polygons), return_inverse=True)
+        meshes.append(Mesh(points[used], faces.reshape(-1, 3).astype(np.int64)))
+    return meshes
+
+
+def polygon_triangles(corners: np.ndarray) -> list[tuple[int, int, int]]:
+    """Return triangles that fill a polygon, which need not be convex, by clipping its ears.
+
+    Args:
+        corners: [N, 3], metres, approximately in a plane.
+
+    Returns:
+        N - 2 triples of indices of corners, with the orientation of the polygon.
+    """
+    from_first = corners - corners[0]
+    normal = np.cross(from_first, np.roll(from_first, -1, axis=0)).sum(axis=0)
+    drop = int(np.abs(normal).argmax())  # the polygon is projected along this axis
+    plane = from_first[:, [(drop + 1) % 3, (drop + 2) % 3]] * [1.0, np.sign(normal[drop]) or 1.0]
+    left, triangles, k = list(range(len(corners))), [], 1
+    tried = 0
+    while len(left) > 3 and tried < len(left):
+        k %= len(left)
+        a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
+        if _is_ear(plane[[a, b, c]], plane[left]):
+            triangles.append((a, b, c))
+            del left[k]
+            tried = 0
+        else:
+            k, tried = k + 1, tried + 1
+    # what remains is a triangle, or crosses itself
+    return triangles + [(left[0], b, c) for b, c in pairwise(left[1:])]
 
 
 def gable_mesh(size_m: tuple[float, float, float], eaves_m: float = 0.0) -> Mesh:
@@ -181,6 +251,59 @@ def centroid(parts: Sequence[Mesh]) -> tuple[float, float, float]:
     volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
     center = (volumes[:, None] * corners.sum(axis=1) / 4).sum(axis=0) / volumes.sum()
     return tuple(center.tolist())
+
+
+def _obj_corners(values: Sequence[bytes], num_vertices: int) -> list[int]:
+    """Return the vertex indices of a face, from 0.
+
+    Args:
+        values: the corners as OBJ writes them: an index from 1, or a negative one that counts back
+            from the last vertex read so far, with or without a texture coordinate and a normal.
+        num_vertices: number of vertices read so far.
+    """
+    if len(values) < 3:
+        raise ValueError("a face needs three corners")
+    numbers = [int(value.split(b"/")[0]) for value in values]
+    corners = [n + num_vertices if n < 0 else n - 1 for n in numbers]
+    if 0 in numbers or min(corners) < 0:
+        raise ValueError("there is no such vertex")
+    return corners
+
+
+def _triangles(points: np.ndarray, polygons: Sequence[Sequence[int]]) -> np.ndarray:
+    """Return triangles [F, 3] that fill polygons, in the order of the polygons."""
+    quads = [i for i, polygon in enumerate(polygons) if len(polygon) == 4]
+    corners = points[np.array([polygons[i] for i in quads], dtype=np.int64).reshape(-1, 4)]
+    with np.errstate(invalid="ignore"):  # coordinates may be infinite
+        edges = corners - corners[:, :1]
+        halves = np.cross(edges[:, 1:3], edges[:, 2:4])  # normals on both sides of the diagonal
+        is_inside = (halves[:, 0] * halves[:, 1]).sum(axis=1) > 0
+        ordinary = {i for i, inside in zip(quads, is_inside.tolist(), strict=True) if inside}
+        faces: list[tuple[int, ...]] = []
+        for i, polygon in enumerate(polygons):
+            if len(polygon) == 3 or i in ordinary:
+                faces += [(polygon[0], b, c) for b, c in pairwise(polygon[1:])]
+            else:
+                triangles = polygon_triangles(points[list(polygon)])
+                faces += [tuple(polygon[k] for k in triangle) for triangle in triangles]
+    return np.array(faces, dtype=np.int64)
+
+
+def _is_ear(corners: np.ndarray, polygon: np.ndarray) -> bool:
+    """Return whether a triangle of successive corners of a polygon contains no other corner.
+
+    Args:
+        corners: [3, 2].
+        polygon: [N, 2], counter-clockwise.
+    """
+    edges = np.roll(corners, -1, axis=0) - corners
+    if edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] <= 0:
+        return False
+    to_points = polygon[:, None] - corners
+    sides = edges[:, 0] * to_points[..., 1] - edges[:, 1] * to_points[..., 0]  # [N, 3]
+    inside = (sides >= 0).all(axis=1)
+    is_corner = (to_points == 0).all(axis=2).any(axis=1)  # also of equal position
+    return not (inside & ~is_corner).any()
 
 
 def _prism_faces(count: int) -> np.ndarray:

@@ -7,8 +7,10 @@ import logging
 import os
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from platformdirs import user_cache_path
@@ -21,18 +23,32 @@ CACHE_VARIABLE = "BA_TORCHRL_CACHE"
 """Environment variable that replaces the user's cache folder."""
 
 
+class Decomposition(NamedTuple):
+    """Convex parts that stand for a mesh."""
+
+    parts: tuple[Mesh, ...]
+    note: str = ""
+    """How the parts differ from the mesh, if that matters for grasping."""
+
+
 def cache_folder() -> Path:
-    """Return the folder of the cached parts, which may not exist."""
+    """Return the folder of the cached parts, which may not exist.
+
+    Raises:
+        OSError: the user has no home.
+    """
     root = os.environ.get(CACHE_VARIABLE)
-    return (Path(root) if root else user_cache_path("ba_torchrl")) / "parts"
+    try:
+        return (Path(root) if root else user_cache_path("ba_torchrl")) / "parts"
+    except RuntimeError as error:
+        raise FileNotFoundError(str(error)) from error
 
 
-def cached_parts(
-    content: bytes, recipe: str, make: Callable[[], Sequence[Mesh]]
-) -> tuple[Mesh, ...]:
+def cached_parts(content: bytes, recipe: str, make: Callable[[], Decomposition]) -> Decomposition:
     """Return convex parts from the cache, or compute and store them.
 
-    Several processes can request the same parts concurrently: files are written atomically.
+    The cache is optional: one warning is given for a folder that cannot be used. Several processes
+    can request the same parts concurrently: files are written atomically.
 
     Args:
         content: content of the file from which the parts are computed.
@@ -40,38 +56,52 @@ def cached_parts(
         make: computes the parts.
     """
     key = hashlib.sha256(recipe.encode() + b"\0" + content).hexdigest()
-    path = cache_folder() / f"{key}.npz"
+    try:
+        path = cache_folder() / f"{key}.npz"
+    except OSError as error:
+        _warn_once(f"cannot store convex parts ({error})")
+        return make()
     try:
         return _read(path)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         pass
+    except PermissionError as error:
+        _warn_once(f"cannot read convex parts in {path.parent} ({error.strerror})")
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         logger.warning("%s cannot be read and is computed again: %s", path, error)
-    parts = tuple(make())
+    made = make()
     try:
-        _write(path, parts)
+        _write(path, made)
     except OSError as error:
-        logger.warning(
-            "cannot store convex parts in %s (%s): set %s to a writable folder",
-            path.parent,
-            error,
-            CACHE_VARIABLE,
-        )
-    return parts
+        _warn_once(f"cannot store convex parts in {path.parent} ({error.strerror or error})")
+    return made
 
 
-def _read(path: Path) -> tuple[Mesh, ...]:
-    with np.load(path, allow_pickle=False) as data:
-        vertices, faces = data["vertices"], data["faces"]
-        vertex_ends, face_ends = data["vertex_ends"], data["face_ends"]
-    starts = zip([0, *vertex_ends], [0, *face_ends], strict=True)
-    return tuple(
-        Mesh(vertices[v0:v1], faces[f0:f1])
-        for (v0, f0), v1, f1 in zip(starts, vertex_ends, face_ends, strict=False)
+@cache
+def _warn_once(problem: str) -> None:
+    """Warn that the cache is not used, once for each problem."""
+    logger.warning(
+        "%s: they are computed by each process; set %s to a writable folder",
+        problem,
+        CACHE_VARIABLE,
     )
 
 
-def _write(path: Path, parts: Sequence[Mesh]) -> None:
+def _read(path: Path) -> Decomposition:
+    with np.load(path, allow_pickle=False) as data:
+        vertices, faces = data["vertices"], data["faces"]
+        vertex_ends, face_ends = data["vertex_ends"], data["face_ends"]
+        note = str(data["note"]) if "note" in data else ""  # absent from older entries
+    starts = zip([0, *vertex_ends], [0, *face_ends], strict=True)
+    parts = tuple(
+        Mesh(vertices[v0:v1], faces[f0:f1])
+        for (v0, f0), v1, f1 in zip(starts, vertex_ends, face_ends, strict=False)
+    )
+    return Decomposition(parts, note)
+
+
+def _write(path: Path, made: Decomposition) -> None:
+    parts, note = made
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
         try:
@@ -81,6 +111,7 @@ def _write(path: Path, parts: Sequence[Mesh]) -> None:
                 faces=np.concatenate([part.faces for part in parts]),
                 vertex_ends=np.cumsum([len(part.vertices) for part in parts]),
                 face_ends=np.cumsum([len(part.faces) for part in parts]),
+                note=np.array(note),
             )
             file.close()
             os.replace(file.name, path)

@@ -3,29 +3,40 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import math
 import os
-import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import pybullet
 
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
-from ba_torchrl.sim.assets.cache import cached_parts
-from ba_torchrl.sim.assets.hulls import convex_hull, volume_and_center
-from ba_torchrl.sim.meshes import Mesh, write_obj
+from ba_torchrl.sim.assets.cache import Decomposition, cached_parts
+from ba_torchrl.sim.assets.decomposition import (
+    CONVEX_FILL,
+    EXTENT_TOLERANCE,
+    SHEET_FILL,
+    SOLID_FILL,
+    VHACD,
+    convex_parts,
+)
+from ba_torchrl.sim.assets.hulls import HULL_ERROR, MAX_HULL_VERTICES
+from ba_torchrl.sim.meshes import Mesh, merge_meshes, read_obj
 
 logger = logging.getLogger(__name__)
 
-PREFERRED_FILES = ("nontextured_simplified.obj", "nontextured.obj")
-"""Names preferred where a folder contains several mesh files."""
-EXPECTED_LAYOUT = "expected one sub-folder for each object, with a mesh file (.obj, metres) in each"
+SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+"""Formats of mesh files, the preferred one first."""
+PREFERRED_NAMES = ("nontextured_simplified", "nontextured")
+"""Names preferred where a folder contains several mesh files of a format."""
+EXPECTED_LAYOUT = (
+    "expected one sub-folder for each object, with a mesh file (.obj, .ply, .stl or .glb, metres) "
+    "in each"
+)
 
 MAX_WIDTH_M, WIDTH_FACTOR = 0.15, 0.8
 MAX_VOLUME_M3, VOLUME_FACTOR = 6e-4, 0.85
@@ -40,11 +51,14 @@ MESH_LENGTHS_M = (1e-5, 1e6)
 MIN_FLATNESS = 1e-3
 """Least ratio of thickness to length of a solid."""
 
-CONVEX_FILL = 0.95
-"""Least ratio of the volume of a convex mesh to that of its convex hull."""
-VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}
-RECIPE = f"graspnet 2 {CONVEX_FILL} {VHACD} {MESH_LENGTHS_M} {MAX_LENGTH_M} {MIN_FLATNESS}"
+RECIPE = (
+    f"graspnet 3 {CONVEX_FILL} {SOLID_FILL} {SHEET_FILL} {EXTENT_TOLERANCE} {VHACD} "
+    f"{MAX_HULL_VERTICES} {HULL_ERROR} {MESH_LENGTHS_M} {MAX_LENGTH_M} {MIN_FLATNESS}"
+)
 """Cache key. It includes the limits because cached meshes are not checked again."""
+
+
+_NOTHING = Mesh(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
 
 
 @OBJECT_SETS.register("graspnet")
@@ -52,7 +66,8 @@ class GraspNet(ObjectSet):
     """One object for each sub-folder of ``asset_root``, scaled so that a gripper can grasp it.
 
     At its first use, a mesh is decomposed into convex parts, which takes seconds; the parts are
-    cached on disk.
+    cached on disk. Holes of its surface are closed with flat faces where they leave the object
+    hollow, and a warning tells so.
 
     Args:
         asset_root: folder with one sub-folder for each object.
@@ -93,14 +108,19 @@ class GraspNet(ObjectSet):
         """
         path = self.paths[index]
 
-        def decompose() -> list[Mesh]:
+        def decompose() -> Decomposition:
             mesh = read_mesh(path)
             check_size(mesh, path)  # before the decomposition, which takes seconds
-            return convex_parts(mesh, path)
+            made = convex_parts(mesh, path)
+            # the parts are a little larger than the mesh
+            check_size(merge_meshes(made.parts), path, MAX_LENGTH_M * (1 + EXTENT_TOLERANCE))
+            return made
 
         with _as_config_error(path):
             content = path.read_bytes()
-        parts = cached_parts(content, RECIPE, decompose)
+        parts, note = cached_parts(content, f"{RECIPE} {path.suffix.lower()}", decompose)
+        if note:
+            logger.warning("asset_root: %r %s", str(path), note)
         points = np.concatenate([part.vertices for part in parts])
         scale = graspable_scale(np.ptp(points, axis=0))
         return tuple(Mesh(part.vertices * scale, part.faces) for part in parts)
@@ -126,16 +146,17 @@ def graspable_scale(extents_m: Sequence[float]) -> float:
     )
 
 
-def check_size(mesh: Mesh, path: Path) -> None:
+def check_size(mesh: Mesh, path: Path, max_length_m: float = MAX_LENGTH_M) -> None:
     """Check that a mesh is a solid that fits into the tray at its graspable scale.
 
     Args:
         mesh: the mesh, metres.
         path: its file, used in error messages.
+        max_length_m: greatest length after scaling.
 
     Raises:
         ConfigError: the mesh is flat, its length is outside of `MESH_LENGTHS_M`, or its scaled
-            length exceeds `MAX_LENGTH_M`.
+            length exceeds ``max_length_m``.
     """
     extents = _principal_extents(mesh.vertices)
     thinnest, _, longest = extents
@@ -152,7 +173,7 @@ def check_size(mesh: Mesh, path: Path) -> None:
             "folder"
         )
     scale = graspable_scale(np.ptp(mesh.vertices, axis=0))
-    if longest * scale > MAX_LENGTH_M:
+    if longest * scale > max_length_m:
         raise ConfigError(
             f"{measured}, and at its graspable scale {_format_extents(extents * scale)}: the tray "
             f"has room for {MAX_LENGTH_M} m; use a less elongated mesh, or remove its folder"
@@ -165,58 +186,40 @@ def _num_factors(ratio: float, factor: float) -> int:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Return the mesh in a file.
+    """Return the mesh in a file, relative to the centre of its bounding box.
 
     Raises:
         ConfigError: the file contains too few triangles or coordinates that are not finite.
     """
-    import trimesh  # imported here: it takes most of a second, and only this object set needs it
-
     try:
-        loaded = trimesh.load(path, process=False, force="mesh", skip_materials=True)
-        vertices = np.asarray(loaded.vertices, dtype=np.float64)
-        faces = np.asarray(loaded.faces, dtype=np.int64)
-    except Exception as error:  # the parser raises exceptions of many types
+        with _as_config_error(path):
+            content = path.read_bytes()
+        if path.suffix.lower() == ".obj":
+            vertices, faces = merge_meshes([_NOTHING, *read_obj(content)])
+        else:
+            vertices, faces = _read_with_trimesh(content, path.suffix.lower()[1:])
+    except ConfigError:
+        raise
+    except Exception as error:  # the parsers raise exceptions of many types
         raise ConfigError(f"asset_root: cannot read {str(path)!r} as a mesh: {error}") from error
     if len(faces) < 4 or not np.isfinite(vertices).all():
         raise ConfigError(
             f"asset_root: {str(path)!r} has {len(faces)} triangles and "
             f"{'in' if not np.isfinite(vertices).all() else ''}finite coordinates: it is no solid"
         )
-    return Mesh(vertices, faces)
+    return Mesh(vertices - (vertices.min(axis=0) / 2 + vertices.max(axis=0) / 2), faces)
 
 
-def convex_parts(mesh: Mesh, path: Path) -> list[Mesh]:
-    """Return the approximate convex decomposition of a mesh (V-HACD).
+def _read_with_trimesh(content: bytes, file_type: str) -> Mesh:
+    """Return the mesh in a file of one of the formats that trimesh reads, in metres."""
+    import trimesh  # imported here: it takes most of a second
 
-    Args:
-        mesh: the mesh, metres.
-        path: its file, used in messages.
-
-    Raises:
-        ConfigError: the mesh has no volume.
-    """
-    try:
-        hull = convex_hull(mesh.vertices)
-    except ValueError as error:
-        raise ConfigError(f"asset_root: {str(path)!r} has no volume: {error}") from None
-    if volume_and_center(mesh)[0] >= CONVEX_FILL * volume_and_center(hull)[0]:
-        return [hull]
-    logger.info("decomposing %s into convex parts; the result is cached", path)
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder, "mesh.obj"), Path(folder, "parts.obj")
-        write_obj(source, [mesh])
-        with _silent_stdout():
-            pybullet.vhacd(str(source), str(target), str(Path(folder, "log.txt")), **VHACD)
-        clouds = _read_objects(target) if target.exists() else []
-    parts = []
-    for cloud in clouds:
-        with contextlib.suppress(ValueError):  # parts without volume are omitted
-            parts.append(convex_hull(cloud))
-    if not parts:
-        logger.warning("%s cannot be decomposed into convex parts: using its convex hull", path)
-        return [hull]
-    return parts
+    loaded = trimesh.load(
+        io.BytesIO(content), file_type=file_type, process=False, force="mesh", skip_materials=True
+    )
+    used, faces = np.unique(np.asarray(loaded.faces), return_inverse=True)
+    vertices = np.asarray(loaded.vertices, dtype=np.float64)[used]
+    return Mesh(vertices, faces.reshape(-1, 3).astype(np.int64))
 
 
 def _principal_extents(points: np.ndarray) -> np.ndarray:
@@ -240,12 +243,23 @@ def _mesh_file(folder: Path) -> Path:
     Raises:
         ConfigError: there is no mesh file, or the path is not a file.
     """
-    rank = {name: i for i, name in enumerate(PREFERRED_FILES)}
+    names = {name: i for i, name in enumerate(PREFERRED_NAMES)}
     with _as_config_error(folder):
-        meshes = [path for path in folder.iterdir() if path.suffix.lower() == ".obj"]
+        meshes = [
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        ]
         if not meshes:
             raise ConfigError(f"asset_root: {str(folder)!r} has no mesh file: {EXPECTED_LAYOUT}")
-        path = min(meshes, key=lambda path: (rank.get(path.name.lower(), len(rank)), path.name))
+        path = min(
+            meshes,
+            key=lambda path: (
+                SUFFIXES.index(path.suffix.lower()),
+                names.get(path.stem.lower(), len(names)),
+                path.name,
+            ),
+        )
         if not path.is_file():
             missing = path.is_symlink() and not path.exists()
             what = "a link to nothing" if missing else "a folder" if path.is_dir() else "no file"
@@ -266,29 +280,3 @@ def _as_config_error(path: Path) -> Iterator[None]:
             f"asset_root: cannot read {str(path)!r} ({error.strerror or error}): restore it or "
             "make it readable, or remove it"
         ) from error
-
-
-def _read_objects(path: Path) -> list[np.ndarray]:
-    """Return the vertices [N, 3] of each object of an OBJ file."""
-    clouds: list[list[list[float]]] = []
-    for line in path.read_text().splitlines():
-        kind, *values = line.split() or [""]
-        if kind == "o":
-            clouds.append([])
-        elif kind == "v":
-            clouds[-1].append([float(value) for value in values[:3]])
-    return [np.array(cloud) for cloud in clouds if cloud]
-
-
-@contextlib.contextmanager
-def _silent_stdout() -> Iterator[None]:
-    """Discard what C code prints to the standard output: hundreds of lines of progress."""
-    sys.stdout.flush()
-    stdout = os.dup(1)
-    with open(os.devnull, "wb") as null:
-        os.dup2(null.fileno(), 1)
-        try:
-            yield
-        finally:
-            os.dup2(stdout, 1)
-            os.close(stdout)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,9 +10,9 @@ import numpy as np
 import pybullet_data
 
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
-from ba_torchrl.sim.assets.cache import cached_parts
+from ba_torchrl.sim.assets.cache import Decomposition, cached_parts
 from ba_torchrl.sim.assets.hulls import convex_hull, stable_poses, volume_and_center
-from ba_torchrl.sim.meshes import Mesh
+from ba_torchrl.sim.meshes import Mesh, merge_meshes, read_obj
 
 UNIT_M = 0.015
 """Metres per unit of the mesh files; their URDF files contain this scale."""
@@ -73,12 +72,13 @@ class RandomShapes(ObjectSet):
         """
         number, scale = SELECTION[index]
 
-        def hull() -> list[Mesh]:
+        def hull() -> Decomposition:
             vertices, faces = convex_hull(read_shape(number).vertices * scale)
             flattest = min(stable_poses(Mesh(vertices, faces)), key=lambda pose: pose.height_m)
-            return [Mesh(vertices @ flattest.rotation.T, faces)]
+            return Decomposition((Mesh(vertices @ flattest.rotation.T, faces),))
 
-        return cached_parts(shape_path(number).read_bytes(), f"random shape 3 {scale}", hull)
+        content = shape_path(number).read_bytes()
+        return cached_parts(content, f"random shape 3 {scale}", hull).parts
 
 
 def shape_path(number: int) -> Path:
@@ -92,15 +92,8 @@ def shape_path(number: int) -> Path:
 
 def read_shape(number: int) -> Mesh:
     """Return the mesh of a random shape at its original size, metres."""
-    vertices, faces = [], []
-    for line in shape_path(number).read_text().splitlines():
-        kind, *values = line.split() or [""]
-        if kind == "v":
-            vertices.append([float(value) for value in values[:3]])
-        elif kind == "f":
-            corners = [int(value.split("/")[0]) - 1 for value in values]
-            faces += [(corners[0], b, c) for b, c in pairwise(corners[1:])]
-    return Mesh(np.array(vertices) * UNIT_M, np.array(faces, dtype=np.int64))
+    vertices, faces = merge_meshes(read_obj(shape_path(number).read_bytes()))
+    return Mesh(vertices * UNIT_M, faces)
 
 
 def scaled_candidate(number: int) -> Candidate | None:

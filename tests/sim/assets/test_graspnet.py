@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.assets import graspnet, hulls
+from ba_torchrl.sim.assets import decomposition, graspnet, hulls
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.assets.graspnet import graspable_scale
 from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, transform_mesh, write_obj
@@ -255,10 +255,15 @@ def test_scales_follow_the_rules():
 
 def test_the_recipe_contains_every_parameter_of_the_decomposition():
     for value in (
-        graspnet.CONVEX_FILL,
+        decomposition.CONVEX_FILL,
+        decomposition.SOLID_FILL,
+        decomposition.SHEET_FILL,
+        decomposition.EXTENT_TOLERANCE,
+        hulls.MAX_HULL_VERTICES,
+        hulls.HULL_ERROR,
         graspnet.MESH_LENGTHS_M,
         graspnet.MAX_LENGTH_M,
         graspnet.MIN_FLATNESS,
     ):
         assert str(value) in graspnet.RECIPE
-    assert all(str(value) in graspnet.RECIPE for value in graspnet.VHACD.values())
+    assert all(str(value) in graspnet.RECIPE for value in decomposition.VHACD.values())

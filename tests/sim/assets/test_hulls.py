@@ -66,3 +66,31 @@ def test_samples_lie_on_the_surface_evenly():
     assert np.all(outer.any(axis=1))
     assert np.all(np.einsum("ij,ij->i", points, normals) > 0)
     assert (np.abs(normals[:, 2]) > 0.5).mean() == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("flattening", [1.0, 0.2])
+def test_a_simplified_hull_is_near_the_hull(flattening):
+    points = np.random.default_rng(0).normal(size=(5000, 3))
+    points *= (1.0, 0.8, flattening) / np.linalg.norm(points, axis=1, keepdims=True)
+    hull = hulls.convex_hull(points)
+    simple = hulls.simplified_hull(hull)
+    assert len(simple.vertices) <= hulls.MAX_HULL_VERTICES
+    a, b, c = (simple.vertices[simple.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    outside = hull.vertices @ normals.T - np.einsum("fi,fi->f", normals, a)
+    assert 0 < outside.max() <= hulls.HULL_ERROR[1] * np.ptp(points, axis=0).max()
+
+
+def test_a_hull_with_few_vertices_is_not_simplified():
+    points = np.random.default_rng(0).normal(size=(hulls.MAX_HULL_VERTICES, 3))
+    hull = hulls.convex_hull(points / np.linalg.norm(points, axis=1, keepdims=True))
+    assert hulls.simplified_hull(hull) is hull
+
+
+def test_more_vertices_are_kept_where_the_error_needs_it(monkeypatch):
+    monkeypatch.setattr(hulls, "MAX_HULL_VERTICES", 200)
+    monkeypatch.setattr(hulls, "HULL_ERROR", (1e-3, 2e-3))
+    points = np.random.default_rng(0).normal(size=(3000, 3))
+    hull = hulls.convex_hull(points / np.linalg.norm(points, axis=1, keepdims=True))
+    assert 200 < len(hulls.simplified_hull(hull).vertices) < 3000

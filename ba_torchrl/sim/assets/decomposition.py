@@ -1,0 +1,249 @@
+"""Convex parts of any mesh: its hull, or an approximate decomposition (V-HACD)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.sim.assets.cache import Decomposition
+from ba_torchrl.sim.assets.hulls import convex_hull, simplified_hull, volume_and_center
+from ba_torchrl.sim.meshes import Mesh, merge_meshes, polygon_triangles, read_obj, write_obj
+
+logger = logging.getLogger(__name__)
+
+CONVEX_FILL = 0.95
+"""Least ratio of the volume of a convex mesh to that of its convex hull."""
+SOLID_FILL = 0.8
+"""Least ratio of the volume of the parts to that of the mesh; thin shells have much less."""
+SHEET_FILL = 0.05
+"""Greatest ratio of the volume of a mesh to that of its parts if the mesh consists of sheets."""
+EXTENT_TOLERANCE = 0.05
+"""Greatest difference between the bounding boxes of parts and mesh, in lengths of the mesh."""
+VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}
+VHACD_LIMIT_S = 300.0
+"""Time limit of a decomposition, which takes seconds."""
+_VHACD_PROGRAM = (
+    "import json, sys, pybullet; pybullet.vhacd(*sys.argv[1:4], **json.loads(sys.argv[4]))"
+)
+
+
+def convex_parts(mesh: Mesh, path: Path) -> Decomposition:
+    """Return convex parts that approximate the solid inside a surface.
+
+    Holes of the surface through which V-HACD does not find the inside are closed with flat faces.
+    The parts are computed at unit size, so that the size and the position of the mesh have no
+    effect.
+
+    Args:
+        mesh: the mesh, metres.
+        path: its file, used in messages.
+
+    Returns:
+        The parts, relative to the centre of the mesh's bounding box, and a note if they differ from
+        the mesh in a way that matters for grasping.
+
+    Raises:
+        ConfigError: the mesh has no volume, or its decomposition fails.
+    """
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    unit = 2.0 ** np.ceil(np.log2((high - low).max()))  # a power of two: no rounding
+    unit_mesh = Mesh((mesh.vertices - (low + (high - low) / 2)) / unit, mesh.faces)
+    try:
+        parts, note = _unit_parts(unit_mesh, path)
+    except ValueError as error:
+        raise ConfigError(f"asset_root: {str(path)!r} has no volume: {error}") from None
+    return Decomposition(tuple(Mesh(part.vertices * unit, part.faces) for part in parts), note)
+
+
+def _unit_parts(mesh: Mesh, path: Path) -> Decomposition:
+    hull = convex_hull(mesh.vertices)
+    whole, hull_volume = (simplified_hull(hull),), volume_and_center(hull)[0]
+    mesh = _joined(mesh)
+    volume = _volume(mesh)
+    if volume >= CONVEX_FILL * hull_volume:
+        return Decomposition(whole)
+    parts = _vhacd(mesh, path)
+    loops = _border_loops(mesh)
+    # bodies of a closed surface can overlap; the parts fill each of them
+    solid = volume if loops else max(map(_volume, _bodies(mesh)))
+    note = ""
+    if loops:
+        closed = _close(mesh, loops)
+        solid = max(solid, _volume(closed))
+        if sum(map(_volume, parts)) < SOLID_FILL * solid:
+            convex = _volume(closed) >= CONVEX_FILL * hull_volume
+            parts = list(whole) if convex else _vhacd(closed, path)
+            widths = [np.ptp(mesh.vertices[loop], axis=0).max() for loop in loops]
+            share = max(widths) / np.ptp(mesh.vertices, axis=0).max()
+            note = (
+                f"has holes in its surface ({len(loops)}; the width of the largest is {share:.0%} "
+                "of the object's length): they are closed with flat faces, so that the object is "
+                "solid and a gripper cannot reach inside; check that the file is complete, and "
+                "give the walls of a vessel a thickness"
+            )
+    problem = _difference(parts, mesh, solid)
+    if problem:
+        return Decomposition(
+            whole,
+            f"cannot be decomposed into convex parts ({problem}): its convex hull is used, so that "
+            "a gripper cannot reach into its hollows; close its surface, or simplify it",
+        )
+    if not note and solid < SHEET_FILL * sum(map(_volume, parts)):
+        note = (
+            "has a surface of sheets without an inside: the object is hollow and has thin walls; "
+            "close its surface, or give it a thickness"
+        )
+    return Decomposition(tuple(parts), note)
+
+
+def _difference(parts: list[Mesh], mesh: Mesh, volume: float) -> str:
+    """Return what tells the parts of a mesh from the mesh, empty if they are equal enough.
+
+    Args:
+        parts: the convex parts.
+        mesh: the mesh at unit size.
+        volume: of the solid inside the mesh.
+    """
+    if not parts:
+        return "no part has a volume"
+    points = merge_meshes(parts).vertices
+    bounds = [
+        np.concatenate([p.min(axis=0), p.max(axis=0)])
+        for p in (points, mesh.vertices[np.unique(mesh.faces)])
+    ]
+    if np.abs(bounds[0] - bounds[1]).max() > EXTENT_TOLERANCE * np.ptp(mesh.vertices, axis=0).max():
+        return "the parts and the mesh have different extents"
+    filled = sum(map(_volume, parts))
+    if filled < SOLID_FILL * volume:
+        return f"the parts fill {filled / volume:.0%} of its volume"
+    return ""
+
+
+def _volume(mesh: Mesh) -> float:
+    """Return the volume inside a mesh, whichever way its faces point; 0 for opposite sheets."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] - mesh.vertices.mean(axis=0) for i in range(3))
+    return abs(float(np.einsum("fi,fi->", a, np.cross(b, c)))) / 6
+
+
+def _joined(mesh: Mesh) -> Mesh:
+    """Return a surface with one vertex for each position, without copies of a face, whose faces
+    point the same way."""
+    vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[mesh.faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    turns = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3  # the smallest index first
+    first = np.unique(np.take_along_axis(faces, turns, axis=1), axis=0, return_index=True)[1]
+    faces = faces[np.sort(first)]
+    edges = _edges(faces)
+    if len(np.unique(edges, axis=0)) < len(edges):  # two faces have an edge in the same direction
+        import trimesh  # imported here: it takes most of a second
+
+        repaired = trimesh.Trimesh(vertices, faces, process=False)
+        trimesh.repair.fix_winding(repaired)
+        faces = np.asarray(repaired.faces, dtype=np.int64)
+    return Mesh(vertices, faces)
+
+
+def _edges(faces: np.ndarray) -> np.ndarray:
+    """Return the directed edges [3 F, 2] of faces [F, 3]."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def _bodies(mesh: Mesh) -> list[Mesh]:
+    """Return the connected pieces of a mesh."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges, count = _edges(mesh.faces), len(mesh.vertices)
+    graph = coo_matrix((np.ones(len(edges), dtype=bool), edges.T), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    ends = np.cumsum(np.unique(labels, return_counts=True)[1])
+    pieces = np.split(mesh.faces[np.argsort(labels, kind="stable")], ends[:-1])
+    return [Mesh(mesh.vertices, faces) for faces in pieces]
+
+
+def _border_loops(mesh: Mesh) -> list[list[int]]:
+    """Return the vertices around each hole of a surface, in the order of a face that fills it."""
+    edges, counts = np.unique(_edges(mesh.faces), axis=0, return_counts=True)
+    balance: dict[tuple[int, int], int] = defaultdict(int)
+    for (a, b), count in zip(edges.tolist(), counts.tolist(), strict=True):
+        balance[a, b] += count
+        balance[b, a] -= count
+    following: dict[int, list[int]] = defaultdict(list)
+    for (a, b), count in balance.items():
+        following[b] += [a] * max(count, 0)  # a hole has the edge in the other direction
+    loops = []
+    for start in list(following):
+        path, position = [start], {start: 0}
+        while following[path[-1]]:
+            vertex = following[path[-1]].pop()
+            if vertex in position:  # as many edges arrive at a vertex as leave it
+                loop = path[position[vertex] :]
+                loops.append(loop)
+                for used in loop[1:]:
+                    del position[used]
+                del path[position[vertex] + 1 :]
+            else:
+                position[vertex] = len(path)
+                path.append(vertex)
+    return loops
+
+
+def _close(mesh: Mesh, loops: list[list[int]]) -> Mesh:
+    """Return a surface with its holes filled."""
+    caps = [
+        [loop[i] for i in triangle]
+        for loop in loops
+        for triangle in polygon_triangles(mesh.vertices[loop])
+    ]
+    return Mesh(mesh.vertices, np.concatenate([mesh.faces, np.array(caps).reshape(-1, 3)]))
+
+
+def _vhacd(mesh: Mesh, path: Path) -> list[Mesh]:
+    """Return the convex parts of a mesh at unit size.
+
+    A process of its own computes them: the C code can crash, and prints its progress.
+
+    Raises:
+        ConfigError: the process fails, or takes longer than `VHACD_LIMIT_S`.
+    """
+    logger.info("decomposing %s into convex parts; the result is cached", path)
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder, "mesh.obj"), Path(folder, "parts.obj")
+        write_obj(source, [mesh])
+        files = [str(source), str(target), str(Path(folder, "log.txt"))]
+        try:
+            subprocess.run(
+                [sys.executable, "-P", "-c", _VHACD_PROGRAM, *files, json.dumps(VHACD)],
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                timeout=VHACD_LIMIT_S,
+                check=True,
+            )
+        except (subprocess.SubprocessError, OSError) as error:
+            reason = str(error).replace(str(getattr(error, "cmd", "")) or "\0", "V-HACD")
+            printed = (getattr(error, "stderr", None) or b"").decode(errors="replace").split("\n")
+            raise ConfigError(
+                f"asset_root: {str(path)!r} cannot be decomposed into convex parts: "
+                f"{' '.join([reason, *filter(None, printed[-2:])])} Simplify the mesh, which has "
+                f"{len(mesh.faces)} triangles, or remove its folder"
+            ) from error
+        clouds = read_obj(target.read_bytes()) if target.exists() else []
+    parts = []
+    for cloud in clouds:
+        try:
+            parts.append(convex_hull(cloud.vertices))
+        except ValueError as error:
+            logger.debug("%s: a part without volume is left out: %s", path, error)
+    return parts
