@@ -191,10 +191,11 @@ class Learner(Algorithm):
         end, updates = self.config.learning_rate_end_factor, self.problem.total_updates
         return LinearLR(optimizer, start_factor=1.0, end_factor=end, total_iters=updates)
 
-    def adam(self, parameters: Iterable[nn.Parameter]) -> Optimizer:
-        """Return Adam for some parameters, with weight decay on those of the networks only."""
+    def adam(self, parameters: Iterable[nn.Parameter], factor: float = 1.0) -> Optimizer:
+        """Return Adam for some parameters with a factor on the learning rate, and with weight decay
+        on those of the networks only."""
         config, decayed = self.config, self.network_parameters()
-        return make_adam(parameters, decayed, config.learning_rate, config.weight_decay)
+        return make_adam(parameters, decayed, factor * config.learning_rate, config.weight_decay)
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return the parameters to which weight decay and the gradient's bound apply."""

@@ -100,21 +100,21 @@ class SACConfig(LearnerConfig):
     """Views of each observation, over which the losses are averaged."""
     target_views: int = Field(default=1, ge=1)
     """Views of each next observation, over which the target is averaged."""
-    contrastive: bool = False
-    """Whether each update also takes two steps on the contrastive loss of pairs of views, as in the
-    reference implementation: one with Adam on the encoder, one with Adam on encoder and similarity.
-    The appendix names the loss only."""
+    contrastive_weight: float = Field(default=0.0, ge=0)
+    """Factor on the learning rate of the two optimisers of the encoder's contrastive loss on pairs
+    of views; 0 for no such loss. Adam's steps do not depend on a factor on the loss. The FERM
+    presets have 1, as the reference implementation; the appendix gives no weight."""
     pretraining: Literal["all", "contrastive"] = "all"
     """Losses that updates before the first collection minimise: all, or the contrastive one alone,
     with ``init="bc"`` together with that of behaviour cloning."""
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
-        needs_views = self.views > 1 or self.target_views > 1 or self.contrastive
+        needs_views = self.views > 1 or self.target_views > 1 or self.contrastive_weight > 0
         if needs_views and self.view_transform == "none":
             raise ValueError("several views or a contrastive loss need view_transform")
-        if self.pretraining == "contrastive" and not self.contrastive:
-            raise ValueError("pretraining 'contrastive' needs contrastive=true")
+        if self.pretraining == "contrastive" and not self.contrastive_weight:
+            raise ValueError("pretraining 'contrastive' needs contrastive_weight")
         if self.stored_copies and self.augmentation == "none":
             raise ValueError("stored_copies needs augmentation")
         return self
@@ -135,9 +135,9 @@ class SACConfig(LearnerConfig):
             yield from changed(self, ["demonstration_distance"], why)
             if self.replay == "uniform":
                 yield from changed(self, ["imitate_successes"], f"{why} and uniform replay")
-        if self.contrastive and getattr(network, "shares_encoder", None) is False:
+        if self.contrastive_weight and getattr(network, "shares_encoder", None) is False:
             name = NETWORKS.name_of(type(network))
-            yield f"contrastive has no effect on the own encoder of the policy of {name!r}"
+            yield f"contrastive_weight has no effect on the own encoder of the policy of {name!r}"
 
     @property
     def init_entropy_weight(self) -> float:
@@ -239,7 +239,7 @@ class SAC(Learner):
         return loss.make_value_estimator(gamma=config.gamma)
 
     def _make_contrastive(self, encoder: nn.Module) -> BilinearInfoNCE | None:
-        if not self.config.contrastive:
+        if not self.config.contrastive_weight:
             return None
         device = self.problem.device
         images = (torch.zeros(image.shape, device=device) for image in self.seen_images.values())
@@ -248,9 +248,10 @@ class SAC(Learner):
         return BilinearInfoNCE(features.shape[-1])
 
     def make_stages(self) -> list[LossFunction]:
-        """Return the loss of actor, critics and temperature and, if configured, then that of the
-        encoder."""
-        return [self.loss, *([self.loss.contrastive_loss] if self.config.contrastive else [])]
+        """Return the loss of actor, critics and temperature and, if configured, then the
+        contrastive one."""
+        is_contrastive = self.config.contrastive_weight > 0
+        return [self.loss, *([self.loss.contrastive_loss] if is_contrastive else [])]
 
     def make_target_updater(self) -> SoftUpdate:
         """Return the soft update of the targets of critic and encoder."""
@@ -282,7 +283,7 @@ class SAC(Learner):
                     padding=0 if is_crop else config.shift_pixels,
                     views=config.views,
                     target_views=config.target_views,
-                    has_positive=config.contrastive,
+                    has_positive=config.contrastive_weight > 0,
                     seed=self.problem.derived_seed(SeedUse.VIEWS),
                 )
             )
@@ -299,14 +300,17 @@ class SAC(Learner):
         return self.adam(p for p in self.loss.parameters() if id(p) not in own)
 
     def make_term_optimizers(self) -> dict[str, dict[str, Optimizer]]:
-        """Return the two optimisers of the contrastive loss, if configured."""
+        """Return the optimisers of the contrastive loss, if configured: one for the encoder, one
+        for encoder and similarity, as in the reference implementation."""
         contrastive = self.loss.contrastive
         if contrastive is None:
             return {}
         encoder = list(self.loss.encoder_network_params.parameters())
-        both = [*encoder, *contrastive.parameters()]
-        optimizers = {"encoder": self.adam(encoder), "contrastive": self.adam(both)}
-        return {"loss_contrastive": optimizers}
+        chosen = {"encoder": encoder, "contrastive": [*encoder, *contrastive.parameters()]}
+        weight = self.config.contrastive_weight
+        return {
+            "loss_contrastive": {name: self.adam(each, weight) for name, each in chosen.items()}
+        }
 
     def _make_rotation(self, probability: float, use: SeedUse) -> SO2Augmentation:
         return SO2Augmentation(

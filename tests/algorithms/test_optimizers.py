@@ -9,8 +9,14 @@ import torch
 from ba_torchrl.algorithms.optimizers import Optimizers
 from tests.algorithms.tiny import FERM, build, transitions
 
-RATE, TAU, ENCODER_TAU = 3e-3, 0.2, 0.4
-SETTINGS = {**FERM, "learning_rate": RATE, "tau": TAU, "encoder_tau": ENCODER_TAU}
+RATE, WEIGHT, TAU, ENCODER_TAU = 3e-3, 0.5, 0.2, 0.4
+SETTINGS = {
+    **FERM,
+    "contrastive_weight": WEIGHT,
+    "learning_rate": RATE,
+    "tau": TAU,
+    "encoder_tau": ENCODER_TAU,
+}
 
 
 def ferm(**settings):
@@ -51,8 +57,14 @@ def test_ferm_takes_the_steps_of_three_optimisers(clamp):
     named = dict(loss.named_parameters())
     similarity = named.pop("contrastive.weight")
     encoder = [p for name, p in named.items() if name.startswith("encoder_network_params")]
-    parameters = (named.values(), encoder, [*encoder, similarity])
-    optimizers = [torch.optim.Adam(each, RATE, fused=True) for each in parameters]
+    optimizers = [
+        torch.optim.Adam(each, rate, fused=True)
+        for each, rate in (
+            (named.values(), RATE),
+            (encoder, WEIGHT * RATE),
+            ([*encoder, similarity], WEIGHT * RATE),
+        )
+    ]
     for number in range(6):
         is_first = number < 3
         torch.manual_seed(number)
@@ -77,7 +89,8 @@ def test_every_learning_rate_follows_the_schedule_of_the_run():
             assert len(names) == 3
             for name in names:
                 rates = [group["lr"] for group in states[name]["param_groups"]]
-                assert rates == pytest.approx([expected] * len(rates))
+                factor = 1 if name == "optimizer" else WEIGHT
+                assert rates == pytest.approx([factor * expected] * len(rates))
             if number < 10:
                 learner.pretrain_update() if number < 3 else learner.update()
 

@@ -318,8 +318,8 @@ def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
     ("changes", "message"),
     [
         ({"views": 2}, "need view_transform"),
-        ({"contrastive": True}, "need view_transform"),
-        ({"pretraining": "contrastive"}, "needs contrastive=true"),
+        ({"contrastive_weight": 1.0}, "need view_transform"),
+        ({"pretraining": "contrastive"}, "needs contrastive_weight"),
         ({"stored_copies": 4}, "stored_copies needs augmentation"),
     ],
 )

@@ -75,8 +75,8 @@ def messages(name, network, values):
         (
             "sac",
             "equi",
-            {"view_transform": "crop", "contrastive": True},
-            "contrastive has no effect on the own encoder of the policy of 'equi'",
+            {"view_transform": "crop", "contrastive_weight": 1.0},
+            "contrastive_weight has no effect on the own encoder of the policy of 'equi'",
         ),
     ],
 )
@@ -92,7 +92,7 @@ def test_values_without_effect(name, network, values, expected):
         ("cnn", {"augmentation": "so2", "augmentation_probability": 0.5}),
         ("cnn", {"view_transform": "crop", "crop_size": 64}),
         ("cnn", {"demonstration_weight": 0.0, "imitate_successes": True, "replay": "symmetric"}),
-        ("ferm", {"view_transform": "crop", "contrastive": True}),
+        ("ferm", {"view_transform": "crop", "contrastive_weight": 1.0}),
     ],
 )
 def test_values_with_an_effect(network, values):

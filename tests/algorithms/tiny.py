@@ -17,7 +17,7 @@ SIZES = {
     "ferm": {"width": 0.125, "features": 8},
     "asr": {"num_rotations": 4, "width": 0.125},
 }
-FERM = {"view_transform": "shift", "contrastive": True}
+FERM = {"view_transform": "shift", "contrastive_weight": 1.0}
 """SAC with optimisers of its own for one of the terms of the loss."""
 OPEN = {"task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects": 2}}
 """Changes of `run` for an open-loop task."""

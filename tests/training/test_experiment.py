@@ -209,7 +209,7 @@ NO_PRETRAINING = {"pretrain_updates": 0}
 FERM = {
     "name": "sac",
     "view_transform": "crop",
-    "contrastive": True,
+    "contrastive_weight": 1.0,
     "pretraining": "contrastive",
 }
 

@@ -42,7 +42,7 @@ FERM = {
     "algorithm": {
         **UNIFORM,
         "view_transform": "shift",
-        "contrastive": True,
+        "contrastive_weight": 1.0,
         "pretraining": "contrastive",
         "learning_rate_end_factor": 0.1,
     },
