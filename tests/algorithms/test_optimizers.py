@@ -47,7 +47,7 @@ def update_by_hand(loss, batch, optimizers, clamp, *, pretrains):
         for name, tau in (("encoder", ENCODER_TAU), ("qvalue", TAU)):
             target = getattr(loss, f"target_{name}_network_params")
             for key, value in getattr(loss, f"{name}_network_params").items(True, True):
-                target[key].mul_(1 - tau).add_(tau * value)
+                target[key].lerp_(value, tau)  # rounds as SoftUpdate does
 
 
 @pytest.mark.parametrize("clamp", [None, 0.02])
@@ -75,8 +75,8 @@ def test_ferm_takes_the_steps_of_three_optimisers(clamp):
         update_by_hand(loss, other.sample(), optimizers, bound, pretrains=is_first)
         for name, value in loss.state_dict().items():
             # Adam's first steps magnify rounding errors of small gradients
-            difference = (learner.loss.state_dict()[name] - value).abs().max()
-            assert difference < RATE / 20, (number, name)
+            difference = float((learner.loss.state_dict()[name] - value).abs().max())
+            assert difference <= RATE / 100, (number, name)
 
 
 def test_every_learning_rate_follows_the_schedule_of_the_run():
