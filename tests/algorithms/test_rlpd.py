@@ -8,7 +8,7 @@ import torch
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.data.replay.symmetric import SymmetricReplay
+from ba_torchrl.data.replay.symmetric import SymmetricSampler
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.cnn import CNNConfig
 from tests.algorithms.tiny import build, problem, run, transitions
@@ -76,8 +76,8 @@ def test_an_update_is_several_critic_updates_and_one_of_the_policy():
 
 def test_optimiser_and_augmentation_have_their_values():
     learner = made()
-    assert isinstance(learner.replay, SymmetricReplay)
-    assert (learner.replay.expert.storage.max_size, learner.replay.batch_size) == (55, 6)
+    assert isinstance(learner.replay.sampler, SymmetricSampler)
+    assert (learner.replay.storage.max_size, learner.replay.batch_size) == (55, 6)
     assert isinstance(learner.augmentation, SO2Augmentation)
     assert learner.augmentation.probability == 0.35
     plain = made(augmentation="none", augmentation_probability=0.8)
@@ -131,8 +131,7 @@ def test_a_network_without_an_ensemble_is_refused():
 @pytest.mark.parametrize("network", ["cnn", "equi"])
 def test_two_iterations_of_a_run(tmp_path, network):
     learner = run(tmp_path, network, {"name": "rlpd", "critics": 3, "critic_updates": 2})
-    assert len(learner.replay.expert) > 0
-    assert len(learner.replay.online) > 0
+    assert 0 < learner.replay.num_demonstrations < len(learner.replay)
 
 
 @pytest.mark.parametrize(("init", "pretrained"), [("random", 0), ("bc", 3)])

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from ba_torchrl.data.replay.symmetric import count_demonstrations
 from ba_torchrl.envs import keys
 from tests.algorithms.tiny import build, make_experiment, transitions
 
@@ -50,8 +49,8 @@ def test_successes_fill_at_most_half_of_the_replay(replay):
     data = collected(learner, [True, True], [True, True])
     for stored in (2, 4, 6, 8, 10):
         learner.extend(learner.to_transitions(data, is_expert=False))
-        assert count_demonstrations(learner.replay) == min(stored, 4)
-        assert learner.replay_size == min(stored, 8 if replay != "symmetric" else 16)
+        assert learner.replay.num_demonstrations == min(stored, 4)
+        assert learner.replay_size == min(stored, 8)
 
 
 def test_without_the_option_transitions_are_stored_at_once():

@@ -199,7 +199,7 @@ def test_demonstrations_are_executed_as_they_are_learnt():
     moved = (algorithm.nearest_action(plain[0]["action"]) - plain[0]["action"]).abs()
     assert moved[:, 3].max() > 0.01  # the expert's own actions are off the grid
     algorithm.on_demonstrations(episodes)
-    stored = algorithm.replay.expert.storage.column("action")
+    stored = algorithm.replay.storage.column("action")
     assert torch.equal(stored, torch.cat([episode["action"] for episode in episodes]))
 
 
@@ -227,7 +227,7 @@ def test_a_yaw_that_wraps_reverses_the_image_of_what_is_held(yaw):
     for key in ("done", "terminated", "truncated", "fault"):
         episode["next", key] = torch.zeros(3, 1, dtype=torch.bool)
     algorithm.on_demonstrations([episode])
-    stored = algorithm.replay.expert.storage[:3]
+    stored = algorithm.replay.storage[:3]
     wraps = yaw > 3
     expected = image.flip(-2, -1) if wraps else image
     assert stored["action"][0, 3] == pytest.approx(0.0 if wraps else math.pi / 2)
