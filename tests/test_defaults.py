@@ -5,6 +5,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import ba_torchrl
+from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.augmentation.views import RandomViews
 from ba_torchrl.data.demos import collect_demonstrations
@@ -101,7 +102,13 @@ def test_the_replay_holds_the_same_transitions(expected_samples, other_default, 
             assert torch.equal(found[kind][key], batch[key]), (kind, key)
 
 
-def augmented(images, batch):
+def augmented(task, images, batch):
+    if task == "open_loop/house_building_1":
+        actions = ba_torchrl.make(task, obs_size=32).actions
+        return [
+            RigidAugmentation(kind, actions, images, seed=0)(batch)
+            for kind in ("translation", "se2", "d4")
+        ]
     rotation = SO2Augmentation(images, "pxyzr", seed=0)
     views = RandomViews(images, size=24, views=2, seed=0)
     return [rotation(batch), views(batch)]
@@ -109,14 +116,19 @@ def augmented(images, batch):
 
 @pytest.fixture(scope="module")
 def expected_augmented(expected_samples):
-    images, drawn = expected_samples["close_loop/block_picking"]
-    return augmented(images, drawn["uniform"])
+    return {
+        task: augmented(task, images, drawn["uniform"])
+        for task, (images, drawn) in expected_samples.items()
+    }
 
 
-def test_augmented_transitions_are_the_same(expected_samples, expected_augmented, other_default):
-    images, drawn = expected_samples["close_loop/block_picking"]
-    found_batches = augmented(images, drawn["uniform"])
-    for found, batch in zip(found_batches, expected_augmented, strict=True):
+@pytest.mark.parametrize("task", ["close_loop/block_picking", "open_loop/house_building_1"])
+def test_augmented_transitions_are_the_same(
+    expected_samples, expected_augmented, other_default, task
+):
+    images, drawn = expected_samples[task]
+    found_batches = augmented(task, images, drawn["uniform"])
+    for found, batch in zip(found_batches, expected_augmented[task], strict=True):
         assert kinds(found) == kinds(batch)
         for key in batch.keys(True, True):
             assert torch.equal(found[key], batch[key]), key

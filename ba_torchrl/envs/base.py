@@ -78,8 +78,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         low, high = config.object_scale_range or self.task_class.scale_range
         scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._episodes = Episodes(scales, self._build_scene, self._place_robot)
-        self.identity = object()
-        """Marks the states of this environment."""
+        self._identity = object()
         self._observation: dict[str, torch.Tensor] = {}
         self._observations = enabled_observations(config, self.workspace)
         self._memory: dict[str, Any] = {}  # of observations; it is replaced, never modified
@@ -211,7 +210,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         """
         scene = self.scene
         return EnvState(
-            owner=self.identity,
+            owner=self._identity,
             scale=self._episodes.scale(),
             scene=scene.get_state(),
             observation=self._observation,
@@ -236,10 +235,9 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             SimulationError: the state is of another environment, or of a world that was closed
                 after a fault.
         """
-        if state.owner is not self.identity:
+        if state.owner is not self._identity:
             raise SimulationError("the state is of another environment")
-        self._episodes.scene = self._episodes.scene_for(state.scale)
-        self.scene.set_state(state.scene)
+        self._episodes.restore(state.scale, state.scene)
         self._observation, self._memory = state.observation, state.memory
         self.base_seed, self._episode = state.base_seed, state.episode
         self._step_count = state.step_count

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torchrl.envs import EnvBase
 
 from ba_torchrl.config import EnvConfig
-from ba_torchrl.envs.episodes import EnvState
 from ba_torchrl.envs.observations import OBSERVATIONS
+from ba_torchrl.envs.scene import SceneState
 from ba_torchrl.envs.settings import parse_env_config
 from ba_torchrl.plugins import MAIN, import_modules
 from ba_torchrl.registry import Registry
@@ -24,11 +25,14 @@ class CopiesWithState:
 
     The copy is an environment of its own: it has another simulator, without a window, in the same
     state, so that the same actions give the same steps bit by bit in both. For the original, this
-    is a `get_state`. It takes as long as `make`; to look ahead in one environment, `get_state` and
-    `set_state` are faster. `on_contact` is not copied.
+    is a `get_state`, after which the actions no longer determine its position. It takes as long as
+    `make`; to look ahead in one environment, `get_state` and `set_state` are faster.
+
+    Subclasses keep the arguments of the constructor. Of the attributes, those that
+    `copied_attributes` names are copied.
     """
 
-    episode_attributes: ClassVar[tuple[str, ...]] = (
+    copied_attributes: ClassVar[tuple[str, ...]] = (
         "base_seed",
         "_episode",
         "_step_count",
@@ -36,28 +40,32 @@ class CopiesWithState:
         "_memory",
         "_ends",
         "_conditions",
+        "_run_type_checks",
+        "training",
     )
-    """Attributes of the state that do not depend on the simulator; a class can add its own."""
+    """Attributes that do not depend on the simulator; a class can add its own."""
+
+    def __copy__(self) -> Self:
+        return copy.deepcopy(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        state = None
+        scene = None
         if self._episodes.scene is not None:
             world = self.scene.world.portable_snapshot()  # of what `get_state` saves and restores
             state = self.get_state()
-            scene = dataclasses.replace(state.scene, world=world)
-            state = dataclasses.replace(state, owner=None, scene=scene)
+            scene = state.scale, dataclasses.replace(state.scene, world=world)
         modules = [module for *_, module in registering_modules(self.task_id, self.config)]
         attributes = {
             name: getattr(self, name)
             for cls in type(self).__mro__
-            for name in vars(cls).get("episode_attributes", ())
+            for name in vars(cls).get("copied_attributes", ())
         }
         return _make_copy, (
             type(self),
             self.task_id,
             {**self.config.model_dump(), "render": False},
             [module for module in modules if module not in MAIN],
-            state,
+            scene,
             attributes,
             self.device,
         )
@@ -68,7 +76,7 @@ def _make_copy(
     task_id: str,
     values: dict[str, Any],
     modules: Sequence[str],
-    state: EnvState | None,
+    scene: tuple[float, SceneState] | None,
     attributes: dict[str, Any],
     device: torch.device | None,
 ) -> EnvBase:
@@ -79,14 +87,14 @@ def _make_copy(
         task_id: as listed by `ba_torchrl.list_tasks`.
         values: fields of `EnvConfig`.
         modules: outside the package, which register the task or other parts.
-        state: with a portable snapshot; None if the environment has no scene.
-        attributes: values of the attributes that `episode_attributes` names.
+        scene: scale of the objects, and state with a portable snapshot; None without a scene.
+        attributes: values of the attributes that `copied_attributes` names.
         device: of its TensorDicts.
     """
     import_modules(modules)
     env = cls(task_id, parse_env_config(task_id, values))
-    if state is not None:
-        env.set_state(dataclasses.replace(state, owner=env.identity))
+    if scene is not None:
+        env._episodes.restore(*scene)
     for name, value in attributes.items():
         setattr(env, name, value)
     return env if device is None else env.to(device)

@@ -84,6 +84,11 @@ class Episodes:
         """Return the scale of the objects in the current episode."""
         return next(key for key, scene in self._scenes.items() if scene is self.scene)
 
+    def restore(self, scale: float, state: SceneState) -> None:
+        """Continue the current episode in a state of the scene with objects of a scale."""
+        self.scene = self.scene_for(scale)
+        self.scene.set_state(state)
+
     def close(self) -> None:
         """Close all worlds; the next episode builds a new one."""
         for scene in self._scenes.values():

@@ -24,7 +24,7 @@ class RecordedPosition:
     Reading the position does not affect the simulation, unlike `ManipulationEnv.get_state`.
     """
 
-    episode_attributes = ("_first_episode", "_played", "_resumed")
+    copied_attributes = ("_first_episode", "_played", "_resumed")
     _first_episode = 0
     _played: list[list[torch.Tensor]] | None = None
     _resumed: TensorDict | None = None

@@ -84,12 +84,12 @@ def read_obj(content: bytes) -> list[Mesh]:
     Raises:
         ValueError: a vertex or a face cannot be read.
     """
-    text = content.removeprefix(codecs.BOM_UTF8)
-    for line_end in (b"\\\r\n", b"\\\n", b"\\\r"):
-        text = text.replace(line_end, b" ")  # a backslash continues a line
+    lines = iter(content.removeprefix(codecs.BOM_UTF8).splitlines())
     vertices: list[list[float]] = []
     objects: list[list[list[int]]] = [[]]
-    for line in text.splitlines():
+    for line in lines:
+        while line.rstrip().endswith(b"\\") and line.lstrip()[:1] in b"vVfF":
+            line = line.rstrip()[:-1] + b" " + next(lines, b"")  # a backslash continues a line
         kind, *values = line.split(b"#")[0].split() or [b""]
         try:
             match kind.lower():

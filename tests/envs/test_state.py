@@ -282,6 +282,9 @@ def test_a_copy_has_the_parameters_of_the_original():
     other = copy.deepcopy(env)
     assert other.config == env.config
     assert other.base_seed == 3
+    assert not other.run_type_checks
+    env.run_type_checks = True
+    assert copy.copy(env).run_type_checks
     env.close()
     other.close()
 
@@ -325,6 +328,29 @@ def test_a_copy_of_a_vector_is_independent(name):
     first = other.step(state.clone())["next", "pixels"]
     other.step(state.clone())
     assert torch.equal(env.step(state.clone())["next", "pixels"], first)
+    env.close()
+    other.close()
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_a_copy_of_a_vector_continues_over_the_ends_of_episodes(name):
+    options = {"parallel": False, "obs_size": 32, "seed": 0, "max_steps": 3}
+    env = ba_torchrl.make_vector_env("close_loop/block_picking", 2, **options)
+    state = env.step(env.reset().set("action", torch.zeros(2, 5)))["next"]
+    other = COPIES[name](env)
+    state["_reset"] = torch.tensor([[True], [False]])
+    first, second = (each.reset(state.clone()) for each in (env, other))
+    assert torch.equal(first["pixels"], second["pixels"])
+    assert first["step_count"].flatten().tolist() == [0, 1]
+    for _ in range(7):
+        taken = []
+        for each, here in ((env, first), (other, second)):
+            here["action"] = torch.full((2, 5), 0.5)
+            taken.append(each.step_and_maybe_reset(here))
+        (step, first), (step_of_copy, second) = taken
+        for key in ("pixels", ("next", "pixels"), ("next", "done")):
+            assert torch.equal(step[key], step_of_copy[key])
+        assert torch.equal(first["pixels"], second["pixels"])
     env.close()
     other.close()
 

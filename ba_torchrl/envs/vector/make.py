@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -158,6 +158,14 @@ class SerialVectorEnv(SeededVector, SerialEnv):
         """Continue episodes; see `SeededVector.continue_from`."""
         for env, position in zip(self._envs, positions, strict=True):
             env.continue_from(position)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if "shared_tensordict_parent" in state:
+            # views of one buffer, which a copy separates: resets are written and read through both
+            content = self.shared_tensordict_parent
+            self._create_td()
+            self.shared_tensordict_parent.update_(content)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the environments, and keep the number of torch threads, which TorchRL increases."""

@@ -8,7 +8,6 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,32 +58,39 @@ def cached_parts(content: bytes, recipe: str, make: Callable[[], Decomposition])
     try:
         path = cache_folder() / f"{key}.npz"
     except OSError as error:
-        _warn_once(f"cannot store convex parts ({error})")
+        _warn_once("the user's cache", str(error))
         return make()
     try:
         return _read(path)
     except (FileNotFoundError, NotADirectoryError):
         pass
     except PermissionError as error:
-        _warn_once(f"cannot read convex parts in {path.parent} ({error.strerror})")
+        _warn_once(str(path.parent), str(error.strerror))
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         logger.warning("%s cannot be read and is computed again: %s", path, error)
     made = make()
     try:
         _write(path, made)
     except OSError as error:
-        _warn_once(f"cannot store convex parts in {path.parent} ({error.strerror or error})")
+        _warn_once(str(path.parent), str(error.strerror or error))
     return made
 
 
-@cache
-def _warn_once(problem: str) -> None:
-    """Warn that the cache is not used, once for each problem."""
-    logger.warning(
-        "%s: they are computed by each process; set %s to a writable folder",
-        problem,
-        CACHE_VARIABLE,
-    )
+_unusable: set[str] = set()
+"""Folders of which a warning has been given."""
+
+
+def _warn_once(folder: str, problem: str) -> None:
+    """Warn that convex parts cannot be kept in a folder, once for each folder."""
+    if folder not in _unusable:
+        _unusable.add(folder)
+        logger.warning(
+            "cannot keep convex parts in %s (%s): each process computes them; set %s to a "
+            "writable folder",
+            folder,
+            problem,
+            CACHE_VARIABLE,
+        )
 
 
 def _read(path: Path) -> Decomposition:

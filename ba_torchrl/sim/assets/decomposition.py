@@ -24,12 +24,16 @@ CONVEX_FILL = 0.95
 """Least ratio of the volume of a convex mesh to that of its convex hull."""
 SOLID_FILL = 0.8
 """Least ratio of the volume of the parts to that of the mesh; thin shells have much less."""
+THICK_FILL = 1.5
+"""Greatest ratio of the volume of the parts to that of the mesh without a note."""
 SHEET_FILL = 0.05
 """Greatest ratio of the volume of a mesh to that of its parts if the mesh consists of sheets."""
 EXTENT_TOLERANCE = 0.05
 """Greatest difference between the bounding boxes of parts and mesh, in lengths of the mesh."""
 VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}
-VHACD_LIMIT_S = 300.0
+VOXELS = 46
+"""Edge of a cube with as many voxels as V-HACD's resolution."""
+VHACD_LIMIT_S = 900.0
 """Time limit of a decomposition, which takes seconds."""
 _VHACD_PROGRAM = (
     "import json, sys, pybullet; pybullet.vhacd(*sys.argv[1:4], **json.loads(sys.argv[4]))"
@@ -68,13 +72,13 @@ def _unit_parts(mesh: Mesh, path: Path) -> Decomposition:
     hull = convex_hull(mesh.vertices)
     whole, hull_volume = (simplified_hull(hull),), volume_and_center(hull)[0]
     mesh = _joined(mesh)
-    volume = _volume(mesh)
-    if volume >= CONVEX_FILL * hull_volume:
+    loops = _border_loops(mesh)
+    bodies = [_volume(body) for body in _bodies(mesh)]
+    # bodies of a closed surface can overlap; the parts fill each of them
+    solid = _volume(mesh) if loops else max(bodies)
+    if solid >= CONVEX_FILL * hull_volume:
         return Decomposition(whole)
     parts = _vhacd(mesh, path)
-    loops = _border_loops(mesh)
-    # bodies of a closed surface can overlap; the parts fill each of them
-    solid = volume if loops else max(map(_volume, _bodies(mesh)))
     note = ""
     if loops:
         closed = _close(mesh, loops)
@@ -97,10 +101,16 @@ def _unit_parts(mesh: Mesh, path: Path) -> Decomposition:
             f"cannot be decomposed into convex parts ({problem}): its convex hull is used, so that "
             "a gripper cannot reach into its hollows; close its surface, or simplify it",
         )
-    if not note and solid < SHEET_FILL * sum(map(_volume, parts)):
+    filled = sum(map(_volume, parts))
+    if not note and solid < SHEET_FILL * filled:
         note = (
             "has a surface of sheets without an inside: the object is hollow and has thin walls; "
             "close its surface, or give it a thickness"
+        )
+    elif not note and THICK_FILL * max(_volume(mesh), sum(bodies)) < filled:
+        note = (
+            f"has walls thinner than the resolution of its decomposition (about {1 / VOXELS:.0%} "
+            "of its length): they are thicker in the simulation"
         )
     return Decomposition(tuple(parts), note)
 
@@ -159,13 +169,16 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 
 
 def _bodies(mesh: Mesh) -> list[Mesh]:
-    """Return the connected pieces of a mesh."""
+    """Return the pieces of a mesh whose faces are connected by edges."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    edges, count = _edges(mesh.faces), len(mesh.vertices)
-    graph = coo_matrix((np.ones(len(edges), dtype=bool), edges.T), shape=(count, count))
-    labels = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    count = len(mesh.faces)
+    edges = np.unique(np.sort(_edges(mesh.faces)), axis=0, return_inverse=True)[1].reshape(-1)
+    links = np.repeat(np.arange(count), 3), count + edges  # of each face with its edges
+    size = count + edges.max() + 1
+    graph = coo_matrix((np.ones(3 * count, dtype=bool), links), shape=(size, size))
+    labels = connected_components(graph, directed=False)[1][:count]
     ends = np.cumsum(np.unique(labels, return_counts=True)[1])
     pieces = np.split(mesh.faces[np.argsort(labels, kind="stable")], ends[:-1])
     return [Mesh(mesh.vertices, faces) for faces in pieces]

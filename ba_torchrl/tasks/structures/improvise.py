@@ -12,7 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from ba_torchrl.sim.assets.cache import cached_parts
+from ba_torchrl.sim.assets.cache import Decomposition, cached_parts
 from ba_torchrl.sim.assets.hulls import convex_hull, surface_samples, volume_and_center
 from ba_torchrl.sim.assets.random_shapes import UNIT_M, read_shape, shape_path
 from ba_torchrl.sim.meshes import Mesh
@@ -138,11 +138,12 @@ def shape_piece(shape: Shape) -> Piece:
 def _hull(number: int) -> Mesh:
     """Return the convex hull of a shape, in the units of its file."""
 
-    def make() -> list[Mesh]:
+    def make() -> Decomposition:
         mesh = read_shape(number)
-        return [convex_hull(mesh.vertices / UNIT_M)]
+        return Decomposition((convex_hull(mesh.vertices / UNIT_M),))
 
-    return cached_parts(shape_path(number).read_bytes(), "hull, units of the file", make)[0]
+    content = shape_path(number).read_bytes()
+    return cached_parts(content, "hull, units of the file", make).parts[0]
 
 
 def _interpolate(ends: tuple[float, float], share: float) -> float:

@@ -67,7 +67,7 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch, caplog):
     for name in (CACHE_VARIABLE, "HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(pwd, "getpwuid", lambda uid: {}[uid])  # a user id without a name
-    cache._warn_once.cache_clear()
+    cache._unusable.clear()
     with caplog.at_level(logging.WARNING):
         for content in (b"content", b"other content"):
             (part,) = cached_parts(content, "recipe", make_box).parts

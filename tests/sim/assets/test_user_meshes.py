@@ -55,6 +55,7 @@ def mixed_tabs(text):
 
 DIALECTS = {
     "plain": ell_obj(),
+    "a comment that ends in a backslash": ell_obj(head="# from C:\\models\\\n"),
     "negative indices in blocks": blocks_obj(),
     "tabs": ell_obj().replace(" ", "\t"),
     "tabs in some lines": mixed_tabs(ell_obj()),
@@ -194,13 +195,23 @@ def test_a_decomposition_that_dies_is_an_error_that_names_the_file(
 def test_parts_that_differ_from_the_mesh_are_replaced_by_the_hull(tmp_path, monkeypatch, caplog):
     from ba_torchrl.sim.assets import decomposition
 
-    for i, wrong in enumerate(([], [box_mesh((0.5, 0.5, 0.5))])):
+    corners = [
+        Mesh(box_mesh((0.1, 0.1, 0.1)).vertices + sign * np.array([0.43, 0.43, 0.27]), faces)
+        for sign, faces in ((-1, box_mesh((1, 1, 1)).faces), (1, box_mesh((1, 1, 1)).faces))
+    ]
+    wrong_parts = {
+        "no part": [],
+        "different extents": [box_mesh((0.5, 0.5, 0.5))],
+        "% of its volume": corners,
+    }
+    for i, (reason, wrong) in enumerate(wrong_parts.items()):
         monkeypatch.setattr(decomposition, "_vhacd", lambda *_, wrong=wrong: wrong)
-        mesh = Mesh(ell().vertices * (1 + i), ell().faces)
+        mesh = Mesh(ell().vertices * 2**i, ell().faces)
         with caplog.at_level(logging.WARNING):
             shape = load(tmp_path / str(i), mesh)
         assert len(shape.parts) == 1
         assert f"{i}/models/007/a.obj' cannot be decomposed" in caplog.text
+        assert reason in caplog.text
 
 
 def test_a_concave_mesh_needs_no_standard_output(tmp_path):
@@ -268,6 +279,7 @@ CLOSED = {
         ell().vertices[ell().faces].reshape(-1, 3), np.arange(60).reshape(-1, 3)
     ),
     "twice": merge_meshes([ell(), ell()]),
+    "nearly twice": merge_meshes([ell(), Mesh(1.001 * ell().vertices, ell().faces)]),
     "a small hole": without(ell(), lambda c: c[2] == 0 and c[0] > 0.045),
 }
 
@@ -279,6 +291,23 @@ def test_surfaces_that_enclose_a_solid_are_decomposed_into_it(tmp_path, caplog, 
     assert len(shape.parts) > 1
     assert volume(shape) == pytest.approx(VOLUME_M3, rel=0.08)
     assert not caplog.records or name == "a small hole"
+
+
+def test_crossed_boxes_are_not_taken_for_their_hull(tmp_path, caplog):
+    cross = merge_meshes([box_mesh((0.09, 0.03, 0.04)), box_mesh((0.03, 0.09, 0.04))])
+    with caplog.at_level(logging.WARNING):
+        shape = load(tmp_path, cross)
+    assert len(shape.parts) > 1
+    assert not caplog.records
+
+
+def test_walls_that_become_thicker_are_reported(tmp_path, caplog):
+    trimesh = pytest.importorskip("trimesh")
+    tube = trimesh.creation.annulus(0.03, 0.034, 0.08)
+    with caplog.at_level(logging.WARNING):
+        shape = load(tmp_path, Mesh(np.asarray(tube.vertices), np.asarray(tube.faces)))
+    assert volume(shape) > 1.5 * tube.volume
+    assert "walls thinner than" in caplog.text
 
 
 @pytest.mark.parametrize("count", [2500, 30_000])
