@@ -36,11 +36,14 @@ class SegmentTree:
     def __len__(self) -> int:
         return self.capacity
 
-    def __getitem__(self, index: int | np.ndarray | torch.Tensor) -> float | torch.Tensor:
+    def __getitem__(
+        self, index: int | np.ndarray | torch.Tensor
+    ) -> float | np.ndarray | torch.Tensor:
         if isinstance(index, int):
             return float(self._nodes[self._leaves + index])
-        index = np.asarray(index)
-        return torch.as_tensor(self._nodes[self._leaves + index], device="cpu").to(self.dtype)
+        found = torch.as_tensor(self._nodes[self._leaves + np.asarray(index)], device="cpu")
+        found = found.to(self.dtype)
+        return found.numpy() if isinstance(index, np.ndarray) else found
 
     def __setitem__(
         self, index: int | np.ndarray | torch.Tensor, value: float | np.ndarray | torch.Tensor

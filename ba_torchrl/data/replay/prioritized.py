@@ -94,9 +94,10 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         mass = total * torch.rand(
             batch_size, generator=self.generator, dtype=torch.float64, device="cpu"
         )
-        index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass), device="cpu").long()
-        index = index.clamp_max(count - 1)  # rounding of the total
-        leaf = torch.as_tensor(self._sum_tree[index], device="cpu")
+        # native trees return a number for a single draw
+        index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass), device="cpu")
+        index = index.long().reshape(-1).clamp_max(count - 1)  # rounding of the total
+        leaf = torch.as_tensor(self._sum_tree[index], device="cpu").reshape(-1)
         weights = {"priority_weight": (leaf / smallest).pow(-self.beta).float()}
         return (torch.unravel_index(index, storage.shape) if storage.ndim > 1 else index), weights
 
@@ -171,7 +172,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         """Return priorities, exponents and the generator's state, as tensors and numbers."""
         everything = torch.arange(self._max_capacity, device="cpu")
         return {
-            "leaves": torch.as_tensor(self._sum_tree[everything], device="cpu").clone(),
+            "leaves": torch.as_tensor(self._sum_tree[everything], device="cpu").reshape(-1).clone(),
             "max_priority": self._max_priority,
             "beta": self.beta,
             "generator": self.generator.get_state(),

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, PrioritizedSampler, TensorDictReplayBuffer
+from torchrl.data import (
+    LazyTensorStorage,
+    PrioritizedSampler,
+    PrioritizedSliceSampler,
+    TensorDictReplayBuffer,
+)
 from torchrl.data.replay_buffers.samplers import prioritized
 
 from ba_torchrl import _segment_tree as segment_tree
@@ -40,7 +45,7 @@ def test_trees_against_plain_arrays(trees, capacity):
         new = torch.from_numpy(rng.random(size) + 0.1)
         total[index], smallest[index] = new, new
         values[index] = new
-    assert np.asarray(total[torch.arange(capacity)]) == pytest.approx(values, rel=1e-6)
+    assert np.asarray(total[torch.arange(capacity)]).reshape(-1) == pytest.approx(values, rel=1e-6)
     for _ in range(20):
         low, high = sorted(rng.integers(0, capacity + 1, 2))
         if low == high:
@@ -146,6 +151,21 @@ def test_prioritised_buffers_of_torchrl_work_once_environments_are_imported(star
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_prioritised_slices_of_torchrl_start_by_priority():
+    sampler = PrioritizedSliceSampler(20, alpha=1.0, beta=1.0, slice_len=2, traj_key="episode")
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(20), sampler=sampler, batch_size=2000, priority_key="td"
+    )
+    episode = torch.arange(4).repeat_interleave(5)
+    data = {"x": torch.arange(20), "episode": episode, "td": torch.ones(20)}
+    buffer.extend(TensorDict(data, [20]))
+    buffer.update_priority(torch.arange(20), torch.where(torch.arange(20) == 7, 100.0, 1e-3))
+    slices = buffer.sample()["x"].reshape(-1, 2)
+    assert torch.equal(slices[:, 1], slices[:, 0] + 1)
+    assert (slices[:, 0] == 7).float().mean() > 0.99
+
+
 def test_samplers_of_torchrl_are_loaded_fast(tmp_path):
     """They set single leaves: 100,000 take half a minute if each is an array operation."""
     sampler, other = (PrioritizedSampler(100_000, alpha=0.7, beta=0.5) for _ in range(2))
@@ -229,6 +249,14 @@ def test_the_exponent_of_the_weights_increases_to_one_except_from_zero(beta, exp
 
 def leaves(sampler, n):
     return np.asarray(sampler._sum_tree[torch.arange(n)])
+
+
+def test_a_single_draw_has_one_index_and_one_weight():
+    buffer, sampler = make(FLAGS)
+    index, info = sampler.sample(buffer.storage, 1)
+    assert index.shape == info["priority_weight"].shape == (1,)
+    one, _ = make([True], capacity=1)
+    assert one.sample(1)["x"].shape == (1,)
 
 
 def test_new_transitions_get_the_largest_priority_of_the_updates():
