@@ -131,8 +131,9 @@ class EnvConfig(StrictModel):
     """Number of objects, for tasks that allow several numbers."""
     obs_size: int = Field(default=128, ge=16, le=1024)
     """Pixels along each side of the image."""
-    in_hand_size: int = Field(default=24, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
-    """Open loop: pixels along each side of the in-hand image."""
+    in_hand_size: int | None = Field(default=None, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
+    """Open loop: pixels along each side of the in-hand image. By default 24, and 40 on bumps
+    (appendix G.1)."""
     in_hand_mode: str | None = Field(default=None, json_schema_extra=_OPEN_LOOP)
     """Open loop: content of the in-hand image: "raw", "sub" or "proj"; see
     `ba_torchrl.sim.vision.in_hand`. By default "raw", and "proj" in six degrees of freedom."""
@@ -259,19 +260,21 @@ class EnvConfig(StrictModel):
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
         return self
 
-    def check_control(self, task_id: str, control: str) -> None:
+    def check_control(self, task_id: str, control: str, filled_in: dict[str, Any]) -> None:
         """Check that the parameters that differ from their defaults apply to a control.
 
         Args:
             task_id: for the message.
             control: "open_loop" or "close_loop".
+            filled_in: values that the task fills in where None is given.
 
         Raises:
             ConfigError: one applies to the other control only.
         """
         for name, field in EnvConfig.model_fields.items():
             needed = (field.json_schema_extra or {}).get("control", control)
-            if needed != control and getattr(self, name) != field.default:
+            unset = field.default, filled_in.get(name, field.default)
+            if needed != control and getattr(self, name) not in unset:
                 kind = needed.replace("_", "-")
                 raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")
 

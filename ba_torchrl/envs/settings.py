@@ -13,8 +13,8 @@ def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = No
     """Validate the parameters of an environment, those of its task included.
 
     A parameter of other tasks is dropped if it has its default value, so that a complete
-    configuration of one task is valid for another. In open loop, the task's default of
-    `in_hand_mode` is filled in.
+    configuration of one task is valid for another. The task's default of `in_hand_size` and, in
+    open loop, that of `in_hand_mode` are filled in.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
@@ -37,9 +37,11 @@ def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = No
             del values[name]
     config = parse(model, values, what or f"configuration of {task_id}")
     task_class = TASKS[task_id]
-    if config.in_hand_mode is None and task_class.control == "open_loop":
-        config = config.model_copy(update={"in_hand_mode": task_class.default_in_hand_mode})
-    return config
+    filled_in = _filled_in(task_class)
+    if task_class.control == "open_loop":
+        filled_in["in_hand_mode"] = task_class.default_in_hand_mode
+    missing = {name: value for name, value in filled_in.items() if getattr(config, name) is None}
+    return config.model_copy(update=missing)
 
 
 def task_parameters(task_class: type[Task], config: EnvConfig) -> TaskParameters:
@@ -55,7 +57,7 @@ def check_task_parameters(task_id: str, config: EnvConfig) -> None:
         ConfigError: a parameter has no meaning for the task, or an unsupported value.
     """
     task_class = TASKS[task_id]
-    config.check_control(task_id, task_class.control)
+    config.check_control(task_id, task_class.control, _filled_in(task_class))
     if config.object_scale_range is not None:
         check_scales(task_id, config.object_scale_range)
     least, most = task_class.num_objects_range
@@ -93,6 +95,11 @@ def check_action_components(task_id: str, components: list[str]) -> None:
             f"action_sequence: {task_id} cannot be solved without the components "
             f"{', '.join(missing)}; the sequence has {', '.join(components)}"
         )
+
+
+def _filled_in(task_class: type[Task]) -> dict[str, Any]:
+    """Return the values that tasks of both controls fill in where None is given."""
+    return {"in_hand_size": task_class.default_in_hand_size}
 
 
 def _tasks_with_parameter(name: str) -> dict[str, Any]:

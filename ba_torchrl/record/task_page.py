@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Sequence
 
 from ba_torchrl import make
+from ba_torchrl.envs import keys
 from ba_torchrl.record.headings import tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
 
@@ -47,6 +48,9 @@ def _section(task: str) -> list[str]:
         ("action", f"`{actions}` by default"),
         ("scale", "{:g} to {:g} (limits {:g} to {:g})".format(*cls.scale_range, *cls.scale_limits)),
     ]
+    if keys.IN_HAND in env.images:
+        shape = " x ".join(map(str, env.images[keys.IN_HAND].shape))
+        rows.append(("in-hand image", f"{shape} by default"))
     if least < most:
         rows.append(("`num_objects`", f"{cls.num_objects} ({numbers})"))
     for name, field in cls.Parameters.model_fields.items():

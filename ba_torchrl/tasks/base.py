@@ -80,6 +80,8 @@ class Task(ABC):
     """Default `action_sequence`; None for the default of the control."""
     default_in_hand_mode: ClassVar[str] = "raw"
     """Default `in_hand_mode` in open loop."""
+    default_in_hand_size: ClassVar[int] = 24
+    """Default `in_hand_size`, pixels."""
     terminates_at_limit: ClassVar[bool] = False
     """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False

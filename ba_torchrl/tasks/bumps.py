@@ -234,6 +234,7 @@ class OnBumps(OnSlopes):
     All objects start beside the platform.
     """
 
+    default_in_hand_size: ClassVar[int] = 40  # appendix G.1
     platform_m: ClassVar[tuple[float, float]]
     """Extents of the platform at the default scale of the objects."""
 

@@ -199,6 +199,26 @@ def test_in_hand_size_sets_the_size_of_in_hand_images(make):
     assert 12 <= (image > 0.02).sum() <= 100
 
 
+@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].control == "open_loop"])
+def test_in_hand_images_have_the_size_of_the_appendix_by_default(make, task):
+    """24 pixels, and 40 on bumps (appendix G.1); projections on slopes have three channels."""
+    size, channels = 40 if task.startswith("bump/") else 24, 3 if "loop" not in task else 1
+    for given in ({}, {"in_hand_size": None}):
+        env = make(task, obs_size=32, **given)
+        assert env.images["in_hand"].shape == (channels, size, size)
+        assert env.config.in_hand_size == size
+    assert make(task, obs_size=32, in_hand_size=24).images["in_hand"].shape[1:] == (24, 24)
+
+
+def test_a_complete_configuration_of_close_loop_is_valid(make):
+    config = make("close_loop/block_reaching", obs_size=32).config
+    assert config.in_hand_size == 24
+    again = make("close_loop/block_reaching", **config.model_dump())
+    assert again.config == config
+    with pytest.raises(ConfigError, match="'in_hand_size' is for open-loop"):
+        make("close_loop/block_reaching", in_hand_size=40)
+
+
 def test_the_step_limit_grows_with_the_number_of_blocks(make):
     for count, limit in ((4, 10), (6, 10), (7, 12), (8, 14)):
         assert make("open_loop/block_stacking", num_objects=count).max_steps == limit
