@@ -127,10 +127,8 @@ class Learner(Algorithm):
         """
         policy = self.trained_policy
         if not isinstance(policy, ProbabilisticTensorDictSequential):
-            raise ConfigError(
-                f"init: algorithm {ALGORITHMS.name_of(type(self.config))!r} has no actor that "
-                "behaviour cloning could initialise"
-            )
+            name = ALGORITHMS.name_of(type(self.config))
+            raise ConfigError(f"init: algorithm {name!r} has no actor for cloning to initialise")
         loss = BehaviourCloningLoss(policy, "kl", self.config.init_entropy_weight)
         loss.set_keys(action=keys.EXPERT_ACTION if self.has_expert_action else keys.ACTION)
         return loss

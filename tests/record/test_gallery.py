@@ -8,6 +8,7 @@ from ba_torchrl.record import gallery
 from ba_torchrl.record.gallery import Strip, expert_strip, overview_figure, strip_figure
 from ba_torchrl.record.headings import tasks_by_heading
 from ba_torchrl.record.video import FrameRecorder
+from tests.recipes import recipe
 
 TASK = "close_loop/block_reaching"
 BLUE = (20, 40, 220)
@@ -131,3 +132,13 @@ def test_every_open_loop_step_has_a_frame_of_the_contact_and_one_after_it():
         for a, b in zip(recorder.frames, recorder.frames[1:], strict=False)
     ]
     assert min(changes) > 0
+
+
+def test_the_gallery_leaves_the_pictures_of_the_repository_alone(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    strip = Strip([np.zeros((8, 8, 3), np.uint8)] * 2, np.zeros((8, 8), np.float32))
+    monkeypatch.setattr("ba_torchrl.record.gallery.expert_strip", lambda *_, **__: strip)
+    recipe("gallery", "tasks=[close_loop/block_reaching]")
+    written = [path.relative_to(tmp_path) for path in tmp_path.rglob("*.png")]
+    assert len(written) == 3
+    assert {str(path.parent) for path in written} == {"runs/gallery"}

@@ -5,10 +5,8 @@ import json
 import math
 import os
 import shutil
-import sys
 from collections import namedtuple
 
-import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -16,7 +14,6 @@ from omegaconf import OmegaConf
 import ba_torchrl
 from ba_torchrl.data.state_files import write_state
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.record.gallery import Strip
 from ba_torchrl.training.command_line import (
     EXIT_CODE,
     check_writable_file,
@@ -235,45 +232,6 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     assert words in error
     assert error.count("\n") == 1
     assert "Traceback" not in error
-
-
-OPEN = ("task=open_loop/block_stacking", "algorithm=dqn")
-
-
-@pytest.mark.parametrize(
-    ("name", "package", "overrides"),
-    [
-        ("train", "escnn", ("network=equi", "algorithm=sac", "label=a", "run_dir=new")),
-        ("train", "escnn", ("network=equi_fcn", *OPEN, "label=a", "run_dir=new")),
-        ("benchmark", "escnn", ("benchmark=close_loop_small", "folder=new")),
-        ("plot", "matplotlib.figure", ("runs=[run]",)),
-    ],
-)
-def test_a_missing_package_is_one_line(name, package, overrides, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, package, None)
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/config.json").write_text(json.dumps(RUN))
-    names = ("success_rate", "standard_error")
-    rows = "".join(f"5,eval/{name},0.5\n" for name in names)
-    (tmp_path / "run/scalars.csv").write_text(f"step,name,value\n{rows}")
-    with pytest.raises(SystemExit) as end:
-        recipe(name, *overrides)
-    error = capsys.readouterr().err
-    assert end.value.code == EXIT_CODE
-    assert error.startswith("error: ")
-    assert "pip install" in error
-    assert error.count("\n") == 1
-
-
-def test_the_gallery_leaves_the_pictures_of_the_repository_alone(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    strip = Strip([np.zeros((8, 8, 3), np.uint8)] * 2, np.zeros((8, 8), np.float32))
-    monkeypatch.setattr("ba_torchrl.record.gallery.expert_strip", lambda *_, **__: strip)
-    recipe("gallery", "tasks=[close_loop/block_reaching]")
-    written = [path.relative_to(tmp_path) for path in tmp_path.rglob("*.png")]
-    assert len(written) == 3
-    assert {str(path.parent) for path in written} == {"runs/gallery"}
 
 
 @pytest.mark.parametrize("name", ["train", "collect_demos", "benchmark"])

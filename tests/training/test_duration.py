@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ba_torchrl import hardware
+from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.duration import (
     MEASURED_UPDATES,
@@ -11,8 +12,9 @@ from ba_torchrl.training.duration import (
     UpdateTimer,
     compute_path,
 )
+from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
-from tests.training.test_experiment import TINY
+from tests.training.test_experiment import TINY, tiny
 
 
 def test_the_first_updates_are_measured_once_without_the_very_first(monkeypatch):
@@ -104,3 +106,29 @@ def test_other_work_between_updates_is_left_out(monkeypatch):
                 timer.exclude(100.0)
         assert found == pytest.approx(2.0)
         timer.restart()
+
+
+@pytest.mark.parametrize(
+    ("changes", "steps"),
+    [
+        ({}, [6]),  # of six updates
+        ({"total_updates": 2}, [2]),  # on the demonstrations alone
+        ({"log_every": 6}, [6]),
+        ({"log_every": 4}, [4]),
+        ({"log_every": 3}, [3, 6]),
+        ({"stop_at_success": 1e-9, "eval_every": 1, "eval_episodes": 2}, [2]),
+    ],
+)
+def test_a_run_shorter_than_the_interval_logs_its_last_update(
+    tmp_path, changes, steps, monkeypatch
+):
+    monkeypatch.setattr(
+        "ba_torchrl.training.experiment.evaluate", lambda *_: Evaluation(3, 1.0, 0.0, 5.0)
+    )
+    config = tiny(tmp_path, **{"log_every": 50, "video_episodes": 0, **changes})
+    result = Experiment(config, progress=False).run()
+    scalars = read_scalars(config.folder)
+    for name in ("train/loss_qvalue", "train/env_steps"):
+        assert scalars[name].steps.tolist() == steps
+    assert scalars["eval/success_rate"].steps[-1] == result.updates
+    assert result.curve.exists()

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.data.demo_files import save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
@@ -73,32 +72,6 @@ def test_a_run_writes_its_files(tmp_path):
     # two pretraining updates, then one per step of both environments
     assert scalars["train/env_steps"].values[-1] == 8
     assert find_checkpoint(folder).name.endswith("6")
-
-
-@pytest.mark.parametrize(
-    ("changes", "steps"),
-    [
-        ({}, [6]),  # of six updates
-        ({"total_updates": 2}, [2]),  # on the demonstrations alone
-        ({"log_every": 6}, [6]),
-        ({"log_every": 4}, [4]),
-        ({"log_every": 3}, [3, 6]),
-        ({"stop_at_success": 1e-9, "eval_every": 1, "eval_episodes": 2}, [2]),
-    ],
-)
-def test_a_run_shorter_than_the_interval_logs_its_last_update(
-    tmp_path, changes, steps, monkeypatch
-):
-    monkeypatch.setattr(
-        "ba_torchrl.training.experiment.evaluate", lambda *_: Evaluation(3, 1.0, 0.0, 5.0)
-    )
-    config = tiny(tmp_path, **{"log_every": 50, "video_episodes": 0, **changes})
-    result = Experiment(config, progress=False).run()
-    scalars = read_scalars(config.folder)
-    for name in ("train/loss_qvalue", "train/env_steps"):
-        assert scalars[name].steps.tolist() == steps
-    assert scalars["eval/success_rate"].steps[-1] == result.updates
-    assert result.curve.exists()
 
 
 @pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -248,27 +221,6 @@ def test_wrong_configurations_fail_before_the_run_starts(tmp_path, changes, mess
     with pytest.raises(ConfigError, match=message):
         tiny(tmp_path, **changes)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("control", ["close_loop", "open_loop"])
-def test_refused_networks_and_algorithms_have_the_names_of_the_registry(tmp_path, control):
-    """As the user writes them, and with what the task takes instead."""
-    task = {"close_loop": TINY["task"], "open_loop": "open_loop/block_stacking"}[control]
-    learner, other = ("sac", "spatial_q") if control == "close_loop" else ("spatial_q", "sac")
-    env = {"task": task, "env": {}, "demonstrations": 1}
-    refused = [name for name in NETWORKS if NETWORKS[name].control != control]
-    assert len(refused) > 3
-    for name in refused:
-        with pytest.raises(ConfigError, match=f"^network '{name}' is for ") as error:
-            tiny(tmp_path, **env, network={"name": name}, algorithm={"name": learner})
-        assert f"{control} tasks take network: " in str(error.value)
-    refused = [name for name in ALGORITHMS if control not in ALGORITHMS[name].controls]
-    assert other in refused
-    for name in refused:
-        with pytest.raises(ConfigError, match=f"^algorithm '{name}' learns ") as error:
-            tiny(tmp_path, **env, algorithm={"name": name})
-        assert f"{control} tasks take algorithm: " in str(error.value)
-        assert learner in str(error.value)
 
 
 def test_demonstrations_of_a_folder_are_filtered(tmp_path, caplog):

@@ -1,0 +1,62 @@
+"""Errors name what the user wrote, and packages that are missing."""
+
+import json
+import sys
+
+import pytest
+
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.training.command_line import EXIT_CODE
+from tests.recipes import recipe
+from tests.training.test_command_line import RUN
+from tests.training.test_experiment import TINY, tiny
+
+OPEN = ("task=open_loop/block_stacking", "algorithm=dqn")
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "overrides"),
+    [
+        ("train", "escnn", ("network=equi", "algorithm=sac", "label=a", "run_dir=new")),
+        ("train", "escnn", ("network=equi_fcn", *OPEN, "label=a", "run_dir=new")),
+        ("benchmark", "escnn", ("benchmark=close_loop_small", "folder=new")),
+        ("plot", "matplotlib.figure", ("runs=[run]",)),
+    ],
+)
+def test_a_missing_package_is_one_line(name, package, overrides, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.json").write_text(json.dumps(RUN))
+    names = ("success_rate", "standard_error")
+    rows = "".join(f"5,eval/{name},0.5\n" for name in names)
+    (tmp_path / "run/scalars.csv").write_text(f"step,name,value\n{rows}")
+    with pytest.raises(SystemExit) as end:
+        recipe(name, *overrides)
+    error = capsys.readouterr().err
+    assert end.value.code == EXIT_CODE
+    assert error.startswith("error: ")
+    assert "pip install" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("control", ["close_loop", "open_loop"])
+def test_refused_networks_and_algorithms_have_the_names_of_the_registry(tmp_path, control):
+    """As the user writes them, and with what the task takes instead."""
+    task = {"close_loop": TINY["task"], "open_loop": "open_loop/block_stacking"}[control]
+    learner, other = ("sac", "spatial_q") if control == "close_loop" else ("spatial_q", "sac")
+    env = {"task": task, "env": {}, "demonstrations": 1}
+    refused = [name for name in NETWORKS if NETWORKS[name].control != control]
+    assert len(refused) > 3
+    for name in refused:
+        with pytest.raises(ConfigError, match=f"^network '{name}' is for ") as error:
+            tiny(tmp_path, **env, network={"name": name}, algorithm={"name": learner})
+        assert f"{control} tasks take network: " in str(error.value)
+    refused = [name for name in ALGORITHMS if control not in ALGORITHMS[name].controls]
+    assert other in refused
+    for name in refused:
+        with pytest.raises(ConfigError, match=f"^algorithm '{name}' learns ") as error:
+            tiny(tmp_path, **env, algorithm={"name": name})
+        assert f"{control} tasks take algorithm: " in str(error.value)
+        assert learner in str(error.value)
