@@ -133,6 +133,7 @@ class Episodes:
             scene.world.restore_pristine()
             self._place_robot(scene)
             try:
+                scene.task.choose_objects(rng)
                 scene.task.terrain.initialize_episode(rng)
                 scene.task.initialize_episode(rng)
             except PlacementError:

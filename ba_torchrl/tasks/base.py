@@ -122,6 +122,15 @@ class Task(ABC):
     def load_scene(self) -> None:
         """Load the bodies into `world`; called by the constructor."""
 
+    def choose_objects(self, rng: np.random.Generator) -> None:  # noqa: B027 -- optional
+        """Choose the objects of an episode, before the terrain and their poses are drawn.
+
+        By default all objects are part of every episode.
+
+        Args:
+            rng: random generator of the episode.
+        """
+
     @abstractmethod
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Set new random poses of the bodies.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +58,7 @@ class Ramps(SlopedTerrain):
     Args:
         world: not sealed yet.
         workspace: bounds of the task.
-        least_gap_m: least distance between the ramps.
+        least_gap_m: least distance between the ramps, of all episodes.
 
     Raises:
         ValueError: the least distance is larger than the largest.
@@ -76,7 +76,8 @@ class Ramps(SlopedTerrain):
         length_m = radius_m / math.cos(SLOPE_RAD[1])
         self.size_m = (2 * radius_m, length_m, length_m * math.tan(SLOPE_RAD[1]) + BORDER_M)
         """Extents of a ramp along its edge, up the slope and perpendicular to it."""
-        self.gap_range_m = (max(GAP_M[0], least_gap_m), GAP_M[1])
+        self.least_gap_m = least_gap_m
+        """Least distance between the ramps in the next episode, if it is above that of `GAP_M`."""
         shapes = [
             Box(size_m=self.size_m, mass_kg=0.0, friction=FRICTION, color=color) for color in COLORS
         ]
@@ -110,7 +111,7 @@ class Ramps(SlopedTerrain):
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Draw gap, heading, slopes and heights."""
-        gap = float(rng.uniform(*self.gap_range_m))
+        gap = float(rng.uniform(max(GAP_M[0], self.least_gap_m), GAP_M[1]))
         offset = float(rng.uniform(-1.0, 1.0)) * OFFSET_SHARE * (GAP_M[1] - gap)
         heading = float(rng.uniform(0.0, 2 * math.pi))
         edges, slopes = (tuple(rng.uniform(*ends, size=2).tolist()) for ends in (EDGE_M, SLOPE_RAD))
@@ -201,15 +202,26 @@ class OnRamps(OnSlopes):
     """Mixin of an open-loop structure task: the structure stands between two ramps (appendix C).
 
     The pieces start on the ramps or between them, where one piece of the lowest layer always is.
-    The gap is at least as wide as the pieces of that layer need.
+    The gap is at least as wide as the episode's pieces of that layer need.
     """
 
     def make_terrain(self) -> Ramps:
         """Load the ramps."""
         bases = [slot.piece for slot in self.blueprint().slots if not slot.on]
-        widths = [_grasped_width_m(p) for base in bases for p in base.variants or (base,)]
-        least_gap_m = max(widths) + 2 * EDGE_MARGIN_M
-        return Ramps(self.world, self.settings.workspace, least_gap_m=least_gap_m)
+        widest = _needed_gap_m(piece for base in bases for piece in base.variants or (base,))
+        return Ramps(self.world, self.settings.workspace, least_gap_m=widest)
+
+    def choose_objects(self, rng: np.random.Generator) -> None:
+        """Draw the variants of the pieces, and set the least gap that they need."""
+        super().choose_objects(rng)
+        kinds = {slot.piece.kind for slot in self.structure.blueprint.slots if not slot.on}
+        bases = (piece for piece in self.structure.pieces.values() if piece.kind in kinds)
+        self.terrain.least_gap_m = _needed_gap_m(bases)
+
+
+def _needed_gap_m(pieces: Iterable[Piece]) -> float:
+    """Return the distance between ramps that a grasp of each of these pieces between them needs."""
+    return max(map(_grasped_width_m, pieces)) + 2 * EDGE_MARGIN_M
 
 
 def _grasped_width_m(piece: Piece) -> float:

@@ -73,6 +73,10 @@ class Deconstruction(OpenLoopTask):
     def load_scene(self) -> None:
         """Load nothing; the pieces are those of the structure task."""
 
+    def choose_objects(self, rng: np.random.Generator) -> None:
+        """Draw the pieces of an episode of the task."""
+        self.task.choose_objects(rng)
+
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Place the structure at random, built from the pieces of an episode of the task."""
         self.task.initialize_episode(rng)

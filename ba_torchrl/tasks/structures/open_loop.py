@@ -53,13 +53,16 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
             clears_blocked_pieces=self.clears_blocked_pieces,
         )
 
+    def choose_objects(self, rng: np.random.Generator) -> None:
+        """Draw the variants of the pieces."""
+        self.structure.draw(rng)
+
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Place the pieces at random poses, apart from each other.
 
         With fixed orientations, a gripper at yaw 0 can grasp each of them. On a terrain that only
         supports a structure in a part of it, one piece of the lowest layer starts there.
         """
-        self.structure.draw(rng)
         self.terrain.scatter(
             rng,
             list(self.structure.pieces),

@@ -211,7 +211,9 @@ def test_a_state_restores_the_shapes():
     scene = env.scene
     first, state = list(scene.task.objects), scene.get_state()
     poses = [body.pose for body in first]
-    scene.task.initialize_episode(np.random.default_rng(5))
+    rng = np.random.default_rng(5)
+    scene.task.choose_objects(rng)
+    scene.task.initialize_episode(rng)
     assert list(scene.task.objects) != first
     scene.set_state(state)
     assert list(scene.task.objects) == first

@@ -1,10 +1,11 @@
-"""Grasps and releases of the expert for structures, with six degrees of freedom."""
+"""Grasps and releases of the expert for structures, and ramps, with six degrees of freedom."""
 
 import math
 
 import numpy as np
 import pytest
 
+import ba_torchrl
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.envs import keys
 from ba_torchrl.sim.bodies import world_vertices
@@ -17,6 +18,8 @@ from ba_torchrl.sim.geometry import (
     tool_rotation,
     yaw_quaternion,
 )
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.ramps import EDGE_MARGIN_M, GAP_M
 from ba_torchrl.tasks.structures.parts import CUBOID
 
 OFF_CENTRE_M = 0.025
@@ -89,3 +92,27 @@ def test_a_tilted_grasp_has_no_clearance_where_the_knuckles_touch_a_piece(make_e
     cuboid.set_pose(at, tool.orientation)
     (clearance_m,) = grasps.clearances_m(roof, [candidate], [cuboid], None)
     assert clearance_m < 0
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if task.startswith("ramp/")])
+def test_the_gap_is_drawn_by_the_pieces_of_the_episode(task):
+    """From 4 cm, or from what its lowest layer needs, to 20 cm, and not from the widest variant."""
+    env = ba_torchrl.make(task, obs_size=16, seed=0)
+    gaps, shares = [], []
+    for _ in range(60):
+        env.reset()
+        built = env.scene.task.structure
+        lowest = {slot.piece.kind for slot in built.blueprint.slots if not slot.on}
+        widths = []
+        for piece in built.pieces.values():
+            if piece.kind in lowest:
+                yaw = piece.grasp_yaws_rad[0]
+                axis = math.cos(yaw), math.sin(yaw)
+                widths.append(np.ptp(piece.shape.vertices[:, :2] @ axis))
+        least = max(GAP_M[0], max(widths) + 2 * EDGE_MARGIN_M)
+        gaps.append(sum(env.scene.task.terrain.layout.distances_m))
+        shares.append((gaps[-1] - least) / (GAP_M[1] - least))
+    assert min(gaps) < 0.07
+    assert 0 <= min(shares) < 0.1
+    assert 0.9 < max(shares) <= 1
+    env.close()
