@@ -92,6 +92,7 @@ PLAIN_UNET = (
 )  # fmt: skip
 IN_HAND_CONVS = (288 + 32) + (18_432 + 64) + (73_728 + 128) + (294_912 + 256)
 GENERATOR = IN_HAND_CONVS + (9216 + 1) * 1024 + (1024 + 1) * (16 * 16 * 48 + 16)
+EQUI_PIXELS = GENERATOR + 6_050_290
 PLAIN_YAWS = (1_152 + 64) + (73_728 + 128) + (294_912 + 256) + 32_769 * 1024 + 1025 * 32
 # C32: 7x7 kernels per pair of fields: 18 from a trivial one, 576; 3x3: 192. One bias per field.
 YAW_CONVS = (8 * 18 + 8) + (8 * 16 * 576 + 16) + (16 * 32 * 576 + 32) + (32 * 32 * 192 + 32)
@@ -112,17 +113,11 @@ def yaw_hand(last_map):
         ("fcn", XY, 24, PLAIN_UNET + 66, 0),
         ("fcn", XYR, 24, PLAIN_UNET + 33 * 32, 0),
         ("rot_fcn", XYR, 24, PLAIN_UNET + 66, 0),
-        ("equi_fcn", XY, 24, GENERATOR + 6_050_290, 0),
+        ("equi_fcn", XY, 24, EQUI_PIXELS, 0),
         ("asr", XYR, 24, PLAIN_UNET + 66, PLAIN_YAWS),
         ("asr", XYR, 40, PLAIN_UNET + 66, PLAIN_YAWS),
-        ("equi_asr", XYR, 24, GENERATOR + 6_050_290, EQUI_YAWS + POOLED_SCENE + yaw_hand(6)),
-        (
-            "equi_asr/flatten",
-            XYR,
-            24,
-            GENERATOR + 6_050_290,
-            EQUI_YAWS + FLATTENED_SCENE + yaw_hand(6),
-        ),
+        ("equi_asr", XYR, 24, EQUI_PIXELS, EQUI_YAWS + POOLED_SCENE + yaw_hand(6)),
+        ("equi_asr/flatten", XYR, 24, EQUI_PIXELS, EQUI_YAWS + FLATTENED_SCENE + yaw_hand(6)),
     ],
 )
 def test_parameter_counts_match_the_reference(name, components, in_hand_size, first, later):
@@ -135,13 +130,12 @@ def test_parameter_counts_match_the_reference(name, components, in_hand_size, fi
 def test_total_parameter_counts_match_the_reference():
     """9.86, 28.5, 34.0 and 36.7 million, of which 17.3 for the flattened scene feature map."""
     assert round(PLAIN_UNET + 66, -4) == 9_860_000
-    assert round(GENERATOR + 6_050_290, -4) == 28_490_000
+    assert round(EQUI_PIXELS, -4) == 28_490_000
     assert round(PLAIN_YAWS, -5) == 34_000_000
-    flattened = EQUI_YAWS + FLATTENED_SCENE
     assert FLATTENED_SCENE == 17_303_040
     assert POOLED_SCENE == 787_968
-    assert round(flattened + yaw_hand(6), -5) == 36_700_000
-    assert round(flattened + yaw_hand(5), -5) == 33_800_000
+    assert round(EQUI_YAWS + FLATTENED_SCENE + yaw_hand(6), -5) == 36_700_000
+    assert round(EQUI_YAWS + FLATTENED_SCENE + yaw_hand(5), -5) == 33_800_000
 
 
 def test_equi_fcn_with_yaws_has_the_size_of_the_reference():
@@ -377,15 +371,12 @@ def test_functional_calls_use_the_given_parameters(name):
 def test_unsupported_images_and_actions_are_refused(name):
     with pytest.raises(ValueError, match="x, y and rz, not z; use"):
         build(name, components=("x", "y", "z", "rz"))
-    with pytest.raises(ValidationError):
-        NETWORKS[name](widht=2)
-    with pytest.raises(ValidationError):
-        NETWORKS[name](width=0.0)
-    size, message = (
-        (91, "even obs_size") if name == "rot_fcn" else (90, "obs_size that is a multiple of 16")
-    )
+    for wrong in ({"widht": 2}, {"width": 0.0}):
+        with pytest.raises(ValidationError):
+            NETWORKS[name](**wrong)
+    message = "even obs_size" if name == "rot_fcn" else "obs_size that is a multiple of 16"
     with pytest.raises(ValueError, match=message):
-        build(name, size)
+        build(name, 91 if name == "rot_fcn" else 90)
     if name not in ("fcn", "equi_fcn"):
         with pytest.raises(ValueError, match="use 'fcn' or 'equi_fcn'"):
             build(name, components=XY)
@@ -394,7 +385,9 @@ def test_unsupported_images_and_actions_are_refused(name):
 def test_patches_and_in_hand_images_of_other_sizes():
     for name in ("asr", "equi_asr"):
         network = build(name, in_hand_size=32, patch_size=24)
-        assert network.later(1, *_state(network, 32)).shape == (4, 4)
+        pixels, in_hand, holding, chosen = batch(in_hand_size=32)
+        state = network.first(pixels, in_hand, holding)[1]
+        assert network.later(1, state, chosen).shape == (4, 4)
         with pytest.raises(ValueError, match="even number of pixels"):
             build(name, in_hand_size=25, patch_size=24)
     with pytest.raises(ValueError, match="patch_size of 24 or 40"):
@@ -405,8 +398,3 @@ def test_patches_and_in_hand_images_of_other_sizes():
         build("fcn", in_hand_size=8)
     with pytest.raises(ValueError, match="leave out group_order"):
         build("equi_fcn", group_order=4)
-
-
-def _state(network, in_hand_size):
-    pixels, in_hand, holding, chosen = batch(in_hand_size=in_hand_size)
-    return network.first(pixels, in_hand, holding)[1], chosen
