@@ -178,8 +178,9 @@ class AlgorithmConfig(StrictModel, ABC):
         return None
 
     @property
-    def collected_capacity(self) -> int | None:
-        """Number of collected transitions that always fit; None without a limit."""
+    def replay_capacity(self) -> int | None:
+        """Number of transitions that fit the replay, demonstrations included; None without a
+        limit."""
         return None
 
     def check(self, network: NetworkConfig, control: Control) -> None:

@@ -42,8 +42,8 @@ LossFunction = Callable[[TensorDictBase], TensorDictBase]
 class Learner(Algorithm):
     """Networks, a loss, an optimiser and a replay.
 
-    The constructor calls the ``make_...`` methods in the order of their definition. An algorithm
-    implements the first three and can override the others. An update minimises the sums of the
+    The constructor calls the ``make_...`` methods. An algorithm implements the first three and can
+    override the others. An update minimises the sums of the
     ``loss_...`` entries of its stages one after the other, by default that of the loss module.
 
     On a CUDA device the host does not wait for an update: batches are copied as uint8 codes from
@@ -329,6 +329,8 @@ class Learner(Algorithm):
             FloatingPointError: a loss is not finite.
             ValueError: the losses of a stage have different optimisers.
         """
+        if isinstance(stages, TensorDictBase):
+            raise TypeError("a list of stages is needed, for example [self.loss(batch)]")
         taken, is_finite, is_deferred = TensorDict(), True, self.host_tasks.is_deferred
         for scalars in stages:
             terms = {name: value for name, value in scalars.items() if name.startswith("loss_")}

@@ -97,6 +97,6 @@ class LearnerConfig(AlgorithmConfig):
         return "init: 'bc'" if self.init == "bc" else None
 
     @property
-    def collected_capacity(self) -> int:
-        """Number of collected transitions that fit if there are no demonstrations."""
+    def replay_capacity(self) -> int:
+        """As for `AlgorithmConfig`."""
         return self.buffer_size

@@ -38,12 +38,11 @@ class Optimizers:
         self._of_terms = of_terms
         self._clamp, self._clamped = clamp, clamped
         self._stepped: set[Optimizer] = set()
-        prefixed = {
-            f"{name}_": optimizer
-            for optimizers in of_terms.values()
-            for name, optimizer in optimizers.items()
-        }
-        self._named = {"": main, **prefixed}
+        self._named = {"": main}
+        for optimizers in of_terms.values():
+            for name, optimizer in optimizers.items():
+                if self._named.setdefault(f"{name}_", optimizer) is not optimizer:
+                    raise ValueError(f"two optimisers have the name {name!r}")
         self.schedulers = {name: make_scheduler(each) for name, each in self._named.items()}
 
     def of(self, terms: Collection[str]) -> list[Optimizer]:
@@ -86,7 +85,9 @@ class Optimizers:
             optimizer.zero_grad()
         loss.backward()
         if self._clamp is not None:
-            nn.utils.clip_grad_value_(self._clamped, self._clamp)
+            stepped = {id(p) for each in optimizers for p in parameters_of(each)}
+            clamped = [p for p in self._clamped if id(p) in stepped]
+            nn.utils.clip_grad_value_(clamped, self._clamp)
         for optimizer in optimizers:
             optimizer.step()
         self._stepped.update(optimizers)
@@ -111,16 +112,19 @@ class Optimizers:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the states from those of a `state_dict` of any device.
 
-        Moments that do not fit the parameters are left out, and a warning says so.
+        Moments that do not fit the parameters are left out, and so is an optimiser that the state
+        of another version lacks; a warning says so.
         """
         for name, optimizer in self._named.items():
-            saved = state[f"{name}optimizer"]
-            if fits(optimizer, saved):
+            saved = state.get(f"{name}optimizer")
+            if saved is not None and fits(optimizer, saved):
                 optimizer.load_state_dict(saved)
             else:
                 logger.warning(
                     "%soptimizer: moments of another version; they are not restored", name
                 )
+            if saved is None:
+                continue
             scheduler = self.schedulers[name]
             scheduler.load_state_dict(state[f"{name}scheduler"])
             # the optimiser's rates, unless its state was left out
@@ -149,6 +153,11 @@ def make_adam(
         {"params": list(others.values()), "weight_decay": 0.0},
     ]
     return Adam([group for group in groups if group["params"]], lr=learning_rate, fused=True)
+
+
+def parameters_of(optimizer: Optimizer) -> list[nn.Parameter]:
+    """Return the parameters of an optimiser."""
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def fits(optimizer: Optimizer, state: Mapping[str, Any]) -> bool:

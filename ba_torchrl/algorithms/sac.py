@@ -137,7 +137,7 @@ class SACConfig(LearnerConfig):
                 yield from changed(self, ["imitate_successes"], f"{why} and uniform replay")
         if self.contrastive_weight and getattr(network, "shares_encoder", None) is False:
             name = NETWORKS.name_of(type(network))
-            yield f"contrastive_weight has no effect on the own encoder of the policy of {name!r}"
+            yield f"contrastive_weight has no effect on the encoder of the policy of {name!r}"
 
     @property
     def init_entropy_weight(self) -> float:
@@ -250,8 +250,8 @@ class SAC(Learner):
     def make_stages(self) -> list[LossFunction]:
         """Return the loss of actor, critics and temperature and, if configured, then the
         contrastive one."""
-        is_contrastive = self.config.contrastive_weight > 0
-        return [self.loss, *([self.loss.contrastive_loss] if is_contrastive else [])]
+        has_own = self.loss.contrastive is not None
+        return [self.loss, *([self.loss.contrastive_loss] if has_own else [])]
 
     def make_target_updater(self) -> SoftUpdate:
         """Return the soft update of the targets of critic and encoder."""

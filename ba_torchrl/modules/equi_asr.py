@@ -152,7 +152,7 @@ class EquivariantYawValues(nn.Module):
         if patch_size not in _TRUNKS:
             raise ValueError(
                 f"equivariant yaw values take a patch_size of {' or '.join(map(str, _TRUNKS))} "
-                f"pixels, got {patch_size}; set it where in_hand_size is another"
+                f"pixels, got {patch_size}; set patch_size if in_hand_size is another"
             )
         self.config = config
         stages = _TRUNKS[patch_size]

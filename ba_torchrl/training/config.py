@@ -239,11 +239,11 @@ class ExperimentConfig(StrictModel):
         option = config.algorithm_config.pretraining_option
         if option is not None and not config.pretrain_updates:
             raise ConfigError(f"algorithm.{option} takes effect in pretrain_updates; set them")
-        capacity = config.algorithm_config.collected_capacity
+        capacity = config.algorithm_config.replay_capacity
         if capacity is not None and config.min_replay > capacity:
             raise ConfigError(
-                f"min_replay: {config.min_replay} transitions are more than the replay holds of "
-                f"collected ones ({capacity}); the run would never start to learn"
+                f"min_replay: {config.min_replay} transitions are more than the replay holds "
+                f"({capacity}); the run would never start to learn"
             )
         config.collector_config.check(config.num_envs)
         if config.compile_mode is not None and not config.algorithm_config.is_compilable:

@@ -119,3 +119,42 @@ def test_terms_with_different_optimisers_are_not_minimised_together():
     for terms in (["loss_x", "loss_a"], ["loss_a", "loss_c"]):
         with pytest.raises(ValueError, match=f"{terms[0]}, {terms[1]} have different optimisers"):
             optimizers.of(terms)
+    with pytest.raises(ValueError, match="two optimisers have the name 'a'"):
+        Optimizers(
+            main,
+            {"loss_a": {"a": first}, "loss_b": {"a": second}},
+            torch.optim.lr_scheduler.LinearLR,
+        )
+
+
+def test_a_state_without_the_optimisers_of_a_term_is_loaded(caplog):
+    learner, other = ferm(), ferm()
+    for _ in range(2):
+        learner.update()
+    state = learner.state_dict()
+    older = {
+        name: part
+        for name, part in state.items()
+        if not name.startswith(("encoder_", "contrastive_"))
+    }
+    with caplog.at_level("WARNING"):
+        other.load_state_dict(older)
+    assert "encoder_optimizer: moments of another version" in caplog.text
+    for name, value in learner.loss.state_dict().items():
+        assert torch.equal(other.loss.state_dict()[name], value)
+    other.update()
+
+
+def test_only_gradients_of_the_step_are_clamped():
+    first, second = (torch.nn.Parameter(torch.zeros(1)) for _ in range(2))
+    main, own = (torch.optim.SGD([p], 1.0) for p in (first, second))
+    optimizers = Optimizers(
+        main,
+        {"loss_own": {"own": own}},
+        torch.optim.lr_scheduler.LinearLR,
+        clamp=0.5,
+        clamped=[first, second],
+    )
+    first.grad = torch.full((1,), 3.0)
+    optimizers.minimize((2 * second).sum(), ["loss_own"])
+    assert (float(first.grad), float(second.grad)) == (3.0, 0.5)

@@ -76,7 +76,7 @@ def messages(name, network, values):
             "sac",
             "equi",
             {"view_transform": "crop", "contrastive_weight": 1.0},
-            "contrastive_weight has no effect on the own encoder of the policy of 'equi'",
+            "contrastive_weight has no effect on the encoder of the policy of 'equi'",
         ),
     ],
 )

@@ -273,7 +273,7 @@ def test_collection_alone_must_reach_the_least_size_of_a_symmetric_replay():
     """Without demonstrations, one of its halves stays empty."""
     algorithm = {"name": "sac", "replay": "symmetric", "buffer_size": 50}
     ExperimentConfig.parse({**RUN, "algorithm": algorithm, "min_replay": 50})
-    with pytest.raises(ConfigError, match=r"holds of collected ones \(50\)"):
+    with pytest.raises(ConfigError, match=r"than the replay holds \(50\)"):
         ExperimentConfig.parse({**RUN, "algorithm": algorithm, "min_replay": 51})
 
 

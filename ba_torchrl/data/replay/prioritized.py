@@ -13,15 +13,15 @@ from torchrl.data.replay_buffers.storages import Storage
 from ba_torchrl import _segment_tree
 from ba_torchrl.envs import keys
 
-_segment_tree.install()
+_segment_tree.install()  # also for a replay without environments
 
 
 class ExpertPrioritizedSampler(PrioritizedSampler):
     """Prioritised sampling that prefers demonstrations (appendix G.2).
 
     A transition is drawn in proportion to p ^ alpha, with p = |td| + eps + bonus * is_expert. A new
-    one, demonstration or not, has the largest p that an update has set so far, one before the first
-    update, as in Schaul et al. (2016) and the reference implementation. Each draw has the
+    one, demonstration or not, has the largest p that an update has set so far, and at least one, as
+    in Schaul et al. (2016) and the reference implementation. Each draw has the
     importance weight ``priority_weight`` = (p / p_min) ^ (-alpha beta), in (0, 1]; the loss
     normalises it over the batch.
 
@@ -146,9 +146,8 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
             storage: as of `update_priority`; needed if it has several dimensions.
         """
         index = _flat_index(index, storage)
-        self._set_leaves(
-            index, torch.full(index.shape, self.default_priority, dtype=self.dtype, device="cpu")
-        )
+        largest = max(1.0, self.default_priority)
+        self._set_leaves(index, torch.full(index.shape, largest, dtype=self.dtype, device="cpu"))
 
     def _set_leaves(self, index: Tensor, raw: Tensor) -> None:
         """Set priorities before the exponent, float64 [N], at flat indices [N]."""

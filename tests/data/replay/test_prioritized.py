@@ -273,6 +273,13 @@ def test_new_transitions_get_the_largest_priority_of_the_updates():
     assert leaves(sampler, 5)[2:] == pytest.approx([2.000001**0.6, 1.050001**0.6, 2.000001**0.6])
 
 
+def test_new_transitions_have_at_least_priority_one():
+    buffer, sampler = make([False, False], capacity=10)
+    buffer.update_priority(torch.tensor([0, 1]), torch.tensor([0.05, 0.01]))
+    buffer.extend(transitions([False]))
+    assert leaves(sampler, 3) == pytest.approx([0.050001**0.6, 0.010001**0.6, 1.0])
+
+
 def test_the_largest_priority_does_not_grow_by_a_bonus_per_insertion():
     buffer, sampler = make([True] * 4, bonus=1.0, capacity=16)
     for i in range(200):
