@@ -143,12 +143,15 @@ def test_the_lifted_object_is_removed_and_the_others_stay(make):
     state = finish(env, env.reset())
     assert state["success"]
     lifted = env.scene.robot.held_body()
-    others = {b.name: b.position for b in env.scene.task.objects if b is not lifted}
+    others = [body for body in env.scene.task.objects if body is not lifted]
+    # one that was lifted with it can still be falling
+    resting = {b: b.position for b in others if b.is_still(speed_m_s=0.01, spin_rad_s=0.2)}
+    assert len(resting) >= len(others) - 1
     env.reset()
-    assert names(env) == list(others)
+    assert names(env) == [body.name for body in others]
     assert lifted.is_hidden
-    for body in env.scene.task.objects:
-        assert math.dist(body.position, others[body.name]) < 5e-3
+    for body, position in resting.items():
+        assert math.dist(body.position, position) < 5e-3
     assert not env.scene.task.is_success()
 
 
