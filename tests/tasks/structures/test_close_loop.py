@@ -315,11 +315,11 @@ def test_a_cylinder_beside_the_stack_is_not_a_success(cylinders, place):
     assert cylinders.is_valid()
 
 
-def test_a_cylinder_over_the_edge_falls_and_ends_the_episode(cylinders):
+def test_a_cylinder_over_the_edge_ends_the_episode_unless_it_lands_on_an_end(cylinders):
     cylinders.objects[-1].place((0.45, 0.018, 0.1055))
-    cylinders.world.settle()
+    cylinders.world.settle(max_steps=1000)
     assert not cylinders.is_success()
-    assert not cylinders.is_valid()
+    assert cylinders.is_valid() == (abs(math.cos(cylinders.objects[-1].tilt_rad)) > 0.5)
 
 
 def test_a_cylinder_on_its_side_ends_the_episode_on_top_or_on_the_floor(cylinders):
