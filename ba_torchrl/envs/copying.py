@@ -24,9 +24,10 @@ class CopiesWithState:
     """Mix-in of environments: `copy.copy`, `copy.deepcopy` and `pickle` keep the state.
 
     The copy is an environment of its own: it has another simulator, without a window, in the same
-    state, so that the same actions give the same steps bit by bit in both. For the original, this
-    is a `get_state`, after which the actions no longer determine its position. It takes as long as
-    `make`; to look ahead in one environment, `get_state` and `set_state` are faster.
+    state, so that the same actions give the same steps bit by bit in both. Copying saves the state
+    of the original as `get_state` does, after which the actions no longer determine its position.
+    It takes as long as `make`; to look ahead in one environment, `get_state` and `set_state` are
+    faster.
 
     Subclasses keep the arguments of the constructor. Of the attributes, those that
     `copied_attributes` names are copied.

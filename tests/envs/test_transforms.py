@@ -3,6 +3,8 @@
 Those that need torchvision (Crop, CenterCrop, Resize) are left out.
 """
 
+import contextlib
+
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
@@ -81,20 +83,23 @@ OF_COUNTS_AND_ACTIONS = {
 }
 
 
-@pytest.fixture(scope="module", params=TASKS)
-def pixel_env(request):
-    config = {"obs_size": 16, "seed": 0, "max_steps": 5, "expert": True, **TASKS[request.param]}
-    env = ba_torchrl.make(request.param, rgb=True, **config)
+@contextlib.contextmanager
+def made(task, **config):
+    env = ba_torchrl.make(task, seed=0, max_steps=5, expert=True, **TASKS[task], **config)
     yield env
     env.close()
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def pixel_env(request):
+    with made(request.param, obs_size=16, rgb=True) as env:
+        yield env
 
 
 @pytest.fixture(scope="module", params=TASKS)
 def vector_env(request):
-    config = {"obs_type": "vec", "seed": 0, "max_steps": 5, "expert": True, **TASKS[request.param]}
-    env = ba_torchrl.make(request.param, **config)
-    yield env
-    env.close()
+    with made(request.param, obs_type="vec") as env:
+        yield env
 
 
 def check(env, transform):
