@@ -69,7 +69,7 @@ def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], N
         try:
             main(settings)
         except ConfigError as error:
-            _end(error)
+            _end(ConfigError(_name_presets(str(error), settings)))
         except OmegaConfBaseException as error:  # a missing value, or a wrong interpolation
             _end(error, lines=1)
         except OSError as error:
@@ -91,6 +91,17 @@ def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], N
             sys.exit(128 + signal.SIGINT)
 
     return decorated
+
+
+def _name_presets(message: str, settings: DictConfig) -> str:
+    """Return a message in which algorithm and network have the names of their presets."""
+    if not HydraConfig.initialized():
+        return message
+    for group, preset in HydraConfig.get().runtime.choices.items():
+        chosen = settings.get(group)
+        if preset and isinstance(chosen, DictConfig) and "name" in chosen:
+            message = message.replace(f"{group} {chosen.name!r}", f"{group} {preset!r}")
+    return message
 
 
 def check_known(settings: DictConfig) -> None:

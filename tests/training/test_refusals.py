@@ -60,3 +60,18 @@ def test_refused_networks_and_algorithms_have_the_names_of_the_registry(tmp_path
             tiny(tmp_path, **env, algorithm={"name": name})
         assert f"{control} tasks take algorithm: " in str(error.value)
         assert learner in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("algorithm=dqn", "network=equi"), "algorithm 'dqn' learns open_loop tasks"),
+        (("algorithm=sac", "network=rot_fcn"), "network 'rot_fcn' is for open_loop tasks"),
+        (("task=open_loop/block_stacking", *OPEN[1:], "network=equi_d4"), "network 'equi_d4' is"),
+    ],
+)
+def test_the_command_line_names_presets(overrides, message, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        recipe("train", *overrides, "label=a", "run_dir=new")
+    assert message in capsys.readouterr().err
