@@ -50,6 +50,10 @@ def wrap_angle(angle_rad: float, period_rad: float = 2 * math.pi) -> float:
     return (angle_rad + half) % period_rad - half
 
 
+def _indices(sequence: str, wanted: str) -> list[int]:
+    return [i for i, letter in enumerate(sequence) if letter == wanted]
+
+
 @dataclass(frozen=True)
 class CloseLoopActions:
     """The close-loop action vector: components in [-1, 1] in the order of ``sequence``.
@@ -84,6 +88,16 @@ class CloseLoopActions:
     def components(self) -> list[str]:
         """Name of each component: p, x, y, z or rz."""
         return ["rz" if letter == "r" else letter for letter in self.sequence]
+
+    @property
+    def turns(self) -> list[int]:
+        """Indices of the components that turn the gripper."""
+        return _indices(self.sequence, "r")
+
+    @property
+    def primitive(self) -> None:
+        """None: the letter p is the opening of the gripper."""
+        return None
 
     @property
     def has_yaw(self) -> bool:
@@ -179,6 +193,16 @@ class OpenLoopActions:
         """Name of each component: p, x, y, z, rz, ry or rx."""
         angles = iter(ANGLES[self.sequence.count("r")])
         return [next(angles) if letter == "r" else letter for letter in self.sequence]
+
+    @property
+    def turns(self) -> list[int]:
+        """Indices of the components that turn the gripper."""
+        return _indices(self.sequence, "r")
+
+    @property
+    def primitive(self) -> int | None:
+        """Index of the primitive; None if there is none."""
+        return next(iter(_indices(self.sequence, "p")), None)
 
     @property
     def ranges(self) -> list[tuple[float, float]]:

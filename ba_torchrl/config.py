@@ -71,6 +71,29 @@ def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str
             yield f"{name} has no effect {why}"
 
 
+class WorkerOptions(StrictModel):
+    """How the environments of a vector are started, and replaced when they fail."""
+
+    parallel: bool | None = True
+    """One process per environment, or all in this process, with the same episodes. None chooses
+    processes where at least three of them can run at a time: with fewer, their communication takes
+    more time than they save (docs/performance.md)."""
+    start_method: Literal["spawn", "fork"] = "spawn"
+    """How processes start. "fork" takes milliseconds and needs a parent without an open simulator
+    and without CUDA; "spawn" takes seconds, and scripts need an ``if __name__ == "__main__":``
+    guard."""
+    timeout_s: float = Field(default=60.0, gt=0)
+    """Seconds after which a process that does not answer is replaced."""
+    max_restarts: int = Field(default=5, ge=0)
+    """Largest number of failures in a row of a process: of attempts to start it, or of resets and
+    steps without a completed step. The end of an idle process does not count."""
+    start_timeout_s: float = Field(default=120.0, gt=0)
+    """Seconds after which a process that does not start is replaced."""
+    wait_for_restarts: bool = True
+    """Reset the environment of a failed process before the next step. Otherwise it reports faults
+    until its new process is ready."""
+
+
 Rgb = tuple[float, float, float]
 
 MAX_SEED = 2**63 - 1
@@ -260,21 +283,19 @@ class EnvConfig(StrictModel):
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
         return self
 
-    def check_control(self, task_id: str, control: str, filled_in: dict[str, Any]) -> None:
+    def check_control(self, task_id: str, control: str) -> None:
         """Check that the parameters that differ from their defaults apply to a control.
 
         Args:
             task_id: for the message.
             control: "open_loop" or "close_loop".
-            filled_in: values that the task fills in where None is given.
 
         Raises:
             ConfigError: one applies to the other control only.
         """
         for name, field in EnvConfig.model_fields.items():
             needed = (field.json_schema_extra or {}).get("control", control)
-            unset = field.default, filled_in.get(name, field.default)
-            if needed != control and getattr(self, name) not in unset:
+            if needed != control and getattr(self, name) != field.default:
                 kind = needed.replace("_", "-")
                 raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")
 

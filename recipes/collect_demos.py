@@ -16,18 +16,15 @@ from ba_torchrl.data.demos import (
     check_noise,
     check_turn_noise,
     collect_demonstrations,
-    primitive_component,
     source_config,
-    turn_components,
 )
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.data.time_reversal import replay_scores
-from ba_torchrl.envs.factory import resolve
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs, progress_bar
-from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.command_line import (
     check_counts,
     check_flags,
@@ -46,7 +43,7 @@ register_schemas()
 @hydra.main(config_path="../configs", config_name="collect_demos", version_base="1.3")
 @plain_errors
 def main(settings: DictConfig) -> None:
-    """Play the expert's episodes and write them as a memory-mapped TensorDict."""
+    """Play the expert's episodes and write them into a folder."""
     limit_library_logs()
     check_known(settings)
     load_plugins(settings.plugins)
@@ -62,9 +59,8 @@ def main(settings: DictConfig) -> None:
         raise ConfigError(f"{settings.path} exists already; choose another path")
     check_writable_file(settings.path)
     env_settings = env_of(settings, seed="seed", expert="source")
-    sequence = resolve(settings.task, **env_settings).action_sequence
-    turns = turn_components(sequence)
-    check_turn_noise(settings.turn_noise, settings.source, turns, "turn_noise")
+    actions = resolve_env(settings.task, env_settings).actions
+    check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")
     env = make_vector_env(
         settings.task,
         settings.num_envs,
@@ -82,8 +78,8 @@ def main(settings: DictConfig) -> None:
                 only_successful=settings.only_successful,
                 noise=settings.noise,
                 turn_noise=settings.turn_noise,
-                turns=turns,
-                primitive=primitive_component(TASKS[settings.task].control, sequence),
+                turns=actions.turns,
+                primitive=actions.primitive,
                 on_episode=lambda _: bar.update(),
             )
     finally:

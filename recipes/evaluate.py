@@ -15,7 +15,6 @@ from tensordict import TensorDict  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
 from ba_torchrl.algorithms.seeds import SeedUse  # noqa: E402
-from ba_torchrl.envs.factory import resolve  # noqa: E402
 from ba_torchrl.envs.vector.make import MAX_ENVS  # noqa: E402
 from ba_torchrl.plugins import load_plugins  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
@@ -88,8 +87,7 @@ def main(settings: DictConfig) -> None:
     print(f"  policy    update {algorithm.updates}, {checkpoint}")
     print(f"  episodes  seed {seed}{chosen}")
     if settings.expert:
-        sequence = resolve(config.task, **config.env).action_sequence
-        print(f"\n{agreement_table(episodes, sequence)}")
+        print(f"\n{agreement_table(episodes, config.resolved_env.actions.sequence)}")
     if settings.video is not None:
         frames = record_episodes(config.task, config.env, policy, settings.video_episodes, seed)
         print(f"  video     {write_video(settings.video, frames, fps=FPS)}")

@@ -12,7 +12,7 @@ import hydra
 from omegaconf import DictConfig
 
 from ba_torchrl import list_tasks
-from ba_torchrl.envs.factory import resolve
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.profiling.soak import TABLE_FILE, SoakJob, run_soak
 from ba_torchrl.record.logging import limit_library_logs
@@ -47,7 +47,7 @@ def main(settings: DictConfig) -> None:
     env = env_of(settings, seed="seed", expert="steps: every other episode is the expert's")
     tasks = list(settings.tasks or list_tasks())
     for task in tasks:
-        resolve(task, **env)  # raises with the known names
+        resolve_env(task, env)  # raises with the known names
     folder = Path(settings.folder)
     check_writable_file(folder / TABLE_FILE)
     jobs = [

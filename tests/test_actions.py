@@ -168,3 +168,13 @@ def test_tilts_are_wrapped_and_then_clipped():
     layout = OpenLoopActions("pxyzrrr", BOUNDS)
     assert layout.wrap(0.0, 2.0, 2 * math.pi + 0.1) == pytest.approx((0.0, math.pi / 2, 0.1))
     assert layout.wrap(0.0, -2.0, -0.3) == pytest.approx((0.0, -math.pi / 2, -0.3))
+
+
+def test_indices_of_components():
+    bounds = ((0.0, 1.0),) * 3
+    assert CloseLoopActions("pxyzr").turns == [4]
+    assert CloseLoopActions("pxyz").turns == []
+    assert CloseLoopActions("pxyzr").primitive is None  # p is the opening
+    assert OpenLoopActions("rxyrrp", bounds).turns == [0, 3, 4]
+    assert OpenLoopActions("xyp", bounds).primitive == 2
+    assert OpenLoopActions("xyr", bounds).primitive is None

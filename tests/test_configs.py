@@ -85,7 +85,8 @@ def test_defaults_are_those_of_the_appendix_or_the_reference():
     assert (algorithm.expert_bonus, algorithm.demonstration_weight) == (1.0, 1.0)
     assert algorithm.buffer_size == 100_000
     assert (network.group_order, network.n_hidden) == (8, 64)
-    assert (config.num_envs, config.eval_every, config.env_config.obs_size) == (5, 500, 128)
+    assert (config.num_envs, config.eval_every) == (5, 500)
+    assert config.resolved_env.config.obs_size == 128
 
 
 def options(algorithm):
@@ -120,7 +121,7 @@ def test_open_loop_defaults_are_those_of_the_appendix_or_the_reference():
     assert (algorithm.demonstrations, algorithm.replay) == ("sdqfd", "symmetric")
     assert (algorithm.demonstration_weight, algorithm.margin) == (0.1, 0.1)
     assert (algorithm.epsilon_init, algorithm.target_interval) == (0.0, 100)
-    assert (config.env_config.obs_size, config.network_config.num_rotations) == (128, 16)
+    assert (config.resolved_env.config.obs_size, config.network_config.num_rotations) == (128, 16)
     assert experiment("train", *overrides[:1], "algorithm=adet", overrides[2]).algorithm_config == (
         algorithm.model_copy(update={"demonstrations": "adet", "demonstration_weight": 0.01})
     )
@@ -155,13 +156,13 @@ def test_the_open_loop_quick_start_composes():
     config = experiment("quickstart_open_loop", "seed=1")
     assert config.task == "open_loop/block_stacking"
     assert config.network_config.scene_head == "pool"
-    assert config.env_config.num_objects == 3
+    assert config.resolved_env.config.num_objects == 3
 
 
 def test_the_quick_start_for_stacking_composes():
     config = experiment("quickstart_stacking")
     assert config.task == "close_loop/block_stacking"
-    assert config.env_config.obs_size == 128
+    assert config.resolved_env.config.obs_size == 128
     assert config.algorithm_config.imitate_successes
     assert config.algorithm_config.replay == "prioritized"
 
@@ -170,7 +171,7 @@ def test_the_quick_start_for_stacking_composes():
 def test_the_quick_start_in_six_degrees_of_freedom_composes(network):
     config = experiment("quickstart_six_dof", f"network={network}")
     assert config.task == "ramp/block_stacking"
-    assert config.env_config.in_hand_mode == "proj"
+    assert config.resolved_env.config.in_hand_mode == "proj"
     assert (config.network_config.voxel_scale, config.network_config.num_rotations) == (10, 8)
 
 
@@ -178,5 +179,7 @@ def test_the_quick_start_in_six_degrees_of_freedom_composes(network):
 @pytest.mark.parametrize("network", [name for name in NETWORKS if suits("sacfd", name)])
 def test_the_quick_starts_of_close_loop_take_any_network(name, network):
     config = experiment(name, f"network={network}", "env.max_steps=20")
-    assert config.env_config.max_steps == 20
-    assert config.env_config.obs_size == {"quickstart": 64, "quickstart_stacking": 128}[name]
+    assert config.resolved_env.config.max_steps == 20
+    assert (
+        config.resolved_env.config.obs_size == {"quickstart": 64, "quickstart_stacking": 128}[name]
+    )

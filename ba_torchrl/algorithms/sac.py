@@ -30,7 +30,7 @@ from ba_torchrl.data.augmentation.views import (
     cropped_images,
 )
 from ba_torchrl.data.episode_assembler import EpisodeAssembler
-from ba_torchrl.data.state_files import read_state, write_state
+from ba_torchrl.data.files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig

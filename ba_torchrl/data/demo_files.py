@@ -14,12 +14,19 @@ from tensordict import TensorDict
 
 from ba_torchrl import __version__
 from ba_torchrl.data.demos import Source, source_config
-from ba_torchrl.data.state_files import check, check_space, publish, seal, write_text
-from ba_torchrl.envs.factory import resolve
+from ba_torchrl.data.files import (
+    check,
+    publish,
+    read_state,
+    seal,
+    write_state,
+    write_text,
+)
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 
 _METADATA_FILE = "demonstrations.json"
-_EPISODE = "episode"
+_LENGTHS, _SEPARATOR = "episode_lengths", "."
 
 
 def save_demonstrations(
@@ -31,7 +38,7 @@ def save_demonstrations(
     seed: int,
     source: Source = "expert",
 ) -> None:
-    """Write episodes as one memory-mapped TensorDict, with their task and parameters.
+    """Write episodes as one table of tensors, with their task and parameters.
 
     The folder appears when it is complete on the disk, with checksums of its files.
 
@@ -52,15 +59,11 @@ def save_demonstrations(
     path = Path(path)
     if path.exists() and any(path.iterdir()):
         raise FileExistsError(f"{path} is not empty; choose another folder")
-    numbered = [
-        episode.copy().set(_EPISODE, torch.full((len(episode), 1), number, device="cpu"))
-        for number, episode in enumerate(episodes)
-    ]
     scratch = path.with_name(f".{path.name}.scratch")
     shutil.rmtree(scratch, ignore_errors=True)
-    data = torch.cat(numbered)
-    check_space(path, list(data.values(True, True)))
-    data.memmap(scratch, copy_existing=True)
+    lengths = torch.tensor([len(episode) for episode in episodes], device="cpu")
+    steps = torch.cat(list(episodes)).flatten_keys(_SEPARATOR)
+    write_state(scratch, {**dict(steps.items()), _LENGTHS: lengths})
     metadata = {
         "task": task,
         "env": _env_values(task, env),
@@ -92,14 +95,14 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
     """
     path = Path(path)
     check_demonstrations(path, task=task, env=env)
+    state = read_state(path)
     try:
-        data = TensorDict.load_memmap(path, allow_pickle=False)
-        for key, value in data.items(True, True):
-            if not len(data) or value.shape[:1] != data.shape:
-                raise ValueError(f"{key} has the shape {list(value.shape)} in {len(data)} rows")
-        numbers = data[_EPISODE].squeeze(-1)
-        return [data[numbers == number].exclude(_EPISODE) for number in numbers.unique()]
-    except (OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+        lengths = state.pop(_LENGTHS).tolist()
+        if not lengths or not all(isinstance(value, torch.Tensor) for value in state.values()):
+            raise ValueError("there are none, or their entries are no tensors")
+        steps = TensorDict(state, batch_size=[sum(lengths)]).unflatten_keys(_SEPARATOR)
+        return [episode.clone() for episode in steps.split(lengths)]
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} does not hold episodes: {error}") from error
 
 
@@ -143,4 +146,4 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
 def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
     """Return every parameter that affects the data, defaults included, as JSON values."""
     other = {"seed", "render", *source_config("deconstruction")}
-    return json.loads(resolve(task, **env).model_dump_json(exclude=other))
+    return json.loads(resolve_env(task, env).config.model_dump_json(exclude=other))

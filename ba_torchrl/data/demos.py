@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
 from ba_torchrl.data.time_reversal import is_reversible, reverse_episode
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.factory import make_vector
+from ba_torchrl.envs.factory import make_vector_env
 from ba_torchrl.errors import ConfigError
 
 Source = Literal["expert", "deconstruction"]
@@ -56,9 +56,9 @@ def collect_demonstrations(
             "expert". The expert is then seen in states that it does not reach by itself (DART:
             Laskey et al., 2017).
         turn_noise: probability of random turns beside the expert's other components, likewise.
-        turns: indices of the components that turn the gripper, see `turn_components`.
+        turns: indices of the components that turn the gripper, `env.actions.turns`.
         primitive: index of the primitive of open-loop actions, which stays the expert's, see
-            `primitive_component`.
+            `env.actions.primitive`.
         nearest_action: maps the expert's and the random actions to those that are executed and
             recorded. A policy with discrete actions needs it; None for the identity.
         on_episode: called with each episode when it ends, for progress bars.
@@ -181,29 +181,6 @@ def check_noise(noise: float, source: Source, name: str) -> None:
         raise ConfigError(f"{name}: demonstrations of the source {source!r} have no random actions")
 
 
-def turn_components(action_sequence: str) -> list[int]:
-    """Return the indices of the components that turn the gripper.
-
-    Args:
-        action_sequence: one letter per component.
-    """
-    return [i for i, letter in enumerate(action_sequence) if letter == "r"]
-
-
-def primitive_component(control: str, action_sequence: str) -> int | None:
-    """Return the index of the primitive of open-loop actions; None if there is none.
-
-    In close loop, the same letter is the opening of the gripper.
-
-    Args:
-        control: "close_loop" or "open_loop".
-        action_sequence: one letter per component.
-    """
-    if control != "open_loop" or "p" not in action_sequence:
-        return None
-    return action_sequence.index("p")
-
-
 def check_turn_noise(noise: float, source: Source, turns: Sequence[int], name: str) -> None:
     """Check the probability of random turns in demonstrations.
 
@@ -255,12 +232,8 @@ def expert_scores(
         parallel: one process per environment; see `ba_torchrl.make_vector_env`.
         env: fields of `EnvConfig`.
     """
-    envs = make_vector(
-        task,
-        num_envs,
-        parallel=parallel,
-        start_method="spawn",
-        **{**env, "seed": seed, "expert": True},
+    envs = make_vector_env(
+        task, num_envs, parallel=parallel, **{**env, "seed": seed, "expert": True}
     )
     try:
         played = collect_episodes(envs, expert_policy, episodes, seed=seed, results_only=True)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.base import ManipulationEnv
-from ba_torchrl.envs.factory import make_env
+from ba_torchrl.envs.factory import make
 
 _ENDS = (
     keys.REWARD,
@@ -111,7 +111,7 @@ def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> 
         seed: of the first episode.
         config: other fields of `EnvConfig`.
     """
-    env = make_env(task, **{**config, "seed": seed, "deconstruct": True, "expert": True})
+    env = make(task, **{**config, "seed": seed, "deconstruct": True, "expert": True})
     lengths, reached = [], 0
     try:
         for _ in range(episodes):

@@ -13,8 +13,6 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ba_torchrl import _segment_tree
-from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
-from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.checks import checked_action
 from ba_torchrl.envs.copying import CopiesWithState
@@ -24,18 +22,15 @@ from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import enabled_observations, merge_entries
 from ba_torchrl.envs.rendering import RelativePoint, scene_viewpoint
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
-from ba_torchrl.envs.settings import check_action_components, check_task_parameters
+from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
-from ba_torchrl.registry import Registry
-from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
-from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
-from ba_torchrl.tasks.workspace import ActionLimits, Workspace
+from ba_torchrl.tasks.base import SCALE_STEP, Task
+from ba_torchrl.tasks.workspace import ActionLimits
 
 _segment_tree.install()  # for TorchRL's prioritised buffers of users
-
-CONTROLS: Registry[type[ManipulationEnv]] = Registry("kind of control", "ba_torchrl.envs")
 
 
 class ManipulationEnv(CopiesWithState, EnvBase):
@@ -45,71 +40,47 @@ class ManipulationEnv(CopiesWithState, EnvBase):
     other episodes. Exceptions are tasks that continue with the objects of the previous episode.
 
     Args:
-        task_id: as listed by `ba_torchrl.list_tasks`.
-        config: the environment's parameters.
+        resolved: the task and the parameters of the environment.
 
     Raises:
-        ConfigError: the task or the robot does not support the parameters.
+        ConfigError: the workspace does not suit the objects or the robot.
     """
 
-    def __init__(self, task_id: str, config: EnvConfig) -> None:
+    def __init__(self, resolved: ResolvedEnv) -> None:
         super().__init__(device="cpu", batch_size=[])
-        self.task_id = task_id
-        self.config = config
-        self.task_class = TASKS[task_id]
-        check_task_parameters(task_id, config)
-        self.robot_class = ROBOTS[config.robot]
-        self.workspace = (
-            self.task_class.workspace if config.workspace is None else Workspace(*config.workspace)
-        )
-        num_objects = config.num_objects or self.task_class.num_objects
-        self.max_steps = config.max_steps or self.task_class.step_limit(num_objects)
-        self.action_sequence = (
-            self.task_class.default_action_sequence or self.default_action_sequence
-            if config.action_sequence is None
-            else config.action_sequence
-        )
-        """One letter per action component."""
-        self.half_rotation = (
-            self.default_half_rotation if config.half_rotation is None else config.half_rotation
-        )
-        self._configure()
-        check_action_components(task_id, self.actions.components)
-        low, high = config.object_scale_range or self.task_class.scale_range
+        self.resolved = resolved
+        self.task_id, self.task_class = resolved.task_id, resolved.task_class
+        self.config = resolved.config
+        """The parameters, with every default filled in."""
+        self.max_steps = self.config.max_steps
+        self.workspace = resolved.workspace
+        self.actions = resolved.actions
+        """The action space."""
+        low, high = self.config.object_scale_range
         scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._episodes = Episodes(scales, self._build_scene, self._place_robot)
         self._identity = object()
         self._observation: dict[str, torch.Tensor] = {}
-        self._observations = enabled_observations(config, self.workspace)
+        self._observations = enabled_observations(self.config, self.workspace)
         self._memory: dict[str, Any] = {}  # of observations; it is replaced, never modified
         self._ends: dict[str, bool] = {}
         """Flags of the last step, by key."""
         self._conditions: dict[str, bool] | None = None
         """The conditions of success after the last step, None before the first."""
         self._step_count = 0
-        self._fault_counter = FaultCounter(task_id)
+        self._fault_counter = FaultCounter(self.task_id)
         self.on_contact: Callable[[], None] | None = None
         """Called in an open-loop step at each grasp and before each release, for videos."""
-        self._set_seed(config.seed)
+        self._set_seed(self.config.seed)
         self._make_specs()
         self._check_feasible()
 
     # -- for subclasses ----------------------------------------------------------------------
 
-    actions: CloseLoopActions | OpenLoopActions
-    """The action space; set by `_configure`."""
     physics: ClassVar[Physics] = Physics()
     """Settings of the physics engine for ``physics_mode="fast"``."""
     hand_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.28)
     """A point of the hand that `render` shows besides the workspace."""
-    default_action_sequence: ClassVar[str]
-    """Default `action_sequence`."""
-    default_half_rotation: ClassVar[bool]
-    """Default `half_rotation`."""
-
-    @abstractmethod
-    def _configure(self) -> None:
-        """Validate the parameters of the control and set `actions`."""
 
     @abstractmethod
     def _make_controller(self, robot: Robot, task: Task) -> Controller:
@@ -269,7 +240,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         return self._tensordict(self._observation)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        action = checked_action(tensordict.get(keys.ACTION), self.task_id, self.action_sequence)
+        action = checked_action(tensordict.get(keys.ACTION), self.task_id, self.actions.sequence)
         scene = self.scene
         self._step_count += 1
         success = valid = fault = False
@@ -344,15 +315,14 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             raise ConfigError(f"{self.task_id}: {error}") from None
         self._condition_names = tuple(largest.task.conditions())
 
-    def _build_scene(self, scale: float, **changes: Any) -> Scene:
+    def _build_scene(self, scale: float, *, window: bool | None = None) -> Scene:
         return build_scene(
-            self.task_id,
-            self.config.model_copy(update=changes),
-            workspace=self.workspace,
-            limits=self.action_limits,
-            scale=scale,
+            self.task_class,
+            self.resolved.task_settings(scale, self.action_limits),
+            self.config,
             physics=self.physics,
             make_controller=self._make_controller,
+            window=self.config.render if window is None else window,
         )
 
     def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:

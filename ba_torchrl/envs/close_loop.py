@@ -9,11 +9,13 @@ import torch
 from torchrl.data import Bounded
 
 from ba_torchrl.actions import CloseLoopActions
+from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.envs.images import Frame, ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.scene import Scene
+from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.views import VIEWS, ViewInput, ViewSetup
@@ -38,24 +40,31 @@ class CloseLoopEnv(RecordedPosition, ManipulationEnv):
     default_action_sequence = "pxyzr"
     default_half_rotation = False
 
-    def _configure(self) -> None:
-        self.actions = CloseLoopActions(self.action_sequence, self.config.dpos, self.config.drot)
-        self._view = VIEWS[self.config.view_type]
+    def __init__(self, resolved: ResolvedEnv) -> None:
+        config, workspace, robot = resolved.config, resolved.workspace, resolved.robot_class
+        self._view = VIEWS[config.view_type]
         self._view_setup = ViewSetup(
-            center_m=self.workspace.center,
-            z_m=self.workspace.z,
-            workspace_m=self.workspace.width,
-            width_m=self.config.view_scale * self.workspace.width,
-            pixels=self.config.obs_size,
-            camera_height_m=self.robot_class.camera_height_m,
-            finger_span_m=self.robot_class.finger_span_m,
+            center_m=workspace.center,
+            z_m=workspace.z,
+            workspace_m=workspace.width,
+            width_m=config.view_scale * workspace.width,
+            pixels=config.obs_size,
+            camera_height_m=robot.camera_height_m,
+            finger_span_m=robot.finger_span_m,
         )
+        super().__init__(resolved)
+
+    @classmethod
+    def make_actions(cls, config: EnvConfig) -> CloseLoopActions:
+        """Return the action space; see `Control`."""
+        return CloseLoopActions(config.action_sequence, config.dpos, config.drot)
 
     @property
     def action_limits(self) -> ActionLimits:
         """Displacement and rotation of one action."""
         turn = self.config.drot if self.actions.has_yaw else 0.0
-        return ActionLimits(self.config.dpos, turn, HALF_TURN if self.half_rotation else None)
+        yaw_range = HALF_TURN if self.config.half_rotation else None
+        return ActionLimits(self.config.dpos, turn, yaw_range)
 
     def _make_controller(self, robot: Robot, task: Task) -> CloseLoopController:
         return CloseLoopController(robot, teleport=self.config.fast_mode)
@@ -83,7 +92,7 @@ class CloseLoopEnv(RecordedPosition, ManipulationEnv):
         (x, y, z), yaw = scene.robot.tool_pose()
         target = self.workspace.clip((x + command.dx_m, y + command.dy_m, z + command.dz_m))
         yaw += command.dyaw_rad
-        if self.half_rotation:
+        if self.config.half_rotation:
             yaw = min(max(yaw, HALF_TURN[0]), HALF_TURN[1])
         scene.controller.move_to(target, yaw)
         scene.controller.grip(command.opening)

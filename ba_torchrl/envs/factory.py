@@ -1,4 +1,4 @@
-"""Construction of environments from task ids."""
+"""`make` and `make_vector_env`: environments from the id of a task and keywords."""
 
 from __future__ import annotations
 
@@ -9,100 +9,70 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from ba_torchrl.config import EnvConfig
-from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
-from ba_torchrl.envs.copying import registering_modules
-from ba_torchrl.envs.settings import parse_env_config
-from ba_torchrl.envs.vector.make import make_vector_env, processes_save_time
-from ba_torchrl.plugins import (
-    MAIN,
-    check_spawned_process_knows,
-    import_modules,
-    module_names,
-)
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.config import WorkerOptions, parse
+from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
+from ba_torchrl.envs.vector.make import make_vector, processes_save_time
+from ba_torchrl.plugins import module_names
 
 
-def make_env(task: str, **config: Any) -> ManipulationEnv:
-    """Make one environment; see `ba_torchrl.make`."""
-    control = TASKS[task].control
-    settings = parse_env_config(task, config)
-    return CONTROLS[control](task, settings)
-
-
-def resolve(task: str, **config: Any) -> EnvConfig:
-    """Return the parameters of an environment, with the task's defaults in place of None.
-
-    Parameters without a default stay None: overrides of the physics, colours, the seed.
+def make(task: str, **config: Any) -> ManipulationEnv:
+    """Make a TorchRL environment.
 
     Args:
-        task: id of the task.
-        config: fields of `EnvConfig`.
+        task: one of `ba_torchrl.list_tasks`.
+        config: fields of `ba_torchrl.config.EnvConfig`, such as ``robot="kuka"``, ``seed=0`` or
+            ``expert=True``.
+
+    Raises:
+        ConfigError: the task or a parameter is unknown, or its value cannot be used.
     """
-    task_class = TASKS[task]
-    control, box = CONTROLS[task_class.control], task_class.workspace
-    settings = parse_env_config(task, config)
-    defaults = {
-        "action_sequence": task_class.default_action_sequence or control.default_action_sequence,
-        "half_rotation": control.default_half_rotation,
-        "workspace": (box.x, box.y, box.z),
-        "object_scale_range": task_class.scale_range,
-        "max_steps": task_class.step_limit(settings.num_objects or task_class.num_objects),
-        "num_objects": task_class.num_objects,
-    }
-    missing = {name: value for name, value in defaults.items() if getattr(settings, name) is None}
-    return settings.model_copy(update=missing)
+    return make_resolved(resolve_env(task, config))
 
 
-def make_vector(
+def make_resolved(resolved: ResolvedEnv) -> ManipulationEnv:
+    """Make the environment that `resolve_env` described.
+
+    Raises:
+        ConfigError: the workspace does not suit the objects or the robot.
+    """
+    return CONTROLS[resolved.task_class.control](resolved)
+
+
+def make_vector_env(
     task: str,
     num_envs: int,
     *,
-    parallel: bool | None,
-    start_method: str,
+    workers: WorkerOptions | None = None,
     register_modules: Sequence[str | ModuleType] = (),
-    timeout_s: float = 60.0,
-    max_restarts: int = 5,
-    start_timeout_s: float = 120.0,
-    wait_for_restarts: bool = True,
-    **config: Any,
+    **options: Any,
 ) -> EnvBase:
-    """Make environments that step together; see `ba_torchrl.make_vector_env`."""
-    modules = module_names(register_modules)
-    import_modules(modules)
-    settings = parse_env_config(task, config)
-    if parallel is None:
-        parallel = processes_save_time(num_envs)
-    if parallel and start_method == "spawn":
-        modules += _plugins_of(task, settings)
-    return make_vector_env(
-        partial(_import_and_make_env, modules, task, **config),
-        num_envs,
-        seed=settings.seed,
-        parallel=parallel,
-        start_method=start_method,
-        timeout_s=timeout_s,
-        max_restarts=max_restarts,
-        start_timeout_s=start_timeout_s,
-        wait_for_restarts=wait_for_restarts,
-    )
+    """Make ``num_envs`` environments that step together.
 
+    They are a TorchRL ``ParallelEnv`` that survives its workers, or with ``parallel=False`` a
+    ``SerialEnv``. The same seed gives the same episodes in both.
 
-def _plugins_of(task: str, settings: EnvConfig) -> tuple[str, ...]:
-    """Return the modules that a new process imports before it can make an environment.
+    Args:
+        task: one of `ba_torchrl.list_tasks`.
+        num_envs: how many; environment i has the seed ``seed + i``.
+        workers: how they are started, and replaced when they fail.
+        register_modules: modules outside the package that each process imports before it makes its
+            environment, such as ``["my_tasks"]``. Those that register the task and the robot are
+            found without being named.
+        options: as for `make`, and single fields of `ba_torchrl.config.WorkerOptions`, such as
+            ``parallel=False`` or ``timeout_s=120``.
 
     Raises:
-        ConfigError: one of them is defined where no other process can import it.
+        ConfigError: as for `make`.
     """
-    modules = []
-    for registry, name, module in registering_modules(task, settings):
-        if module in MAIN:
-            check_spawned_process_knows(registry.kind, name)
-        else:
-            modules.append(module)
-    return tuple(modules)
-
-
-def _import_and_make_env(modules: Sequence[str], task: str, **config: Any) -> ManipulationEnv:
-    import_modules(modules)
-    return make_env(task, **config)
+    of_workers = {name: options.pop(name) for name in WorkerOptions.model_fields if name in options}
+    given = {} if workers is None else workers.model_dump()
+    workers = parse(WorkerOptions, {**given, **of_workers}, "workers")
+    resolved = resolve_env(task, options, modules=module_names(register_modules))
+    if workers.parallel is None:
+        workers = workers.model_copy(update={"parallel": processes_save_time(num_envs)})
+    if workers.parallel and workers.start_method == "spawn":
+        resolved.check_spawned_process_knows()
+    return make_vector(
+        partial(make_resolved, resolved), num_envs, seed=resolved.config.seed, workers=workers
+    )

@@ -14,9 +14,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.factory import make_env
+from ba_torchrl.envs.factory import make_resolved
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, InvalidActionError
-from ba_torchrl.plugins import import_modules
 
 Observation = dict[str, np.ndarray]
 
@@ -57,9 +57,8 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
             raise ConfigError(f"unknown render_mode {render_mode!r}. Known: {known}")
         if render_mode == "human":
             config = {**config, "render": True}
-        import_modules(register_modules)
         self.render_mode = render_mode
-        self.torchrl_env = make_env(task, **config)
+        self.torchrl_env = make_resolved(resolve_env(task, config, modules=register_modules))
         """The same environment for TorchRL; stepping it steps this one."""
         specs = self.torchrl_env.observation_spec
         self.observation_space = spaces.Dict(

@@ -13,12 +13,13 @@ from torchrl.data import Binary, Bounded, Unbounded
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import CONTROLS, ManipulationEnv
+from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.envs.episodes import SETTLE_STEPS
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.rendering import ArmDisplay, RelativePoint
 from ba_torchrl.envs.scene import Scene
+from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.control.limits import PickPlaceLimits
 from ba_torchrl.sim.control.pick_place import PickPlace
@@ -46,10 +47,6 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
     component, the height is computed from the heightmap around the target. Without the primitive,
     an empty gripper picks and a gripper that holds an object places. The image is the heightmap of
     the workspace, without the arm and the held object.
-
-    Raises:
-        ConfigError: the task or the robot does not support the parameters, or the workspace is not
-            square.
     """
 
     default_action_sequence = "pxyr"
@@ -58,19 +55,19 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
     # a stack of four creeps by 0.15 mm in two seconds; without a residual, by 0.11 mm
     physics = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-5)
 
-    def __init__(self, task_id: str, config: EnvConfig) -> None:
-        self._in_hand_kind = IN_HAND_MODES[config.in_hand_mode]()
-        self._display = ArmDisplay(partial(self._build_scene, render=False))
-        super().__init__(task_id, config)
+    def __init__(self, resolved: ResolvedEnv) -> None:
+        self._in_hand_kind = IN_HAND_MODES[resolved.config.in_hand_mode]()
+        self._display = ArmDisplay(partial(self._build_scene, window=False))
+        super().__init__(resolved)
 
-    def _configure(self) -> None:
-        x, y = self.workspace.x, self.workspace.y
+    @classmethod
+    def make_actions(cls, config: EnvConfig) -> OpenLoopActions:
+        """Return the action space; see `Control`."""
+        x, y, _ = config.workspace
         if not math.isclose(x[1] - x[0], y[1] - y[0], rel_tol=1e-6):
             raise ConfigError("workspace: an open-loop task needs a square one, x as wide as y")
-        self.actions = OpenLoopActions(
-            self.action_sequence,
-            (self.workspace.x, self.workspace.y, self.workspace.z),
-            half_rotation=self.half_rotation,
+        return OpenLoopActions(
+            config.action_sequence, config.workspace, half_rotation=config.half_rotation
         )
 
     @property

@@ -38,7 +38,7 @@ class RecordedPosition:
         """
         if not self._played:
             raise SimulationError("the actions since the last reset do not determine the state")
-        size = len(self.action_sequence)
+        size = self.actions.size
         return {
             "seed": self.base_seed,
             "episode": self._first_episode,

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from ba_torchrl.config import CUSTOM_PHYSICS, EnvConfig
-from ba_torchrl.envs.settings import task_parameters
 from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
@@ -16,9 +15,9 @@ from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.snapshots import PortableSnapshot, Snapshot
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, World
-from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
+from ba_torchrl.tasks.base import Task, TaskSettings
 from ba_torchrl.tasks.clutter.tray import Tray
-from ba_torchrl.tasks.workspace import ActionLimits, Workspace
+from ba_torchrl.tasks.workspace import Workspace
 
 MARK_M = 1e-3
 """Thickness of the coloured sheet that marks the workspace."""
@@ -94,49 +93,31 @@ class Scene:
 
 
 def build_scene(
-    task_id: str,
+    task_class: type[Task],
+    settings: TaskSettings,
     config: EnvConfig,
     *,
-    workspace: Workspace,
-    limits: ActionLimits,
-    scale: float,
     physics: Physics,
     make_controller: Callable[[Robot, Task], Controller],
+    window: bool,
 ) -> Scene:
     """Build the world of a task for objects of one scale.
 
     Args:
-        task_id: as listed by `ba_torchrl.list_tasks`.
+        task_class: of the task.
+        settings: of the task.
         config: the environment's parameters.
-        workspace: bounds of the task.
-        limits: limits of one action.
-        scale: scale of the objects.
         physics: settings of the engine, which the configuration can override.
         make_controller: builds the controller of a robot and a task.
+        window: show the world in PyBullet's window.
 
     Raises:
-        ConfigError: ``render=True`` without a display.
+        ConfigError: the window needs a display, and there is none.
     """
-    task_class = TASKS[task_id]
-    world = _empty_world(config, workspace, physics)
-    terrain = Tray(world, workspace) if config.close_loop_tray else None
+    world = _empty_world(config, settings.workspace, physics, window)
+    terrain = Tray(world, settings.workspace) if config.close_loop_tray else None
     robot = ROBOTS[config.robot](world)
-    task = task_class(
-        TaskSettings(
-            workspace=workspace,
-            scale=scale,
-            random_orientation=config.random_orientation,
-            bounding_box_check=config.workspace_check == "bounding_box",
-            action_limits=limits,
-            num_objects=(
-                task_class.num_objects if config.num_objects is None else config.num_objects
-            ),
-            parameters=task_parameters(task_class, config),
-        ),
-        world,
-        robot,
-        terrain,
-    )
+    task = task_class(settings, world, robot, terrain)
     if config.deconstruct:
         task = task.deconstruction()
     world.seal()
@@ -160,7 +141,7 @@ def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[
                     )
 
 
-def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> World:
+def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics, window: bool) -> World:
     """Return a world with a floor only."""
     if config.physics_mode == "slow":
         physics = FINE_PHYSICS
@@ -169,11 +150,9 @@ def _empty_world(config: EnvConfig, workspace: Workspace, physics: Physics) -> W
     }
     color = None if config.floor_color is None else (*config.floor_color, 1.0)
     try:
-        world = World(
-            dataclasses.replace(physics, **custom), window=config.render, floor_color=color
-        )
+        world = World(dataclasses.replace(physics, **custom), window=window, floor_color=color)
     except SimulationError as error:
-        if config.render:
+        if window:
             raise ConfigError(str(error)) from None
         raise
     if config.workspace_color is not None:

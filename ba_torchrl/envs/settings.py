@@ -1,63 +1,208 @@
-"""Validation of an environment's configuration for its task."""
+"""ResolvedEnv: an environment's task and parameters, validated, with every default filled in."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Protocol
 
-from ba_torchrl.config import EnvConfig, TaskParameters, env_config_model, parse
+from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.config import EnvConfig, env_config_model, parse
+from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.tasks.base import TASKS, Task, check_scales
+from ba_torchrl.plugins import MAIN, check_spawned_process_knows, import_modules
+from ba_torchrl.registry import Registry
+from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.tasks.base import TASKS, Task, TaskSettings, check_scales
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 
-def parse_env_config(task_id: str, values: dict[str, Any], what: str | None = None) -> EnvConfig:
-    """Validate the parameters of an environment, those of its task included.
+class Control(Protocol):
+    """What the class of environments of a control declares besides `ManipulationEnv`."""
+
+    default_action_sequence: ClassVar[str]
+    """Default `action_sequence`."""
+    default_half_rotation: ClassVar[bool]
+    """Default `half_rotation`."""
+
+    @classmethod
+    def make_actions(cls, config: EnvConfig) -> CloseLoopActions | OpenLoopActions:
+        """Return the action space.
+
+        Args:
+            config: the parameters, with defaults filled in.
+
+        Raises:
+            ConfigError: the control does not support them.
+        """
+
+
+CONTROLS: Registry[type[Control]] = Registry("kind of control", "ba_torchrl.envs")
+
+
+@dataclass(frozen=True)
+class ResolvedEnv:
+    """A task and the parameters of its environment, which `resolve_env` returns.
+
+    Another process that unpickles it imports `modules` and validates the values again.
+    """
+
+    task_id: str
+    config: EnvConfig
+    """The parameters. Of them, only changes of the physics, colours, the seed and, in close loop,
+    the parameters of open loop can be None."""
+    actions: CloseLoopActions | OpenLoopActions
+    """The action space."""
+    modules: tuple[str, ...] = ()
+    """Modules outside the package to import before the environment can be made."""
+
+    @property
+    def task_class(self) -> type[Task]:
+        """The class of the task."""
+        return TASKS[self.task_id]
+
+    @property
+    def robot_class(self) -> type[Robot]:
+        """The class of the robot."""
+        return ROBOTS[self.config.robot]
+
+    @cached_property
+    def workspace(self) -> Workspace:
+        """Bounds of the task."""
+        return Workspace(*self.config.workspace)
+
+    def task_settings(self, scale: float, limits: ActionLimits) -> TaskSettings:
+        """Return the settings of the task for objects of one scale.
+
+        Args:
+            scale: of the objects.
+            limits: of one action.
+        """
+        config, model = self.config, self.task_class.Parameters
+        return TaskSettings(
+            workspace=self.workspace,
+            scale=scale,
+            random_orientation=config.random_orientation,
+            bounding_box_check=config.workspace_check == "bounding_box",
+            action_limits=limits,
+            num_objects=config.num_objects,
+            parameters=model(**{name: getattr(config, name) for name in model.model_fields}),
+        )
+
+    def check_spawned_process_knows(self) -> None:
+        """Check that a spawned process can import what registers the parts of the environment.
+
+        Raises:
+            ConfigError: a part is defined where no other process can import it.
+        """
+        for registry, name, module in _plugins(self.task_id, self.config):
+            if module in MAIN:
+                check_spawned_process_knows(registry.kind, name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return resolve_env, (self.task_id, self.config.model_dump(), None, self.modules)
+
+
+def resolve_env(
+    task_id: str,
+    values: dict[str, Any],
+    what: str | None = None,
+    modules: Iterable[str] = (),
+) -> ResolvedEnv:
+    """Validate the parameters of an environment and fill in the defaults of task and control.
 
     A parameter of other tasks is dropped if it has its default value, so that a complete
-    configuration of one task is valid for another. The task's default of `in_hand_size` and, in
-    open loop, that of `in_hand_mode` are filled in.
+    configuration of one task is valid for another.
 
     Args:
         task_id: as listed by `ba_torchrl.list_tasks`.
-        values: field names and their values.
+        values: fields of `EnvConfig` and of the task's parameters.
         what: name of the configuration in the error message.
+        modules: outside the package, to import first. Those that register the task, the robot and
+            the observations need not be named.
 
     Raises:
-        ConfigError: a name is unknown, a type wrong or a value out of range.
+        ConfigError: a name is unknown, a type wrong or a value out of range, the task does not
+            support a value, or a module does not exist.
     """
-    model = env_config_model(TASKS[task_id].Parameters)
-    values = dict(values)
+    import_modules(modules)
+    task_class = TASKS[task_id]
+    model = env_config_model(task_class.Parameters)
+    given = _own_values(task_id, values, model)
+    config = parse(model, given, what or f"configuration of {task_id}")
+    config.check_control(task_id, task_class.control)
+    _check_task_supports(task_id, config)
+    _ = ROBOTS[config.robot]  # raises with the known names
+    config = _with_defaults(task_class, config)
+    actions = CONTROLS[task_class.control].make_actions(config)
+    missing = sorted(task_class.required_action_components - set(actions.components))
+    if missing:
+        raise ConfigError(
+            f"action_sequence: {task_id} cannot be solved without the components "
+            f"{', '.join(missing)}; the sequence has {', '.join(actions.components)}"
+        )
+    registering = (module for *_, module in _plugins(task_id, config) if module not in MAIN)
+    return ResolvedEnv(task_id, config, actions, tuple(dict.fromkeys([*modules, *registering])))
+
+
+def _plugins(task_id: str, config: EnvConfig) -> Iterator[tuple[Registry[Any], str, str]]:
+    """Yield the parts that modules outside the package have registered.
+
+    Yields:
+        Registry, name in it, and module.
+    """
+    parts = [(TASKS, task_id), (ROBOTS, config.robot)]
+    parts += [(OBSERVATIONS, name) for name in config.observations]
+    for registry, name in parts:
+        module = registry.plugin_module(name)
+        if module is not None:
+            yield registry, name, module
+
+
+def _own_values(task_id: str, values: dict[str, Any], model: type[EnvConfig]) -> dict[str, Any]:
+    """Return the values without defaults of other tasks' parameters.
+
+    Raises:
+        ConfigError: another task's parameter has a value that is not its default.
+    """
+    own = dict(values)
     for name in values.keys() - model.model_fields.keys():
-        defaults = _tasks_with_parameter(name)
-        if defaults and all(values[name] != default for default in defaults.values()):
+        fields = {other: TASKS[other].Parameters.model_fields.get(name) for other in TASKS}
+        defaults = {other: field.default for other, field in fields.items() if field is not None}
+        if defaults and own.pop(name) not in defaults.values():
             raise ConfigError(
                 f"{name!r} has no meaning for {task_id}: leave it out; it is a parameter of "
                 f"{', '.join(defaults)}"
             )
-        if defaults:
-            del values[name]
-    config = parse(model, values, what or f"configuration of {task_id}")
-    task_class = TASKS[task_id]
-    filled_in = _filled_in(task_class)
+    return own
+
+
+def _with_defaults(task_class: type[Task], config: EnvConfig) -> EnvConfig:
+    """Return a configuration with the defaults of task and control in place of None."""
+    control, box = CONTROLS[task_class.control], task_class.workspace
+    defaults = {
+        "action_sequence": task_class.default_action_sequence or control.default_action_sequence,
+        "half_rotation": control.default_half_rotation,
+        "workspace": (box.x, box.y, box.z),
+        "object_scale_range": task_class.scale_range,
+        "max_steps": task_class.step_limit(config.num_objects or task_class.num_objects),
+        "num_objects": task_class.num_objects,
+    }
     if task_class.control == "open_loop":
-        filled_in["in_hand_mode"] = task_class.default_in_hand_mode
-    missing = {name: value for name, value in filled_in.items() if getattr(config, name) is None}
+        defaults["in_hand_mode"] = task_class.default_in_hand_mode
+        defaults["in_hand_size"] = task_class.default_in_hand_size
+    missing = {name: value for name, value in defaults.items() if getattr(config, name) is None}
     return config.model_copy(update=missing)
 
 
-def task_parameters(task_class: type[Task], config: EnvConfig) -> TaskParameters:
-    """Return the task's parameters in a configuration."""
-    model = task_class.Parameters
-    return model(**{name: getattr(config, name) for name in model.model_fields})
-
-
-def check_task_parameters(task_id: str, config: EnvConfig) -> None:
+def _check_task_supports(task_id: str, config: EnvConfig) -> None:
     """Check that a task supports the parameters of a configuration.
 
     Raises:
         ConfigError: a parameter has no meaning for the task, or an unsupported value.
     """
     task_class = TASKS[task_id]
-    config.check_control(task_id, task_class.control, _filled_in(task_class))
     if config.object_scale_range is not None:
         check_scales(task_id, config.object_scale_range)
     least, most = task_class.num_objects_range
@@ -77,35 +222,3 @@ def check_task_parameters(task_id: str, config: EnvConfig) -> None:
     if config.deconstruct and not task_class.can_be_deconstructed:
         possible = ", ".join(name for name in TASKS if TASKS[name].can_be_deconstructed)
         raise ConfigError(f"'deconstruct' has no meaning for {task_id}; it is for {possible}")
-
-
-def check_action_components(task_id: str, components: list[str]) -> None:
-    """Check that an action space has the components that a task needs.
-
-    Args:
-        task_id: as listed by `ba_torchrl.list_tasks`.
-        components: as named by the action space.
-
-    Raises:
-        ConfigError: one is missing.
-    """
-    missing = sorted(TASKS[task_id].required_action_components - set(components))
-    if missing:
-        raise ConfigError(
-            f"action_sequence: {task_id} cannot be solved without the components "
-            f"{', '.join(missing)}; the sequence has {', '.join(components)}"
-        )
-
-
-def _filled_in(task_class: type[Task]) -> dict[str, Any]:
-    """Return the values that tasks of both controls fill in where None is given."""
-    return {"in_hand_size": task_class.default_in_hand_size}
-
-
-def _tasks_with_parameter(name: str) -> dict[str, Any]:
-    """Return the default of a parameter in each task that declares it."""
-    return {
-        task_id: TASKS[task_id].Parameters.model_fields[name].default
-        for task_id in TASKS
-        if name in TASKS[task_id].Parameters.model_fields
-    }

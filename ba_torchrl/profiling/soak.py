@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from tqdm import tqdm
 
-from ba_torchrl.data.state_files import write_text
+from ba_torchrl.data.files import write_text
 
 logger = logging.getLogger(__name__)
 

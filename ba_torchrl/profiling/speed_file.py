@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.config import StrictModel
-from ba_torchrl.data.state_files import write_text
+from ba_torchrl.data.files import write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.hardware import hardware, onednn_max_cpu_isa
 from ba_torchrl.modules.trunk import Precision

@@ -13,8 +13,9 @@ from typing import Any
 
 from torchrl.collectors import Collector
 
-from ba_torchrl.envs.factory import make_env
-from ba_torchrl.envs.vector.make import make_vector_env
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.factory import make
+from ba_torchrl.envs.vector.make import make_vector
 from ba_torchrl.profiling.simulation import SEED, SimulationUnit
 from ba_torchrl.profiling.table import Bench, Row, measurement
 from ba_torchrl.training.checkpoint import build_algorithm
@@ -34,11 +35,11 @@ RAY_CPUS = 0.5
 UNIT_STEPS = 100
 """Units of work that are timed together, since one is much shorter than a batch."""
 VECTORS: dict[str, dict[str, Any]] = {
-    "one process": {"parallel": False},
-    "workers, shared memory": {"parallel": True, "use_buffers": True},
-    "workers, pipes": {"parallel": True, "use_buffers": False},
+    "one process": {"workers": WorkerOptions(parallel=False)},
+    "workers, shared memory": {"use_buffers": True},
+    "workers, pipes": {"use_buffers": False},
 }
-"""Options of `make_vector_env` by name."""
+"""Options of `make_vector` by name."""
 
 
 @measurement("throughput/collection", over=lambda: itertools.product(TASKS, NUM_ENVS))
@@ -138,7 +139,7 @@ def _repeat(unit: SimulationUnit) -> None:
 @contextlib.contextmanager
 def _batches(task: str, num_envs: int, options: dict[str, Any]) -> Iterator[Iterator[Any]]:
     """Context in which a collector yields batches of a vector of environments."""
-    env = make_vector_env(partial(make_env, task), num_envs, seed=SEED, **options)
+    env = make_vector(partial(make, task), num_envs, seed=SEED, **options)
     collector = Collector(
         env,
         None,  # random actions

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 
 from ba_torchrl import __version__
 from ba_torchrl.config import StrictModel
-from ba_torchrl.data.state_files import write_text
+from ba_torchrl.data.files import write_text
 
 RESULT_FILE = "result.json"
 CONFIG_FILE = "config.json"

@@ -38,7 +38,7 @@ def _section(task: str) -> list[str]:
     cls = TASKS[task]
     env = make(task, seed=0, obs_size=16)
     env.reset()
-    conditions, steps, actions = list(env.conditions), env.max_steps, env.action_sequence
+    conditions, steps, actions = list(env.conditions), env.max_steps, env.actions.sequence
     env.close()
     least, most = cls.num_objects_range
     numbers = ", ".join(map(str, range(least, most + 1, cls.num_objects_step)))

@@ -202,8 +202,8 @@ def close_around_object(
     scene.controller.reset(((x, y, above_z), yaw))
     scene.controller.move_to((x, y, z), yaw)
     for i in range(1 + int(rng.integers(HELD_STEPS))):
-        shares = rng.uniform(0, 1, len(env.action_sequence)) if i else np.full(7, 0.5)
-        shares[env.action_sequence.index("p")] = 0.0  # closed
+        shares = rng.uniform(0, 1, len(env.actions.sequence)) if i else np.full(7, 0.5)
+        shares[env.actions.sequence.index("p")] = 0.0  # closed
         action = action_at(env, shares.astype(np.float32).tolist())
         state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
         if state[keys.DONE]:
@@ -230,7 +230,7 @@ def drop_object(
     body.set_pose((*xy, z + float(rng.uniform(0.1, 1)) * DROP_M), orientation)
     scene.world.settle(max_steps=SETTLE_STEPS)
     shares = np.full(7, 0.5)
-    shares[env.action_sequence.index("p")] = 1.0  # a place without an object has no effect
+    shares[env.actions.sequence.index("p")] = 1.0  # a place without an object has no effect
     action = action_at(env, shares.astype(np.float32).tolist())
     return env.step(state.set(keys.ACTION, action))[keys.NEXT]
 

@@ -12,12 +12,11 @@ from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Algorithm, Problem
-from ba_torchrl.data.state_files import write_text
-from ba_torchrl.envs.factory import make_env
+from ba_torchrl.data.files import write_text
+from ba_torchrl.envs.factory import make_resolved
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import check_known
 from ba_torchrl.record.results import CONFIG_FILE
-from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.durable import (
     DurableCheckpoint,
@@ -39,15 +38,11 @@ class Checkpoints:
     Args:
         folder: the run folder.
         algorithm: what to save.
-        device: where to load it to.
         keep_last: how many of the latest to keep.
     """
 
-    def __init__(
-        self, folder: Path, algorithm: Algorithm, device: torch.device, keep_last: int = 2
-    ) -> None:
+    def __init__(self, folder: Path, algorithm: Algorithm, keep_last: int = 2) -> None:
         self._folder = folder
-        self._device = device
         self._checkpoint = DurableCheckpoint(algorithm=algorithm)
         remove_leftovers(folder / "checkpoints")
         self._rotation = _rotation(folder, keep_last)
@@ -81,7 +76,7 @@ class Checkpoints:
             ConfigError: there is none.
         """
         path = find_checkpoint(self._folder, "best")
-        self._checkpoint.load(path, map_location=self._device)
+        self._checkpoint.load(path)
         return path
 
 
@@ -164,7 +159,7 @@ def load(
     checkpoint = find_checkpoint(path, which)
     config = read_config(checkpoint.parent.parent, **changes)
     algorithm = build_algorithm(config)
-    DurableCheckpoint(algorithm=algorithm).load(checkpoint, map_location=config.torch_device)
+    DurableCheckpoint(algorithm=algorithm).load(checkpoint)
     return config, algorithm
 
 
@@ -194,10 +189,10 @@ def problem_of(config: ExperimentConfig) -> Problem:
     Raises:
         ConfigError: the environment cannot be made.
     """
-    env = make_env(config.task, **config.env)
+    env = make_resolved(config.resolved_env)
     env.close()
     return Problem(
-        control=TASKS[config.task].control,
+        control=config.resolved_env.task_class.control,
         images=env.images,
         actions=env.actions,
         total_updates=config.total_updates,

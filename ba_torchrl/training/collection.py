@@ -27,28 +27,22 @@ from ba_torchrl.training.config import ExperimentConfig
 logger = logging.getLogger(__name__)
 
 
-def make_env(
-    config: ExperimentConfig, seed: int, *, wait_for_restarts: bool = True, **changes: bool
-) -> EnvBase:
+def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
     """Return the environments of a run, ready to be reset.
 
     Args:
         config: of the run.
         seed: of the first environment.
-        wait_for_restarts: as for `ba_torchrl.make_vector_env`.
-        changes: fields of `EnvConfig` that differ from the run's.
+        changes: fields of `EnvConfig` and `WorkerOptions` that differ from the run's; by default,
+            failed processes are waited for.
     """
+    options = {**config.env, "seed": seed, "wait_for_restarts": True, **changes}
     return make_vector_env(
         config.task,
         config.num_envs,
-        parallel=config.parallel,
-        start_method=config.start_method,
+        workers=config.workers,
         register_modules=config.plugins,
-        timeout_s=config.timeout_s,
-        max_restarts=config.max_restarts,
-        start_timeout_s=config.start_timeout_s,
-        wait_for_restarts=wait_for_restarts,
-        **{**config.env, "seed": seed, **changes},
+        **options,
     )
 
 
@@ -74,10 +68,7 @@ def start_collection(
         seed=seed,
         make_env=partial(_make_some_envs, values, algorithm.collects_expert_action),
         make_policy=partial(_make_policy, values),
-        start_method=config.start_method,
-        max_restarts=config.max_restarts,
-        timeout_s=config.timeout_s,
-        start_timeout_s=config.start_timeout_s,
+        workers=config.workers,
     )
     return config.collector_config.start(problem, positions)
 
@@ -87,7 +78,7 @@ def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: i
     if values["parallel"] is None and shared_with_other_workers:
         values = {**values, "parallel": False}  # the workers are processes already
     config = _read(values, num_envs=num_envs)
-    return make_env(config, seed, wait_for_restarts=False, expert=expert)
+    return make_env(config, seed, wait_for_restarts=config.wait_for_restarts, expert=expert)
 
 
 def _make_policy(values: dict[str, Any], seed: int) -> TensorDictModuleBase:
@@ -142,8 +133,8 @@ def gather_demonstrations(
             only_successful=config.only_successful_demonstrations,
             noise=config.demonstrations_noise,
             turn_noise=config.demonstrations_turn_noise,
-            turns=config.turn_components,
-            primitive=config.primitive_component,
+            turns=config.resolved_env.actions.turns,
+            primitive=config.resolved_env.actions.primitive,
             nearest_action=algorithm.nearest_action,
             on_episode=on_episode,
         )

@@ -13,24 +13,18 @@ from pydantic import Field
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
 from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
-from ba_torchrl.config import MAX_SEED, EnvConfig, StrictModel, changed, parse
+from ba_torchrl.config import MAX_SEED, WorkerOptions, changed, parse
 from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import (
     Source,
     check_noise,
     check_turn_noise,
-    primitive_component,
     source_config,
-    turn_components,
 )
-from ba_torchrl.envs.factory import resolve
-from ba_torchrl.envs.observations import OBSERVATIONS
-from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
-from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectorConfig
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
@@ -45,7 +39,7 @@ _OF_DEMONSTRATIONS = (
 """Fields that describe the demonstrations."""
 
 
-class ExperimentConfig(StrictModel):
+class ExperimentConfig(WorkerOptions):
     """One training run. The defaults are those of the close-loop benchmarks (appendix G.2).
 
     Where the appendix gives no value, the default is that of the reference implementation, and the
@@ -79,17 +73,8 @@ class ExperimentConfig(StrictModel):
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool | None = None
-    """One process per environment, or all in the learner's process; None chooses by the number of
-    environments and cores, see `ba_torchrl.make_vector_env`. Results are the same."""
-    start_method: Literal["spawn", "fork"] = "spawn"
-    """How these processes start."""
-    timeout_s: float = Field(default=60.0, gt=0)
-    """Seconds after which a process that does not answer is replaced."""
-    max_restarts: int = Field(default=5, ge=0)
-    """Largest number of failures in a row of a process: of attempts to start it, or of resets and
-    steps without a completed step."""
-    start_timeout_s: float = Field(default=120.0, gt=0)
-    """Seconds after which a process that does not start is replaced."""
+    wait_for_restarts: bool = False
+    """In collection; evaluations wait. See `WorkerOptions` for the fields of processes."""
     collector: dict[str, Any] = Field(default_factory=lambda: {"name": "single"})
     """``name`` of a registered collector and its options: where the policy collects."""
     demonstrations: int = Field(default=100, ge=0)
@@ -151,9 +136,14 @@ class ExperimentConfig(StrictModel):
     """Name of the benchmark that the run belongs to, for reports."""
 
     @cached_property
-    def env_config(self) -> EnvConfig:
-        """The environments' parameters."""
-        return parse_env_config(self.task, self.env, "env")
+    def resolved_env(self) -> ResolvedEnv:
+        """The environments' task and parameters."""
+        return resolve_env(self.task, self.env, "env", self.plugins)
+
+    @property
+    def workers(self) -> WorkerOptions:
+        """How the processes of environments start and are replaced."""
+        return WorkerOptions(**{name: getattr(self, name) for name in WorkerOptions.model_fields})
 
     @cached_property
     def network_config(self) -> NetworkConfig:
@@ -183,7 +173,9 @@ class ExperimentConfig(StrictModel):
         """Return the configuration as JSON, every default filled in."""
         return {
             **self.model_dump(mode="json"),
-            "env": self.env_config.model_dump(mode="json", exclude=set(SET_BY_THE_EXPERIMENT)),
+            "env": self.resolved_env.config.model_dump(
+                mode="json", exclude=set(SET_BY_THE_EXPERIMENT)
+            ),
             "algorithm": {
                 "name": self.algorithm["name"],
                 **self.algorithm_config.model_dump(mode="json"),
@@ -219,13 +211,12 @@ class ExperimentConfig(StrictModel):
         """
         config = parse(cls, values, what)
         load_plugins(config.plugins)
-        control = TASKS[config.task].control  # raises with the known names
         for reserved in SET_BY_THE_EXPERIMENT:
             if reserved in config.env:
                 raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
-        _ = config.env_config
-        if config.env_config.obs_type != "pixel":
+        if config.resolved_env.config.obs_type != "pixel":
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
+        control = config.resolved_env.task_class.control
         config.algorithm_config.check(config.network_config, control)
         if config.pretrain_updates > config.total_updates:
             raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
@@ -261,27 +252,13 @@ class ExperimentConfig(StrictModel):
     def _all_plugins(self) -> list[str]:
         """Return `plugins` and the modules that register what the run uses, each once."""
         used = (
-            (TASKS, self.task),
-            (ROBOTS, self.env_config.robot),
             (NETWORKS, self.network["name"]),
             (ALGORITHMS, self.algorithm["name"]),
             (COLLECTORS, self.collector["name"]),
-            *((OBSERVATIONS, name) for name in self.env_config.observations),
         )
         modules = (registry.plugin_module(name) for registry, name in used)
         found = [name for name in modules if name is not None and name not in MAIN]
-        return list(dict.fromkeys([*self.plugins, *found]))
-
-    @property
-    def turn_components(self) -> list[int]:
-        """Indices of the action's components that turn the gripper."""
-        return turn_components(resolve(self.task, **self.env).action_sequence)
-
-    @property
-    def primitive_component(self) -> int | None:
-        """Index of the primitive of open-loop actions; None if there is none."""
-        sequence = resolve(self.task, **self.env).action_sequence
-        return primitive_component(TASKS[self.task].control, sequence)
+        return list(dict.fromkeys([*self.resolved_env.modules, *found]))
 
     def without_effect(self) -> Iterator[str]:
         """Yield a message for each value that has no effect together with the others."""
@@ -299,13 +276,11 @@ class ExperimentConfig(StrictModel):
         check_turn_noise(
             self.demonstrations_turn_noise,
             self.demonstrations_source,
-            self.turn_components,
+            self.resolved_env.actions.turns,
             "demonstrations_turn_noise",
         )
         if self.demonstrations:
-            check_task_parameters(
-                self.task, parse_env_config(self.task, {**self.env, **source}, "env")
-            )
+            _ = resolve_env(self.task, {**self.env, **source}, "env")
         if self.demonstrations_path is not None:
             if not self.demonstrations:
                 raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")

@@ -9,12 +9,29 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointLoadResult
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointAdapter,
+    CheckpointError,
+    CheckpointLoadResult,
+)
 
-from ba_torchrl.data.state_files import OLD, check, check_space, publish, seal
+from ba_torchrl.data.files import OLD, check, publish, read_state, seal, write_state
 from ba_torchrl.errors import ConfigError, DamagedFilesError
 
 logger = logging.getLogger(__name__)
+
+
+class _StateAdapter(CheckpointAdapter):
+    """Writes a component's ``state_dict`` with `write_state`."""
+
+    adapter_id = "ba_torchrl.state"
+
+    def save(self, component: Any, path: Path, **_: Any) -> None:
+        write_state(path, component.state_dict())
+
+    def load(self, component: Any, path: Path, **_: Any) -> None:
+        component.load_state_dict(read_state(path))
 
 
 class DurableCheckpoint(Checkpoint):
@@ -24,6 +41,12 @@ class DurableCheckpoint(Checkpoint):
         components: what is saved, by name.
     """
 
+    def __init__(self, **components: Any) -> None:
+        super().__init__()
+        for name, component in components.items():
+            has_own_format = hasattr(component, "dump")
+            self.register(name, component, adapter=None if has_own_format else _StateAdapter())
+
     def save(self, path: str | Path, **options: Any) -> Path:
         """Write a checkpoint; see TorchRL.
 
@@ -31,9 +54,6 @@ class DurableCheckpoint(Checkpoint):
             OSError: there is not enough space.
         """
         path = Path(path)
-        for component in self.components.values():
-            if hasattr(component, "state_dict"):
-                check_space(path, component.state_dict())
         scratch = path.with_name(f".{path.name}.scratch")
         shutil.rmtree(scratch, ignore_errors=True)
         try:
@@ -49,7 +69,8 @@ class DurableCheckpoint(Checkpoint):
 
         Raises:
             DamagedFilesError: a file is missing, altered or shorter than written.
-            ConfigError: a file is not plain data, or its content does not fit the components.
+            ConfigError: a file is neither safetensors nor JSON, or its content does not fit the
+                components.
         """
         check(path)
         try:

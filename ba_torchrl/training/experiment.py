@@ -58,14 +58,12 @@ class Experiment:
         self._lock = RunLock(config.folder)
         open_run_folder(config)
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)
-        self.checkpoints = Checkpoints(config.folder, self.algorithm, config.torch_device)
+        self.checkpoints = Checkpoints(config.folder, self.algorithm)
         self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
         self._collection: Collection | None = None
         self._eval_env: EnvBase | None = None
         self._progress = Progress()
-        self._state = ResumeState(
-            config.folder, self.algorithm, self._progress, config.torch_device
-        )
+        self._state = ResumeState(config.folder, self.algorithm, self._progress)
         self._timer = UpdateTimer()
         self._signals = StopSignals()
         self._is_between_updates = False

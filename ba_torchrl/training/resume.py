@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 
 from ba_torchrl.algorithms.base import Algorithm
@@ -82,14 +81,10 @@ class ResumeState:
         folder: the run folder.
         algorithm: whose state and replay are saved.
         progress: the run's counters and curve.
-        device: where to load tensors to; it may differ from the one they were saved on.
     """
 
-    def __init__(
-        self, folder: Path, algorithm: Algorithm, progress: Progress, device: torch.device
-    ) -> None:
+    def __init__(self, folder: Path, algorithm: Algorithm, progress: Progress) -> None:
         self._folder = folder / _FOLDER
-        self._device = device
         self._checkpoint = DurableCheckpoint(
             algorithm=algorithm,
             replay=_Replay(algorithm),
@@ -118,7 +113,7 @@ class ResumeState:
                 f"all states in {self._folder} are damaged: start the run again in another "
                 "run_dir, or evaluate its checkpoints"
             )
-        self._checkpoint.load(sound, map_location=self._device)
+        self._checkpoint.load(sound)
         for damaged in states[: states.index(sound)]:
             shutil.rmtree(damaged)
         return True

@@ -7,11 +7,9 @@ import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import (
     collect_demonstrations,
-    primitive_component,
     source_config,
-    turn_components,
 )
-from ba_torchrl.data.state_files import seal
+from ba_torchrl.data.files import read_state, seal, write_state
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -98,18 +96,17 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
         load_demonstrations(tmp_path, task=TASK, env=ENV)
 
 
-def test_entries_of_other_lengths_are_refused(collected, tmp_path):
+@pytest.mark.parametrize(
+    "changed", [{"holding": torch.ones(3, 1)}, {"holding": 1}, {"episode_lengths": torch.ones(0)}]
+)
+def test_folders_with_other_tensors_are_refused(collected, tmp_path, changed):
     source, episodes = collected
-    save_demonstrations(
-        tmp_path / "demos", episodes, task=TASK, env={**ENV, **source_config(source)}, seed=0
-    )
-    description = tmp_path / "demos" / "meta.json"
-    values = json.loads(description.read_text())
-    values["holding"]["shape"] = [2, 1]
-    description.write_text(json.dumps(values))
+    env = {**ENV, **source_config(source)}
+    save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=env, seed=0)
+    write_state(tmp_path / "demos", {**read_state(tmp_path / "demos"), **changed})
     seal(tmp_path / "demos")
-    with pytest.raises(ConfigError, match=r"holding has the shape \[2, 1\] in 8 rows"):
-        load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, **source_config(source)})
+    with pytest.raises(ConfigError, match="does not hold episodes"):
+        load_demonstrations(tmp_path / "demos", task=TASK, env=env)
 
 
 def test_demonstrations_are_not_overwritten(collected, tmp_path):
@@ -212,7 +209,7 @@ def test_random_turns_leave_the_other_components(noise):
         seed=0,
         noise=noise,
         turn_noise=0.5,
-        turns=turn_components("pxyzr"),
+        turns=[4],
         on_episode=played.append,
     )
     env.close()
@@ -225,12 +222,6 @@ def test_random_turns_leave_the_other_components(noise):
     drawn = steps[keys.ACTION][~turn, 4]
     assert drawn.min() < -0.8
     assert drawn.max() > 0.8
-
-
-def test_turn_components():
-    assert turn_components("pxyzr") == [4]
-    assert turn_components("rxyrrp") == [0, 3, 4]
-    assert turn_components("pxyz") == []
 
 
 @pytest.mark.parametrize(
@@ -258,9 +249,7 @@ def test_random_actions_keep_the_primitive_that_the_gripper_can_execute():
         num_objects=2,
         expert=True,
     )
-    episodes = collect_demonstrations(
-        env, 10, seed=0, noise=0.4, primitive=primitive_component("open_loop", "pxyr")
-    )
+    episodes = collect_demonstrations(env, 10, seed=0, noise=0.4, primitive=0)
     env.close()
     steps = torch.cat(episodes)
     is_random = ~steps[keys.IS_EXPERT].squeeze(-1)
@@ -269,10 +258,3 @@ def test_random_actions_keep_the_primitive_that_the_gripper_can_execute():
     assert torch.equal(steps[keys.ACTION][:, :1], holding)
     drawn, expert = (steps[key][is_random, 1:] for key in (keys.ACTION, keys.EXPERT_ACTION))
     assert (drawn != expert).all()
-
-
-def test_primitive_component():
-    assert primitive_component("open_loop", "pxyr") == 0
-    assert primitive_component("open_loop", "xyp") == 2
-    assert primitive_component("open_loop", "xyr") is None
-    assert primitive_component("close_loop", "pxyzr") is None

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from ba_torchrl.envs.vector.make import make_vector_env
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector.make import make_vector
 
 # Spawned workers inherit this path and find the modules of the tests there.
 sys.path.insert(0, str(Path(__file__).parent))
@@ -18,10 +19,26 @@ def make_fakes():
 
     made = []
 
-    def make(num_envs=2, *, seed=0, folder=None, horizon=1000, **options):
-        options = {"start_method": "fork", "timeout_s": 20.0} | options
+    def make(
+        num_envs=2,
+        *,
+        seed=0,
+        folder=None,
+        horizon=1000,
+        num_threads=None,
+        use_buffers=True,
+        **options,
+    ):
+        workers = WorkerOptions(**{"start_method": "fork", "timeout_s": 20.0} | options)
         factory = partial(FakeEnv, folder=folder, horizon=horizon)
-        env = make_vector_env(factory, num_envs, seed=seed, **options)
+        env = make_vector(
+            factory,
+            num_envs,
+            seed=seed,
+            workers=workers,
+            num_threads=num_threads,
+            use_buffers=use_buffers,
+        )
         made.append(env)
         return env
 

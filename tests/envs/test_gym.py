@@ -282,13 +282,13 @@ def test_render_without_a_mode_warns(make):
 
 def test_human_opens_a_window(monkeypatch):
     asked = []
-    real = gym.make_env
+    real = gym.resolve_env
 
-    def make_env(task, *, render=False, **config):
-        asked.append(render)
-        return real(task, **config)
+    def without_window(task, config, **options):
+        asked.append(config.pop("render", False))
+        return real(task, config, **options)
 
-    monkeypatch.setattr(gym, "make_env", make_env)
+    monkeypatch.setattr(gym, "resolve_env", without_window)
     for mode in ("human", "rgb_array", None):
         env = gym.GymEnv("close_loop/block_picking", render_mode=mode, obs_size=16)
         env.reset()

@@ -34,7 +34,7 @@ def make():
 
 def act(env, state, **components):
     """Take one step with the named components, the others zero and the gripper open."""
-    sequence = env.action_sequence
+    sequence = env.actions.sequence
     action = torch.tensor([components.get(c, float(c == "p")) for c in sequence])
     return env.step(state.clone().set(keys.ACTION, action))[keys.NEXT]
 
@@ -212,7 +212,7 @@ def test_in_hand_images_have_the_size_of_the_appendix_by_default(make, task):
 
 def test_a_complete_configuration_of_close_loop_is_valid(make):
     config = make("close_loop/block_reaching", obs_size=32).config
-    assert config.in_hand_size == 24
+    assert config.in_hand_size is None
     again = make("close_loop/block_reaching", **config.model_dump())
     assert again.config == config
     with pytest.raises(ConfigError, match="'in_hand_size' is for open-loop"):

@@ -5,7 +5,7 @@ import math
 import pytest
 
 import ba_torchrl
-from ba_torchrl.envs.factory import resolve
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS
 
@@ -68,6 +68,7 @@ def test_a_task_may_have_a_default_action_sequence(monkeypatch):
     monkeypatch.setattr(TASKS[PICKING], "default_action_sequence", "pxyz")
     env = ba_torchrl.make(PICKING, obs_size=16)
     assert env.action_spec.shape == (4,)
-    assert resolve(PICKING).action_sequence == "pxyz"
-    assert resolve(PICKING, action_sequence="pxyzr").action_sequence == "pxyzr"
+    assert resolve_env(PICKING, {}).config.action_sequence == "pxyz"
+    given = {"action_sequence": "pxyzr"}
+    assert resolve_env(PICKING, given).config.action_sequence == "pxyzr"
     env.close()

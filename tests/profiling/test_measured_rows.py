@@ -101,7 +101,7 @@ def test_frames_per_second(monkeypatch):
 def test_frames_per_second_count_all_environments(monkeypatch):
     monkeypatch.setattr(throughput, "VECTORS", {"one process": {"parallel": False}})
     monkeypatch.setattr(throughput, "STEPS", 4)
-    monkeypatch.setattr(throughput, "make_vector_env", lambda *_, **__: None)
+    monkeypatch.setattr(throughput, "make_vector", lambda *_, **__: None)
     taken = []
 
     class Collector:

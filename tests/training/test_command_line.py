@@ -12,7 +12,6 @@ import torch
 from omegaconf import OmegaConf
 
 import ba_torchrl
-from ba_torchrl.data.state_files import write_state
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training.command_line import (
     EXIT_CODE,
@@ -214,7 +213,7 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
         raise AssertionError("work started")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ba_torchrl.envs.factory.make_env", started)
+    monkeypatch.setattr("ba_torchrl.envs.factory.make_resolved", started)
     monkeypatch.setattr("ba_torchrl.make", started)
     monkeypatch.setattr("ba_torchrl.training.experiment.Experiment.run", started)
     monkeypatch.setattr("ba_torchrl.training.grid.launchers.local.run_all", started)
@@ -298,15 +297,6 @@ def test_too_few_file_handles_are_refused(monkeypatch):
     monkeypatch.setattr("ba_torchrl.envs.vector.parallel.Worker", fail)
     with pytest.raises(ConfigError, match=r"Too many open files.*ulimit -n"):
         ba_torchrl.make_vector_env("close_loop/block_reaching", 2, start_method="fork")
-
-
-def test_a_full_disk_is_noticed_before_anything_is_written(monkeypatch, tmp_path):
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(10**9, 10**9, 10**7))
-    write_state(tmp_path / "small", {"step": 1})
-    with pytest.raises(OSError, match="MB are free") as error:
-        write_state(tmp_path / "large", {"part": [torch.zeros(2_600_000)]})
-    assert error.value.errno == errno.ENOSPC
-    assert not (tmp_path / "large").exists()
 
 
 def test_an_interruption_outside_of_a_run_is_one_line(capsys):

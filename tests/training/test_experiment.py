@@ -132,7 +132,7 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
 def test_a_crash_while_saving_keeps_the_last_checkpoint(tmp_path, monkeypatch):
     config = tiny(tmp_path)
     algorithm = build_algorithm(config)
-    checkpoints = Checkpoints(config.folder, algorithm, config.torch_device)
+    checkpoints = Checkpoints(config.folder, algorithm)
     checkpoints.save(1, 0.1)
     with monkeypatch.context() as patch:
         patch.setattr(algorithm, "state_dict", lambda: {"loss": 1 / 0})
@@ -143,9 +143,7 @@ def test_a_crash_while_saving_keeps_the_last_checkpoint(tmp_path, monkeypatch):
 
 def test_the_best_checkpoint_is_kept(tmp_path):
     config = tiny(tmp_path)
-    checkpoints = Checkpoints(
-        config.folder, build_algorithm(config), config.torch_device, keep_last=1
-    )
+    checkpoints = Checkpoints(config.folder, build_algorithm(config), keep_last=1)
     for updates, rate in ((1, 0.9), (2, 0.1), (3, 0.2)):
         checkpoints.save(updates, rate)
     kept = sorted(path.name[-1] for path in (config.folder / "checkpoints").iterdir())

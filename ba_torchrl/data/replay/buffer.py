@@ -9,10 +9,10 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 
+from ba_torchrl.data.files import StateFolder
 from ba_torchrl.data.replay.schema import Schema, differences
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
-from ba_torchrl.data.state_files import StateFolder
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError
 

@@ -11,9 +11,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
+from ba_torchrl.data.files import StateFolder
 from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.frames import FrameTable
-from ba_torchrl.data.state_files import StateFolder
 from ba_torchrl.envs import keys
 
 

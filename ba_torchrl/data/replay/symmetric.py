@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 
+from ba_torchrl.data.files import StateFolder
 from ba_torchrl.data.replay.storage import FrameStorage
-from ba_torchrl.data.state_files import StateFolder
 from ba_torchrl.envs import keys
 
 _SIDES = ("expert", "online")

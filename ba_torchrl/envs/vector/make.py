@@ -7,12 +7,13 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, SerialEnv
 
+from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.checks import check_actions
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
@@ -23,7 +24,7 @@ __all__ = [
     "SerialVectorEnv",
     "VectorEnv",
     "check_actions",
-    "make_vector_env",
+    "make_vector",
     "processes_save_time",
 ]
 
@@ -53,19 +54,14 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def make_vector_env(
+def make_vector(
     make_env: MakeEnv | Sequence[MakeEnv],
     num_envs: int,
     *,
     seed: int | None = None,
-    parallel: bool = True,
-    start_method: Literal["spawn", "fork"] = "spawn",
+    workers: WorkerOptions = WorkerOptions(),  # noqa: B008 -- immutable
     num_threads: int | None = None,
-    use_buffers: bool | None = None,
-    timeout_s: float = 60.0,
-    max_restarts: int = 5,
-    start_timeout_s: float = 120.0,
-    wait_for_restarts: bool = True,
+    use_buffers: bool = True,
 ) -> SerialVectorEnv | VectorEnv:
     """Return ``num_envs`` environments as one, with batch size [num_envs], ready to be reset.
 
@@ -74,18 +70,11 @@ def make_vector_env(
             `functools.partial` of an importable function or class works with every start method.
         num_envs: number of environments.
         seed: environment i is seeded with ``seed + i``, both in this process and in workers.
-        parallel: whether each environment runs in a separate process.
-        start_method: how processes start. "fork" takes milliseconds and needs a parent without an
-            open simulator and without CUDA; "spawn" takes seconds and has no such condition.
+        workers: how the environments are started, and replaced when they fail.
         num_threads: number of torch threads of this process while the environments are open; None
             for no change.
-        use_buffers: whether data pass through shared memory (the default, faster for steps of a
-            few milliseconds) or through pipes.
-        timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: largest number of failures in a row of a worker; see `VectorEnv`.
-        start_timeout_s: seconds after which a worker that does not start is replaced.
-        wait_for_restarts: whether the environment of a failed worker is reset before the next step;
-            see `VectorEnv`.
+        use_buffers: whether data pass through shared memory (faster for steps of a few
+            milliseconds) or through pipes.
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.
@@ -100,22 +89,18 @@ def make_vector_env(
     if num_envs > MAX_ENVS:
         raise ConfigError(f"num_envs: at most {MAX_ENVS}, the number of worlds of PyBullet")
     env: SerialVectorEnv | VectorEnv
-    if parallel:
+    if workers.parallel:
         env = VectorEnv(
             num_envs,
             make_env,
-            timeout_s=timeout_s,
-            max_restarts=max_restarts,
-            start_timeout_s=start_timeout_s,
-            wait_for_restarts=wait_for_restarts,
-            mp_start_method=start_method,
+            workers=workers,
             num_threads=num_threads,
-            use_buffers=True if use_buffers is None else use_buffers,
+            use_buffers=use_buffers,
         )
     else:
         env = SerialVectorEnv(num_envs, make_env)
     try:
-        if parallel and env._use_buffers:
+        if workers.parallel and use_buffers:
             _check_shared_memory(env)
         env.start()
     except OSError as error:

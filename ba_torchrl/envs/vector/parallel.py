@@ -14,6 +14,7 @@ from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
 from torchrl.envs.batched_envs import _run_worker_pipe_direct, _run_worker_pipe_shared_mem
 
+from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.answers import ask_all, collect_flags, collect_messages
@@ -46,18 +47,15 @@ class VectorEnv(SeededVector, ParallelEnv):
     and ``done`` set and a reward of zero; TorchRL then resets it like any environment that is done.
     Actions are validated in this process before they are sent.
 
-    This reset waits for the new worker, unless ``wait_for_restarts`` is False. Then the environment
-    is absent until the worker is ready: the reset returns the last valid observation with ``fault``
-    set, and so does every step, which is truncated and done. A full reset always waits.
+    This reset waits for the new worker, unless ``workers.wait_for_restarts`` is False. Then the
+    environment is absent until the worker is ready: the reset returns the last valid observation
+    with ``fault`` set, and so does every step, which is truncated and done. A full reset always
+    waits.
 
     Args:
         num_workers: number of environments.
         create_env_fn: builds one environment, or one such function per environment.
-        timeout_s: seconds after which a worker that does not answer is replaced.
-        max_restarts: largest number of failures in a row of a worker: of attempts to start it, or
-            of resets and steps without a completed step. The end of an idle worker does not count.
-        start_timeout_s: seconds after which a worker that does not start is replaced.
-        wait_for_restarts: whether the environment of a failed worker is reset before the next step.
+        workers: how processes start and when they are replaced.
         parallel_options: further options of `torchrl.envs.ParallelEnv`.
 
     Raises:
@@ -69,31 +67,23 @@ class VectorEnv(SeededVector, ParallelEnv):
         num_workers: int,
         create_env_fn: MakeEnv | Sequence[MakeEnv],
         *,
-        timeout_s: float = 60.0,
-        max_restarts: int = 5,
-        start_timeout_s: float = 120.0,
-        wait_for_restarts: bool = True,
+        workers: WorkerOptions = WorkerOptions(),  # noqa: B008 -- immutable
         **parallel_options: Any,
     ) -> None:
         parallel_options.setdefault("shutdown_timeout", 5.0)
-        super().__init__(num_workers, create_env_fn, **parallel_options)
+        super().__init__(
+            num_workers, create_env_fn, mp_start_method=workers.start_method, **parallel_options
+        )
         missing = {keys.TRUNCATED, keys.FAULT} - {*self.done_keys, *self.observation_keys}
         if missing:
             raise ValueError(f"environments in workers need the entries {sorted(missing)}")
-        self.timeout_s = timeout_s
-        self.start_timeout_s = start_timeout_s
-        self.wait_for_restarts = wait_for_restarts
+        self.workers, self.wait_for_restarts = workers, workers.wait_for_restarts
         self._lost: set[int] = set()  # without an episode, and the next step reports a fault
         self._threads_before = torch.get_num_threads()
         self.parent_channels: list[Worker] = []
         self._replacements = Replacements(
-            self.parent_channels, self._launch, self._close_all, max_restarts, num_workers
+            self.parent_channels, self._launch, self._close_all, workers.max_restarts, num_workers
         )
-
-    @property
-    def max_restarts(self) -> int:
-        """Largest number of failures in a row of a worker."""
-        return self._replacements.max_restarts
 
     @property
     def restarts(self) -> int:
@@ -110,14 +100,14 @@ class VectorEnv(SeededVector, ParallelEnv):
         if self._lost:
             raise WorkerError(f"the episodes of environments {sorted(self._lost)} are lost")
         arguments = [()] * self.num_workers
-        return ask_all(self.parent_channels, "get_position", arguments, self.timeout_s)
+        return ask_all(self.parent_channels, "get_position", arguments, self.workers.timeout_s)
 
     def continue_from(self, positions: Sequence[Position]) -> None:
         """Continue episodes; see `SeededVector.continue_from`."""
         steps = max(sum(map(len, position["actions"])) for position in positions)
         arguments = [(position,) for position in positions]
         self._replacements.finish(wait_for_all=True)
-        timeout_s = self.timeout_s + steps * _STEP_S
+        timeout_s = self.workers.timeout_s + steps * _STEP_S
         ask_all(self.parent_channels, "continue_from", arguments, timeout_s)
 
     def step_and_maybe_reset(
@@ -221,7 +211,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             "num_threads": self.num_sub_threads,
             "filter_warnings": self._filter_warnings_subprocess(),
         }
-        limits = self._mp_start_method, self.timeout_s, self.start_timeout_s
+        limits = self._mp_start_method, self.workers.timeout_s, self.workers.start_timeout_s
         if not self._use_buffers:
             options["consolidate"] = self.consolidate
             return Worker(_run_worker_pipe_direct, options, *limits)
@@ -334,7 +324,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         """Wait for the answers of workers; return the errors of failed workers by index."""
         pending = set(indices)
         failures: dict[int, WorkerError] = {}
-        deadline = time.monotonic() + self.timeout_s
+        deadline = time.monotonic() + self.workers.timeout_s
         try:
             while pending:
                 workers = self.parent_channels
@@ -343,7 +333,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 else:
                     failed = collect_messages(workers, pending)
                 if time.monotonic() > deadline:
-                    late = f"it did not finish within {self.timeout_s:g} s"
+                    late = f"it did not finish within {self.workers.timeout_s:g} s"
                     failed = {index: WorkerError(late) for index in pending} | failed
                 failures |= failed
                 pending -= failed.keys()

@@ -110,7 +110,7 @@ def run_env(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> None:
     try:
         facts |= spec_facts(env)
         facts["max_steps"] = env.max_steps
-        actions = Actions(env.action_spec, case.seed, env.action_sequence)
+        actions = Actions(env.action_spec, case.seed, env.actions.sequence)
         for i in range(case.plan.get("expert", 0)):
             trace = Trace(traces, f"expert {i}")
             _play_episode(env, trace, _expert)
@@ -132,7 +132,7 @@ def run_state(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> None
     """Restore a state twice, each time with the same actions after it."""
     env = _make(case)
     try:
-        actions = Actions(env.action_spec, case.seed, env.action_sequence)
+        actions = Actions(env.action_spec, case.seed, env.actions.sequence)
         trace = Trace(traces, "before")
         data = trace.reset(env)
         for _ in range(2):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDict
@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl.algorithms.base import Algorithm
-from ba_torchrl.config import StrictModel
+from ba_torchrl.config import StrictModel, WorkerOptions
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.registry import Registry
 
@@ -35,14 +35,8 @@ class CollectionProblem:
     CPU. Other processes and machines can call it."""
     make_policy: Callable[[int], TensorDictModuleBase]
     """From a seed to an untrained policy on the CPU. Other processes and machines can call it."""
-    start_method: Literal["spawn", "fork"]
-    """How processes start."""
-    max_restarts: int
-    """Largest number of failures in a row."""
-    timeout_s: float
-    """Seconds after which a process that does not answer is replaced."""
-    start_timeout_s: float
-    """Seconds after which a process that does not start is replaced."""
+    workers: WorkerOptions
+    """How processes start and when they are replaced."""
 
 
 class Collection(ABC):

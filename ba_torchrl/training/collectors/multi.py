@@ -105,7 +105,7 @@ class MultiCollection(WorkerCollection):
                 self._replace(error)
                 continue
             self._failures_in_a_row = 0
-            self._patience_s = self.problem.timeout_s
+            self._patience_s = self.problem.workers.timeout_s
             return batch
 
     def close(self) -> None:
@@ -119,10 +119,11 @@ class MultiCollection(WorkerCollection):
 
     def _start(self) -> MultiSyncCollector | MultiAsyncCollector:
         problem = self.problem
-        self._patience_s = problem.start_timeout_s + problem.timeout_s  # until the first batch
+        workers = problem.workers
+        self._patience_s = workers.start_timeout_s + workers.timeout_s  # until the first batch
         # A worker is killed when the thread that started it ends, so only for the main thread.
         is_main = threading.current_thread() is threading.main_thread()
-        with _start_method(problem.start_method):
+        with _start_method(workers.start_method):
             return self._collector_class(
                 self.make_envs(problem.make_env, self._restarts),
                 # TorchRL sends its weights at first, and moves them to shared memory.
@@ -145,7 +146,7 @@ class MultiCollection(WorkerCollection):
         """
         self.close()
         self._failures_in_a_row += 1
-        if self._failures_in_a_row > self.problem.max_restarts:
+        if self._failures_in_a_row > self.problem.workers.max_restarts:
             raise RuntimeError(
                 f"the collector's workers failed {self._failures_in_a_row} times in a row; the "
                 f"last time: {cause}. Raise max_restarts, or use collector=single to see the error "

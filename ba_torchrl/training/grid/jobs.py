@@ -19,7 +19,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ba_torchrl.data.state_files import write_text
+from ba_torchrl.data.files import write_text
 from ba_torchrl.record.results import FAILURE_FILE, now
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import status

@@ -18,8 +18,8 @@ from torchrl.data import (
 from torchrl.data.replay_buffers.samplers import prioritized
 
 from ba_torchrl import _segment_tree as segment_tree
+from ba_torchrl.data.files import read_state, write_state
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
-from ba_torchrl.data.state_files import read_state, write_state
 from ba_torchrl.envs import keys
 
 EPS = 1e-6

@@ -8,6 +8,7 @@ import pytest
 import torch
 from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
 
+from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.make import VectorEnv
 
@@ -154,7 +155,9 @@ class TestFailures:
         assert env.is_closed
 
     def test_to_build_raise_with_the_cause(self, tmp_path):
-        env = VectorEnv(2, partial(FakeEnv, folder=tmp_path), mp_start_method="fork")
+        env = VectorEnv(
+            2, partial(FakeEnv, folder=tmp_path), workers=WorkerOptions(start_method="fork")
+        )
         (tmp_path / "build").touch()
         with pytest.raises(RuntimeError, match=r"(?s)could not be started.*no simulator today"):
             env.start()

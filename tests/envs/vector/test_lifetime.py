@@ -13,15 +13,18 @@ import torch
 from fake_env import BUFFERS, act
 
 import ba_torchrl
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.errors import ConfigError
 
 PARENT = """
 import os, signal, sys, time
 sys.path.insert(0, {tests!r})
 from fake_env import FakeEnv
-from ba_torchrl.envs.vector.make import make_vector_env
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector.make import make_vector
 
 if __name__ == "__main__":
-    env = make_vector_env(FakeEnv, 3, start_method={method!r})
+    env = make_vector(FakeEnv, 3, workers=WorkerOptions(start_method={method!r}))
     env.reset()
     os.kill(env.worker_pids[0], signal.SIGSTOP)  # hangs
     print(*env.worker_pids, flush=True)
@@ -31,11 +34,12 @@ THREAD = """
 import os, signal, sys, threading, time
 sys.path.insert(0, {tests!r})
 from fake_env import FakeEnv, act
-from ba_torchrl.envs.vector.make import make_vector_env
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector.make import make_vector
 
 made = []
 thread = threading.Thread(
-    target=lambda: made.append(make_vector_env(FakeEnv, 3, start_method="fork"))
+    target=lambda: made.append(make_vector(FakeEnv, 3, workers=WorkerOptions(start_method="fork")))
 )
 thread.start()
 thread.join()
@@ -149,17 +153,19 @@ def test_signals_for_all_processes_leave_the_workers_to_the_parent(make_fakes):
     assert env.restarts == 0
 
 
-def test_the_limits_are_parameters_of_make_vector_env():
+def test_worker_options_are_an_object_or_keywords_of_make_vector_env():
     env = ba_torchrl.make_vector_env(
         "close_loop/block_reaching",
         1,
-        start_method="fork",
-        timeout_s=7.0,
+        workers=WorkerOptions(start_method="fork", timeout_s=7.0, max_restarts=2),
         max_restarts=3,
-        start_timeout_s=50.0,
+        wait_for_restarts=False,
         obs_size=16,
         seed=0,
     )
-    assert (env.timeout_s, env.max_restarts, env.start_timeout_s) == (7.0, 3, 50.0)
+    expected = {"timeout_s": 7.0, "max_restarts": 3, "wait_for_restarts": False}
+    assert env.workers == WorkerOptions(start_method="fork", **expected)
+    with pytest.raises(ConfigError, match=r"workers:\n  timeout_s: .* greater than 0"):
+        ba_torchrl.make_vector_env("close_loop/block_reaching", 1, timeout_s=0)
     assert isinstance(env.reset()["pixels"], torch.Tensor)
     env.close()

@@ -11,7 +11,7 @@ import pytest
 import torch
 from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
 
-import ba_torchrl
+from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector.make import VectorEnv
 from ba_torchrl.errors import WorkerError
 
@@ -150,7 +150,7 @@ def test_a_restart_that_succeeds_resets_the_count(make_fakes, tmp_path, caplog):
 @METHODS
 def test_deaths_at_the_first_start_are_retried_up_to_the_limit(tmp_path, method):
     factory = partial(FakeEnv, folder=tmp_path)
-    env = VectorEnv(2, factory, mp_start_method=method, max_restarts=1)
+    env = VectorEnv(2, factory, workers=WorkerOptions(start_method=method, max_restarts=1))
     (tmp_path / "build").write_text("kill")
     with pytest.raises(RuntimeError, match=r"failed 2 times without starting.*SIGKILL"):
         env.start()
@@ -171,11 +171,3 @@ def test_deaths_in_mid_step_end_at_the_limit(make_fakes, tmp_path, method):
     with pytest.raises(RuntimeError, match=r"worker \d failed 2 times without completing a step"):
         env.step_and_maybe_reset(act(env, state))
     assert env.is_closed
-
-
-def test_background_restarts_are_a_parameter_of_make_vector_env():
-    env = ba_torchrl.make_vector_env(
-        "close_loop/block_reaching", 1, start_method="fork", wait_for_restarts=False, obs_size=16
-    )
-    assert not env.wait_for_restarts
-    env.close()

@@ -19,7 +19,8 @@ import torch
 from fake_env import FakeEnv, act
 from torchrl.collectors import Collector
 
-from ba_torchrl.envs.vector.make import make_vector_env
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector.make import make_vector
 
 SECONDS = float(os.environ.get("BA_STORM_SECONDS", "60"))
 CALM_S = min(10.0, SECONDS)
@@ -98,16 +99,11 @@ def collect(steps, seconds, seen):
 @pytest.mark.parametrize("use_buffers", [True, False], ids=["buffers", "pipes"])
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 def test_no_transition_is_torn_or_duplicated_in_a_storm(method, use_buffers, tmp_path, capsys):
-    env = make_vector_env(
-        partial(SealedEnv, horizon=20, work_s=0.002),
-        NUM_ENVS,
-        seed=0,
-        start_method=method,
-        use_buffers=use_buffers,
-        timeout_s=2.0,
-        max_restarts=20,
-        wait_for_restarts=False,
+    workers = WorkerOptions(
+        start_method=method, timeout_s=2.0, max_restarts=20, wait_for_restarts=False
     )
+    factory = partial(SealedEnv, horizon=20, work_s=0.002)
+    env = make_vector(factory, NUM_ENVS, seed=0, workers=workers, use_buffers=use_buffers)
     collector = Collector(
         env,
         lambda td: act(env, td, value=torch.rand(()).item()),

@@ -11,12 +11,15 @@ from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
 from torchrl.collectors import Collector
 
 import ba_torchrl
+from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector.make import (
     SerialVectorEnv,
     VectorEnv,
     available_cores,
-    make_vector_env,
+    make_vector,
 )
+
+FORK = WorkerOptions(start_method="fork")
 
 
 class TestSeeds:
@@ -176,7 +179,7 @@ class TestResources:
     @BUFFERS
     def test_restarts_and_close_leak_nothing(self, use_buffers):
         def live():
-            env = make_vector_env(FakeEnv, 2, seed=0, start_method="fork", use_buffers=use_buffers)
+            env = make_vector(FakeEnv, 2, seed=0, workers=FORK, use_buffers=use_buffers)
             state = env.reset()
             for _ in range(4):
                 os.kill(env.worker_pids[0], signal.SIGKILL)
@@ -221,9 +224,9 @@ class TestResources:
 
 def test_refuses_impossible_sizes():
     with pytest.raises(ValueError, match="at least 1"):
-        make_vector_env(FakeEnv, 0)
+        make_vector(FakeEnv, 0)
     with pytest.raises(ValueError, match="2 functions were given for 3"):
-        make_vector_env([FakeEnv, FakeEnv], 3)
+        make_vector([FakeEnv, FakeEnv], 3)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +264,7 @@ def test_available_cores_are_those_of_the_process():
 
 def test_takes_a_function_per_environment(make_fakes):
     factories = [partial(FakeEnv, horizon=2), partial(FakeEnv, horizon=3)]
-    env = make_vector_env(factories, 2, seed=0, start_method="fork")
+    env = make_vector(factories, 2, seed=0, workers=FORK)
     try:
         rollout = env.rollout(3, break_when_any_done=False)
         assert rollout["next", "truncated"].squeeze(-1).tolist() == [
@@ -276,7 +279,7 @@ def test_refuses_environments_that_cannot_report_a_fault():
     from torchrl.envs import GymEnv
 
     with pytest.raises(ValueError, match="fault"):
-        VectorEnv(1, partial(GymEnv, "CartPole-v1"), mp_start_method="fork")
+        VectorEnv(1, partial(GymEnv, "CartPole-v1"), workers=FORK)
 
 
 def test_closing_serial_environments_keeps_the_number_of_threads(monkeypatch):

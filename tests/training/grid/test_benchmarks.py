@@ -67,7 +67,7 @@ def test_close_loop_benchmarks_have_the_appendix_or_reference_values(name, actio
     assert {run.benchmark for run in runs} == {name}
     assert {run.run_dir.split("/")[1] for run in runs} == {name}
     for run in runs:
-        env, algorithm = run.env_config, run.algorithm_config
+        env, algorithm = run.resolved_env.config, run.algorithm_config
         assert (env.action_sequence, env.random_orientation) == (actions, turned)
         pretraining, size = (1600, 142) if "ferm" in run.label else (0, 128)
         assert (env.robot, env.obs_size, run.num_envs) == ("kuka", size, 5)
@@ -110,7 +110,7 @@ def test_overrides_make_a_small_budget():
         "folder=somewhere",
     )
     cnn, equi = runs
-    assert (cnn.total_updates, cnn.env_config.obs_size) == (600, 64)
+    assert (cnn.total_updates, cnn.resolved_env.config.obs_size) == (600, 64)
     assert cnn.network_config.width == 0.5
     assert {run.network_config.depth_scale_m for run in runs} == {0.1}
     assert {run.algorithm_config.tau for run in runs} == {0.05}
@@ -140,7 +140,7 @@ def test_open_loop_benchmarks_have_the_values_of_the_appendix_or_the_reference(n
     assert {run.algorithm_config.gamma for run in runs} == {0.95}
     if name == "open_loop_3d":
         assert len(runs) == 12 * (5 + 3) * 4
-        assert {run.env_config.obs_size for run in runs if "rot_fcn" in run.label} == {90}
+        assert {run.resolved_env.config.obs_size for run in runs if "rot_fcn" in run.label} == {90}
         assert config.per_network["rot_fcn"] == {"env": {"obs_size": 90}}
         equi = [run.network_config for run in runs if run.network["name"] == "equi_asr"]
         assert {network.scene_head for network in equi} == {"flatten"}
@@ -158,7 +158,7 @@ def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_
     assert len(runs) == 9 * (2 + 3) * 4
     assert (common["total_updates"], common["eval_every"], common["num_envs"]) == (20_000, 500, 5)
     for run in runs:
-        env, network, algorithm = run.env_config, run.network_config, run.algorithm_config
+        env, network, algorithm = run.resolved_env.config, run.network_config, run.algorithm_config
         is_bump = run.task in bumps
         assert (env.action_sequence, env.in_hand_mode) == ("pxyzrrr", "proj")
         assert (env.obs_size, env.in_hand_size) == (128, 40 if is_bump else 24)

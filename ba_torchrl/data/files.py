@@ -1,8 +1,7 @@
-"""Folders of data: tensors as memory maps and values as JSON, with checksums, read without pickle.
+"""Folders of data: tensors in safetensors files and values in JSON, with checksums.
 
 `seal` writes ``checksums.json``, with length and CRC-32 of every file of a folder; `check` compares
-the folder with it. Both refuse files of other types, so that TorchRL's and TensorDict's readers,
-which unpickle some of them, find none.
+the folder with it. No file of another type is opened, so that none can run code.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping
@@ -18,27 +18,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from torchrl.checkpoint import StateDictCheckpointAdapter
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 
-from ba_torchrl.errors import ConfigError, DamagedFilesError, as_os_error
+from ba_torchrl.errors import ConfigError, DamagedFilesError
 
 OLD = ".old"
 """Suffix of a folder that `publish` replaces."""
 CHECKSUMS_FILE = "checksums.json"
-_DATA_SUFFIXES = frozenset({".json", ".memmap"})
+_DATA_SUFFIXES = frozenset({".json", ".safetensors"})
+_TENSORS_FILE, _VALUES_FILE = "tensors.safetensors", "values.json"
 _CHUNK = 1 << 20
-_LOAD_ERRORS = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
-"""What the readers of JSON, tensors and TensorDicts raise for files of another content."""
-_RESERVE = 10_000_000
-"""Bytes for all files besides the tensors, and for tensors that take whole blocks."""
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -66,7 +56,7 @@ def seal(folder: str | Path) -> None:
     """Write the checksums of a folder's files, and wait until all of them are on the disk.
 
     Raises:
-        ConfigError: a file is neither a memory map nor JSON.
+        ConfigError: a file is neither safetensors nor JSON.
     """
     folder = Path(folder)
     (folder / CHECKSUMS_FILE).unlink(missing_ok=True)
@@ -93,7 +83,7 @@ def check(folder: str | Path) -> None:
     Raises:
         DamagedFilesError: a file is missing, shorter, altered or not listed; or there are no
             checksums.
-        ConfigError: a file is neither a memory map nor JSON.
+        ConfigError: a file is neither safetensors nor JSON.
     """
     folder = Path(folder)
     try:
@@ -118,7 +108,7 @@ def check(folder: str | Path) -> None:
             raise DamagedFilesError(f"{path} was altered: its checksum differs")
 
 
-def write_state(folder: str | Path, state: dict[str, Any]) -> None:
+def write_state(folder: str | Path, state: Mapping[str, Any]) -> None:
     """Write a nested state of tensors and plain values into a folder, without checksums.
 
     Args:
@@ -127,30 +117,74 @@ def write_state(folder: str | Path, state: dict[str, Any]) -> None:
 
     Raises:
         OSError: there is not enough space, or a file cannot be written.
+        TypeError: a value is neither a tensor, an array nor plain.
     """
-    check_space(folder, state)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors: dict[str, torch.Tensor] = {}
+    values = _encoded(state, tensors)
+    (folder / _VALUES_FILE).write_text(json.dumps(values) + "\n", encoding="utf-8")
     try:
-        _ADAPTER.save(_State(state), Path(folder), args=(), kwargs={})
-    except RuntimeError as error:
-        raise as_os_error(error) or error from None
+        save_file(tensors, folder / _TENSORS_FILE)
+    except SafetensorError as error:
+        number = re.search(r"os error (\d+)", str(error))
+        code = int(number[1]) if number else errno.EIO
+        raise OSError(code, os.strerror(code), str(folder / _TENSORS_FILE)) from error
 
 
 def read_state(folder: str | Path) -> dict[str, Any]:
     """Return a state that `write_state` wrote, with its tensors on the CPU.
 
     Raises:
-        ConfigError: a file is neither a memory map nor JSON.
         DamagedFilesError: the files are not a state.
     """
     folder = Path(folder)
-    for _ in _files(folder):  # refuses what TensorDict would unpickle
-        pass
-    holder = _State({})
     try:
-        _ADAPTER.load(holder, folder, map_location="cpu", tensor_load_kwargs={}, args=(), kwargs={})
-    except _LOAD_ERRORS as error:
-        raise _not_a_state(folder, error) from error
-    return holder.state
+        values = json.loads((folder / _VALUES_FILE).read_text(encoding="utf-8"))
+        with safe_open(folder / _TENSORS_FILE, framework="pt") as file:
+            # copies, as the file may be deleted or altered while they are in use
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+        return dict(_decoded(values, tensors))
+    except (OSError, ValueError, LookupError, TypeError, SafetensorError, RecursionError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise DamagedFilesError(
+            f"{folder} does not hold a state: {type(error).__name__}: {reason}"
+        ) from error
+
+
+def _encoded(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    """Return a state as JSON values, and collect its tensors under the names that it has there."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, list):
+        return [_encoded(item, tensors) for item in value]
+    if isinstance(value, tuple):
+        return {"tuple": [_encoded(item, tensors) for item in value]}
+    if isinstance(value, Mapping):
+        pairs = value.items()
+        return {"dict": [[_encoded(key, tensors), _encoded(item, tensors)] for key, item in pairs]}
+    if not isinstance(value, torch.Tensor | np.ndarray):
+        raise TypeError(f"a state holds tensors and plain values, not {type(value).__name__}")
+    kind, name = "array" if isinstance(value, np.ndarray) else "tensor", str(len(tensors))
+    # a copy, since safetensors refuses tensors that share memory
+    tensors[name] = torch.as_tensor(value).detach().to("cpu", copy=True).contiguous()
+    return {kind: name}
+
+
+def _decoded(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    """Return the state of which `_encoded` returned the values."""
+    if isinstance(value, list):
+        return [_decoded(item, tensors) for item in value]
+    if not isinstance(value, dict):
+        return value
+    ((kind, content),) = value.items()
+    if kind == "tuple":
+        return tuple(_decoded(item, tensors) for item in content)
+    if kind == "dict":
+        return {_decoded(key, tensors): _decoded(item, tensors) for key, item in content}
+    if kind not in ("tensor", "array"):
+        raise ValueError(f"unknown kind of value {kind!r}")
+    return tensors[content] if kind == "tensor" else tensors[content].numpy()
 
 
 class StateFolder:
@@ -171,61 +205,10 @@ class StateFolder:
         """Read a folder that ``dumps`` wrote.
 
         Raises:
-            ConfigError: a file is neither a memory map nor JSON.
+            ConfigError: a file is neither safetensors nor JSON.
             DamagedFilesError: the files are not a state.
         """
         self.load_state_dict(read_state(path))
-
-
-def _not_a_state(folder: Path, error: Exception) -> DamagedFilesError:
-    reason = (str(error).splitlines() or [""])[0]
-    return DamagedFilesError(f"{folder} does not hold a state: {type(error).__name__}: {reason}")
-
-
-def check_space(folder: str | Path, state: Any) -> None:
-    """Check that the tensors of a state fit on the disk.
-
-    Writing a memory map to a full disk would end the process (SIGBUS).
-
-    Args:
-        folder: which need not exist.
-        state: nested dictionaries and sequences with tensors.
-
-    Raises:
-        OSError: there is not enough space.
-    """
-    existing = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
-    needed, free = _bytes(state) + _RESERVE, shutil.disk_usage(existing).free
-    if needed > free:
-        raise OSError(
-            errno.ENOSPC,
-            f"{needed / 1e6:.0f} MB are needed, {free / 1e6:.0f} MB are free",
-            str(existing),
-        )
-
-
-def _bytes(state: Any) -> int:
-    if isinstance(state, torch.Tensor | np.ndarray):
-        return state.nbytes
-    if isinstance(state, Mapping):
-        return sum(map(_bytes, state.values()))
-    return sum(map(_bytes, state)) if isinstance(state, list | tuple) else 0
-
-
-class _State:
-    """The interface that TorchRL's adapter saves and loads."""
-
-    def __init__(self, state: dict[str, Any]) -> None:
-        self.state = state
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.state
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.state = state
-
-
-_ADAPTER = StateDictCheckpointAdapter("directory")
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -1,13 +1,16 @@
 """Checksums of folders, atomic text files, and states without pickle."""
 
+import errno
 import json
 import os
 
+import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 
-from ba_torchrl.data import state_files
-from ba_torchrl.data.state_files import (
+from ba_torchrl.data import files
+from ba_torchrl.data.files import (
     CHECKSUMS_FILE,
     check,
     publish,
@@ -18,10 +21,13 @@ from ba_torchrl.data.state_files import (
 )
 from ba_torchrl.errors import ConfigError, DamagedFilesError
 
+weights = torch.arange(6.0).reshape(2, 3)
 STATE = {
-    "weights": torch.arange(6.0).reshape(2, 3),
+    "weights": weights,
     "empty": torch.zeros(0, dtype=torch.uint8),
-    "nested": {"step": 3, "largest": (0.25, 7), "rows": [True, None, "text"]},
+    "shared": (weights, weights[1], weights.T),
+    "generator": ("MT19937", np.arange(3, dtype=np.uint32)),
+    "nested": {"step": 3, "largest": (0.25, 7), "rows": [True, None, "text"], 5: {}},
 }
 
 
@@ -34,7 +40,7 @@ def folder(tmp_path):
 
 
 def weights_of(folder):
-    return max(folder.rglob("*.memmap"), key=lambda path: path.stat().st_size)
+    return max(folder.rglob("*.safetensors"), key=lambda path: path.stat().st_size)
 
 
 def test_a_state_is_read_as_it_was_written(folder):
@@ -43,7 +49,13 @@ def test_a_state_is_read_as_it_was_written(folder):
     assert torch.equal(state["weights"], STATE["weights"])
     assert state["empty"].shape == (0,)
     assert state["nested"] == STATE["nested"]
-    assert {path.suffix for path in folder.rglob("*") if path.is_file()} == {".json", ".memmap"}
+    assert all(map(torch.equal, state["shared"], STATE["shared"]))
+    name, numbers = state["generator"]
+    assert (name, numbers.dtype, numbers.tolist()) == ("MT19937", np.uint32, [0, 1, 2])
+    assert {path.suffix for path in folder.rglob("*") if path.is_file()} == {
+        ".json",
+        ".safetensors",
+    }
 
 
 def test_the_tensors_read_do_not_depend_on_the_files(folder):
@@ -54,8 +66,9 @@ def test_the_tensors_read_do_not_depend_on_the_files(folder):
 
 def cut_in_half(folder):
     path = weights_of(folder)
-    os.truncate(path, path.stat().st_size // 2)
-    return "12 bytes, 24 were written"
+    size = path.stat().st_size
+    os.truncate(path, size // 2)
+    return f"has {path.stat().st_size} bytes, {size} were written"
 
 
 def flip_one_bit(folder):
@@ -72,7 +85,7 @@ def delete_one(folder):
 
 
 def add_one(folder):
-    (folder / "more.memmap").write_bytes(b"abc")
+    (folder / "more.safetensors").write_bytes(b"abc")
     return "is not listed"
 
 
@@ -113,9 +126,24 @@ def test_damage_is_found_and_named(folder, damage):
 @pytest.mark.parametrize("name", ["other.pickle", "state.pt", "prefetch.pkl", "state.tdz"])
 def test_files_that_a_library_would_unpickle_are_refused(folder, name):
     (folder / "part" / name).write_bytes(b"")
-    for opened in (check, lambda path: read_state(path / "part"), seal):
+    for opened in (check, seal):
         with pytest.raises(ConfigError, match="is not opened"):
             opened(folder)
+
+
+def test_a_full_disk_is_an_error_of_the_system(tmp_path, monkeypatch):
+    def full(*_):
+        raise SafetensorError("Error while serializing: I/O error: No space left (os error 28)")
+
+    monkeypatch.setattr(files, "save_file", full)
+    with pytest.raises(OSError, match="No space left on device") as error:
+        write_state(tmp_path / "state", STATE)
+    assert error.value.errno == errno.ENOSPC
+
+
+def test_other_values_are_no_state(tmp_path):
+    with pytest.raises(TypeError, match="not set"):
+        write_state(tmp_path / "state", {"names": {"a"}})
 
 
 def test_links_are_refused(folder, tmp_path):
@@ -139,7 +167,7 @@ def test_a_published_folder_replaces_the_one_before(folder, tmp_path):
 def test_a_text_file_is_whole_or_not_there(tmp_path, monkeypatch):
     path = tmp_path / "result.json"
     write_text(path, "{}\n")
-    monkeypatch.setattr(state_files.os, "fsync", lambda _: (_ for _ in ()).throw(OSError("full")))
+    monkeypatch.setattr(files.os, "fsync", lambda _: (_ for _ in ()).throw(OSError("full")))
     with pytest.raises(OSError, match="full"):
         write_text(path, "x" * 100)
     assert json.loads(path.read_text()) == {}
