@@ -28,7 +28,8 @@ def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigEr
             lines.append(f"unknown parameter {field!r}.{hint} Known: {', '.join(known)}")
         else:
             message = item["msg"].removeprefix("Value error, ")
-            lines.append(f"{field}: {message} (got {item['input']!r})")
+            given = repr(item["input"])
+            lines.append(f"{field}: {message}" + (f" (got {given})" if len(given) < 80 else ""))
     return ConfigError(f"invalid {what}:\n  " + "\n  ".join(lines))
 
 

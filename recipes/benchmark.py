@@ -15,15 +15,13 @@ from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
 
-from ba_torchrl.config import parse
+from ba_torchrl.config import StrictModel, parse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.command_line import (
-    check_counts,
-    check_flags,
-    check_texts,
     check_writable_folder,
     plain_errors,
     register_schemas,
@@ -35,17 +33,21 @@ from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 register_schemas()
 
 
+class Settings(StrictModel):
+    """Settings of this command besides those of the grid and its runs."""
+
+    dry_run: bool
+    only: int | None = Field(ge=0)
+
+
 @hydra.main(config_path="../configs", config_name="benchmark", version_base="1.3")
 @plain_errors
 def main(settings: DictConfig) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
     limit_library_logs()
-    check_flags(settings, "dry_run")
-    check_texts(settings, "folder")
-    if settings.only is not None:
-        check_counts(settings, "only", least=0)
     values = OmegaConf.to_container(settings, resolve=True)
-    dry_run, only = values.pop("dry_run"), values.pop("only")
+    own = parse(Settings, {name: values.pop(name) for name in Settings.model_fields}, "settings")
+    dry_run, only = own.dry_run, own.only
     grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields if name in values}
     config = parse(BenchmarkConfig, grid, "benchmark")
     if not dry_run:

@@ -9,49 +9,52 @@ from ba_torchrl._malloc import tune_malloc
 
 tune_malloc()  # before torch allocates anything
 
+from typing import Literal  # noqa: E402
+
 import hydra  # noqa: E402
-from omegaconf import DictConfig  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
 from ba_torchrl.algorithms.seeds import SeedUse  # noqa: E402
-from ba_torchrl.envs.vector.make import MAX_ENVS  # noqa: E402
-from ba_torchrl.plugins import load_plugins  # noqa: E402
-from ba_torchrl.record.logging import limit_library_logs, progress_bar  # noqa: E402
-from ba_torchrl.record.video import check_video, write_video  # noqa: E402
+from ba_torchrl.config import StrictModel  # noqa: E402
+from ba_torchrl.record.logging import progress_bar  # noqa: E402
+from ba_torchrl.record.video import write_video  # noqa: E402
 from ba_torchrl.training.agreement import agreement_table, check_comparable  # noqa: E402
 from ba_torchrl.training.checkpoint import find_checkpoint, load  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
-    check_counts,
-    check_flags,
-    check_known,
-    check_seed,
-    check_texts,
-    check_writable_file,
-    plain_errors,
+    Count,
+    NumEnvs,
+    Plugins,
+    Seed,
+    Text,
+    VideoFile,
+    command,
 )
 from ba_torchrl.training.evaluation import acting_on, evaluate, record_episodes  # noqa: E402
 
 FPS = 5
 
 
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins
+    checkpoint: Text
+    which: Literal["best", "latest"]
+    device: Text
+    episodes: Count
+    num_envs: NumEnvs
+    expert: bool
+    parallel: bool | None
+    seed: Seed | None
+    video: VideoFile | None
+    video_episodes: Count
+
+
 @hydra.main(config_path="../configs", config_name="evaluate", version_base="1.3")
-@plain_errors
-def main(settings: DictConfig) -> None:
+@command(Settings)
+def main(settings: Settings) -> None:
     """Play greedy episodes with the policy of a checkpoint."""
-    limit_library_logs()
-    check_known(settings)
-    load_plugins(settings.plugins)
-    check_texts(settings, "checkpoint", "which", "device")
-    check_texts(settings, "video", optional=True)
-    check_counts(settings, "episodes", "video_episodes")
-    check_counts(settings, "num_envs", most=MAX_ENVS)
-    check_flags(settings, "parallel", optional=True)
-    check_flags(settings, "expert")
-    check_seed(settings, optional=True)
-    if settings.video is not None:
-        check_video(settings.video, FPS)
-        check_writable_file(settings.video)
     checkpoint = find_checkpoint(settings.checkpoint, settings.which)
     config, algorithm = load(checkpoint, device=settings.device)
     if settings.expert:

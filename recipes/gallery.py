@@ -8,40 +8,39 @@ python recipes/gallery.py tasks=[close_loop/block_picking] folder=pictures overv
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
-from ba_torchrl.plugins import load_plugins
+from ba_torchrl.config import StrictModel
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
 from ba_torchrl.training.command_line import (
-    check_counts,
-    check_deconstructions,
-    check_known,
-    check_seed,
-    check_tasks,
-    check_texts,
-    check_writable_file,
-    check_writable_folder,
-    plain_errors,
+    Count,
+    OutputFolder,
+    Plugins,
+    PngFile,
+    Seed,
+    Structures,
+    Tasks,
+    command,
 )
 
 
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins
+    tasks: Tasks
+    deconstructions: Structures
+    seed: Seed
+    pictures: Count
+    folder: OutputFolder
+    overview: PngFile | None
+
+
 @hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
-@plain_errors
-def main(settings: DictConfig) -> None:
+@command(Settings)
+def main(settings: Settings) -> None:
     """Play one episode per task and write its pictures."""
-    check_known(settings)
-    load_plugins(settings.plugins)
-    check_counts(settings, "pictures")
-    check_seed(settings)
-    check_tasks(settings)
-    check_deconstructions(settings, "deconstructions")
-    check_texts(settings, "folder")
-    check_texts(settings, "overview", optional=True)
-    check_writable_folder(settings.folder)
-    if settings.overview is not None:
-        check_writable_file(settings.overview, ".png")
     strips = {}
     for task in tqdm(settings.tasks or list_tasks(), unit="task"):
         strips[task] = expert_strip(task, settings.seed, settings.pictures)

@@ -5,54 +5,58 @@ python recipes/play.py task=close_loop/block_pushing policy=random episodes=3
 python recipes/play.py task=close_loop/corner_picking video=null env.render=true   # needs a display
 """
 
+from typing import Any, Literal
+
 import hydra
 import torch
-from omegaconf import DictConfig
+from pydantic import Field, field_validator
 
+from ba_torchrl.config import StrictModel
 from ba_torchrl.data.demos import expert_policy
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import load_plugins
-from ba_torchrl.record.logging import limit_library_logs
-from ba_torchrl.record.video import check_video, write_video
+from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
 from ba_torchrl.training.command_line import (
-    check_counts,
-    check_known,
-    check_seed,
-    check_texts,
-    check_writable_file,
-    env_of,
-    plain_errors,
+    Count,
+    Plugins,
+    Seed,
+    TaskId,
+    VideoFile,
+    command,
     register_schemas,
+    without,
 )
 from ba_torchrl.training.evaluation import record_episodes
-
-POLICIES = {"expert": expert_policy, "random": None}
 
 register_schemas()
 
 
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins
+    task: TaskId
+    env: dict[str, Any]
+    policy: Literal["expert", "random"]
+    episodes: Count
+    seed: Seed
+    video: VideoFile | None
+    fps: float = Field(ge=MIN_FPS, le=MAX_FPS)
+
+    @field_validator("env")
+    @classmethod
+    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
+        return without(env, seed="set seed", expert="set policy")
+
+
 @hydra.main(config_path="../configs", config_name="play", version_base="1.3")
-@plain_errors
-def main(settings: DictConfig) -> None:
+@command(Settings)
+def main(settings: Settings) -> None:
     """Play episodes and write a video of them."""
-    limit_library_logs()
-    check_known(settings)
-    load_plugins(settings.plugins)
-    check_texts(settings, "task", "policy")
-    check_texts(settings, "video", optional=True)
-    if settings.policy not in POLICIES:
-        raise ConfigError(f"policy: {settings.policy!r} is none of {', '.join(POLICIES)}")
-    check_counts(settings, "episodes")
-    check_seed(settings)
-    if settings.video is not None:
-        check_video(settings.video, settings.fps)
-        check_writable_file(settings.video)
-    env = env_of(settings, seed="seed", expert="policy")
+    is_expert = settings.policy == "expert"
     torch.manual_seed(settings.seed)
     frames = record_episodes(
         settings.task,
-        {**env, "expert": settings.policy == "expert"},
-        POLICIES[settings.policy],
+        {**settings.env, "expert": is_expert},
+        expert_policy if is_expert else None,
         settings.episodes,
         settings.seed,
     )

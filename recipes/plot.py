@@ -7,37 +7,32 @@ import csv
 
 import hydra
 import numpy as np
-from omegaconf import DictConfig
 
+from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.training.checkpoint import read_config
-from ba_torchrl.training.command_line import (
-    check_known,
-    check_texts,
-    check_writable_file,
-    folders_of,
-    plain_errors,
-)
+from ba_torchrl.training.command_line import Folders, Plugins, PngFile, command
 
 RATE, ERROR = "eval/success_rate", "eval/standard_error"
 
 
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins
+    runs: Folders
+    path: PngFile
+    title: str
+
+
 @hydra.main(config_path="../configs", config_name="plot", version_base="1.3")
-@plain_errors
-def main(settings: DictConfig) -> None:
+@command(Settings)
+def main(settings: Settings) -> None:
     """Plot the success rate of the greedy policies against the updates."""
-    check_known(settings)
-    load_plugins(settings.plugins)
-    runs = folders_of(settings, "runs")
-    check_texts(settings, "path")
-    if not isinstance(settings.title, str):
-        raise ConfigError(f"title: must be text, got {settings.title!r}")
-    check_writable_file(settings.path, ".png")
     curves = {}
-    for run in runs:
+    for run in settings.runs:
         config = read_config(run, device="cpu")  # that of the run may not be here
         name = f"{config.label}, {config.task.split('/')[-1]}, seed {config.seed}"
         curves[name] = _curve(run)

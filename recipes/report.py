@@ -8,32 +8,30 @@ import sys
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
 
+from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import run_folders
-from ba_torchrl.training.command_line import (
-    check_known,
-    check_texts,
-    check_writable_folder,
-    folders_of,
-    plain_errors,
-)
+from ba_torchrl.training.command_line import Folders, OutputFolder, check_writable_folder, command
+
+
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    runs: Folders
+    folder: OutputFolder | None
 
 
 @hydra.main(config_path="../configs", config_name="report", version_base="1.3")
-@plain_errors
-def main(settings: DictConfig) -> None:
+@command(Settings)
+def main(settings: Settings) -> None:
     """Write the report and print its tables."""
-    check_known(settings)
-    roots = folders_of(settings, "runs")
-    check_texts(settings, "folder", optional=True)
-    folder = Path(settings.folder or Path(roots[0]) / "report")
-    if not run_folders(roots)[0]:
-        raise ConfigError(f"no finished run below {', '.join(roots)}")
+    folder = Path(settings.folder or Path(settings.runs[0]) / "report")
+    if not run_folders(settings.runs)[0]:
+        raise ConfigError(f"no finished run below {', '.join(settings.runs)}")
     check_writable_folder(folder)
-    page = write_report(roots, folder)
+    page = write_report(settings.runs, folder)
     print((page.parent / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
     print(f"  tables  {page.parent / 'table.csv'}, {page.parent / 'table.md'}")

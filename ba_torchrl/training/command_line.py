@@ -1,4 +1,4 @@
-"""What recipes check before their work starts, and how they report errors of configuration."""
+"""Settings of commands as validated models, and how commands report errors of configuration."""
 
 from __future__ import annotations
 
@@ -8,19 +8,22 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from ba_torchrl.config import MAX_SEED
+from ba_torchrl.config import MAX_SEED, Model, parse
 from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError, as_os_error
+from ba_torchrl.plugins import load_plugins
+from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
@@ -93,6 +96,28 @@ def plain_errors(main: Callable[[DictConfig], None]) -> Callable[[DictConfig], N
     return decorated
 
 
+def command(model: type[Model]) -> Callable[..., Callable[[DictConfig], None]]:
+    """Decorate the main function of a command: its settings are validated before it starts.
+
+    Errors are printed as by `plain_errors`.
+
+    Args:
+        model: the settings; the function gets an instance.
+    """
+
+    def decorate(main: Callable[[Model], None]) -> Callable[[DictConfig], None]:
+        @functools.wraps(main)
+        @plain_errors
+        def decorated(settings: DictConfig) -> None:
+            limit_library_logs()
+            values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
+            main(parse(model, values, "settings"))
+
+        return decorated
+
+    return decorate
+
+
 def _name_presets(message: str, settings: DictConfig) -> str:
     """Return a message in which algorithm and network have the names of their presets."""
     if not HydraConfig.initialized():
@@ -104,204 +129,40 @@ def _name_presets(message: str, settings: DictConfig) -> str:
     return message
 
 
-def check_known(settings: DictConfig) -> None:
-    """Check that a recipe has all settings that the command line adds to its configuration.
+def checked(check: Callable[[Any], Any]) -> AfterValidator:
+    """Return the annotation of a field whose value is kept if ``check`` raises no `ConfigError`."""
+
+    def validate(value: Any) -> Any:
+        check(value)
+        return value
+
+    return AfterValidator(validate)
+
+
+def without(values: dict[str, Any], **reserved: str) -> dict[str, Any]:
+    """Return fields of `EnvConfig`, none of which the command sets itself.
 
     Args:
-        settings: of the recipe, within its main function.
+        values: the fields.
+        reserved: by the name of each field that the command sets, what to do instead.
 
     Raises:
-        ConfigError: a setting is unknown.
+        ConfigError: one of them is given.
     """
-    if not HydraConfig.initialized():  # called from Python, without a command line
-        return
-    started = HydraConfig.get()
-    if not any(each.startswith("+") for each in started.overrides.task):
-        return
-    known = {str(name) for name in compose(started.job.config_name)}
-    unknown = [str(name) for name in settings if name not in known]
-    if unknown:
-        raise ConfigError(f"unknown setting {unknown[0]!r}. Known: {', '.join(sorted(known))}")
-
-
-def check_counts(
-    settings: DictConfig, *names: str, least: int = 1, most: int | None = None
-) -> None:
-    """Check that settings are whole numbers.
-
-    Args:
-        settings: of the recipe.
-        names: of the settings.
-        least: smallest value.
-        most: largest value; None for no limit.
-
-    Raises:
-        ConfigError: one of them is not, or is too small or too large.
-    """
-    wanted = f"of at least {least}" if most is None else f"from {least} to {most}"
-    for name in names:
-        value: Any = settings[name]
-        is_number = isinstance(value, int) and not isinstance(value, bool)
-        if not is_number or value < least or (most is not None and value > most):
-            raise ConfigError(f"{name}: must be a whole number {wanted}, got {value!r}")
-
-
-def check_flags(settings: DictConfig, *names: str, optional: bool = False) -> None:
-    """Check that settings are true or false.
-
-    Args:
-        settings: of the recipe.
-        names: of the settings.
-        optional: allow None.
-
-    Raises:
-        ConfigError: one of them is neither.
-    """
-    for name in names:
-        value = settings[name]
-        if not isinstance(value, bool) and not (optional and value is None):
-            allowed = "true, false or null" if optional else "true or false"
-            raise ConfigError(f"{name}: must be {allowed}, got {value!r}")
-
-
-def check_seed(settings: DictConfig, *, optional: bool = False) -> None:
-    """Check the setting ``seed``.
-
-    Args:
-        settings: of the recipe.
-        optional: allow None.
-
-    Raises:
-        ConfigError: it is not a whole number from zero to `MAX_SEED`.
-    """
-    value: Any = settings.seed
-    if optional and value is None:
-        return
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEED:
-        raise ConfigError(f"seed: must be a whole number from 0 to {MAX_SEED}, got {value!r}")
-
-
-def check_texts(settings: DictConfig, *names: str, optional: bool = False) -> None:
-    """Check that settings are text, such as a path or the id of a task.
-
-    Args:
-        settings: of the recipe.
-        names: of the settings.
-        optional: allow None.
-
-    Raises:
-        ConfigError: one of them is not, or is empty.
-    """
-    for name in names:
-        value = settings[name]
-        if not (optional and value is None) and not (isinstance(value, str) and value):
-            raise ConfigError(f"{name}: must be text, got {value!r}")
-
-
-def check_lists(settings: DictConfig, *names: str, optional: bool = False, least: int = 0) -> None:
-    """Check that settings are lists of text.
-
-    Args:
-        settings: of the recipe.
-        names: of the settings.
-        optional: allow None.
-        least: smallest number of names in the list.
-
-    Raises:
-        ConfigError: one of them is not, or has too few names.
-    """
-    for name in names:
-        value = settings[name]
-        if optional and value is None:
-            continue
-        if not isinstance(value, ListConfig) or not all(isinstance(item, str) for item in value):
-            raise ConfigError(f"{name}: must be a list of names, got {value!r}")
-        if len(value) < least:
-            raise ConfigError(f"{name}: the list is empty")
-
-
-def check_tasks(settings: DictConfig, name: str = "tasks") -> None:
-    """Check that a setting is None, or a list of ids of tasks that is not empty.
-
-    Args:
-        settings: of the recipe.
-        name: of the setting.
-
-    Raises:
-        ConfigError: it is something else, or a task is unknown.
-    """
-    check_lists(settings, name, optional=True, least=1)
-    for task in settings[name] or ():
-        _ = TASKS[task]  # raises with the known names
-
-
-def check_deconstructions(settings: DictConfig, name: str) -> None:
-    """Check that a setting is a list of ids of tasks whose structures can be deconstructed.
-
-    Args:
-        settings: of the recipe.
-        name: of the setting.
-
-    Raises:
-        ConfigError: it is something else, or one of the tasks has no such structure.
-    """
-    check_lists(settings, name)
-    for task in settings[name]:
-        _ = resolve_env(task, {"deconstruct": True})
-
-
-def folders_of(settings: DictConfig, name: str) -> list[str]:
-    """Return a setting that is a folder or a list of folders.
-
-    Args:
-        settings: of the recipe.
-        name: of the setting.
-
-    Raises:
-        ConfigError: it is something else, the list is empty, or a folder does not exist.
-    """
-    value = settings[name]
-    folders = [value] if isinstance(value, str) else value
-    is_list = isinstance(folders, list | ListConfig) and len(folders) > 0
-    if not is_list or not all(isinstance(folder, str) and folder for folder in folders):
-        raise ConfigError(f"{name}: must be a folder or a list of folders, got {value!r}")
-    for folder in folders:
-        if not os.path.isdir(folder):  # False also if the name is too long
-            raise ConfigError(f"{name}: there is no folder {folder}")
-    return list(folders)
-
-
-def mapping_of(settings: DictConfig, name: str) -> dict[str, Any]:
-    """Return a group of settings as a dictionary.
-
-    Args:
-        settings: of the recipe.
-        name: of the group, such as "env".
-
-    Raises:
-        ConfigError: it is not a group.
-    """
-    value = settings[name]
-    if not isinstance(value, DictConfig):
-        raise ConfigError(f"{name}: must be a group of settings, got {value!r}")
-    return OmegaConf.to_container(value, resolve=True)
-
-
-def env_of(settings: DictConfig, **reserved: str) -> dict[str, Any]:
-    """Return the fields of `EnvConfig` in the group ``env``.
-
-    Args:
-        settings: of the recipe.
-        reserved: by field that the recipe sets itself, what to set in its place.
-
-    Raises:
-        ConfigError: it is not a group, or a reserved field is set.
-    """
-    env = mapping_of(settings, "env")
     for name, instead in reserved.items():
-        if name in env:
-            raise ConfigError(f"env.{name} is set by the recipe; leave it out, and set {instead}")
-    return env
+        if name in values:
+            raise ConfigError(f"{name} is set by the command; leave it out, and {instead}")
+    return values
+
+
+def _is_new(path: str) -> None:
+    if os.path.exists(path):
+        raise ConfigError(f"{path} exists already; choose another path")
+
+
+def _folder_exists(path: str) -> None:
+    if not os.path.isdir(path):  # False also if the name is too long
+        raise ConfigError(f"there is no folder {path}")
 
 
 def check_writable_folder(folder: str | Path) -> None:
@@ -322,7 +183,7 @@ def check_writable_folder(folder: str | Path) -> None:
         raise ConfigError(f"cannot write to {folder!r}: {error}") from None
 
 
-def check_writable_file(path: str | Path, *suffixes: str) -> None:
+def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
     """Check that a file can be written; its folder is created if needed.
 
     Args:
@@ -333,7 +194,7 @@ def check_writable_file(path: str | Path, *suffixes: str) -> None:
         ConfigError: it cannot, its name has another end, or it is a folder.
     """
     path = Path(path)
-    if suffixes and path.suffix not in suffixes:
+    if suffixes and path.suffix.lower() not in suffixes:
         raise ConfigError(f"the name of the file ends in {' or '.join(suffixes)}, not {path.name}")
     if len(os.fsencode(path.name)) > MAX_NAME_BYTES:
         raise ConfigError(f"cannot write to {_short(path)}: the name is too long")
@@ -342,6 +203,32 @@ def check_writable_file(path: str | Path, *suffixes: str) -> None:
         raise ConfigError(f"cannot write to {path}: it is a folder; name a file")
     if os.path.exists(path) and not os.access(path, os.W_OK):
         raise ConfigError(f"cannot write to {path}: {os.strerror(errno.EACCES)}")
+
+
+Count = Annotated[int, Field(ge=1)]
+NumEnvs = Annotated[int, Field(ge=1, le=MAX_ENVS)]
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+Text = Annotated[str, Field(min_length=1)]
+Plugins = Annotated[list[str], checked(load_plugins)]
+"""Modules outside the package, imported at once; the first field of a model, as others use them."""
+TaskId = Annotated[str, checked(TASKS.__getitem__)]
+Tasks = Annotated[list[TaskId], Field(min_length=1)] | None
+"""Ids of tasks; None for all."""
+Folders = Annotated[
+    list[Annotated[Text, checked(_folder_exists)]],
+    Field(min_length=1),
+    BeforeValidator(lambda value: [value] if isinstance(value, str) else value),
+]
+"""Existing folders, or one."""
+OutputFolder = Annotated[Text, checked(check_writable_folder)]
+OutputFile = Annotated[Text, checked(check_writable_file)]
+NewPath = Annotated[Text, checked(_is_new), checked(check_writable_file)]
+PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(".png",)))]
+VideoFile = Annotated[
+    Text, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))
+]
+Structures = list[Annotated[str, checked(lambda task: resolve_env(task, {"deconstruct": True}))]]
+"""Ids of tasks whose structures can be deconstructed."""
 
 
 def _short(path: str | Path) -> str:

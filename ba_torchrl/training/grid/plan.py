@@ -44,7 +44,7 @@ class BenchmarkConfig(StrictModel):
 
     name: str
     """Of the benchmark, for reports."""
-    folder: str
+    folder: str = Field(min_length=1)
     """Of all its runs."""
     tasks: list[str] = Field(min_length=1)
     """Ids of tasks."""
