@@ -15,15 +15,6 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
 from ba_torchrl.plugins import load_plugins  # noqa: E402
-from ba_torchrl.profiling.comparison import columns_of_changes  # noqa: E402
-from ba_torchrl.profiling.speed_file import (  # noqa: E402
-    Machine,
-    SpeedFile,
-    check_output,
-    read_speed_file,
-    write_speed_file,
-)
-from ba_torchrl.profiling.table import COLUMNS, as_markdown, measure  # noqa: E402
 from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     check_counts,
@@ -34,6 +25,15 @@ from ba_torchrl.training.command_line import (  # noqa: E402
     plain_errors,
 )
 from ba_torchrl.training.config import usable_device  # noqa: E402
+from profiling.comparison import columns_of_changes  # noqa: E402
+from profiling.speed_file import (  # noqa: E402
+    Machine,
+    SpeedFile,
+    check_output,
+    read_speed_file,
+    write_speed_file,
+)
+from profiling.table import COLUMNS, as_markdown, measure  # noqa: E402
 
 
 @hydra.main(config_path="../configs", config_name="speed", version_base="1.3")

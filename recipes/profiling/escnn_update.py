@@ -23,13 +23,13 @@ from ba_torchrl.modules.equivariant import ActionFields
 from ba_torchrl.modules.gaussian_policy import UnitTanhNormal
 from ba_torchrl.modules.steerable import planar_rotations
 from ba_torchrl.modules.trunk import scale_from_log_std, trunk_stages
-from ba_torchrl.profiling.learning import (
+from profiling.learning import (
     CLOSE_LOOP,
     SEED,
     LearningUnit,
     make_learner,
 )
-from ba_torchrl.profiling.table import CPU, Bench, Row, measurement, timed_row
+from profiling.table import CPU, Bench, Row, measurement, timed_row
 
 if TYPE_CHECKING:
     from escnn.group import Representation

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.profiling.fingerprint.cases import PARTS
+from profiling.fingerprint.cases import PARTS
 
 
 class _Trace(BaseModel):
@@ -39,7 +39,6 @@ class _Record(BaseModel):
     model_config = ConfigDict(strict=True)
 
     parts: list[Literal[PARTS]]
-    tasks: list[str] | None
     versions: dict[str, str]
     cases: dict[str, _CaseRecord]
 
@@ -57,15 +56,11 @@ def read_record(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path} is not a record: {_reason(error)}") from None
-
-
-def _reason(error: Exception) -> str:
-    """Return the first line of an error, and where a schema is not met."""
-    if isinstance(error, ValidationError):
-        first = error.errors()[0]
-        return f"{'.'.join(map(str, first['loc'])) or 'content'}: {first['msg']}"
-    return str(error).splitlines()[0]
+        reason = str(error).splitlines()[0]
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            reason = f"{'.'.join(map(str, first['loc'])) or 'content'}: {first['msg']}"
+        raise ConfigError(f"{path} is not a record: {reason}") from None
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:

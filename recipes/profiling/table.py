@@ -21,7 +21,7 @@ from ba_torchrl.registry import Registry
 
 GROUPS = ("simulation", "learning", "throughput", "memory")
 
-MEASUREMENTS: Registry[Measurement] = Registry("measurement", "ba_torchrl.profiling")
+MEASUREMENTS: Registry[Measurement] = Registry("measurement", "profiling")
 
 WARM_UP = 3
 """Calls before the first timed one, which allocate memory."""

@@ -15,11 +15,11 @@ from torchrl.collectors import Collector
 
 from ba_torchrl.envs.factory import make_env
 from ba_torchrl.envs.vector.make import make_vector_env
-from ba_torchrl.profiling.simulation import SEED, SimulationUnit
-from ba_torchrl.profiling.table import Bench, Row, measurement
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collection import start_collection
 from ba_torchrl.training.config import ExperimentConfig
+from profiling.simulation import SEED, SimulationUnit
+from profiling.table import Bench, Row, measurement
 
 TASKS = ("close_loop/block_picking", "open_loop/block_stacking")
 NUM_ENVS = (1, 2, 5)

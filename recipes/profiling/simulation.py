@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 import pybullet
-import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from ba_torchrl import list_tasks, make
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
-from ba_torchrl.profiling.numpy_camera import NumpyHeightCamera
-from ba_torchrl.profiling.table import Bench, Budget, Row, measurement, seconds, timed_row
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.sloped_terrain import OnSlopes
+from profiling.table import Bench, Budget, Row, measurement, seconds, timed_row
 
 SEED = 0
 CAMERA_M = 1.0
-SLIP_TASKS = ("open_loop/block_stacking", "open_loop/bin_packing", "ramp/house_building_1")
 
 
 class SimulationUnit:
@@ -172,118 +161,31 @@ def seeded_reset(bench: Bench, task: str) -> list[Row]:
     return [timed_row(f"{task}, reset with a seed", "ms", resets, units)]
 
 
-class _Turn(NamedTuple):
-    """One step of each environment."""
-
-    times_s: tuple[float, ...]
-    physics: tuple[int, ...]
-    """Numbers of physics steps."""
-    states: tuple[TensorDictBase, ...]
-    unit_s: float
-    """Duration of a unit of work."""
-
-
-def _turns(
-    bench: Bench,
-    tasks: Sequence[str],
-    on_reset: Callable[[Sequence[ManipulationEnv]], None] = lambda _: None,
-    settings: Sequence[dict[str, Any]] = ({}, {}),
-) -> Iterator[_Turn]:
-    """Step one environment of each task in turns under the experts' actions.
-
-    The order of the environments is reversed after each turn.
-
-    Args:
-        bench: counts the episodes.
-        tasks: of the environments; the shortest episode ends a round.
-        on_reset: called with the environments after each reset.
-        settings: of each environment.
-    """
-    with contextlib.ExitStack() as stack:
-        unit = SimulationUnit()
-        stack.callback(unit.world.close)
-        envs = [
-            make(task, seed=SEED, **values) for task, values in zip(tasks, settings, strict=True)
-        ]
-        for env in envs:
-            stack.callback(env.close)
-        played = {task: _expert_actions(task, bench.repeats) for task in dict.fromkeys(tasks)}
-        order = list(range(len(envs)))
-        for number in bench.rounds():
-            states = [env.reset() for env in envs]
-            on_reset(envs)
-            for actions in zip(*(played[task][number] for task in tasks), strict=False):
-                times, physics = [0.0] * len(envs), [0] * len(envs)
-                for i in order:
-                    states[i][keys.ACTION] = actions[i]
-                    before = envs[i].scene.world.steps
-                    start = time.perf_counter()
-                    result = envs[i].step(states[i])
-                    times[i] = time.perf_counter() - start
-                    physics[i] = envs[i].scene.world.steps - before
-                    states[i] = result[keys.NEXT]
-                order.reverse()
-                yield _Turn(tuple(times), tuple(physics), tuple(states), seconds(unit))
-
-
-def _on_level_ground(task: str) -> str:
-    return f"open_loop/{task.rpartition('/')[2]}"
-
-
-def _tasks_on_slopes() -> list[str]:
-    """Return the tasks on slopes of which there is another one on level ground."""
-    return [
-        task
-        for task in list_tasks()
-        if issubclass(TASKS[task], OnSlopes) and _on_level_ground(task) in TASKS
-    ]
-
-
-@measurement("simulation/terrain", over=lambda: zip(_tasks_on_slopes()))
-def step_on_slopes(bench: Bench, task: str) -> list[Row]:
-    """Times of steps on ramps or bumps, and in turns those of the same task on level ground."""
-    turns = list(_turns(bench, (task, _on_level_ground(task))))
-    units = [turn.unit_s for turn in turns]
-    on_slopes, level = zip(*(turn.times_s for turn in turns), strict=True)
-    steps, level_steps = np.mean([turn.physics for turn in turns], axis=0)
-    ratio = statistics.median(on_slopes) / statistics.median(level)
-    notes = f"{ratio:.2f} times that on level ground, {steps:.1f} physics steps per action"
-    level_notes = f"{level_steps:.1f} physics steps per action"
-    return [
-        timed_row(f"{task}, step", "ms", on_slopes, units, notes=notes),
-        timed_row(f"{task}, on level ground", "ms", level, units, notes=level_notes),
-    ]
-
-
-@measurement("simulation/slip_test", over=lambda: zip(SLIP_TASKS))
-def slip_test(bench: Bench, task: str) -> list[Row]:
-    """Times of steps with and without the test whether a held body slips, in turns.
-
-    The measurement ends when a body slips, since the states then differ.
-    """
-
-    def leave_out_second(envs: Sequence[ManipulationEnv]) -> None:
-        controller = envs[1].scene.controller
-        controller.limits = replace(controller.limits, max_slip_m=math.inf)
-
-    times, units = [], []
-    for turn in _turns(bench, (task, task), leave_out_second):
-        times.append(turn.times_s)
-        units.append(turn.unit_s)
-        if not torch.equal(*(state[keys.PIXELS] for state in turn.states)):
-            break
-    return [
-        timed_row(f"{task}, step {name} the slip test", "ms", values, units)
-        for name, values in zip(("with", "without"), zip(*times, strict=True), strict=True)
-    ]
-
-
 @measurement("simulation/expert", over=lambda: zip(list_tasks()))
 def expert_action(bench: Bench, task: str) -> list[Row]:
-    """Times of steps with and without the expert's next action, in turns."""
-    turns = list(_turns(bench, (task, task), settings=({"expert": True}, {})))
-    units = [turn.unit_s for turn in turns]
-    steps, plain = zip(*(turn.times_s for turn in turns), strict=True)
+    """Times of steps with and without the expert's next action, in turns.
+
+    The order of the two environments is reversed after each turn.
+    """
+    unit = SimulationUnit()
+    envs = [make(task, seed=SEED, expert=expert) for expert in (True, False)]
+    episodes = _expert_actions(task, bench.repeats)
+    times: list[list[float]] = [[], []]
+    units = []
+    for number in bench.rounds():
+        states = [env.reset() for env in envs]
+        for turn, action in enumerate(episodes[number]):
+            for i in (0, 1) if turn % 2 else (1, 0):
+                states[i][keys.ACTION] = action
+                start = time.perf_counter()
+                result = envs[i].step(states[i])
+                times[i].append(time.perf_counter() - start)
+                states[i] = result[keys.NEXT]
+            units.append(seconds(unit))
+    for env in envs:
+        env.close()
+    unit.world.close()
+    steps, plain = times
     notes = f"the action takes {1e3 * (statistics.mean(steps) - statistics.mean(plain)):.2f} ms"
     return [
         timed_row(f"{task}, step with the expert's action", "ms", steps, units, notes=notes),
@@ -293,10 +195,10 @@ def expert_action(bench: Bench, task: str) -> list[Row]:
 
 @measurement("simulation/depth_image")
 def depth_image(bench: Bench) -> list[Row]:
-    """Times of an image of four cubes at 128 x 128: compiled, NumPy and PyBullet."""
+    """Times of an image of four cubes at 128 x 128, by the compiled kernels and by PyBullet."""
     unit = SimulationUnit()
     center, side_m, pixels = (0.45, 0.0), 0.45, 128
-    camera, plain = HeightCamera(unit.bodies), NumpyHeightCamera(unit.bodies)
+    camera = HeightCamera(unit.bodies)
     # the camera does not draw an unchanged image again
     centers = itertools.cycle([center, (center[0] + side_m / pixels, center[1])])
     view, projection = _looking_down(center, side_m)
@@ -311,32 +213,21 @@ def depth_image(bench: Bench) -> list[Row]:
             physicsClientId=unit.world.client,
         )
 
+    calls = {
+        "compiled": lambda: camera.heightmap(next(centers), side_m, pixels),
+        "TinyRenderer, arm and floor visible": tiny_renderer,
+    }
+    times = bench.time_against({"unit": unit}, calls, repeats=10)
     heights = camera.heightmap(center, side_m, pixels)
-    np.testing.assert_allclose(plain.heightmap(center, side_m, pixels), heights, atol=1e-12)
-    times = bench.time_against(
-        {"unit": unit},
-        {
-            "compiled": lambda: camera.heightmap(next(centers), side_m, pixels),
-            "NumPy": lambda: plain.heightmap(center, side_m, pixels),
-            "TinyRenderer, arm and floor visible": tiny_renderer,
-        },
-        repeats=10,
-    )
-    units = times.pop("unit")
     cubes = [body.id for body in unit.bodies]
     pybullet.removeBody(unit.robot.id, physicsClientId=unit.world.client)  # the arm occludes cubes
     drawn = np.isin(np.reshape(tiny_renderer()[4], (pixels, pixels)), cubes)
     off = int((drawn != (heights > 0)).sum())
     unit.world.close()
-    notes = {
-        "NumPy": "equal to the compiled one within 1e-12 m",
-        "TinyRenderer, arm and floor visible": (
-            f"{off} pixels differ at the edges of {int((heights > 0).sum())}"
-        ),
-    }
+    differing = f"{off} pixels differ at the edges of {int((heights > 0).sum())}"
     return [
-        timed_row(f"depth image, 128 px, {name}", "ms", values, units, notes=notes.get(name, ""))
-        for name, values in times.items()
+        timed_row(f"depth image, 128 px, {name}", "ms", times[name], times["unit"], notes=notes)
+        for name, notes in zip(calls, ("", differing), strict=True)
     ]
 
 

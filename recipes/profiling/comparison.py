@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import bootstrap
 
-from ba_torchrl.profiling.table import SECONDS, Row, digits
+from profiling.table import SECONDS, Row, digits
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
@@ -91,32 +91,18 @@ def _blocks(sample: np.ndarray) -> np.ndarray:
     return sample[len(sample) % length :].reshape(-1, length)
 
 
-@dataclass(frozen=True)
-class Change:
-    """An earlier row beside a new one."""
+def changes(old: Row, new: Row) -> tuple[Ratio, Ratio | None]:
+    """Return the new median over the old one, and the same as multiples of the unit of work.
 
-    old: Row
-    of_values: Ratio
-    """New median over the old one."""
-    of_units: Ratio | None
-    """The same as multiples of the unit of work; None if a row has no unit."""
-
-    @classmethod
-    def between(cls, old: Row, new: Row) -> Change:
-        """Compare two rows with the same unit."""
-        units = None
-        if old.unit_s and new.unit_s:
-            if new.unit in SECONDS:  # duration / unit of work
-                units = ratio_of_medians([new.values, old.unit_s], [old.values, new.unit_s])
-            else:  # frames per second x unit of work
-                units = ratio_of_medians([new.values, new.unit_s], [old.values, old.unit_s])
-        return cls(old, ratio_of_medians([new.values], [old.values]), units)
-
-    @property
-    def difference(self) -> str:
-        """Whether the difference is above the noise, in units of work where there are units."""
-        is_above = (self.of_units or self.of_values).is_above_noise
-        return {None: "", True: "above noise", False: "within noise"}[is_above]
+    The latter is None if a row has no unit of work.
+    """
+    of_values = ratio_of_medians([new.values], [old.values])
+    if not (old.unit_s and new.unit_s):
+        return of_values, None
+    if new.unit in SECONDS:  # duration / unit of work
+        return of_values, ratio_of_medians([new.values, old.unit_s], [old.values, new.unit_s])
+    # frames per second x unit of work
+    return of_values, ratio_of_medians([new.values, new.unit_s], [old.values, old.unit_s])
 
 
 def columns_of_changes(
@@ -129,22 +115,21 @@ def columns_of_changes(
         new_rows: of the table; cells are empty where there is no old row.
     """
     old = {(row.work, row.unit): row for row in old_rows}
-    changes = {
-        (row.work, row.unit): Change.between(old[row.work, row.unit], row)
-        for row in new_rows
-        if (row.work, row.unit) in old
-    }
-
-    def cell(text: Callable[[Change], str]) -> Callable[[Row], str]:
-        def of_row(row: Row) -> str:
-            change = changes.get((row.work, row.unit))
-            return "" if change is None else text(change)
-
-        return of_row
-
+    cells: dict[tuple[str, str], tuple[str, ...]] = {}
+    for row in new_rows:
+        key = (row.work, row.unit)
+        if key in old:
+            of_values, of_units = changes(old[key], row)
+            is_above = (of_units or of_values).is_above_noise
+            cells[key] = (
+                digits(statistics.median(old[key].values)),
+                str(of_values),
+                str(of_units or ""),
+                {None: "", True: "above noise", False: "within noise"}[is_above],
+            )
+    headings = ("old median", "new / old", "new / old, units", "difference")
+    nothing = ("",) * len(headings)
     return {
-        "old median": cell(lambda change: digits(statistics.median(change.old.values))),
-        "new / old": cell(lambda change: str(change.of_values)),
-        "new / old, units": cell(lambda change: str(change.of_units or "")),
-        "difference": cell(lambda change: change.difference),
+        heading: lambda row, i=i: cells.get((row.work, row.unit), nothing)[i]
+        for i, heading in enumerate(headings)
     }

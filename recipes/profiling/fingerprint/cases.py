@@ -12,6 +12,7 @@ from typing import Any
 import ba_torchrl
 from ba_torchrl.tasks.base import TASKS
 
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 PARTS = ("envs", "training")
 ROBOTS = ("kuka", "panda", "ur5", "ur5_robotiq")
 SEED = 7
@@ -210,29 +211,10 @@ class Case:
     seed: int = SEED
 
 
-def config_folder() -> Path:
-    """Return the folder of Hydra's presets: inside the package in a wheel, else beside it."""
-    package = Path(ba_torchrl.__file__).resolve().parent
-    inside = package / "configs"
-    return inside if inside.is_dir() else package.parent / "configs"
-
-
-def cases(parts: Iterable[str], tasks: Iterable[str] | None = None) -> list[Case]:
-    """Return the cases of these parts.
-
-    Args:
-        parts: of `PARTS`.
-        tasks: ids; None for all.
-    """
+def cases(parts: Iterable[str]) -> list[Case]:
+    """Return the cases of some of `PARTS`."""
     known = {"envs": _env_cases, "training": _training_cases}
-    wanted = None if tasks is None else set(tasks)
-    return [
-        case
-        for part in PARTS
-        if part in parts
-        for case in known[part]()
-        if wanted is None or case.task in wanted
-    ]
+    return [case for part in PARTS if part in parts for case in known[part]()]
 
 
 def _env_cases() -> Iterator[Case]:
@@ -285,7 +267,7 @@ def _env_cases() -> Iterator[Case]:
 
 def _training_cases() -> Iterator[Case]:
     """Yield every pair of an algorithm and a network preset, and some options."""
-    networks = sorted(path.stem for path in (config_folder() / "network").glob("*.yaml"))
+    networks = sorted(path.stem for path in (CONFIGS / "network").glob("*.yaml"))
     for (algorithm, task), network in product(_tasks_of_algorithms().items(), networks):
         yield _training_case(f"{algorithm} {network}", task, algorithm, network)
     for name, (task, algorithm, network, changes) in TRAINING_OPTIONS.items():
@@ -299,10 +281,9 @@ def _tasks_of_algorithms() -> dict[str, str]:
     from ba_torchrl.algorithms.base import ALGORITHMS
     from ba_torchrl.training import hydra_schema
 
-    folder = config_folder()
     hydra_schema.register()
-    with initialize_config_dir(str(folder), version_base="1.3"):
-        presets = sorted(path.stem for path in (folder / "algorithm").glob("*.yaml"))
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        presets = sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
         names = {preset: hydra_schema.preset("algorithm", preset)["name"] for preset in presets}
     return {
         preset: CLOSE_LOOP_TASK if "close_loop" in ALGORITHMS[name].controls else OPEN_LOOP_TASK

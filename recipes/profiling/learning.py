@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextvars import copy_context
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -21,11 +23,11 @@ from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.hardware import amx_is_used
-from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
-from ba_torchrl.profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on
+from profiling.limits import MatrixProduct, count_multiply_adds
+from profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 
 SEED = 0
 CAPACITY = 100_000
@@ -108,137 +110,113 @@ def make_learner(
     return learner
 
 
-def measure_update(
-    bench: Bench,
-    work: str,
-    experiment: dict[str, Any],
-    network: dict[str, Any],
-    obs_size: int,
-    with_amx: Budget | None = None,
-    without_amx: Budget | None = None,
-) -> list[Row]:
-    """Return the row of a learner's updates, with the expert's transitions in its replay.
+@dataclass(frozen=True)
+class Update:
+    """A learner whose updates are measured, with the expert's transitions in its replay.
 
-    The budget of a CPU depends on whether it computes in bfloat16 with AMX; None for none.
+    Args:
+        work: name of the row.
+        experiment: task, algorithm and fields of the environment.
+        network: its name and parameters.
+        obs_size: pixels of the images.
+        with_amx: budget of a CPU that computes in bfloat16 with AMX; None for none.
+        without_amx: budget of another CPU.
     """
-    config = _config(bench, experiment, network, obs_size)
-    learner = make_learner(bench, experiment, network, obs_size)
+
+    work: str
+    experiment: dict[str, Any]
+    network: dict[str, Any]
+    obs_size: int = 128
+    with_amx: Budget | None = None
+    without_amx: Budget | None = None
+
+
+UPDATES: dict[str, list[Update]] = {
+    "equi_sacfd_update": [
+        Update(
+            "Equi SACfD update, batch 64, 128 px, C8, 64 fields",
+            CLOSE_LOOP,
+            {"name": "equi", "group_order": 8, "n_hidden": 64},
+            with_amx=Budget("13.5", 1.8, 1.3),
+            without_amx=Budget("25.3", 9.0, 5.0),
+        )
+    ],
+    "equi_sacfd_update_small": [  # of `make train`
+        Update(
+            "Equi SACfD update, batch 64, 64 px, C8, 16 fields",
+            CLOSE_LOOP,
+            {"name": "equi", "group_order": 8, "n_hidden": 16},
+            64,
+            with_amx=Budget("", None, 0.15),
+        )
+    ],
+    "strided_sacfd_update": [
+        Update(
+            f"Equi SACfD update, strided, batch 64, {obs_size} px, C8, {fields} fields",
+            CLOSE_LOOP,
+            {"name": "equi_strided", "group_order": 8, "n_hidden": fields},
+            obs_size,
+        )
+        for obs_size, fields in ((128, 64), (64, 16))
+    ],
+    "cnn_sacfd_update": [
+        Update(
+            "CNN SACfD update, batch 64, 128 px",
+            CLOSE_LOOP,
+            {"name": "cnn"},
+            with_amx=Budget("1.57", 0.29, 0.2),
+            without_amx=Budget("3.6", 1.0, 0.7),
+        )
+    ],
+    "equi_sdqfd_update": [
+        Update(
+            "SDQfD Equi ASR update, batch 16, 128 px, 16 rotations",
+            OPEN_LOOP,
+            {"name": "equi_asr"},
+            with_amx=Budget("40.6", 6.0, 4.0),
+        )
+    ],
+    "cnn_sdqfd_update": [
+        Update(
+            "SDQfD CNN ASR update, batch 16, 128 px, 16 rotations",
+            OPEN_LOOP,
+            {"name": "asr"},
+            with_amx=Budget("3.9", 0.75, 0.5),
+        )
+    ],
+    "equi_deictic_sdqfd_update": [  # six degrees of freedom, images of ramps
+        Update(
+            "SDQfD Equi Deictic ASR update, batch 16, 128 px, 24 px in hand",
+            SIX_DOF,
+            {"name": "equi_deictic_asr"},
+        )
+    ],
+}
+"""The reference's learners and others, by name of the measurement."""
+
+
+def measure_update(bench: Bench, update: Update) -> list[Row]:
+    """Return the row of a learner's updates."""
+    config = _config(bench, update.experiment, update.network, update.obs_size)
+    learner = make_learner(bench, update.experiment, update.network, update.obs_size)
     dtype = network_dtype(config.network_config, bench.device)
     product = MatrixProduct(dtype, bench.device)
     multiply_adds = count_multiply_adds(learner.update)
     if bench.compile_mode is not None:  # after the count, in which nothing is compiled
         learner.compile(bench.compile_mode)
     times = bench.time_against(
-        {"unit": LearningUnit(bench.device), "product": product}, {work: learner.update}
+        {"unit": LearningUnit(bench.device), "product": product}, {update.work: learner.update}
     )
     limits = [multiply_adds / product.multiply_adds * value for value in times["product"]]
     notes = f"{multiply_adds / 1e9:.3g} G multiply-adds, {product.describe(times['product'])}"
-    budget = with_amx if amx_is_used() and dtype == torch.bfloat16 else without_amx
+    uses_amx = amx_is_used() and dtype == torch.bfloat16
+    budget = update.with_amx if uses_amx else update.without_amx
     shown = budget if bench.device.type == "cpu" else None
-    return [timed_row(work, "s", times[work], times["unit"], shown, notes, limits)]
+    return [timed_row(update.work, "s", times[update.work], times["unit"], shown, notes, limits)]
 
 
-@measurement("learning/equi_sacfd_update")
-def equivariant_update(bench: Bench) -> list[Row]:
-    """Update of the reference's largest close-loop learner."""
-    return measure_update(
-        bench,
-        "Equi SACfD update, batch 64, 128 px, C8, 64 fields",
-        CLOSE_LOOP,
-        {"name": "equi", "group_order": 8, "n_hidden": 64},
-        128,
-        Budget("13.5", 1.8, 1.3),
-        Budget("25.3", 9.0, 5.0),
-    )
-
-
-@measurement("learning/equi_sacfd_update_small")
-def quickstart_update(bench: Bench) -> list[Row]:
-    """Update of the learner of `make train`."""
-    return measure_update(
-        bench,
-        "Equi SACfD update, batch 64, 64 px, C8, 16 fields",
-        CLOSE_LOOP,
-        {"name": "equi", "group_order": 8, "n_hidden": 16},
-        64,
-        Budget("", None, 0.15),
-    )
-
-
-@measurement("learning/strided_sacfd_update", over=lambda: [(128, 64), (64, 16)])
-def strided_update(bench: Bench, obs_size: int, fields: int) -> list[Row]:
-    """Update of an equivariant learner with strided convolutions instead of max pools."""
-    return measure_update(
-        bench,
-        f"Equi SACfD update, strided, batch 64, {obs_size} px, C8, {fields} fields",
-        CLOSE_LOOP,
-        {"name": "equi_strided", "group_order": 8, "n_hidden": fields},
-        obs_size,
-    )
-
-
-@measurement("learning/cnn_sacfd_update")
-def plain_update(bench: Bench) -> list[Row]:
-    """Update of the reference's plain close-loop learner."""
-    return measure_update(
-        bench,
-        "CNN SACfD update, batch 64, 128 px",
-        CLOSE_LOOP,
-        {"name": "cnn"},
-        128,
-        Budget("1.57", 0.29, 0.2),
-        Budget("3.6", 1.0, 0.7),
-    )
-
-
-@measurement("learning/equi_sdqfd_update")
-def equivariant_spatial_update(bench: Bench) -> list[Row]:
-    """Update of the reference's equivariant open-loop learner."""
-    return measure_update(
-        bench,
-        "SDQfD Equi ASR update, batch 16, 128 px, 16 rotations",
-        OPEN_LOOP,
-        {"name": "equi_asr"},
-        128,
-        Budget("40.6", 6.0, 4.0),
-    )
-
-
-@measurement("learning/cnn_sdqfd_update")
-def plain_spatial_update(bench: Bench) -> list[Row]:
-    """Update of the reference's plain open-loop learner."""
-    return measure_update(
-        bench,
-        "SDQfD CNN ASR update, batch 16, 128 px, 16 rotations",
-        OPEN_LOOP,
-        {"name": "asr"},
-        128,
-        Budget("3.9", 0.75, 0.5),
-    )
-
-
-@measurement("learning/equi_deictic_sdqfd_update")
-def equivariant_pose_update(bench: Bench) -> list[Row]:
-    """Update of the reference's equivariant learner in six degrees of freedom, images of ramps."""
-    return measure_update(
-        bench,
-        "SDQfD Equi Deictic ASR update, batch 16, 128 px, 24 px in hand",
-        SIX_DOF,
-        {"name": "equi_deictic_asr"},
-        128,
-    )
-
-
-@measurement("learning/cnn_pose_sdqfd_update")
-def plain_pose_update(bench: Bench) -> list[Row]:
-    """Update of the reference's plain learner in six degrees of freedom, images of ramps."""
-    return measure_update(
-        bench,
-        "SDQfD CNN ASR update in six degrees of freedom, batch 16, 128 px, 24 px in hand",
-        SIX_DOF,
-        {"name": "asr"},
-        128,
-    )
+for _name, _updates in UPDATES.items():
+    measurement(f"learning/{_name}", over=partial(zip, _updates))(measure_update)
 
 
 ACTING = {
