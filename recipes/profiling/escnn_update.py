@@ -19,10 +19,10 @@ from torch import Tensor, nn
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.equivariant import ActionFields
-from ba_torchrl.modules.gaussian_policy import UnitTanhNormal
-from ba_torchrl.modules.steerable import planar_rotations
-from ba_torchrl.modules.trunk import scale_from_log_std, trunk_stages
+from ba_torchrl.modules.actor_critic.equivariant import ActionFields
+from ba_torchrl.modules.actor_critic.gaussian_policy import UnitTanhNormal
+from ba_torchrl.modules.actor_critic.trunk import scale_from_log_std, trunk_stages
+from ba_torchrl.modules.steerable.layers import planar_rotations
 from profiling.learning import (
     CLOSE_LOOP,
     SEED,

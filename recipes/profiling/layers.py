@@ -8,13 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ba_torchrl.modules.irrep_convolution import irrep_convolution
-from ba_torchrl.modules.kernel_blocks import regular_irrep_kernels
-from ba_torchrl.modules.max_pool import relu_of_max_pool
-from ba_torchrl.modules.steerable import (
-    SteerableConv2d,
-    planar_rotations,
-)
+from ba_torchrl.modules.steerable.irrep_convolution import irrep_convolution
+from ba_torchrl.modules.steerable.kernels import regular_irrep_kernels
+from ba_torchrl.modules.steerable.layers import SteerableConv2d, planar_rotations
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 from profiling.learning import LearningUnit
 from profiling.table import Bench, Row, measurement, timed_row
 

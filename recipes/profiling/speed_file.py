@@ -15,7 +15,7 @@ from ba_torchrl.config import StrictModel
 from ba_torchrl.data.state_files import write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.hardware import hardware, onednn_max_cpu_isa
-from ba_torchrl.modules.trunk import Precision
+from ba_torchrl.modules.layers import Precision
 from ba_torchrl.record.results import now, versions
 from profiling.table import Row
 

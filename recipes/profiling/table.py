@@ -16,7 +16,7 @@ from tqdm import tqdm
 from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.modules.trunk import Precision
+from ba_torchrl.modules.layers import Precision
 from ba_torchrl.registry import Registry
 
 GROUPS = ("simulation", "learning", "throughput", "memory")

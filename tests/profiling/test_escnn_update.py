@@ -8,8 +8,8 @@ from torch import nn
 from tqdm import tqdm
 
 from ba_torchrl.envs import keys
+from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
-from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.sacfd import SACfDLoss
 from profiling.table import Bench
 from tests.specs import close_loop_images

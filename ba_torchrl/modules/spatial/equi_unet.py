@@ -9,14 +9,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.modules.cnn import initialise_plain
-from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
-from ba_torchrl.modules.in_hand_encoders import InHandVector
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_inputs import SpatialImageConfig
-from ba_torchrl.modules.steerable import FieldTypes, SteerableConv2d
-from ba_torchrl.modules.trunk import scaled_width
-from ba_torchrl.modules.unet import ResidualBlock, UNet
+from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.spatial.base import SpatialImageConfig, SpatialSpec
+from ba_torchrl.modules.spatial.in_hand import InHandVector
+from ba_torchrl.modules.spatial.unet import ResidualBlock, UNet
+from ba_torchrl.modules.steerable.layers import (
+    DynamicSteerableConv2d,
+    FieldTypes,
+    SteerableConv2d,
+    filter_generator,
+)
 
 if TYPE_CHECKING:
     from escnn.group import Representation

@@ -1,4 +1,4 @@
-"""What the levels of six degrees of freedom see of the scene: patches and projections at poses."""
+"""What later levels see of the scene: rotated crops, and projections at poses."""
 
 from __future__ import annotations
 
@@ -7,14 +7,75 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
 from ba_torchrl.config import StrictModel
-from ba_torchrl.modules.patches import patches
-from ba_torchrl.modules.projections import cell_table, project, project_upright
-from ba_torchrl.modules.spatial import Level, SpatialSpec
-from ba_torchrl.modules.widest_float import constants
+from ba_torchrl.modules.layers import constants
+from ba_torchrl.modules.spatial.base import Level, SpatialSpec
+from ba_torchrl.modules.spatial.projections import cell_table, project, project_upright
+
+
+def sampling_grid(center_px: Tensor, yaw_rad: Tensor, size: int, image_size: int) -> Tensor:
+    """Return where a square view samples a square image, for ``grid_sample``.
+
+    The view has the frame of a gripper at this yaw: its row axis is the image's row axis rotated by
+    the yaw, so the view shows the scene rotated by minus the yaw.
+
+    Args:
+        center_px: rows and columns of the views' centres [N, 2]; pixel (i, j) has its centre at
+            (i + 1/2, j + 1/2).
+        yaw_rad: [N].
+        size: rows and columns of the views, whose pixels have the size of the image's pixels.
+        image_size: rows and columns of the image.
+
+    Returns:
+        [N, size, size, 2], column then row; -1 and 1 are the outer edges of the image.
+    """
+    offsets = torch.arange(size, device=center_px.device) - (size - 1) / 2
+    along, across = torch.meshgrid(offsets, offsets, indexing="ij")
+    cos, sin = yaw_rad.cos()[:, None, None], yaw_rad.sin()[:, None, None]
+    rows = center_px[:, 0, None, None] + cos * along - sin * across
+    columns = center_px[:, 1, None, None] + sin * along + cos * across
+    return torch.stack([columns, rows], dim=-1) * (2 / image_size) - 1
+
+
+def sample(images: Tensor, grid: Tensor) -> Tensor:
+    """Return views [N, C, h, w] of float32 images [N, C, H, W], zero outside the images."""
+    return F.grid_sample(images, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+
+
+def patches(images: Tensor, pixels: Tensor, size: int, yaw_rad: Tensor | None = None) -> Tensor:
+    """Return a patch around one pixel of each image.
+
+    The centre of the patch is the centre of the pixel. With an even size and no yaw, every value is
+    therefore the mean of four neighbouring pixels.
+
+    Args:
+        images: float32 [B, C, H, H].
+        pixels: int64 [B, 2], row and column.
+        size: rows and columns of the patch.
+        yaw_rad: rotation of the patch relative to the image, [B]; zero if None.
+
+    Returns:
+        [B, C, size, size]; zero outside the image.
+    """
+    center_px = pixels.to(images.dtype) + 0.5
+    yaw_rad = torch.zeros_like(center_px[:, 0]) if yaw_rad is None else yaw_rad
+    return sample(images, sampling_grid(center_px, yaw_rad, size, images.shape[-1]))
+
+
+def centre_fit(images: Tensor, size: int) -> Tensor:
+    """Return images [B, C, h, h] cropped, or padded with zeros, to ``size`` about their centre.
+
+    Args:
+        images: of a size that differs from ``size`` by an even number.
+        size: rows and columns of the result.
+    """
+    margin = (size - images.shape[-1]) // 2
+    return F.pad(images, (margin,) * 4) if margin else images
+
 
 POSE_COMPONENTS = ("x", "y", "rz", "z", "ry", "rx")
 """Components of six degrees of freedom in the order of their choice (appendix D.2)."""

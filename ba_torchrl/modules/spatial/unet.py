@@ -8,11 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.modules.cnn import CastConv2d, initialise_plain
-from ba_torchrl.modules.in_hand_encoders import InHandMap
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, select_primitive
-from ba_torchrl.modules.trunk import scaled_width
+from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
+from ba_torchrl.modules.spatial.base import SpatialImageConfig, SpatialSpec, select_primitive
+from ba_torchrl.modules.spatial.in_hand import InHandMap
 
 _WIDTHS = (32, 64, 128, 256, 512)
 

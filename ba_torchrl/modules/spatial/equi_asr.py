@@ -11,27 +11,27 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.modules.asr_base import ASR, ASRNetworkConfig, PatchView
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.cnn import initialise_plain
-from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
-from ba_torchrl.modules.equi_unet import EquivariantPixelValues
-from ba_torchrl.modules.in_hand_encoders import InHandVector
-from ba_torchrl.modules.max_pool import relu_of_max_pool
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_inputs import (
+from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.spatial.asr import ASR, ASRNetworkConfig, PatchView
+from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
     SpatialImageConfig,
+    SpatialSpec,
     require_yaw,
     select_primitive,
 )
-from ba_torchrl.modules.steerable import (
+from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
+from ba_torchrl.modules.spatial.in_hand import InHandVector
+from ba_torchrl.modules.steerable.layers import (
+    DynamicSteerableConv2d,
     SteerableConv2d,
     SteerableLinear,
+    filter_generator,
     planar_rotations_and_flips,
     planar_yaws,
 )
-from ba_torchrl.modules.trunk import scaled_width
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 if TYPE_CHECKING:
     from escnn.group import Representation

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ba_torchrl.modules.irrep_convolution import IrrepKernels, irrep_kernels
+from ba_torchrl.modules.steerable.irrep_convolution import IrrepKernels, irrep_kernels
 
 if TYPE_CHECKING:
     from escnn.group import Representation

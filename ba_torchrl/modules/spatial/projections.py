@@ -10,8 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ba_torchrl.modules.cached_constant import cached_constant
-from ba_torchrl.modules.widest_float import widened
+from ba_torchrl.modules.layers import cached_constant, widened
 
 TIE_TOLERANCE = 1e-9
 """Voxels. A rotated voxel centre this close to halfway between two cells belongs to the upper

@@ -11,14 +11,10 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from ba_torchrl.modules.actor_critic.cnn import plain_trunk
+from ba_torchrl.modules.actor_critic.trunk import ImageNetworkConfig, ImageTrunk, scale_from_log_std
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
-from ba_torchrl.modules.cnn import initialise_plain, plain_trunk
-from ba_torchrl.modules.trunk import (
-    ImageNetworkConfig,
-    ImageTrunk,
-    scale_from_log_std,
-    scaled_width,
-)
+from ba_torchrl.modules.layers import initialise_plain, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 1024)
 _HIDDEN = 1024

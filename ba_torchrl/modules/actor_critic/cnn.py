@@ -5,32 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
-from ba_torchrl.modules.ensembles import EnsembleCritic
-from ba_torchrl.modules.trunk import (
+from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
+from ba_torchrl.modules.actor_critic.trunk import (
     ImageNetworkConfig,
     ImageTrunk,
     scale_from_log_std,
-    scaled_width,
     trunk_stages,
 )
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 128)
 _HIDDEN = 128
-
-
-class CastConv2d(nn.Conv2d):
-    """A convolution that computes in its input's dtype and keeps float32 parameters."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Return the convolution of x [B, C, H, W], in x's dtype."""
-        weight = self.weight.to(dtype=x.dtype, memory_format=torch.channels_last)
-        bias = None if self.bias is None else self.bias.to(x.dtype)
-        return F.conv2d(x, weight, bias, self.stride, self.padding)
 
 
 class CNNActor(nn.Module):
@@ -76,15 +65,6 @@ class CNNTwinCritic(nn.Module):
         """Return twin values [..., 2] of features [..., F] and action [..., A]."""
         x = torch.cat([features, action], dim=-1)
         return torch.cat([head(x) for head in self.heads], dim=-1)
-
-
-def initialise_plain(module: nn.Module) -> None:
-    """Xavier-initialise a convolution or linear layer; a function for ``nn.Module.apply``."""
-    if isinstance(module, nn.Conv2d):
-        nn.init.xavier_normal_(module.weight)
-    elif isinstance(module, nn.Linear):
-        nn.init.xavier_uniform_(module.weight)
-        nn.init.zeros_(module.bias)
 
 
 def plain_trunk(

@@ -7,26 +7,26 @@ from functools import partial
 from pydantic import Field
 
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.asr_base import ASR, ASRNetworkConfig, PatchView
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.equi_asr import (
+from ba_torchrl.modules.spatial.asr import ASR, ASRNetworkConfig, PatchView
+from ba_torchrl.modules.spatial.base import SpatialSpec
+from ba_torchrl.modules.spatial.equi_asr import (
     SCENE_COPIES,
     EquivariantYawValues,
     InvariantSceneVector,
     SceneHead,
     yaw_scene_vector,
 )
-from ba_torchrl.modules.equi_unet import EquivariantPixelValues
-from ba_torchrl.modules.pose_values import FingerSymmetricValues, PoseValues, SceneMapVector
-from ba_torchrl.modules.pose_views import (
+from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
+from ba_torchrl.modules.spatial.pose_values import FingerSymmetricValues, PoseValues, SceneMapVector
+from ba_torchrl.modules.spatial.views import (
     BothFingerOrders,
     PoseGridConfig,
     TiltedView,
     UprightView,
     is_six_dof,
 )
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.steerable import planar_rotations_and_flips, planar_yaws
+from ba_torchrl.modules.steerable.layers import planar_rotations_and_flips, planar_yaws
 
 
 @NETWORKS.register("equi_deictic_asr")

@@ -7,12 +7,15 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.modules.cnn import CastConv2d, initialise_plain
-from ba_torchrl.modules.max_pool import relu_of_max_pool
-from ba_torchrl.modules.patches import centre_fit
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_inputs import UNET_STRIDE, SpatialImageConfig, select_primitive
-from ba_torchrl.modules.trunk import scaled_width
+from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
+from ba_torchrl.modules.spatial.base import (
+    UNET_STRIDE,
+    SpatialImageConfig,
+    SpatialSpec,
+    select_primitive,
+)
+from ba_torchrl.modules.spatial.views import centre_fit
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 _WIDTHS = (32, 64, 128, 128)
 _POOLS = 3

@@ -8,11 +8,17 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.equi_unet import EquivariantPixelValues
-from ba_torchrl.modules.spatial import Level, SpatialQNetwork, SpatialSpec
-from ba_torchrl.modules.spatial_inputs import SpatialImageConfig, has_yaw, require_unet_size
-from ba_torchrl.modules.steerable import planar_rotations_and_flips, planar_yaws
-from ba_torchrl.modules.unet import PlainPixelValues
+from ba_torchrl.modules.spatial.base import (
+    Level,
+    SpatialImageConfig,
+    SpatialQNetwork,
+    SpatialSpec,
+    has_yaw,
+    require_unet_size,
+)
+from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
+from ba_torchrl.modules.spatial.unet import PlainPixelValues
+from ba_torchrl.modules.steerable.layers import planar_rotations_and_flips, planar_yaws
 
 _DEFAULT_GROUP_ORDER = 4
 

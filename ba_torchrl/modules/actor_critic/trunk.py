@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import ClassVar, Literal
 
@@ -11,38 +10,16 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl import hardware
 from ba_torchrl.config import StrictModel
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
-from ba_torchrl.modules.cached_constant import cached_constant
-from ba_torchrl.modules.max_pool import relu_of_max_pool
-
-Precision = Literal["auto", "float32", "bfloat16"]
+from ba_torchrl.modules.layers import (
+    Precision,
+    compute_dtype,
+)
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 SUPPORTED_IMAGE_SIZES = (64, 128)
-
-
-@cached_constant()
-def _bfloat16_is_fast(device_type: str) -> bool:
-    if device_type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    if device_type == "cpu":
-        return hardware.bfloat16_is_fast()
-    return False
-
-
-def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
-    """Return the number format that convolutions on ``device`` use.
-
-    Args:
-        precision: "auto" is bfloat16 if the hardware multiplies it faster than float32, else
-            float32.
-        device: device of the input.
-    """
-    if precision == "auto":
-        return torch.bfloat16 if _bfloat16_is_fast(device.type) else torch.float32
-    return getattr(torch, precision)
 
 
 def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int, bool]]:
@@ -192,8 +169,3 @@ class ImageTrunk(nn.Module):
 def scale_from_log_std(log_std: Tensor) -> Tensor:
     """Return the standard deviation of a log standard deviation clamped to [-20, 2]."""
     return log_std.clamp(LOG_STD_MIN, LOG_STD_MAX).exp()
-
-
-def scaled_width(width: int, scale: float) -> int:
-    """Return ``width`` times ``scale``, rounded, at least one."""
-    return max(1, math.floor(width * scale + 0.5))

@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.modules.cnn import CastConv2d
-from ba_torchrl.modules.max_pool import relu_of_max_pool
-from ba_torchrl.modules.trunk import scaled_width
+from ba_torchrl.modules.layers import CastConv2d, scaled_width
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 _LARGEST_LAST_MAP = 6
 

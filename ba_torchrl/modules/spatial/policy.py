@@ -13,8 +13,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.actions import PLACE, TILTS, GridAxis, OpenLoopActions
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.spatial import Level, SpatialQNetwork
-from ba_torchrl.modules.widest_float import widened, widest_float
+from ba_torchrl.modules.layers import widened, widest_float
+from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
 
 OBJECT_HEIGHT_M = 0.01
 """Random actions choose among the pixels higher than this, if there are any."""

@@ -10,10 +10,17 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.patches import sample, sampling_grid
-from ba_torchrl.modules.spatial import Level, SpatialQNetwork, SpatialSpec
-from ba_torchrl.modules.spatial_inputs import UNET_STRIDE, SpatialImageConfig, require_yaw, yaws_rad
-from ba_torchrl.modules.unet import PlainPixelValues
+from ba_torchrl.modules.spatial.base import (
+    UNET_STRIDE,
+    Level,
+    SpatialImageConfig,
+    SpatialQNetwork,
+    SpatialSpec,
+    require_yaw,
+    yaws_rad,
+)
+from ba_torchrl.modules.spatial.unet import PlainPixelValues
+from ba_torchrl.modules.spatial.views import sample, sampling_grid
 
 
 class RotFCN(SpatialQNetwork):

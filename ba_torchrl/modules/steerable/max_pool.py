@@ -11,7 +11,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ba_torchrl._jit import njit
-from ba_torchrl.modules.cpu_threads import in_parts, is_plain_float32, refuse_second_derivatives
+from ba_torchrl.modules.steerable.cpu_threads import (
+    in_parts,
+    is_plain_float32,
+    refuse_second_derivatives,
+)
 
 _NONE = 8
 """Position where no input has a gradient, because all are negative or zero."""

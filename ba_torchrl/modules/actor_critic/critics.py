@@ -1,4 +1,4 @@
-"""Ensembles of layer-normalised critics, computed as one batch (Ball et al., 2023; "RLPD")."""
+"""Critics beside those of the networks: ensembles (Ball et al., 2023; "RLPD"), values of states."""
 
 from __future__ import annotations
 
@@ -90,3 +90,46 @@ class EnsembleCritic(nn.Module):
         x = F.relu(self.first_norm(x.unflatten(-1, self._shape))).amax(dim=-1)
         x = F.relu(self.second_norm(self.second(x)[..., None]))[..., 0]
         return self.values(x)[..., 0]
+
+
+class ActionValue(nn.Module):
+    """The value of an action: the first critic's.
+
+    Args:
+        encoder: from the observation to features [..., F].
+        critic: from features and action to values [..., K].
+    """
+
+    def __init__(self, encoder: nn.Module, critic: nn.Module) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.critic = critic
+
+    def forward(self, *observation_and_action: Tensor) -> Tensor:
+        """Return values [..., 1] of the observation's entries and, last, the action [..., A]."""
+        *observation, action = observation_and_action
+        return self.critic(self.encoder(*observation), action)[..., :1]
+
+
+class StateValue(nn.Module):
+    """The value of a state: the first critic's at the action zero.
+
+    Zero is invariant under rotations, so the value of an equivariant network is invariant.
+
+    Args:
+        encoder: from the observation to features [..., F].
+        critic: from features and action to values [..., K].
+        action_size: number of action components.
+    """
+
+    def __init__(self, encoder: nn.Module, critic: nn.Module, action_size: int) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.critic = critic
+        self.action_size = action_size
+
+    def forward(self, *observation: Tensor) -> Tensor:
+        """Return values [..., 1] of the observation's entries."""
+        features = self.encoder(*observation)
+        zero = torch.zeros(*features.shape[:-1], self.action_size).to(features)
+        return self.critic(features, zero)[..., :1]
