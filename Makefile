@@ -22,7 +22,7 @@ help:
 	@echo "make train      the quick start: train, evaluate, write curves and a video"
 	@echo "make test       the tests (minutes)"
 	@echo "make test-slow  the tests that take longer"
-	@echo "make lint       check style"
+	@echo "make lint       check style; list long files, deep classes and lines to read"
 	@echo
 	@echo "ARGS='...' is passed on: make train ARGS='seed=1', make test ARGS='-k vector'."
 	@echo "PYTHON=/path/to/python3.11 names the interpreter if it is not found."
@@ -43,6 +43,7 @@ test-slow: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python -m docs.layout
 
 # The stamp comes last, so an interrupted set-up is taken up again. One recipe, so that -j
 # cannot reorder it: torch goes first, or a requirement would pull in another build of it.

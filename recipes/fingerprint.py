@@ -2,7 +2,7 @@
 
 python recipes/fingerprint.py --out before.json                  # every task, robot and option
 python recipes/fingerprint.py --compare before.json              # exit code 1 if anything differs
-python recipes/fingerprint.py --compare before.json --parts envs --tasks close_loop/block_picking
+python recipes/fingerprint.py --compare before.json --parts envs # without training
 python recipes/fingerprint.py --compare before.json --match kuka # cases by a part of their name
 
 A record holds for each case the first 64 bits of the SHA-256 of every tensor at every step, and the
@@ -19,21 +19,22 @@ import time
 from pathlib import Path
 from typing import Any
 
-import ba_torchrl
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.profiling.fingerprint.cases import PARTS, cases
-from ba_torchrl.profiling.fingerprint.compare import compare, read_record
-from ba_torchrl.profiling.fingerprint.record import run_all, versions
 from ba_torchrl.training.command_line import check_writable_file
+from profiling.fingerprint.cases import PARTS, cases
+from profiling.fingerprint.compare import compare, read_record
+from profiling.fingerprint.record import run_all, versions
+
+LINES = 12
+"""Differences of a case that are printed."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Record, compare, or both; return the exit code."""
     options, old = _parse(arguments)
     parts = options.parts.split(",") if options.parts else (old["parts"] if old else PARTS)
-    tasks = options.tasks.split(",") if options.tasks else (old["tasks"] if old else None)
     started = time.perf_counter()
-    wanted = [case for case in cases(parts, tasks) if options.match in case.name]
+    wanted = [case for case in cases(parts) if options.match in case.name]
     records = run_all(wanted, options.workers)
     seconds = time.perf_counter() - started
     for word in ("refused", "failed"):
@@ -43,12 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
             for name in names:
                 print(f"  {name}: {records[name]['facts'][word]}")
     if options.out is not None:
-        content = {
-            "parts": list(parts),
-            "tasks": tasks,
-            "versions": versions(),
-            "cases": records,
-        }
+        content = {"parts": list(parts), "versions": versions(), "cases": records}
         options.out.write_text(json.dumps(content, separators=(",", ":")) + "\n")
     print(f"{len(records)} cases in {seconds:.0f} s")
     if old is None:
@@ -58,17 +54,13 @@ def main(arguments: list[str] | None = None) -> int:
     before = {
         name: record
         for name, record in old["cases"].items()
-        if record["part"] in parts
-        and (tasks is None or record["task"] in tasks)
-        and options.match in name
+        if record["part"] in parts and options.match in name
     }
     found = compare(before, json.loads(json.dumps(records)))
     for name, lines in found.items():
-        print(name)
-        for line in lines[: options.lines]:
-            print(f"  {line}")
-        if len(lines) > options.lines:
-            print(f"  and {len(lines) - options.lines} lines more; see --lines")
+        print("\n  ".join([name, *lines[:LINES]]))
+        if len(lines) > LINES:
+            print(f"  and {len(lines) - LINES} lines more")
     if found:
         print(f"different: {len(found)} of {len(records)} cases")
         return 1
@@ -76,36 +68,29 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _parse(
-    arguments: list[str] | None,
-) -> tuple[argparse.Namespace, dict[str, Any] | None]:
+def _parse(arguments: list[str] | None) -> tuple[argparse.Namespace, dict[str, Any] | None]:
     """Return the checked options, and the old record if they name one."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, help="file to write the record to")
     parser.add_argument("--compare", type=Path, help="file of an earlier record")
-    parser.add_argument("--tasks", help="ids, separated by commas; all if left out")
     parser.add_argument("--parts", help=f"of {','.join(PARTS)}; all, or those of the old record")
     parser.add_argument("--match", default="", help="only cases whose name contains this")
     parser.add_argument("--workers", type=int, default=2, help="processes")
-    parser.add_argument("--lines", type=int, default=12, help="to print of each case that differs")
     options = parser.parse_args(arguments)
     if options.out is None and options.compare is None:
         parser.error("give --out, --compare or both")
-    if options.workers < 1 or options.lines < 0:
-        parser.error("--workers must be at least 1, and --lines at least 0")
+    if options.workers < 1:
+        parser.error("--workers must be at least 1")
+    if options.parts and (unknown := {*options.parts.split(",")} - {*PARTS}):
+        parser.error(f"unknown: {', '.join(sorted(unknown))}")
     try:
         old = None if options.compare is None else read_record(options.compare)
         if options.out is not None:
             check_writable_file(options.out)
     except ConfigError as error:
         parser.error(str(error))
-    unknown = {*options.parts.split(",")} - {*PARTS} if options.parts else set()
-    if options.tasks and old is None:
-        unknown |= {*options.tasks.split(",")} - {*ba_torchrl.list_tasks()}
-    if unknown:
-        parser.error(f"unknown: {', '.join(sorted(unknown))}")
     return options, old
 
 

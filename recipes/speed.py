@@ -12,46 +12,49 @@ from ba_torchrl._malloc import tune_malloc
 tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
 
 import hydra  # noqa: E402
-from omegaconf import DictConfig  # noqa: E402
 
-from ba_torchrl.plugins import load_plugins  # noqa: E402
-from ba_torchrl.profiling.comparison import columns_of_changes  # noqa: E402
-from ba_torchrl.profiling.speed_file import (  # noqa: E402
+from ba_torchrl.config import StrictModel  # noqa: E402
+from ba_torchrl.training.command_line import (  # noqa: E402
+    Count,
+    OutputFile,
+    Plugins,
+    Text,
+    command,
+)
+from ba_torchrl.training.config import usable_device  # noqa: E402
+from profiling.comparison import columns_of_changes  # noqa: E402
+from profiling.speed_file import (  # noqa: E402
     Machine,
     SpeedFile,
     check_output,
     read_speed_file,
     write_speed_file,
 )
-from ba_torchrl.profiling.table import COLUMNS, as_markdown, measure  # noqa: E402
-from ba_torchrl.record.logging import limit_library_logs  # noqa: E402
-from ba_torchrl.training.command_line import (  # noqa: E402
-    check_counts,
-    check_flags,
-    check_known,
-    check_texts,
-    check_writable_file,
-    plain_errors,
-)
-from ba_torchrl.training.config import usable_device  # noqa: E402
+from profiling.table import COLUMNS, as_markdown, measure  # noqa: E402
+
+
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins
+    which: Text
+    repeats: Count
+    device: Text
+    precision: Text
+    compile_mode: Text | None
+    output: OutputFile | None
+    compare: Text | None
+    profile: bool
 
 
 @hydra.main(config_path="../configs", config_name="speed", version_base="1.3")
-@plain_errors
-def main(settings: DictConfig) -> None:
+@command(Settings)
+def main(settings: Settings) -> None:
     """Measure, print a table, and write or compare it."""
-    limit_library_logs()
-    check_known(settings)
-    load_plugins(settings.plugins)
-    check_texts(settings, "which", "device", "precision")
-    check_texts(settings, "compile_mode", "output", "compare", optional=True)
-    check_counts(settings, "repeats")
-    check_flags(settings, "profile")
     device = usable_device(settings.device)
     old = None if settings.compare is None else read_speed_file(settings.compare)
     if settings.output is not None:
         check_output(settings.output)
-        check_writable_file(settings.output)
     where = Machine.here(device)  # includes the load before the measurement
     profiles: dict[str, str] | None = {} if settings.profile else None
     rows = measure(

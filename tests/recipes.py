@@ -1,6 +1,7 @@
 """Recipes that run in the process of the test."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -16,6 +17,7 @@ def load_recipe(name):
     """Return the module of a recipe."""
     spec = importlib.util.spec_from_file_location(f"recipe_{name}", ROOT / f"recipes/{name}.py")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where pydantic looks up the types of models
     spec.loader.exec_module(module)
     return module
 

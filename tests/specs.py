@@ -2,7 +2,7 @@
 
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import ActorCriticSpec
-from ba_torchrl.modules.spatial import SpatialSpec
+from ba_torchrl.modules.spatial.base import SpatialSpec
 
 
 def close_loop_images(size=64, high_m=0.39):

@@ -1,19 +1,17 @@
 """docs/architecture.md: its picture is that of the present imports, and it names every folder."""
 
-import importlib.util
 import re
 from pathlib import Path
+
+from docs import architecture, layout
+from docs.sources import Definition
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
-spec = importlib.util.spec_from_file_location("architecture", ROOT / "docs" / "architecture.py")
-architecture = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(architecture)
-
 
 def test_the_picture_is_drawn_from_the_imports():
-    assert architecture.page_with_picture(PAGE) == PAGE, "run `python docs/architecture.py`"
+    assert architecture.page_with_picture(PAGE) == PAGE, "run `python -m docs.architecture`"
 
 
 def test_imports_that_follow_from_others_are_left_out():
@@ -35,3 +33,18 @@ def test_examples_and_files_exist():
     ]
     assert [path for path in paths if not (ROOT / path).exists()] == []
     assert len(paths) > 8
+
+
+def test_the_lines_to_read_are_those_of_what_is_named():
+    registry = Definition("ba_torchrl.registry", "Registry")
+    error = Definition("ba_torchrl.errors", "UnknownNameError")
+    assert error in registry.uses
+    assert error not in layout.to_read(registry, ("ba_torchrl.registry",))
+    assert error in layout.to_read(registry, ("ba_torchrl.registry", "ba_torchrl.errors"))
+    for entry, folders in layout.SUBJECTS.values():
+        assert sum(each.lines for each in layout.to_read(entry, folders)) > 500
+
+
+def test_levels_of_classes_do_not_count_the_base_of_settings():
+    assert layout.levels(Definition("ba_torchrl.errors", "UnknownNameError")) == 1
+    assert layout.levels(Definition("ba_torchrl.config", "EnvConfig")) == 0

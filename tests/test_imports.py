@@ -16,12 +16,11 @@ PACKAGE = "ba_torchrl"
 BASE = {"errors", "config", "plugins", "registry", "actions"}
 # Each part may import itself, what comes before it, and what EXTRA names. `__init__` is the
 # package itself, whose functions make environments.
-CHAIN = ["sim", "tasks", "envs", "data", "algorithms", "training", "profiling", "recipes"]
+CHAIN = ["sim", "tasks", "envs", "data", "algorithms", "training", "recipes"]
 EXTRA = {
     "data": {"__init__"},
     "algorithms": {"__init__", "modules", "objectives"},
     "training": {"__init__", "record", "hardware"},
-    "profiling": {"__init__", "record", "modules", "objectives", "hardware"},
     "recipes": {"__init__", "record"},
 }
 SHARED = {"_malloc", "_segment_tree", "_jit"}
@@ -35,6 +34,10 @@ APART = {
     "_segment_tree": set(),
     "_jit": set(),
     "hardware": set(),
+    # measurements, which read every part
+    "recipes.profiling": BASE
+    | {"__init__", "sim", "tasks", "envs", "data", "modules", "objectives", "algorithms"}
+    | {"training", "record", "hardware"},
     # whole algorithms as scripts: no learner and no experiment
     "recipes.torchrl": BASE
     | {"envs", "data", "modules", "objectives", "__init__"}
@@ -59,7 +62,7 @@ def part_of(module):
     """Return the part a dotted module name belongs to: 'ba_torchrl.sim.world' -> 'sim'."""
     names = module.split(".")
     if names[0] != PACKAGE:
-        return ".".join(names[:-1]) if len(names) > 2 else names[0]
+        return ".".join(names[:2]) if len(names) > 2 else names[0]
     return names[1] if len(names) > 1 else "__init__"
 
 

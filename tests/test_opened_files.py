@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.profiling.fingerprint.compare import read_record
-from ba_torchrl.profiling.soak import SoakJob, run_soak
-from ba_torchrl.profiling.speed_file import read_speed_file
 from ba_torchrl.record.results import read_failure
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, Decomposition, cached_parts
 from ba_torchrl.sim.assets.graspnet import read_mesh
 from ba_torchrl.sim.meshes import rod_mesh
+from profiling.fingerprint.compare import read_record
+from profiling.speed_file import read_speed_file
+from recipes.soak import SoakJob, run_soak
 from tests.planted import Planted
 
 REACHING = "close_loop/block_reaching"

@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.steerable import reuse_filters
+from ba_torchrl.modules.steerable.layers import reuse_filters
 
 
 @contextlib.contextmanager

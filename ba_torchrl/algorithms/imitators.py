@@ -15,9 +15,9 @@ from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import ActorCriticSpec
-from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
-from ba_torchrl.modules.spatial_policy import SpatialPolicy, spatial_policy
+from ba_torchrl.modules.spatial.policy import SpatialPolicy, spatial_policy
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
 
 

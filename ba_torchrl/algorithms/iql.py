@@ -20,9 +20,9 @@ from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
 from ba_torchrl.algorithms.learner import Learner
 from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
+from ba_torchrl.modules.actor_critic.gaussian_policy import truncated_gaussian_policy
 from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
-from ba_torchrl.modules.gaussian_policy import truncated_gaussian_policy
-from ba_torchrl.modules.values import ActionValue, StateValue
 
 
 @ALGORITHMS.register("iql")
@@ -32,7 +32,7 @@ class IQLConfig(LearnerConfig):
     Expectile and temperature are those of Kostrikov et al. (2021) for sparse rewards (AntMaze), tau
     is theirs as well. They subtract one from AntMaze's rewards; with rewards of 0 and 1, advantages
     are of the order of 1 - gamma, so that the policy is close to behaviour cloning. Unlike theirs,
-    the critics have layer normalisation (`ba_torchrl.modules.ensembles`).
+    the critics have layer normalisation (`ba_torchrl.modules.actor_critic.critics`).
     """
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})

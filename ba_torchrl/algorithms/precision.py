@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ba_torchrl.algorithms.base import NetworkConfig
-from ba_torchrl.modules.trunk import compute_dtype
+from ba_torchrl.modules.layers import compute_dtype
 
 
 def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:

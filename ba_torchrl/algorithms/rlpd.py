@@ -27,9 +27,9 @@ from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
+from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
-from ba_torchrl.modules.ensembles import EnsembleCritic
-from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.rlpd import RLPDLoss
 
 

@@ -33,8 +33,8 @@ from ba_torchrl.data.episode_assembler import EpisodeAssembler
 from ba_torchrl.data.files import read_state, write_state
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
-from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.contrastive import BilinearInfoNCE
 from ba_torchrl.objectives.imitation import ActionDistance
 from ba_torchrl.objectives.sacfd import SACfDLoss

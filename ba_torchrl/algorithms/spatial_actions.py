@@ -12,8 +12,8 @@ from ba_torchrl.algorithms.base import Problem
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import NetworkConfig
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_policy import SpatialActions, SpatialValues
+from ba_torchrl.modules.spatial.base import SpatialSpec
+from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
 
 
 def make_spatial_values(

@@ -20,7 +20,7 @@ from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.modules.base import NetworkConfig
-from ba_torchrl.modules.spatial_policy import SpatialPolicy, SpatialValues, spatial_policy
+from ba_torchrl.modules.spatial.policy import SpatialPolicy, SpatialValues, spatial_policy
 from ba_torchrl.objectives.dqn import Demonstrations, LevelDQNLoss
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torchrl
 from tensordict import TensorDict
 
+import torchrl
 from ba_torchrl import __version__
 from ba_torchrl.data.demos import Source, source_config
 from ba_torchrl.data.files import (

@@ -29,7 +29,7 @@ class ActorCriticSpec:
         images: declarations of the network's input images, by key, in the order of its arguments.
         action_sequence: one letter per action component, in the order of the action ("pxyzr").
         critics: number of critics of an ensemble with layer normalisation, see
-            `ba_torchrl.modules.ensembles`; None for twin critics without it.
+            `ba_torchrl.modules.actor_critic.critics`; None for twin critics without it.
 
     Raises:
         ValueError: the sequence is empty, repeats a letter or holds one outside "pxyzr".
@@ -84,7 +84,7 @@ class NetworkConfig(Protocol):
 
     control: ClassVar[Control]
     """Control of the tasks that it supports. ``build`` returns an `ActorCritic` for close-loop
-    tasks and a `ba_torchrl.modules.spatial.SpatialQNetwork` for open-loop tasks."""
+    tasks and a `ba_torchrl.modules.spatial.base.SpatialQNetwork` for open-loop tasks."""
     image_keys: ClassVar[tuple[str, ...]]
     """Keys of its input images, in the order of its arguments. The last argument is the holding
     flag."""

@@ -32,10 +32,10 @@ from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
+from ba_torchrl.modules.actor_critic.cnn import CNNConfig
+from ba_torchrl.modules.actor_critic.equivariant import EquivariantConfig
+from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
-from ba_torchrl.modules.cnn import CNNConfig
-from ba_torchrl.modules.equivariant import EquivariantConfig
-from ba_torchrl.modules.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.sacfd import SACfDLoss
 
 OBSERVATION = [keys.PIXELS, keys.HOLDING]

@@ -32,10 +32,10 @@ from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.asr import ASRConfig
-from ba_torchrl.modules.equi_asr import EquiASRConfig
-from ba_torchrl.modules.spatial import SpatialSpec
-from ba_torchrl.modules.spatial_policy import SpatialActions, SpatialPolicy, SpatialValues
+from ba_torchrl.modules.spatial.asr import ASRConfig
+from ba_torchrl.modules.spatial.base import SpatialSpec
+from ba_torchrl.modules.spatial.equi_asr import EquiASRConfig
+from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialPolicy, SpatialValues
 from ba_torchrl.objectives.dqn import LevelDQNLoss
 
 

@@ -9,8 +9,8 @@ from tqdm import tqdm
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.config import parse
-from ba_torchrl.profiling import learning
-from ba_torchrl.profiling.table import Bench, Budget
+from profiling import learning
+from profiling.table import Bench, Budget
 from tests.algorithms.tiny import OPEN, SIZES, make_experiment, problem, run, transitions
 
 pytestmark = pytest.mark.cuda
@@ -119,11 +119,7 @@ def test_speed_of_an_update(cuda):
     with tqdm(disable=True) as bar:
         (row,) = learning.measure_update(
             Bench(3, bar, device=cuda),
-            "update",
-            experiment,
-            {"name": "cnn"},
-            64,
-            Budget("1", 1.0, 1.0),
+            learning.Update("update", experiment, {"name": "cnn"}, 64, Budget("1", 1.0, 1.0)),
         )
     assert row.budget is None  # the budgets are those of a CPU
     assert 0 < row.share_of_limit < 1

@@ -10,7 +10,7 @@ from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.modules.cnn import CNNConfig
+from ba_torchrl.modules.actor_critic.cnn import CNNConfig
 from tests.algorithms.tiny import build, problem, run, transitions
 
 UNUSUAL = {

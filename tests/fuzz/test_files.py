@@ -14,11 +14,11 @@ from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.files import CHECKSUMS_FILE, read_state, seal, write_state
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.profiling.soak import TABLE_FILE, SoakJob, run_soak
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result, run_folders
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, load, write_config
 from ba_torchrl.training.config import ExperimentConfig
+from recipes.soak import TABLE_FILE, SoakJob, run_soak
 from tests.fuzz.values import JSON, check, examples
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 4}

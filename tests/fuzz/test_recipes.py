@@ -1,9 +1,7 @@
 """Command lines of recipes: an error is one line, before work starts."""
 
 import contextlib
-import importlib.util
 import io
-from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -15,8 +13,8 @@ from omegaconf.errors import OmegaConfBaseException
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.command_line import EXIT_CODE
 from tests.fuzz.values import check, examples
+from tests.recipes import ROOT, load_recipe
 
-ROOT = Path(__file__).parents[2]
 WORK = {
     "collect_demos": "make_vector_env",
     "experts": "expert_scores",
@@ -60,10 +58,8 @@ def recipe(request, monkeypatch, tmp_path):
     """The function of a recipe whose work is replaced, and its settings by overrides."""
     name = request.param
     monkeypatch.chdir(tmp_path)
-    spec = importlib.util.spec_from_file_location(f"fuzzed_{name}", ROOT / f"recipes/{name}.py")
-    module = importlib.util.module_from_spec(spec)
     monkeypatch.setattr("sys.argv", [name])
-    spec.loader.exec_module(module)
+    module = load_recipe(name)
     if WORK[name] is not None:
         monkeypatch.setattr(module, WORK[name], started)
     hydra_schema.register()

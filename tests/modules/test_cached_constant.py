@@ -2,7 +2,7 @@
 
 import torch
 
-from ba_torchrl.modules.cached_constant import cached_constant
+from ba_torchrl.modules.layers import cached_constant
 
 
 def make_constant(calls):

@@ -5,8 +5,8 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
-from ba_torchrl.modules.ensembles import EnsembleCritic
 from tests.specs import close_loop_images
 
 

@@ -10,10 +10,11 @@ import torch.nn.functional as F
 
 pytest.importorskip("escnn")
 
-from ba_torchrl.modules import cpu_threads, irrep_chunks
-from ba_torchrl.modules.irrep_convolution import irrep_convolution, saves_time
-from ba_torchrl.modules.kernel_blocks import kernel_block, regular_irrep_kernels
-from ba_torchrl.modules.steerable import (
+from ba_torchrl.modules.steerable import cpu_threads
+from ba_torchrl.modules.steerable import irrep_convolution as chunked
+from ba_torchrl.modules.steerable.irrep_convolution import irrep_convolution, saves_time
+from ba_torchrl.modules.steerable.kernels import kernel_block, regular_irrep_kernels
+from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
     planar_rotations,
     planar_rotations_and_flips,
@@ -81,9 +82,9 @@ def test_equals_the_convolution_with_the_expanded_filter(group, padding, threads
 
 
 def test_images_are_computed_in_groups(monkeypatch, threads):
-    monkeypatch.setattr(irrep_chunks, "CHUNK_BYTES", 4 * 48 * 2 * 81 * 3)  # three images of 8 x 8
+    monkeypatch.setattr(chunked, "CHUNK_BYTES", 4 * 48 * 2 * 81 * 3)  # three images of 8 x 8
     check(planar_rotations(8), 2, 3, (8, 8), 1, batch=11)
-    monkeypatch.setattr(irrep_chunks, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(chunked, "CHUNK_BYTES", 1)
     check(planar_rotations(8), 2, 3, (8, 8), 1)
 
 
@@ -100,10 +101,10 @@ def test_images_are_computed_in_groups(monkeypatch, threads):
     ],
 )
 def test_rows_of_large_images_are_computed_in_groups(monkeypatch, least_rows, padding, tops):
-    monkeypatch.setattr(irrep_chunks, "CHUNK_BYTES", 1)
-    monkeypatch.setattr(irrep_chunks, "LEAST_ROWS", least_rows)
+    monkeypatch.setattr(chunked, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(chunked, "LEAST_ROWS", least_rows)
     check(planar_rotations(4), 2, 3, (13, 9), padding)
-    layout = irrep_chunks.Layout((2, 8, 13, 9), maps=12, order=4, padding=padding)
+    layout = chunked.Layout((2, 8, 13, 9), maps=12, order=4, padding=padding)
     assert [chunk.top for chunk in layout.chunks(slice(0, 2), 3)] == 2 * tops
 
 

@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils.flop_counter import FlopCounterMode
 
-from ba_torchrl.modules import cpu_threads
-from ba_torchrl.modules.cpu_threads import in_parts
-from ba_torchrl.modules.max_pool import relu_of_max_pool
+from ba_torchrl.modules.steerable import cpu_threads
+from ba_torchrl.modules.steerable.cpu_threads import in_parts
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
 
@@ -150,7 +150,7 @@ def test_counts_of_operations_contain_all_parts(threads):
 
 END = """
 import threading, time, torch
-from ba_torchrl.modules.cpu_threads import in_parts
+from ba_torchrl.modules.steerable.cpu_threads import in_parts
 torch.set_num_threads(2)
 assert in_parts(4, lambda part: part.stop) == [2, 4]
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from torchrl.objectives import LossModule
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.trunk import compute_dtype
+from ba_torchrl.modules.layers import compute_dtype
 from tests.specs import actor_critic_spec
 
 pytest.importorskip("escnn")
@@ -133,7 +133,7 @@ def test_bfloat16_is_close_to_float32(name):
 
 
 def test_auto_precision_follows_the_hardware(monkeypatch):
-    from ba_torchrl.modules import trunk
+    from ba_torchrl.modules import layers
 
     cpu = torch.device("cpu")
     for variable in ("ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA"):
@@ -145,10 +145,10 @@ def test_auto_precision_follows_the_hardware(monkeypatch):
         ({"avx512_bf16": True, "cpu_name": "Intel Xeon"}, torch.float32),
         ({"avx2": True, "amx_bf16": False}, torch.float32),
     ]:
-        trunk._bfloat16_is_fast.cache_clear()
+        layers._bfloat16_is_fast.cache_clear()
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags)
         assert compute_dtype("auto", cpu) is expected
-    trunk._bfloat16_is_fast.cache_clear()
+    layers._bfloat16_is_fast.cache_clear()
     assert compute_dtype("float32", cpu) is torch.float32
     assert compute_dtype("bfloat16", cpu) is torch.bfloat16
     assert compute_dtype("auto", torch.device("meta")) is torch.float32
@@ -170,17 +170,17 @@ def test_auto_precision_follows_the_hardware(monkeypatch):
 def test_auto_precision_uses_the_instructions_that_onednn_may_use(
     variable, allowed, with_amx, on_amd, monkeypatch
 ):
-    from ba_torchrl.modules import trunk
+    from ba_torchrl.modules import layers
 
     monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
     monkeypatch.setenv(variable, allowed)
     intel = {"amx_bf16": True, "avx512_bf16": True, "cpu_name": "Intel Xeon"}
     amd = {"avx512_bf16": True, "cpu_name": "AMD Zen 4"}
     for flags, expected in [(intel, with_amx), (amd, on_amd)]:
-        trunk._bfloat16_is_fast.cache_clear()
+        layers._bfloat16_is_fast.cache_clear()
         monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags)
         assert compute_dtype("auto", torch.device("cpu")) is expected
-    trunk._bfloat16_is_fast.cache_clear()
+    layers._bfloat16_is_fast.cache_clear()
 
 
 def test_functional_calls_use_the_given_parameters():

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 pytest.importorskip("escnn")
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.pose_values import PoseValues, SceneMapVector
+from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView, crop
 from tests.specs import spatial_spec
 

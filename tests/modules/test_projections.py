@@ -7,14 +7,14 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ba_torchrl.modules.patches import patches
-from ba_torchrl.modules.projections import (
+from ba_torchrl.modules.spatial.projections import (
     cell_table,
     project,
     project_upright,
     rotated_cells,
     tool_rotations,
 )
+from ba_torchrl.modules.spatial.views import patches
 from ba_torchrl.sim.geometry import euler_matrix
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from torchrl.objectives import LossModule
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.equi_unet import EquivariantPixelValues
+from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
 from tests.specs import spatial_spec
 
 pytest.importorskip("escnn")

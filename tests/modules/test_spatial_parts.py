@@ -10,12 +10,13 @@ pytest.importorskip("escnn")
 
 from escnn import nn as enn
 
-from ba_torchrl.modules.dynamic_filter import DynamicSteerableConv2d, filter_generator
-from ba_torchrl.modules.in_hand_encoders import InHandMap, InHandVector
-from ba_torchrl.modules.patches import centre_fit, patches, sample, sampling_grid
-from ba_torchrl.modules.spatial_inputs import yaws_rad
-from ba_torchrl.modules.steerable import (
+from ba_torchrl.modules.spatial.base import yaws_rad
+from ba_torchrl.modules.spatial.in_hand import InHandMap, InHandVector
+from ba_torchrl.modules.spatial.views import centre_fit, patches, sample, sampling_grid
+from ba_torchrl.modules.steerable.layers import (
+    DynamicSteerableConv2d,
     SteerableConv2d,
+    filter_generator,
     planar_rotations,
     planar_rotations_and_flips,
     planar_yaws,

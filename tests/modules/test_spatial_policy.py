@@ -8,8 +8,8 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.actions import OpenLoopActions
-from ba_torchrl.modules.spatial import Level, SpatialQNetwork
-from ba_torchrl.modules.spatial_policy import (
+from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
+from ba_torchrl.modules.spatial.policy import (
     SpatialActions,
     SpatialPolicy,
     SpatialValues,

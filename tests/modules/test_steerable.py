@@ -11,8 +11,8 @@ pytest.importorskip("escnn")
 
 from escnn import nn as enn
 
-from ba_torchrl.modules.kernel_blocks import he_scales, kernel_block
-from ba_torchrl.modules.steerable import (
+from ba_torchrl.modules.steerable.kernels import he_scales, kernel_block
+from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
     SteerableLinear,
     planar_rotations,

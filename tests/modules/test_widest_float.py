@@ -5,7 +5,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ba_torchrl.modules import widest_float
+from ba_torchrl.modules import layers
 from tests.algorithms import test_spatial_q_pose as six_dof
 from tests.algorithms import test_wiring, tiny
 
@@ -28,11 +28,11 @@ def learn_and_act(learner, batch):
 @pytest.fixture
 def without_float64(monkeypatch):
     def declare():
-        monkeypatch.setattr(widest_float, "WITHOUT_FLOAT64", {"cpu"})
-        widest_float.constants.cache_clear()
+        monkeypatch.setattr(layers, "WITHOUT_FLOAT64", {"cpu"})
+        layers.constants.cache_clear()
 
     yield declare
-    widest_float.constants.cache_clear()
+    layers.constants.cache_clear()
 
 
 def check(learner, without_float64, transitions):

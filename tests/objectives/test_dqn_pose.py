@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from ba_torchrl.actions import OpenLoopActions
-from ba_torchrl.modules.spatial import Level, SpatialQNetwork
-from ba_torchrl.modules.spatial_policy import SpatialActions, SpatialValues
+from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
+from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
 from ba_torchrl.objectives.dqn import LevelDQNLoss
 
 GAMMA = 0.9

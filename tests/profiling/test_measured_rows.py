@@ -7,9 +7,10 @@ import torch
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from ba_torchrl.profiling import layers, learning, limits, throughput
-from ba_torchrl.profiling.limits import MatrixProduct, count_multiply_adds
-from ba_torchrl.profiling.table import COLUMNS, Bench, Budget, Row, as_markdown
+from ba_torchrl.config import WorkerOptions
+from profiling import layers, learning, limits, throughput
+from profiling.limits import MatrixProduct, count_multiply_adds
+from profiling.table import COLUMNS, Bench, Budget, Row, as_markdown
 
 
 def test_multiply_adds_of_forward_and_backward():
@@ -54,12 +55,14 @@ def test_an_update_has_a_limit_and_the_budget_of_its_instructions(
     with tqdm(disable=True) as bar:
         (row,) = learning.measure_update(
             Bench(2, bar, precision=precision),
-            "update",
-            experiment,
-            {"name": "cnn", "width": 0.125},
-            64,
-            with_amx=Budget("1", None, None),
-            without_amx=Budget("2", None, None),
+            learning.Update(
+                "update",
+                experiment,
+                {"name": "cnn", "width": 0.125},
+                64,
+                with_amx=Budget("1", None, None),
+                without_amx=Budget("2", None, None),
+            ),
         )
     assert row.budget.reference == reference
     assert len(row.values) == len(row.unit_s) == len(row.limit_s) == 2
@@ -76,11 +79,11 @@ def test_the_matrix_product_has_the_format_of_the_network():
 
 def test_frames_per_second(monkeypatch):
     # Forking is fast; it needs a process without an open simulator, so workers come first.
-    options = {"parallel": True, "start_method": "fork"}
+    options = {"workers": WorkerOptions(start_method="fork")}
     vectors = {
         "workers, shared memory": {**options, "use_buffers": True},
         "workers, pipes": {**options, "use_buffers": False},
-        "one process": {"parallel": False},
+        "one process": {"workers": WorkerOptions(parallel=False)},
     }
     monkeypatch.setattr(throughput, "VECTORS", vectors)
     monkeypatch.setattr(throughput, "STEPS", 3)
@@ -99,7 +102,8 @@ def test_frames_per_second(monkeypatch):
 
 
 def test_frames_per_second_count_all_environments(monkeypatch):
-    monkeypatch.setattr(throughput, "VECTORS", {"one process": {"parallel": False}})
+    vectors = {"one process": {"workers": WorkerOptions(parallel=False)}}
+    monkeypatch.setattr(throughput, "VECTORS", vectors)
     monkeypatch.setattr(throughput, "STEPS", 4)
     monkeypatch.setattr(throughput, "make_vector", lambda *_, **__: None)
     taken = []
@@ -127,54 +131,20 @@ def test_frames_per_second_count_all_environments(monkeypatch):
     assert list(row.values) == [40.0, 40.0]
 
 
-def test_the_measured_loop_computes_the_margin():
-    generator = torch.Generator().manual_seed(0)
-    values = torch.randn(6, 40, generator=generator)
-    values[0, 7] = 10.0  # above all others by more than the margin
-    chosen = torch.tensor([7, 0, 3, 39, 12, 5])
-    found = layers.margin_in_a_loop(values, chosen, 0.1)
-    assert found[0] == 0
-    torch.testing.assert_close(found, layers.strict_large_margin(values, chosen, 0.1))
-
-
-def test_the_measured_products_compute_the_dynamic_convolution():
-    generator = torch.Generator().manual_seed(0)
-    x = torch.randn(3, 4, 6, 7, generator=generator)
-    filters = torch.randn(3, 5, 4, 3, 3, generator=generator)
-    found = layers.convolution_by_products(x, filters)
-    expected = [
-        F.conv2d(image[None], weight, padding=1) for image, weight in zip(x, filters, strict=True)
-    ]
-    torch.testing.assert_close(found, torch.cat(expected))
-
-
 def test_layers_are_measured_in_pairs(monkeypatch):
     pytest.importorskip("escnn")
     monkeypatch.setattr(layers, "BATCH", 2)
-    monkeypatch.setattr(layers, "MARGIN_VALUES", 64)
-    monkeypatch.setattr(layers, "HELD_FIELDS", 2)
-    monkeypatch.setattr(layers, "HELD_PIXELS", 8)
     monkeypatch.setattr(layers, "LearningUnit", lambda _: lambda: None)
     with tqdm(disable=True) as bar:
         bench = Bench(1, bar)
         convolutions = layers.measure_steerable(bench, 2, 3, 8)
         pools = layers.measure_max_pool(bench, "channels-last")
-        dtypes = layers.measure_dtypes(bench)
-        margins = layers.measure_margin(bench)
-        dynamic = layers.measure_dynamic_filter(bench)
-    rows = (*convolutions, *pools, *dtypes, *margins, *dynamic)
+    rows = (*convolutions, *pools)
     assert [row.work.rpartition(", ")[2] for row in rows] == [
         "expanded filter",
         "basis of irreps",
         "PyTorch",
         "one pass",
         "slope 0.1",
-        "float32",
-        "bfloat16",
-        "all samples",
-        "8 demonstrations",
-        "8 demonstrations in a loop",
-        "grouped convolution",
-        "matrix products",
     ]
     assert all(row.values[0] > 0 for row in rows)

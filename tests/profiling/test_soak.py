@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from ba_torchrl.profiling import soak, soak_one
-from ba_torchrl.profiling.soak import TABLE_FILE, SoakFigures, SoakJob, run_soak
+from recipes import soak
+from recipes.soak import TABLE_FILE, SoakFigures, SoakJob, run_soak
 
 JOB = SoakJob(task="close_loop/block_reaching", steps=60, env={"obs_size": 16, "max_steps": 10})
 
@@ -14,8 +14,8 @@ JOB = SoakJob(task="close_loop/block_reaching", steps=60, env={"obs_size": 16, "
 @pytest.fixture(scope="module")
 def figures():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(soak_one, "SAMPLES", 8)  # each collects the garbage of the whole test session
-        return soak_one.soak(JOB)
+        patch.setattr(soak, "SAMPLES", 8)  # each collects the garbage of the whole test session
+        return soak.soak(JOB)
 
 
 def worker(folder, figures, code=""):
@@ -79,8 +79,11 @@ def test_criteria_that_are_not_met_are_reported(tmp_path, figures, change, probl
     assert failures == {JOB.task: problem}
 
 
-def test_the_worker_is_the_module_of_one_task():
-    assert soak.WORKER[1:] == ("-m", "ba_torchrl.profiling.soak_one")
+@pytest.mark.slow
+def test_a_process_of_the_recipe_measures_a_task(tmp_path):
+    failures = run_soak([JOB], tmp_path, progress=False)
+    assert failures.get(JOB.task, "memory grows") == "memory grows"
+    assert f"| `{JOB.task}` | 60 |" in (tmp_path / TABLE_FILE).read_text()
 
 
 def test_a_deeply_nested_file_of_figures_is_damaged(caplog, tmp_path):

@@ -12,16 +12,15 @@ from hydra import compose, initialize_config_dir
 from hypothesis import strategies as st
 
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.profiling import speed_file
-from ba_torchrl.profiling.comparison import Change, columns_of_changes, ratio_of_medians
-from ba_torchrl.profiling.speed_file import (
+from profiling import speed_file
+from profiling.comparison import changes, columns_of_changes, ratio_of_medians
+from profiling.speed_file import (
     Machine,
     SpeedFile,
-    check_output,
     read_speed_file,
     write_speed_file,
 )
-from ba_torchrl.profiling.table import COLUMNS, Budget, Row, as_markdown
+from profiling.table import COLUMNS, Budget, Row, as_markdown
 from tests.fuzz.values import JSON, check, examples
 
 ROOT = Path(__file__).parents[2]
@@ -153,7 +152,7 @@ def test_the_recipe_writes_a_file_and_compares_with_it(recipe, tmp_path, content
         (["compare=none.json"], "error: cannot read none.json: No such file or directory"),
         (["compare=."], "error: cannot read .: Is a directory"),
         (["output=speed.csv"], "error: output: the file ends in .json, not 'speed.csv'"),
-        (["repeats=few"], "error: repeats: must be a whole number of at least 1, got 'few'"),
+        (["repeats=few"], "error: invalid settings: repeats: Input should be a valid integer"),
         (["device=nothing"], "error: device: use device=cpu or device=auto"),
     ],
 )
@@ -167,12 +166,6 @@ def test_mistakes_are_reported_in_one_line_before_the_measurement(
     assert error.startswith(message)
     assert error.count("\n") == 1
     assert out == ""
-
-
-def test_other_suffixes_are_refused():
-    check_output("a/b.json")
-    with pytest.raises(ConfigError, match=r"ends in \.json"):
-        check_output("a/json")
 
 
 # -- noise -----------------------------------------------------------------------------------------
@@ -210,22 +203,17 @@ def test_few_values_have_no_interval():
     assert ratio_of_medians([[1.0] * 6], [[2.0] * 47]).interval == (0.5, 0.5)
 
 
-def test_units_cancel_the_speed_of_the_machine():
+@pytest.mark.parametrize(("unit", "values"), [("ms", (10.0, 20.0)), ("frames/s", (10.0, 5.0))])
+def test_units_cancel_the_speed_of_the_machine(unit, values):
     """All durations on the new machine are twice as long, also that of the unit of work."""
-    old = Row("work", "ms", [10.0] * 8, unit_s=[1.0] * 8)
-    change = Change.between(old, Row("work", "ms", [20.0] * 8, unit_s=[2.0] * 8))
-    assert (change.of_values.value, change.of_units.value) == (2.0, 1.0)
-    assert change.of_values.is_above_noise
-    assert change.difference == "within noise"
-    old = Row("work", "frames/s", [10.0] * 8, unit_s=[1.0] * 8)
-    change = Change.between(old, Row("work", "frames/s", [5.0] * 8, unit_s=[2.0] * 8))
-    assert (change.of_values.value, change.of_units.value) == (0.5, 1.0)
-    assert change.of_units.value == 5.0 * 2.0 / (10.0 * 1.0)
-
-
-def test_rows_without_a_unit_of_work_compare_by_value():
-    change = Change.between(Row("memory", "MB", [50.0]), Row("memory", "MB", [40.0]))
-    assert (change.of_values.value, change.of_units, change.difference) == (0.8, None, "")
+    old, new = (
+        Row("work", unit, [value] * 8, unit_s=[unit_s] * 8)
+        for value, unit_s in zip(values, (1.0, 2.0), strict=True)
+    )
+    of_values, of_units = changes(old, new)
+    assert (of_values.value, of_units.value) == (values[1] / values[0], 1.0)
+    assert (of_values.is_above_noise, of_units.is_above_noise) == (True, False)
+    assert columns_of_changes([old], [new])["difference"](new) == "within noise"
 
 
 def test_rows_are_compared_with_those_of_the_same_work_and_unit():

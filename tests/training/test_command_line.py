@@ -39,6 +39,8 @@ COMMANDS = (
     "play",
     "plot",
     "report",
+    "soak",
+    "speed",
     "tasks",
 )
 LONG = 300 * "n"

@@ -10,8 +10,8 @@ from tensordict import TensorDict
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
-from ba_torchrl.modules.spatial import Level
-from ba_torchrl.modules.spatial_policy import SpatialActions
+from ba_torchrl.modules.spatial.base import Level
+from ba_torchrl.modules.spatial.policy import SpatialActions
 from ba_torchrl.sim.geometry import euler_matrix
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from tests.specs import open_loop_images

@@ -1,0 +1,1 @@
+"""Networks of close-loop tasks: policy, encoder and critics."""

@@ -1,0 +1,127 @@
+"""The plain convolutional actor-critic (appendix G.2; "CNN SACfD")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
+from ba_torchrl.modules.actor_critic.trunk import (
+    ImageNetworkConfig,
+    ImageTrunk,
+    scale_from_log_std,
+    trunk_stages,
+)
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
+
+_WIDTHS = (16, 32, 64, 128, 256, 256, 128)
+_HIDDEN = 128
+
+
+class CNNActor(nn.Module):
+    """Gaussian policy: an image trunk and one linear layer each for mean and log-std.
+
+    Args:
+        trunk: the image trunk.
+        features: its output size.
+        action_size: number of action components.
+    """
+
+    def __init__(self, trunk: ImageTrunk, features: int, action_size: int) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.loc = nn.Linear(features, action_size)
+        self.log_std = nn.Linear(features, action_size)
+
+    def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
+        features = self.trunk(pixels, holding)
+        return self.loc(features), scale_from_log_std(self.log_std(features))
+
+
+class CNNTwinCritic(nn.Module):
+    """Two value heads on shared features.
+
+    Args:
+        features: size of the features.
+        action_size: number of action components.
+        hidden: width of each head's hidden layer.
+    """
+
+    def __init__(self, features: int, action_size: int, hidden: int) -> None:
+        super().__init__()
+        self.heads = nn.ModuleList(
+            nn.Sequential(
+                nn.Linear(features + action_size, hidden), nn.ReLU(), nn.Linear(hidden, 1)
+            )
+            for _ in range(2)
+        )
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return twin values [..., 2] of features [..., F] and action [..., A]."""
+        x = torch.cat([features, action], dim=-1)
+        return torch.cat([head(x) for head in self.heads], dim=-1)
+
+
+def plain_trunk(
+    config: ImageNetworkConfig, spec: ActorCriticSpec, widths: Sequence[int]
+) -> ImageTrunk:
+    """Return a trunk of plain convolutions.
+
+    Args:
+        config: precision and the input's units.
+        spec: the images.
+        widths: of the stages of 128 px images.
+    """
+    stages = trunk_stages(spec.image_size, widths)
+    inputs = [config.input_channels(spec.image_channels), *(width for width, _, _ in stages)]
+    convs = [
+        CastConv2d(channels, width, 3, padding=padding)
+        for channels, (width, padding, _) in zip(inputs, stages, strict=False)
+    ]
+    return config.image_trunk(convs, [pools for _, _, pools in stages])
+
+
+@NETWORKS.register("cnn")
+class CNNConfig(ImageNetworkConfig):
+    """Hyper-parameters of the plain convolutional actor-critic.
+
+    Args:
+        width: factor on every layer's width; 1 is the reference's size.
+    """
+
+    width: float = Field(default=1.0, gt=0)
+
+    def build(self, spec: ActorCriticSpec) -> ActorCritic:
+        """Return freshly initialised modules.
+
+        Args:
+            spec: the images and the action.
+
+        Raises:
+            ValueError: the image size is not 64 or 128, or the image is not depth or height.
+        """
+        self.check_images(spec)
+        features = scaled_width(_WIDTHS[-1], self.width)
+        networks = ActorCritic(
+            actor=CNNActor(self._trunk(spec), features, spec.action_size),
+            encoder=self._trunk(spec),
+            critic=self._critic(spec, features),
+        )
+        for network in networks:
+            network.apply(initialise_plain)
+        return networks
+
+    def _critic(self, spec: ActorCriticSpec, features: int) -> nn.Module:
+        hidden = scaled_width(_HIDDEN, self.width)
+        if spec.critics is None:
+            return CNNTwinCritic(features, spec.action_size, hidden)
+        first = nn.Linear(features + spec.action_size, spec.critics * hidden)
+        return EnsembleCritic(first, spec.critics, hidden)
+
+    def _trunk(self, spec: ActorCriticSpec) -> ImageTrunk:
+        return plain_trunk(self, spec, [scaled_width(width, self.width) for width in _WIDTHS])

@@ -1,0 +1,246 @@
+"""The equivariant actor-critic (appendix G.2; "Equi SACfD"), also with strided convolutions.
+
+Turning the scene by +90 degrees about z turns the image by ``torch.rot90(k=1)`` and (dx, dy) into
+(-dy, dx); escnn's rotations have the same sense, so (dx, dy) is a vector field without a change of
+sign. Reflecting the scene's y axis reverses the columns of the image, dy and the yaw.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
+from ba_torchrl.modules.actor_critic.trunk import (
+    ImageNetworkConfig,
+    ImageTrunk,
+    scale_from_log_std,
+    trunk_stages,
+)
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.steerable.layers import (
+    FieldTypes,
+    SteerableConv2d,
+    SteerableLinear,
+    planar_rotations,
+    planar_rotations_and_flips,
+)
+
+if TYPE_CHECKING:
+    from escnn.gspaces import GSpace2D
+
+
+class ActionFields:
+    """How the components of an action transform under rotations and reflections.
+
+    (x, y) is a vector and the other components are invariant, except for the yaw r, which a
+    reflection reverses.
+
+    Args:
+        action_sequence: one letter per component.
+        has_reflections: whether the group contains reflections.
+
+    Raises:
+        ValueError: x or y is missing.
+    """
+
+    def __init__(self, action_sequence: str, *, has_reflections: bool = False) -> None:
+        if not {"x", "y"} <= set(action_sequence):
+            raise ValueError(
+                f"an equivariant network needs x and y in the action, got {action_sequence!r}"
+            )
+        self.size = len(action_sequence)
+        self.has_reflections = has_reflections
+        self.signed = [
+            i for i, letter in enumerate(action_sequence) if letter == "r" and has_reflections
+        ]
+        """Indices of the components that a reflection reverses."""
+        self.invariants = [
+            i
+            for i, letter in enumerate(action_sequence)
+            if letter not in "xy" and i not in self.signed
+        ]
+        # Index in the action of each component of [vector, signed, invariants], and the inverse
+        # permutation.
+        vector = [action_sequence.index("x"), action_sequence.index("y")]
+        self._grouped = [*vector, *self.signed, *self.invariants]
+        self._restore = [self._grouped.index(i) for i in range(self.size)]
+
+    def types(self, gspace: GSpace2D, extra_invariants: int = 0) -> FieldTypes:
+        """Return the fields [vector, signed, invariants], with extra invariants at the end."""
+        rotation = gspace.irrep(1, 1) if self.has_reflections else gspace.irrep(1)
+        # A half turn acts on x and y separately, so C_2 needs its one-dimensional irrep twice.
+        fields = [(rotation, 2 // rotation.size)]
+        if self.signed:
+            fields.append((gspace.irrep(1, 0), len(self.signed)))
+        count = len(self.invariants) + extra_invariants
+        return [*fields, (gspace.trivial_repr, count)] if count else fields
+
+    def group(self, action: Tensor) -> Tensor:
+        """Return the action's components [..., A] as [vector, signed, invariants]."""
+        return torch.stack([action[..., i] for i in self._grouped], dim=-1)
+
+    def ungroup(self, fields: Tensor) -> Tensor:
+        """Return the components [..., A] of [vector, signed, invariants] in the action's order."""
+        return torch.stack([fields[..., i] for i in self._restore], dim=-1)
+
+
+class EquivariantActor(nn.Module):
+    """Gaussian policy with equivariant mean and invariant log-std, before the squashing.
+
+    Args:
+        gspace: images and their symmetry group.
+        trunk: the image trunk.
+        features: fields that the trunk returns.
+        action: how the action transforms.
+    """
+
+    def __init__(
+        self, gspace: GSpace2D, trunk: ImageTrunk, features: FieldTypes, action: ActionFields
+    ) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.action = action
+        # The log standard deviations are invariant as well.
+        outputs = action.types(gspace, extra_invariants=action.size)
+        self.head = SteerableLinear(gspace, features, outputs)
+
+    def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
+        fields = self.head(self.trunk(pixels, holding))
+        loc, log_std = fields.split(self.action.size, dim=-1)
+        return self.action.ungroup(loc), scale_from_log_std(log_std)
+
+
+class EquivariantTwinCritic(nn.Module):
+    """Two invariant value heads on shared features and the action.
+
+    Args:
+        gspace: images and their symmetry group.
+        features: fields of the features, all regular.
+        action: how the action transforms.
+    """
+
+    def __init__(self, gspace: GSpace2D, features: FieldTypes, action: ActionFields) -> None:
+        super().__init__()
+        self.action = action
+        ((regular, count),) = features
+        self._group_order = regular.size
+        inputs = [*features, *action.types(gspace)]
+        self.hidden = nn.ModuleList(
+            SteerableLinear(gspace, inputs, [(regular, count)]) for _ in range(2)
+        )
+        # From invariants to one value: the only steerable kernel is the identity, so this is a
+        # plain linear layer.
+        scalars, value = [(gspace.trivial_repr, count)], [(gspace.trivial_repr, 1)]
+        self.values = nn.ModuleList(SteerableLinear(gspace, scalars, value) for _ in range(2))
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Return twin values [..., 2] of features [..., F] and action [..., A]."""
+        x = torch.cat([features, self.action.group(action)], dim=-1)
+        values = []
+        for hidden, value in zip(self.hidden, self.values, strict=True):
+            fields = F.relu(hidden(x)).unflatten(-1, (-1, self._group_order))
+            values.append(value(fields.amax(dim=-1)))
+        return torch.cat(values, dim=-1)
+
+
+@NETWORKS.register("equi")
+class EquivariantConfig(ImageNetworkConfig):
+    """Hyper-parameters of the equivariant actor-critic.
+
+    Args:
+        group_order: number of rotations n of the group, at least 2; the default is that of the
+            reference implementation.
+        reflections: the group is the dihedral group D_n instead of the cyclic group C_n.
+        n_hidden: number of regular fields of the last layers; the default is that of the reference
+            implementation. The first layer has an eighth of it
+            at 128 px, and a quarter at 64 px, where the first stage is left out.
+    """
+
+    group_order: int = Field(default=8, ge=2)
+    reflections: bool = False
+    n_hidden: int = Field(default=64, ge=4)
+
+    def build(self, spec: ActorCriticSpec) -> ActorCritic:
+        """Return freshly initialised modules.
+
+        Args:
+            spec: the images and the action.
+
+        Raises:
+            ImportError: escnn is missing; the message names the fix.
+            ValueError: the image size is not 64 or 128, the image is not depth or height,
+                ``n_hidden`` does not divide into whole fields, the action lacks x or y, or the
+                group is D_2.
+        """
+        self.check_images(spec)
+        if self.reflections and self.group_order < 3:
+            raise ValueError("reflections need a group_order of at least 3")
+        group = planar_rotations_and_flips if self.reflections else planar_rotations
+        gspace = group(self.group_order)
+        action = ActionFields(spec.action_sequence, has_reflections=self.reflections)
+        features = [(gspace.regular_repr, self.n_hidden)]
+        return ActorCritic(
+            actor=EquivariantActor(gspace, self._trunk(gspace, spec), features, action),
+            encoder=self._trunk(gspace, spec),
+            critic=self._critic(gspace, features, action, spec.critics),
+        )
+
+    def _critic(
+        self, gspace: GSpace2D, features: FieldTypes, action: ActionFields, critics: int | None
+    ) -> nn.Module:
+        if critics is None:
+            return EquivariantTwinCritic(gspace, features, action)
+        regular, fields = gspace.regular_repr, self.n_hidden
+        inputs = [*features, *action.types(gspace)]
+        first = SteerableLinear(gspace, inputs, [(regular, critics * fields)])
+        return EnsembleCritic(first, critics, fields, regular.size, action.group)
+
+    def _trunk(self, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:
+        n = self.n_hidden
+        stages = trunk_stages(spec.image_size, (n / 8, n / 4, n / 2, n, 2 * n, n, n))
+        divisor = round(n / stages[0][0])
+        if n % divisor:
+            raise ValueError(
+                f"n_hidden must be a multiple of {divisor} at {spec.image_size} px, since the "
+                f"first layer has n_hidden/{divisor} fields; got {n}"
+            )
+        regular = gspace.regular_repr
+        fields: FieldTypes = [(gspace.trivial_repr, self.input_channels(spec.image_channels))]
+        convs = []
+        for width, padding, pools in stages:
+            out = [(regular, int(width))]
+            convs.append(self._convolution(gspace, fields, out, padding, pools))
+            fields = out
+        pools = [  # a stride halves the image as a pool does
+            pools and conv.stride == 1 for (_, _, pools), conv in zip(stages, convs, strict=True)
+        ]
+        return self.image_trunk(convs, pools)
+
+    def _convolution(
+        self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool
+    ) -> SteerableConv2d:
+        return SteerableConv2d(gspace, inputs, outputs, 3, padding=padding)
+
+
+@NETWORKS.register("equi_strided")
+class StridedEquivariantConfig(EquivariantConfig):
+    """Hyper-parameters of the equivariant actor-critic with strided convolutions, not max pools.
+
+    Not part of the paper. A 4x4 kernel with stride 2 reads pixels that are symmetric about the
+    centre of the image, so that quarter turns remain exact; a 3x3 kernel with stride 2 does not. It
+    takes four products per input pixel and pair of channels where a 3x3 kernel before a max pool
+    takes nine. The stages, their numbers of fields and the arguments are those of
+    `EquivariantConfig`.
+    """
+
+    def _convolution(
+        self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool
+    ) -> SteerableConv2d:
+        size, stride = (4, 2) if pools else (3, 1)
+        return SteerableConv2d(gspace, inputs, outputs, size, padding=padding, stride=stride)

@@ -1,0 +1,171 @@
+"""Shared by the image networks: input assembly, compute precision and the convolution trunk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import ClassVar, Literal
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from ba_torchrl.config import StrictModel
+from ba_torchrl.envs import keys
+from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
+from ba_torchrl.modules.layers import (
+    Precision,
+    compute_dtype,
+)
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
+
+SUPPORTED_IMAGE_SIZES = (64, 128)
+
+
+def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int, bool]]:
+    """Return (width, padding, pools) of each stage of a trunk that ends at one pixel.
+
+    The padding is that of a 3x3 convolution before a 2x2 pool; in place of both, a 4x4 convolution
+    with stride 2 gives the same size. 128 px shrink to 8 in four pooled stages; then come 8 -> 8,
+    8 -> 6 with a pool to 3, and 3 -> 1. At 64 px the first stage is left out (design, section 2).
+
+    Args:
+        image_size: pixels, 64 or 128.
+        widths: the seven widths of the 128 px trunk.
+
+    Raises:
+        ValueError: another image size.
+    """
+    if image_size not in SUPPORTED_IMAGE_SIZES:
+        raise ValueError(
+            f"this network takes images of {' or '.join(map(str, SUPPORTED_IMAGE_SIZES))} px, got "
+            f"{image_size}; set obs_size, or crop_size where views are crops"
+        )
+    stages = list(
+        zip(
+            widths,
+            (1, 1, 1, 1, 1, 0, 0),
+            (True, True, True, True, False, True, False),
+            strict=True,
+        )
+    )
+    return stages if image_size == 128 else stages[1:]
+
+
+class ImageNetworkConfig(StrictModel):
+    """Hyper-parameters that every network on depth images has.
+
+    The input of the networks is (depth - depth_center_m) / depth_scale_m. The defaults keep metres,
+    as the reference implementation does. With a center of 0.2 and a scale of 0.1, inputs have unit
+    size and differences of a block's height are well above the resolution of bfloat16; learning is
+    much faster.
+
+    With the floor as the reference, the floor's depth is an input of its own, the same at all
+    pixels, and the image becomes heights above it, so that the activations of the floor do not
+    exceed those of the objects on it.
+
+    Args:
+        precision: number format of the convolutions, see `compute_dtype`.
+        depth_reference: "camera", or "floor" for two inputs: height above the lowest visible point,
+            and the depth of that point.
+        depth_center_m: depth that is scaled to zero.
+        depth_scale_m: difference in depth that is scaled to one.
+        negative_slope: slope of the activation function below zero; 0 is a ReLU, as in the
+            reference implementation. After a max pool, narrow layers with a ReLU can hide an object
+            completely, and then receive no gradient from it.
+    """
+
+    control: ClassVar[Control] = "close_loop"
+    image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS,)
+    shares_encoder: ClassVar[bool] = False
+    """Whether the policy sees features of the critics' encoder."""
+
+    precision: Precision = "auto"
+    depth_reference: Literal["camera", "floor"] = "camera"
+    depth_center_m: float = 0.0
+    depth_scale_m: float = Field(default=1.0, gt=0)
+    negative_slope: float = Field(default=0.0, ge=0, lt=1)
+
+    def input_channels(self, image_channels: int) -> int:
+        """Return the number of input channels of the first convolution.
+
+        Args:
+            image_channels: channels of the image.
+        """
+        return image_channels + (1 if self.depth_reference == "camera" else 2)
+
+    def check_images(self, spec: ActorCriticSpec) -> None:
+        """Refuse images that are not depth or height.
+
+        Raises:
+            ValueError: an image has several channels, or values below zero.
+        """
+        for key, image in spec.images.items():
+            if image.channels != 1 or image.low < 0:
+                raise ValueError(
+                    f"{key} has {image.channels} channels with values from {image.low:g}; this "
+                    "network takes depth or height in one channel, nothing below zero: choose "
+                    "another view_type"
+                )
+
+    def image_trunk(self, convs: Iterable[nn.Module], pools: Iterable[bool]) -> ImageTrunk:
+        """Return a trunk of convolutions, each followed by a 2x2 max pool where ``pools`` is
+        true."""
+        return ImageTrunk(convs, pools, self)
+
+
+class ImageTrunk(nn.Module):
+    """Depth image and holding flag to one feature vector, through convolutions.
+
+    Activations are channels-last in the compute dtype; parameters stay float32 and each
+    convolution casts its own filter. The result is float32.
+
+    Args:
+        convs: convolutions that take and return plain tensors in the input's dtype.
+        pools: for each, whether a 2x2 max pool follows.
+        config: precision and the input's units.
+    """
+
+    def __init__(
+        self, convs: Iterable[nn.Module], pools: Iterable[bool], config: ImageNetworkConfig
+    ) -> None:
+        super().__init__()
+        self.convs = nn.ModuleList(convs)
+        self.pools = tuple(pools)
+        self.config = config
+
+    def forward(self, pixels: Tensor, holding: Tensor) -> Tensor:
+        """Return features [..., F] of pixels [..., C, H, W] and holding [..., 1]."""
+        leading = pixels.shape[:-3]
+        x = self._input(pixels.flatten(0, -4) if leading else pixels[None], holding)
+        slope = self.config.negative_slope
+        for conv, pool in zip(self.convs, self.pools, strict=True):
+            x = conv(x)
+            if pool:
+                x = relu_of_max_pool(x, slope)
+            else:
+                x = F.leaky_relu(x, slope) if slope else F.relu(x)
+        return x.flatten(1).float().reshape(*leading, -1)
+
+    def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:
+        batch, channels, height, width = pixels.shape
+        x = torch.empty(
+            (batch, self.config.input_channels(channels), height, width),
+            dtype=compute_dtype(self.config.precision, pixels.device),
+            device=pixels.device,
+            memory_format=torch.channels_last,
+        )
+        center, scale = self.config.depth_center_m, self.config.depth_scale_m
+        if self.config.depth_reference == "floor":
+            floor = pixels.amax((-2, -1), keepdim=True)
+            x[:, :channels] = (floor - pixels) / scale
+            x[:, channels:-1] = (floor - center) / scale
+        else:
+            x[:, :channels] = pixels if (center, scale) == (0, 1) else (pixels - center) / scale
+        x[:, -1:] = holding.reshape(batch, 1, 1, 1)
+        return x
+
+
+def scale_from_log_std(log_std: Tensor) -> Tensor:
+    """Return the standard deviation of a log standard deviation clamped to [-20, 2]."""
+    return log_std.clamp(LOG_STD_MIN, LOG_STD_MAX).exp()

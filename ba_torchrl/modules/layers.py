@@ -1,0 +1,119 @@
+"""Shared by all networks: number formats, constants of a process, plain layers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import wraps
+from typing import Literal, TypeVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ba_torchrl import hardware
+
+Value = TypeVar("Value")
+
+
+def cached_constant(
+    maxsize: int | None = None,
+) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
+    """Return a decorator for functions of hashable positional arguments.
+
+    `torch.compile` ignores the cache of `functools.lru_cache` and would compute the result in each
+    call of a graph. It reads this one, whose entries are inputs of the graph, and compiles a graph
+    again in whose first call an entry was missing.
+
+    Args:
+        maxsize: number of results that are kept, the newest ones; None for all.
+    """
+
+    def decorate(function: Callable[..., Value]) -> Callable[..., Value]:
+        results: dict[tuple, Value] = {}
+
+        @wraps(function)
+        def call(*args: object) -> Value:
+            if args not in results:
+                # a tensor of inference mode could not be used in a later training step
+                with torch.inference_mode(False):
+                    result = function(*args)
+                if maxsize is not None and len(results) >= maxsize:
+                    del results[next(iter(results))]
+                results[args] = result
+                return result
+            return results[args]
+
+        call.cache_clear = results.clear
+        return call
+
+    return decorate
+
+
+WITHOUT_FLOAT64 = {"mps"}
+"""Types of devices that have no float64."""
+
+
+def widest_float(device: torch.device) -> torch.dtype:
+    """Return float64, or float32 on a device that has no float64."""
+    return torch.float32 if device.type in WITHOUT_FLOAT64 else torch.float64
+
+
+def widened(value: Tensor) -> Tensor:
+    """Return a tensor in the widest floating type of its device."""
+    return value.to(widest_float(value.device))
+
+
+@cached_constant()
+def constants(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """Return numbers [n] in the widest floating type of a device; they are copied to it once."""
+    return torch.tensor(values, dtype=widest_float(device), device=device)
+
+
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+@cached_constant()
+def _bfloat16_is_fast(device_type: str) -> bool:
+    if device_type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device_type == "cpu":
+        return hardware.bfloat16_is_fast()
+    return False
+
+
+def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
+    """Return the number format that convolutions on ``device`` use.
+
+    Args:
+        precision: "auto" is bfloat16 if the hardware multiplies it faster than float32, else
+            float32.
+        device: device of the input.
+    """
+    if precision == "auto":
+        return torch.bfloat16 if _bfloat16_is_fast(device.type) else torch.float32
+    return getattr(torch, precision)
+
+
+def scaled_width(width: int, scale: float) -> int:
+    """Return ``width`` times ``scale``, rounded, at least one."""
+    return max(1, math.floor(width * scale + 0.5))
+
+
+class CastConv2d(nn.Conv2d):
+    """A convolution that computes in its input's dtype and keeps float32 parameters."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the convolution of x [B, C, H, W], in x's dtype."""
+        weight = self.weight.to(dtype=x.dtype, memory_format=torch.channels_last)
+        bias = None if self.bias is None else self.bias.to(x.dtype)
+        return F.conv2d(x, weight, bias, self.stride, self.padding)
+
+
+def initialise_plain(module: nn.Module) -> None:
+    """Xavier-initialise a convolution or linear layer; a function for ``nn.Module.apply``."""
+    if isinstance(module, nn.Conv2d):
+        nn.init.xavier_normal_(module.weight)
+    elif isinstance(module, nn.Linear):
+        nn.init.xavier_uniform_(module.weight)
+        nn.init.zeros_(module.bias)

@@ -1,0 +1,252 @@
+"""Augmented state representation: a pixel, then one component of the pose after the other.
+
+The plain network chooses a pixel, then a yaw, then height and tilts if the action has them
+(appendix D.2, G.1; "ASR").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.spatial.base import (
+    UNET_STRIDE,
+    Level,
+    SpatialImageConfig,
+    SpatialQNetwork,
+    SpatialSpec,
+    require_unet_size,
+    require_yaw,
+    select_primitive,
+)
+from ba_torchrl.modules.spatial.in_hand import InHandMap
+from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector
+from ba_torchrl.modules.spatial.unet import PlainPixelValues
+from ba_torchrl.modules.spatial.views import (
+    HeightView,
+    PoseGridConfig,
+    TiltedView,
+    UprightView,
+    centre_fit,
+    is_six_dof,
+    patches,
+)
+
+View = Callable[[Tensor, Tensor], Tensor]
+"""From heightmaps [B, 1, H, W] and the indices chosen so far [B, n] to what a later level sees."""
+
+
+class ASRState(NamedTuple):
+    """Inputs of the later levels besides the choices: the images and the first level's features."""
+
+    pixels: Tensor
+    in_hand: Tensor
+    holding: Tensor
+    scene: Tensor
+
+
+class ASR(SpatialQNetwork):
+    """Levels of choices: all pixels, then the values of one component at the chosen pixel each.
+
+    All levels share the first level's feature map, so the losses of the later levels also train the
+    first level's encoder.
+
+    Args:
+        positions: (pixels, in_hand, holding) -> (values [B, 1, H, W], scene feature map).
+        later: for each later level, its view of the heightmap around the chosen pixel, and its
+            head: (view, in_hand, scene feature map, holding) -> values [B, n].
+        levels: pixels, then one component each.
+        limits: first and last value on the grids of z and the tilts.
+    """
+
+    def __init__(
+        self,
+        positions: nn.Module,
+        later: Sequence[tuple[View, nn.Module]],
+        levels: Sequence[Level],
+        limits: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        super().__init__()
+        self.positions = positions
+        self.views = tuple(view for view, _ in later)
+        self.heads = nn.ModuleList(head for _, head in later)
+        self.levels = tuple(levels)
+        self.limits = dict(limits or {})
+
+    def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, ASRState]:
+        """Return the Q values [B, H, W] of the pixels, and the state for `later`."""
+        values, scene = self.positions(pixels, in_hand, holding)
+        return values.squeeze(1), ASRState(pixels, in_hand, holding, scene)
+
+    def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
+        """Return the Q values [B, n] of a component, given the choices [B, m] before it.
+
+        Raises:
+            ValueError: there is no such level.
+        """
+        if not 1 <= level < len(self.levels):
+            raise ValueError(
+                f"the later levels of this network are 1 to {len(self.levels) - 1}, got {level}"
+            )
+        view = self.views[level - 1](state.pixels, chosen)
+        return self.heads[level - 1](view, state.in_hand, state.scene, state.holding)
+
+
+@dataclass(frozen=True)
+class PatchView:
+    """Heights around the chosen pixel.
+
+    Args:
+        size: rows and columns of the patch.
+    """
+
+    size: int
+
+    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+        """Return patches [B, 1, p, p], metres."""
+        return patches(pixels, chosen[:, :2], self.size)
+
+
+class ASRNetworkConfig(SpatialImageConfig):
+    """Hyper-parameters of every ASR network.
+
+    Args:
+        num_rotations: yaws, evenly spaced; the default is that of the reference implementation.
+        patch_size: rows and columns of the patch around a pixel that the later levels see; None for
+            the size of the in-hand image (in the paper 24, and 40 on bumps). If the two sizes
+            differ, the in-hand image is cropped or zero-padded to the patch size about its centre.
+    """
+
+    num_rotations: int = Field(default=16, ge=2)
+    patch_size: int | None = Field(default=None, ge=1)
+
+    def _planar_layout(self, name: str, spec: SpatialSpec) -> tuple[tuple[Level, Level], int]:
+        """Return the levels of pixels and yaws, and the patch's size.
+
+        Raises:
+            ValueError: a size does not fit.
+        """
+        require_unet_size(name, spec.image_size)
+        patch_size = self.patch_size or spec.in_hand_size
+        if (patch_size - spec.in_hand_size) % 2:
+            raise ValueError(
+                f"patch_size and in_hand_size must share a centre, so differ by an even number of "
+                f"pixels; got {patch_size} and {spec.in_hand_size}"
+            )
+        pixels = Level(("x", "y"), (spec.image_size, spec.image_size))
+        return (pixels, Level(("rz",), (self.num_rotations,))), patch_size
+
+
+_LARGEST_MAP = 8
+
+
+class PlainYawValues(nn.Module):
+    """Q values of yaws from a patch, the in-hand image and the scene feature map.
+
+    Args:
+        spec: shapes of the images.
+        config: width, precision, units.
+        num_yaws: number of yaws.
+        patch_size: rows and columns of the patch.
+        scene_channels: channels of the scene map.
+
+    Raises:
+        ValueError: the patch is too small.
+    """
+
+    def __init__(
+        self,
+        spec: SpatialSpec,
+        config: SpatialImageConfig,
+        num_yaws: int,
+        patch_size: int,
+        scene_channels: int,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.patch = InHandMap(1 + spec.in_hand_channels, patch_size, config.width)
+        self.map_size = min(self.patch.out_size, _LARGEST_MAP)
+        hidden = scaled_width(1024, config.width)
+        self.linear = nn.Linear(
+            self.patch.out_channels * self.map_size**2
+            + scene_channels * (spec.image_size // UNET_STRIDE) ** 2,
+            hidden,
+        )
+        self.values = nn.Linear(hidden, 2 * num_yaws)
+        self.apply(initialise_plain)
+
+    def forward(self, patch: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
+        """Return values [B, yaws].
+
+        Args:
+            patch: heights around the pixel [B, 1, p, p].
+            in_hand: [B, C, h, w].
+            scene: [B, scene_channels, H/16, W/16].
+            holding: [B, 1], which selects the primitive.
+        """
+        hand = centre_fit(self.config.in_hand(in_hand), patch.shape[-1])
+        x = self.patch(torch.cat([self.config.heights(patch), hand], dim=1))
+        if x.shape[-1] != self.map_size:
+            size = (self.map_size, self.map_size)
+            x = F.interpolate(x, size, mode="bilinear", align_corners=False)
+        x = torch.cat([x.flatten(1), scene.flatten(1)], dim=1).float()
+        return select_primitive(self.values(F.relu(self.linear(x))), holding)
+
+
+@NETWORKS.register("asr")
+class ASRConfig(ASRNetworkConfig, PoseGridConfig):
+    """Hyper-parameters of the plain network that chooses one component after the other.
+
+    The hyper-parameters of z and the tilts apply to actions in six degrees of freedom only.
+    """
+
+    def build(self, spec: SpatialSpec) -> ASR:
+        """Return a freshly initialised network.
+
+        Args:
+            spec: shapes and the action's components: x, y and rz, or x, y, z, rz, ry and rx.
+
+        Raises:
+            ValueError: a size does not fit, or the action has other components.
+        """
+        if is_six_dof(spec):
+            return self._build_for_poses(spec)
+        require_yaw("asr", spec)
+        levels, patch_size = self._planar_layout("asr", spec)
+        positions = PlainPixelValues(spec, self, maps=1)
+        yaws = PlainYawValues(spec, self, self.num_rotations, patch_size, positions.scene_channels)
+        return ASR(positions, [(PatchView(patch_size), yaws)], levels)
+
+    def _build_for_poses(self, spec: SpatialSpec) -> ASR:
+        """Return the network of five levels; every later level has one view and all its values."""
+        planar, patch_size = self._planar_layout("asr", spec)
+        levels = (*planar, *self.pose_levels())
+        grid = self.pose_grid(self.num_rotations, spec.half_rotation)
+        positions = PlainPixelValues(spec, self, maps=1)
+        views = (
+            HeightView(patch_size),
+            HeightView(patch_size, grid.rz_rad),
+            UprightView(grid, spec.pixel_m, patch_size),
+            TiltedView(grid._replace(rx_rad=(0.0,)), spec.pixel_m, patch_size),
+        )
+        in_voxels = self.in_voxels(spec.pixel_m)
+        heads = [
+            PoseValues(
+                spec,
+                in_voxels,
+                view.channels,
+                level.shape[0],
+                patch_size,
+                SceneMapVector(positions.scene_channels, spec.image_size, self.width),
+            )
+            for view, level in zip(views, levels[1:], strict=True)
+        ]
+        return ASR(positions, list(zip(views, heads, strict=True)), levels, self.limits)

@@ -1,0 +1,234 @@
+"""The interface of spatial Q networks, their inputs, and checks of the actions they support."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, Self
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from ba_torchrl.config import StrictModel
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.modules.base import Control
+from ba_torchrl.modules.layers import Precision, compute_dtype
+
+
+@dataclass(frozen=True)
+class SpatialSpec:
+    """Images and actions that a spatial Q network is built for.
+
+    Args:
+        images: declarations of the network's input images, by key, in the order of its arguments:
+            the heightmap, the in-hand image (1 channel for "raw" and "sub", 3 for "proj"), others.
+        components: components of the action except its primitive, in the order of the action: a
+            subset of x, y, z, rz, ry, rx.
+        half_rotation: whether yaws half a turn apart are equivalent.
+        side_m: edge of the square workspace, which the heightmap covers.
+
+    Raises:
+        ValueError: x or y is missing.
+    """
+
+    images: Mapping[str, ImageSpec]
+    components: tuple[str, ...]
+    half_rotation: bool = True
+    side_m: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not {"x", "y"} <= set(self.components):
+            raise ValueError(f"the action needs x and y, got {self.components}")
+
+    @property
+    def image_size(self) -> int:
+        """Rows and columns of the heightmap."""
+        return self.images[keys.PIXELS].size
+
+    @property
+    def pixel_m(self) -> float:
+        """Edge of a pixel of the heightmap."""
+        return self.side_m / self.image_size
+
+    @property
+    def in_hand_size(self) -> int:
+        """Rows and columns of the in-hand image."""
+        return self.images[keys.IN_HAND].size
+
+    @property
+    def in_hand_channels(self) -> int:
+        """Channels of the in-hand image."""
+        return self.images[keys.IN_HAND].channels
+
+
+class Level(NamedTuple):
+    """Components of the action that one maximisation chooses together.
+
+    Fields:
+        components: their names in the order of the axes of the Q values: x (rows of the image),
+            y (columns), z, rz, ry, rx.
+        shape: number of choices along each axis.
+    """
+
+    components: tuple[str, ...]
+    shape: tuple[int, ...]
+
+
+class SpatialQNetwork(nn.Module, ABC):
+    """Q values of an action that is chosen level by level, each given the choices before it.
+
+    The primitive is not chosen: an empty gripper picks, a gripper that holds an object places. The
+    values are those of that primitive.
+    """
+
+    levels: tuple[Level, ...]
+    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    """First and last value on the grids of z (metres) and the tilts (radians); components without
+    an entry span the range of the action."""
+
+    @abstractmethod
+    def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
+        """Return the Q values of the first level, and the state that `later` needs.
+
+        Args:
+            pixels: heightmaps [B, 1, H, W], metres.
+            in_hand: images of what is held [B, C, h, w].
+            holding: [B, 1], true where an object is held; follows all input images.
+
+        Returns:
+            float32 [B, *levels[0].shape], and a state of any type, None if there is one level.
+        """
+
+    def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
+        """Return the Q values of a later level.
+
+        Args:
+            level: index of the level, at least 1.
+            state: from `first`.
+            chosen: int64 [B, n], indices of the components chosen so far, level after level.
+
+        Returns:
+            float32 [B, *levels[level].shape].
+        """
+        raise NotImplementedError(f"{type(self).__name__} has one level")
+
+
+UNET_STRIDE = 16
+"""Pixels of the image per pixel of a UNet's bottleneck map; image sizes are multiples of it."""
+
+
+class SpatialImageConfig(StrictModel):
+    """Hyper-parameters of every spatial Q network.
+
+    By default heights are in metres, as in the reference implementation, and a block of 3 cm hardly
+    affects the values of a freshly initialised network. With a scale of 0.05 it has a height of
+    about one, and learning is faster at the start.
+
+    Args:
+        precision: number format of the convolutions, see `compute_dtype`. Values of actions, the
+            fully connected layers and the filters' coefficients are always float32.
+        height_scale_m: height that is scaled to one. The floor stays zero, like the padding.
+        voxel_scale: number of voxels of a projection that is scaled to one.
+        width: factor on every layer's width; 1 is the reference's size.
+    """
+
+    control: ClassVar[Control] = "open_loop"
+    image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS, keys.IN_HAND)
+
+    precision: Precision = "auto"
+    height_scale_m: float = Field(default=1.0, gt=0)
+    voxel_scale: float = Field(default=1.0, gt=0)
+    width: float = Field(default=1.0, gt=0)
+
+    def heights(self, images: Tensor) -> Tensor:
+        """Return heights [B, 1, H, W] divided by the scale, in the compute dtype."""
+        return self.images(images if self.height_scale_m == 1 else images / self.height_scale_m)
+
+    def in_hand(self, images: Tensor) -> Tensor:
+        """Return scaled heights (C = 1) or projections [B, C, h, w] in the compute dtype."""
+        if images.shape[1] == 1:
+            return self.heights(images)
+        return self.images(images if self.voxel_scale == 1 else images / self.voxel_scale)
+
+    def in_voxels(self, pixel_m: float) -> Self:
+        """Return a copy that scales heights like projections: their unit is a voxel.
+
+        Args:
+            pixel_m: edge of a pixel and a voxel.
+        """
+        return self.model_copy(update={"height_scale_m": pixel_m * self.voxel_scale})
+
+    def images(self, images: Tensor) -> Tensor:
+        """Return images [B, C, H, W] in the compute dtype, channels-last."""
+        dtype = compute_dtype(self.precision, images.device)
+        return images.to(dtype=dtype, memory_format=torch.channels_last)
+
+
+def select_primitive(values: Tensor, holding: Tensor) -> Tensor:
+    """Return the values of the primitive: those of picks where nothing is held, else of places.
+
+    Args:
+        values: [B, 2n, ...], first those of picks, then those of places.
+        holding: [B, 1].
+
+    Returns:
+        [B, n, ...].
+    """
+    pick, place = values.chunk(2, dim=1)
+    return torch.where(holding.bool().reshape(-1, *[1] * (values.dim() - 1)), place, pick)
+
+
+def has_yaw(name: str, spec: SpatialSpec) -> bool:
+    """Return whether the action has a yaw besides x and y.
+
+    Args:
+        name: of the network, for the error message.
+        spec: holds the action's components.
+
+    Raises:
+        ValueError: the action has other components.
+    """
+    others = [c for c in spec.components if c not in ("x", "y", "rz")]
+    if others:
+        raise ValueError(
+            f"network {name!r} chooses x, y and rz, not {', '.join(others)}; use an "
+            "action_sequence without, such as 'pxy' or 'pxyr'"
+        )
+    return "rz" in spec.components
+
+
+def require_yaw(name: str, spec: SpatialSpec) -> None:
+    """Refuse an action without yaw.
+
+    Raises:
+        ValueError: the action has no yaw, or has components other than x, y and rz.
+    """
+    if not has_yaw(name, spec):
+        raise ValueError(
+            f"network {name!r} chooses a yaw, and the action has no rz; use 'fcn' or 'equi_fcn', "
+            "or an action_sequence with r, such as 'pxyr'"
+        )
+
+
+def require_unet_size(name: str, image_size: int) -> None:
+    """Refuse images that a UNet cannot halve four times.
+
+    Raises:
+        ValueError: the size is not a multiple of 16 pixels.
+    """
+    if image_size % UNET_STRIDE:
+        raise ValueError(
+            f"network {name!r} needs an obs_size that is a multiple of {UNET_STRIDE}, got "
+            f"{image_size}; 'rot_fcn' takes any even one"
+        )
+
+
+def yaws_rad(count: int, half_rotation: bool, device: torch.device) -> Tensor:
+    """Return the yaw of each index of a yaw axis, [count]."""
+    period_rad = math.pi if half_rotation else 2 * math.pi
+    return torch.arange(count, device=device) * (period_rad / count)

@@ -1,0 +1,258 @@
+"""The equivariant network that chooses a pixel, then a yaw (appendix E, G.1; "Equi ASR")."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field
+from torch import Tensor, nn
+
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.spatial.asr import ASR, ASRNetworkConfig, PatchView
+from ba_torchrl.modules.spatial.base import (
+    UNET_STRIDE,
+    SpatialImageConfig,
+    SpatialSpec,
+    require_yaw,
+    select_primitive,
+)
+from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
+from ba_torchrl.modules.spatial.in_hand import InHandVector
+from ba_torchrl.modules.steerable.layers import (
+    DynamicSteerableConv2d,
+    SteerableConv2d,
+    SteerableLinear,
+    filter_generator,
+    planar_rotations_and_flips,
+    planar_yaws,
+)
+from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
+
+if TYPE_CHECKING:
+    from escnn.group import Representation
+    from escnn.gspaces import GSpace2D
+
+
+class _Stage(NamedTuple):
+    fields: int
+    kernel_size: int
+    padding: int
+    pools: bool
+
+
+_TRUNKS = {
+    24: (
+        _Stage(8, 7, 2, False),  # 22
+        _Stage(16, 7, 2, True),  # 20 -> 10
+        _Stage(32, 7, 2, False),  # 8
+        _Stage(32, 3, 0, True),  # 6 -> 3
+        _Stage(16, 3, 0, False),  # 1
+    ),
+    40: (
+        _Stage(8, 7, 3, True),  # 40 -> 20
+        _Stage(16, 7, 3, True),  # 20 -> 10
+        _Stage(32, 7, 2, False),  # 8
+        _Stage(32, 3, 0, True),  # 6 -> 3
+        _Stage(16, 3, 0, False),  # 1
+    ),
+}
+"""Stages from a patch of 24 or 40 pixels to one pixel. Pooling layers have inputs of even size,
+which exact equivariance under quarter turns requires."""
+
+
+SceneHead = Literal["pool", "flatten"]
+"""How the later levels read the scene feature map: pooled to an invariant vector, or with the
+positions of its features, as in the reference implementation."""
+
+SCENE_COPIES = 2
+"""Copies of each invariant channel in the reference implementation's scene feature map, whose
+later levels then have the 256 input channels of the plain networks."""
+
+
+class InvariantSceneVector(nn.Sequential):
+    """A vector that does not change when the scene feature map rotates with the scene.
+
+    Two linear layers on the maximum and the mean of each channel.
+
+    Args:
+        channels: of the map, each invariant except for the positions.
+        width: factor on the layers' widths, 1024 and 512.
+    """
+
+    def __init__(self, channels: int, width: float) -> None:
+        wide, narrow = scaled_width(1024, width), scaled_width(512, width)
+        super().__init__(nn.Linear(2 * channels, wide), nn.ReLU(), nn.Linear(wide, narrow))
+        self.out_features = narrow
+
+    def forward(self, scene: Tensor) -> Tensor:
+        """Return float32 [B, out_features] of a map [B, C, h, w]."""
+        scene = scene.float()
+        return super().forward(
+            torch.cat([scene.amax(dim=(-2, -1)), scene.mean(dim=(-2, -1))], dim=1)
+        )
+
+
+class FlattenedSceneVector(nn.Sequential):
+    """A vector of the scene feature map with its positions, which changes when the map rotates.
+
+    Two linear layers on the flattened map, as in the reference implementation.
+
+    Args:
+        channels: of the map.
+        image_size: rows and columns of the heightmap.
+        width: factor on the layers' widths, 1024 and 512.
+    """
+
+    def __init__(self, channels: int, image_size: int, width: float) -> None:
+        wide, narrow = scaled_width(1024, width), scaled_width(512, width)
+        inputs = SCENE_COPIES * channels * (image_size // UNET_STRIDE) ** 2
+        super().__init__(nn.Linear(inputs, wide), nn.ReLU(), nn.Linear(wide, narrow))
+        self.out_features = narrow
+
+    def forward(self, scene: Tensor) -> Tensor:
+        """Return float32 [B, out_features] of a map [B, C, h, w]."""
+        return super().forward(scene.float().repeat(1, SCENE_COPIES, 1, 1).flatten(1))
+
+
+class EquivariantYawValues(nn.Module):
+    """Q values of yaws, equivariant under rotations of the patch.
+
+    Vectors of the scene feature map and the in-hand image determine the coefficients of a dynamic
+    filter. The values are equivariant under rotations of the whole scene if these are invariant.
+
+    Args:
+        gspace: images and their symmetry group.
+        out_repr: how the values of the yaws transform.
+        spec: shapes of the images.
+        config: width, precision, units.
+        patch_size: rows and columns of the patch.
+        make_scene: returns the layers from the scene feature map to a vector, with
+            ``out_features``.
+
+    Raises:
+        ValueError: the patch size is not 24 or 40, or the size of the in-hand image is not
+            supported.
+    """
+
+    def __init__(
+        self,
+        gspace: GSpace2D,
+        out_repr: Representation,
+        spec: SpatialSpec,
+        config: SpatialImageConfig,
+        patch_size: int,
+        make_scene: Callable[[], nn.Module],
+    ) -> None:
+        super().__init__()
+        if patch_size not in _TRUNKS:
+            raise ValueError(
+                f"equivariant yaw values take a patch_size of {' or '.join(map(str, _TRUNKS))} "
+                f"pixels, got {patch_size}; set patch_size if in_hand_size is another"
+            )
+        self.config = config
+        stages = _TRUNKS[patch_size]
+        self.pools = tuple(stage.pools for stage in stages)
+        self.convs = nn.ModuleList()
+        types = [(gspace.trivial_repr, 1)]
+        for fields, kernel_size, padding, _ in stages:
+            # The last layer keeps its full width in narrow networks: with few fields, all outputs
+            # of the dynamic filter can be negative, and the gradient after the ReLU is zero.
+            width = config.width if len(self.convs) < len(stages) - 1 else max(config.width, 1.0)
+            out = [(gspace.regular_repr, scaled_width(fields, width))]
+            self.convs.append(SteerableConv2d(gspace, types, out, kernel_size, padding=padding))
+            types = out
+        ((_, fields),) = types
+        self.held = DynamicSteerableConv2d(gspace, gspace.regular_repr, fields, 1)
+        self.values = SteerableLinear(gspace, types, [(out_repr, 2)])
+
+        narrow = scaled_width(512, config.width)
+        self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width)
+        self.hand_linear = nn.Linear(self.hand.out_features, narrow)
+        self.scene = make_scene()
+        self.apply(initialise_plain)
+        self.coefficients = filter_generator(narrow + self.scene.out_features, self.held)
+
+    def forward(self, patch: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
+        """Return values [B, yaws].
+
+        Args:
+            patch: heights around the pixel [B, 1, p, p].
+            in_hand: [B, C, h, w].
+            scene: [B, scene_channels, h', w'].
+            holding: [B, 1], which picks the primitive.
+        """
+        x = self.config.heights(patch)
+        for conv, pool in zip(self.convs, self.pools, strict=True):
+            x = conv(x)
+            x = relu_of_max_pool(x) if pool else F.relu(x, inplace=True)
+        x = F.relu(self.held(x.float(), self._coefficients(in_hand, scene)))
+        return select_primitive(self.values(x.flatten(1)), holding)
+
+    def _coefficients(self, in_hand: Tensor, scene: Tensor) -> Tensor:
+        hand = self.hand_linear(self.hand(self.config.in_hand(in_hand)))
+        return self.coefficients(F.relu(torch.cat([self.scene(scene), hand], dim=1)))
+
+
+def yaw_scene_vector(
+    head: SceneHead, channels: int, image_size: int, width: float
+) -> InvariantSceneVector | FlattenedSceneVector:
+    """Return the layers from the scene feature map to the vector that the yaw values use.
+
+    Args:
+        head: how the map is read.
+        channels: of the map, each invariant except for the positions.
+        image_size: rows and columns of the heightmap.
+        width: factor on the layers' widths.
+    """
+    if head == "flatten":
+        return FlattenedSceneVector(channels, image_size, width)
+    return InvariantSceneVector(channels, width)
+
+
+@NETWORKS.register("equi_asr")
+class EquiASRConfig(ASRNetworkConfig):
+    """Hyper-parameters of the equivariant network that chooses a pixel, then a yaw.
+
+    The yaw values are equivariant under the cyclic group generated by the step between neighbouring
+    yaws: C_32 for 16 yaws in half a turn.
+
+    Args:
+        group_order: number of rotations of the dihedral group of the pixel values; the default is
+            that of the reference implementation.
+        scene_head: how the yaw values read the scene feature map: "pool" keeps them equivariant
+            under rotations of the scene; "flatten", of the reference implementation, keeps the
+            positions of the features, so only the patch's part of the values is equivariant.
+    """
+
+    group_order: int = Field(default=4, ge=2)
+    scene_head: SceneHead = "pool"
+
+    def build(self, spec: SpatialSpec) -> ASR:
+        """Return a freshly initialised network.
+
+        Args:
+            spec: shapes and the action's components: x, y and rz.
+
+        Raises:
+            ImportError: escnn is missing; the message names the fix.
+            ValueError: a size does not fit, or the action has other components.
+        """
+        require_yaw("equi_asr", spec)
+        levels, patch_size = self._planar_layout("equi_asr", spec)
+        gspace = planar_rotations_and_flips(self.group_order)
+        positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
+        gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
+        scene = partial(
+            yaw_scene_vector,
+            self.scene_head,
+            positions.scene_channels,
+            spec.image_size,
+            self.width,
+        )
+        yaws = EquivariantYawValues(gspace, yaw_repr, spec, self, patch_size, scene)
+        return ASR(positions, [(PatchView(patch_size), yaws)], levels)

@@ -1,0 +1,159 @@
+"""escnn's bases of steerable kernels, and the scales of their initial coefficients."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from ba_torchrl.modules.steerable.irrep_convolution import IrrepKernels, irrep_kernels
+
+if TYPE_CHECKING:
+    from escnn.group import Representation
+    from escnn.gspaces import GSpace2D
+
+FieldTypes = Sequence[tuple["Representation", int]]
+"""Representations with their multiplicities, in the order of the channels."""
+
+
+@dataclass(frozen=True, eq=False)
+class KernelBlock:
+    """The steerable kernels between one input and one output representation.
+
+    Args:
+        kernels: float32 [D, O, K, K, I], escnn's normalised basis, input channels last.
+        in_irreps: for each of the D kernels, the input irrep that it reads.
+        out_irreps: for each kernel, the position of the output irrep that it writes.
+    """
+
+    kernels: Tensor
+    in_irreps: tuple[Any, ...]
+    out_irreps: tuple[int, ...]
+    _copies: dict[tuple[torch.device, torch.dtype], Tensor] = field(default_factory=dict)
+
+    def __deepcopy__(self, memo: dict) -> KernelBlock:
+        return self  # constant, shared by every layer of the process
+
+    def __getstate__(self) -> dict:
+        return {**self.__dict__, "_copies": {}}
+
+    def matrix(self, like: Tensor) -> Tensor:
+        """Return the kernels as [D, O*K*K*I] on the device and in the dtype of ``like``."""
+        key = (like.device, like.dtype)
+        if key not in self._copies:
+            with torch.inference_mode(False):  # for later training steps
+                self._copies[key] = self.kernels.flatten(1).to(like)
+        return self._copies[key]
+
+
+_BLOCKS: dict[tuple, KernelBlock | None] = {}
+
+
+def kernel_block(
+    gspace: GSpace2D, in_repr: Representation, out_repr: Representation, kernel_size: int
+) -> KernelBlock | None:
+    """Return the kernels between two representations, None if there are none.
+
+    Built once per process: escnn's construction takes up to a second for large groups.
+
+    Args:
+        gspace: images and their symmetry group.
+        in_repr: representation of the input field.
+        out_repr: representation of the output field.
+        kernel_size: pixels.
+    """
+    key = (gspace, in_repr.name, out_repr.name, kernel_size)
+    if key not in _BLOCKS:
+        _BLOCKS[key] = _build_block(gspace, in_repr, out_repr, kernel_size)
+    return _BLOCKS[key]
+
+
+def _build_block(
+    gspace: GSpace2D, in_repr: Representation, out_repr: Representation, kernel_size: int
+) -> KernelBlock | None:
+    from escnn.nn import FieldType, R2Conv
+
+    types = FieldType(gspace, [in_repr]), FieldType(gspace, [out_repr])
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # escnn prints when the basis is empty
+            layer = R2Conv(*types, kernel_size, initialize=False)
+    except ValueError as error:
+        if "basis" in str(error) and "empty" in str(error):
+            return None  # for example trivial to vector with a 1x1 kernel
+        raise
+    expansion = layer.basisexpansion
+    # One pair of representations has one buffer. Expanding unit vectors gives the same numbers, but
+    # takes almost a minute for 7x7 kernels of C_32.
+    (kernels,) = (v for n, v in expansion.named_buffers() if n.endswith("sampled_basis"))
+    shape = (-1, out_repr.size, in_repr.size, kernel_size, kernel_size)
+    info = list(expansion.get_basis_info())
+    return KernelBlock(
+        kernels=kernels.reshape(shape).permute(0, 1, 3, 4, 2).contiguous().float(),
+        in_irreps=tuple(entry["in_irrep"] for entry in info),
+        out_irreps=tuple(entry["out_irreps_position"] for entry in info),
+    )
+
+
+@cache
+def regular_irrep_kernels(gspace: GSpace2D, rep: Representation) -> IrrepKernels | None:
+    """Return the 3x3 kernels between fields of a representation in the basis of irreps."""
+    block = kernel_block(gspace, rep, rep, 3)
+    return None if block is None else irrep_kernels(rep, block.kernels, block.in_irreps)
+
+
+def he_scales(
+    blocks: dict[tuple[int, int], KernelBlock], in_types: FieldTypes, out_types: FieldTypes
+) -> dict[tuple[int, int], Tensor]:
+    """Return the standard deviation of each kernel's coefficients, for every pair of types.
+
+    The generalised He initialisation (Weiler and Cesa, "General E(2)-equivariant steerable
+    CNNs", 2019): every input irrep that feeds an output irrep contributes equally, and so does
+    every kernel from it. The values are the same for all fields of a type.
+
+    Args:
+        blocks: kernels of each pair (input type, output type) that has kernels.
+        in_types: input fields.
+        out_types: output fields.
+    """
+    sources: dict[tuple[int, int], set] = defaultdict(set)
+    kernels: Counter = Counter()
+    for (i, o), block in blocks.items():
+        for source, target in zip(block.in_irreps, block.out_irreps, strict=True):
+            sources[o, target].add(source)
+            kernels[source, o, target] += in_types[i][1]
+    return {
+        (i, o): torch.tensor(
+            [
+                1 / math.sqrt(len(sources[o, target]) * kernels[source, o, target])
+                for source, target in zip(block.in_irreps, block.out_irreps, strict=True)
+            ]
+        )
+        for (i, o), block in blocks.items()
+    }
+
+
+def bias_expansion(out_types: FieldTypes) -> Tensor:
+    """Return [channels, biases]: a bias acts on a trivial irrep, mapped into its field's basis."""
+    columns, channels = [], sum(rep.size * count for rep, count in out_types)
+    start = 0
+    for rep, count in out_types:
+        position, trivial = 0, []
+        for irrep in (rep.group.irrep(*name) for name in rep.irreps):
+            if irrep.is_trivial():
+                trivial.append(torch.tensor(rep.change_of_basis[:, position], dtype=torch.float32))
+            position += irrep.size
+        for _ in range(count):
+            for values in trivial:
+                column = torch.zeros(channels)
+                column[start : start + rep.size] = values
+                columns.append(column)
+            start += rep.size
+    return torch.stack(columns, dim=1) if columns else torch.zeros(channels, 0)

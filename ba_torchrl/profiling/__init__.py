@@ -1,8 +1,0 @@
-"""Measurements of the package: times of steps, images and updates, memory, and fingerprints.
-
-Times on different machines are not comparable, so each is also given as a multiple of a unit of
-work that is timed alternately in the same process: a step of PyBullet for the simulation, a
-convolution for the learner. A function decorated with `table.measurement` adds rows.
-
-`fingerprint` records the results of environments and training bit by bit.
-"""
