@@ -17,7 +17,7 @@ from ba_torchrl.sim.snapshots import PortableSnapshot, Snapshot
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, World
 from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
-from ba_torchrl.tasks.clutter.tray import Tray
+from ba_torchrl.tasks.terrain.tray import Tray
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 MARK_M = 1e-3

@@ -10,8 +10,7 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.tasks.base import Task
-from ba_torchrl.tasks.open_loop_task import OpenLoopControl
+from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 from ba_torchrl.tasks.structures.goal import StructureGoal
@@ -22,7 +21,7 @@ WINDOW_SHARE = 0.375
 """Half the width of the window for a long piece, as a multiple of its length."""
 
 
-class StructureTask(StructureGoal, OpenLoopControl, Task):
+class StructureTask(StructureGoal, OpenLoopTask):
     """Pieces at random poses on the ground; success when they form the blueprint's structure."""
 
     can_be_deconstructed = True
@@ -44,6 +43,7 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
     def load_scene(self) -> None:
         """Load the pieces."""
         self.structure = Structure(self.blueprint(), self.world, self.block_m, self.terrain)
+        self.terrain.reserve(self.structure.widest_base_m(of_all=True))
         self.expert = PickPlaceExpert(
             self.structure,
             self.robot,
@@ -56,6 +56,7 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
     def choose_objects(self, rng: np.random.Generator) -> None:
         """Draw the variants of the pieces."""
         self.structure.draw(rng)
+        self.terrain.reserve(self.structure.widest_base_m())
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Place the pieces at random poses, apart from each other.
