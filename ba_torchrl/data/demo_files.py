@@ -13,7 +13,7 @@ import torchrl
 from tensordict import TensorDict
 
 from ba_torchrl import __version__
-from ba_torchrl.data.demos import Source, source_config
+from ba_torchrl.data.demos import Source
 from ba_torchrl.data.state_files import check, check_space, publish, seal, write_text
 from ba_torchrl.envs.factory import resolve
 from ba_torchrl.errors import ConfigError
@@ -142,5 +142,5 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
 
 def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
     """Return every parameter that affects the data, defaults included, as JSON values."""
-    other = {"seed", "render", *source_config("deconstruction")}
-    return json.loads(resolve(task, **env).model_dump_json(exclude=other))
+    resolved = resolve(task, **env)
+    return json.loads(resolved.model_dump_json(exclude={"seed", "render", "expert"}))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -61,13 +61,14 @@ def make_vector(
     parallel: bool | None,
     start_method: str,
     register_modules: Sequence[str | ModuleType] = (),
+    make: Callable[..., ManipulationEnv] = make_env,
     timeout_s: float = 60.0,
     max_restarts: int = 5,
     start_timeout_s: float = 120.0,
     wait_for_restarts: bool = True,
     **config: Any,
 ) -> EnvBase:
-    """Make environments that step together; see `ba_torchrl.make_vector_env`."""
+    """Make environments that step together by ``make``; see `ba_torchrl.make_vector_env`."""
     modules = module_names(register_modules)
     import_modules(modules)
     settings = parse_env_config(task, config)
@@ -76,7 +77,7 @@ def make_vector(
     if parallel and start_method == "spawn":
         modules += _plugins_of(task, settings)
     return make_vector_env(
-        partial(_import_and_make_env, modules, task, **config),
+        partial(_import_and_make_env, modules, make, task, **config),
         num_envs,
         seed=settings.seed,
         parallel=parallel,
@@ -103,6 +104,8 @@ def _plugins_of(task: str, settings: EnvConfig) -> tuple[str, ...]:
     return tuple(modules)
 
 
-def _import_and_make_env(modules: Sequence[str], task: str, **config: Any) -> ManipulationEnv:
+def _import_and_make_env(
+    modules: Sequence[str], make: Callable[..., ManipulationEnv], task: str, **config: Any
+) -> ManipulationEnv:
     import_modules(modules)
-    return make_env(task, **config)
+    return make(task, **config)

@@ -137,8 +137,6 @@ def build_scene(
         robot,
         terrain,
     )
-    if config.deconstruct:
-        task = task.deconstruction()
     world.seal()
     return Scene(world, robot, task, make_controller(robot, task), HeightCamera(world.bodies))
 

@@ -100,8 +100,6 @@ class Task(ABC):
     """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False
     """Whether the objects fit the tray of `close_loop_tray`."""
-    can_be_deconstructed: ClassVar[bool] = False
-    """Whether `deconstruction` returns the reversed task."""
 
     Parameters: ClassVar[type[TaskParameters]] = TaskParameters
     """Model of the task's own parameters; its fields are keywords of `ba_torchrl.make`."""
@@ -222,14 +220,6 @@ class Task(ABC):
 
         Called when the bodies are at rest after an action, before `evaluate` and the observation.
         """
-
-    def deconstruction(self) -> Task:
-        """Return the task that takes this task's structure apart, in the same world.
-
-        Raises:
-            NotImplementedError: the task has none; see `can_be_deconstructed`.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no deconstruction")
 
     def get_state(self) -> Any:
         """Return the state of the task besides the poses of its bodies."""

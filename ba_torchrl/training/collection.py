@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 
 def make_env(
-    config: ExperimentConfig, seed: int, *, wait_for_restarts: bool = True, **changes: bool
+    config: ExperimentConfig, seed: int, *, wait_for_restarts: bool = True, **changes: Any
 ) -> EnvBase:
     """Return the environments of a run, ready to be reset.
 
@@ -36,7 +36,7 @@ def make_env(
         config: of the run.
         seed: of the first environment.
         wait_for_restarts: as for `ba_torchrl.make_vector_env`.
-        changes: fields of `EnvConfig` that differ from the run's.
+        changes: fields of `EnvConfig` that differ from the run's, and `make` as for `make_vector`.
     """
     return make_vector_env(
         config.task,

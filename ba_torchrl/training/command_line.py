@@ -19,7 +19,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ba_torchrl.config import MAX_SEED
-from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
+from ba_torchrl.data.time_reversal import check_has_structure
 from ba_torchrl.errors import ConfigError, as_os_error
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
@@ -247,7 +247,7 @@ def check_deconstructions(settings: DictConfig, name: str) -> None:
     """
     check_lists(settings, name)
     for task in settings[name]:
-        check_task_parameters(task, parse_env_config(task, {"deconstruct": True}))
+        check_has_structure(task)
 
 
 def folders_of(settings: DictConfig, name: str) -> list[str]:

@@ -20,9 +20,9 @@ from ba_torchrl.data.demos import (
     check_noise,
     check_turn_noise,
     primitive_component,
-    source_config,
     turn_components,
 )
+from ba_torchrl.data.time_reversal import check_has_structure
 from ba_torchrl.envs.factory import resolve
 from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.envs.settings import check_task_parameters, parse_env_config
@@ -294,7 +294,6 @@ class ExperimentConfig(StrictModel):
             yield f"algorithm.{message}"
 
     def _check_demonstrations(self) -> None:
-        source = source_config(self.demonstrations_source)
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
         check_turn_noise(
             self.demonstrations_turn_noise,
@@ -303,9 +302,9 @@ class ExperimentConfig(StrictModel):
             "demonstrations_turn_noise",
         )
         if self.demonstrations:
-            check_task_parameters(
-                self.task, parse_env_config(self.task, {**self.env, **source}, "env")
-            )
+            check_task_parameters(self.task, parse_env_config(self.task, self.env, "env"))
+            if self.demonstrations_source == "deconstruction":
+                check_has_structure(self.task)
         if self.demonstrations_path is not None:
             if not self.demonstrations:
                 raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")

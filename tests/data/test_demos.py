@@ -99,17 +99,15 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
 
 
 def test_entries_of_other_lengths_are_refused(collected, tmp_path):
-    source, episodes = collected
-    save_demonstrations(
-        tmp_path / "demos", episodes, task=TASK, env={**ENV, **source_config(source)}, seed=0
-    )
+    _, episodes = collected
+    save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)
     description = tmp_path / "demos" / "meta.json"
     values = json.loads(description.read_text())
     values["holding"]["shape"] = [2, 1]
     description.write_text(json.dumps(values))
     seal(tmp_path / "demos")
     with pytest.raises(ConfigError, match=r"holding has the shape \[2, 1\] in 8 rows"):
-        load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, **source_config(source)})
+        load_demonstrations(tmp_path / "demos", task=TASK, env=ENV)
 
 
 def test_demonstrations_are_not_overwritten(collected, tmp_path):

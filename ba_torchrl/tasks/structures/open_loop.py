@@ -12,7 +12,6 @@ from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint
-from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 from ba_torchrl.tasks.structures.goal import StructureGoal
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.structure import Structure
@@ -24,7 +23,6 @@ WINDOW_SHARE = 0.375
 class StructureTask(StructureGoal, OpenLoopTask):
     """Pieces at random poses on the ground; success when they form the blueprint's structure."""
 
-    can_be_deconstructed = True
     tipped_rad: ClassVar[float] = UPRIGHT_RAD
     """Tilt at which a piece that must stay upright, such as a roof, ends the episode."""
     clears_blocked_pieces: ClassVar[bool] = False
@@ -71,10 +69,6 @@ class StructureTask(StructureGoal, OpenLoopTask):
             lambda body: self._random_yaw_of(body, rng),
             base=self.structure.base_body(),
         )
-
-    def deconstruction(self) -> Deconstruction:
-        """Return the task that takes the structure apart."""
-        return Deconstruction(self)
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""
