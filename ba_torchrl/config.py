@@ -191,9 +191,6 @@ class EnvConfig(StrictModel):
     """Add an RGB image of the scene, arm included, and its depth to every observation."""
     point_cloud: int = Field(default=0, ge=0, le=1_000_000)
     """Number of points of the scene's surfaces that are added to every observation."""
-    deconstruct: bool = False
-    """Structures: start with the structure standing and take it apart; every observation contains
-    the action that reverses the last one. See `ba_torchrl.data.time_reversal`."""
     observations: tuple[str, ...] = ()
     """Further observations by their registered names; see `ba_torchrl.envs.observations`."""
     floor_color: Rgb | None = None

@@ -8,11 +8,13 @@ import ba_torchrl
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.augmentation.views import RandomViews
-from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.factory import make_resolved
+from ba_torchrl.envs.settings import resolve_env
 
 SETTERS = {"dtype": torch.set_default_dtype, "device": torch.set_default_device}
 OTHERS = {"dtype": torch.float64, "device": "meta"}
@@ -21,7 +23,7 @@ CASES = [
     ("close_loop/block_picking", {}),
     ("close_loop/block_picking", {"obs_type": "vec"}),
     ("open_loop/house_building_1", {"rgb": True, "point_cloud": 64}),
-    ("open_loop/house_building_1", {"deconstruct": True}),
+    ("open_loop/house_building_1", source_config("deconstruction")),
 ]
 
 
@@ -45,7 +47,8 @@ def expected():
 
 
 def rollout(task, config):
-    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=3, **config)
+    options = {"obs_size": 32, "seed": 0, "expert": True, "max_steps": 3, **config}
+    env = options.pop("make", make_resolved)(resolve_env(task, options))
     data = env.rollout(4, lambda td: td.set(keys.ACTION, td[keys.EXPERT_ACTION]))
     env.close()
     return data
@@ -57,8 +60,8 @@ def test_environments_fulfil_their_specs(expected, other_default, case):
     assert kinds(rollout(task, config)) == expected[str(case)]
     options = {"obs_size": 32, "seed": 0, "expert": True, "max_steps": 3, **config}
     for env in (
-        ba_torchrl.make(task, **options),
         ba_torchrl.make_vector_env(task, 2, parallel=False, **options),
+        options.pop("make", make_resolved)(resolve_env(task, options)),
     ):
         check_env_specs(env, break_when_any_done="both", seed=0)
         env.close()

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torchrl
 from tensordict import TensorDict
 
-import torchrl
 from ba_torchrl import __version__
-from ba_torchrl.data.demos import Source, source_config
+from ba_torchrl.data.demos import Source
 from ba_torchrl.data.files import (
     check,
     publish,
@@ -145,5 +145,5 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
 
 def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
     """Return every parameter that affects the data, defaults included, as JSON values."""
-    other = {"seed", "render", *source_config("deconstruction")}
-    return json.loads(resolve_env(task, env).config.model_dump_json(exclude=other))
+    config = resolve_env(task, env).config
+    return json.loads(config.model_dump_json(exclude={"seed", "render", "expert"}))

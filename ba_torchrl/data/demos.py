@@ -13,9 +13,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
-from ba_torchrl.data.time_reversal import is_reversible, reverse_episode
+from ba_torchrl.data.time_reversal import DeconstructionEnv, is_reversible, reverse_episode
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.factory import make_vector_env
+from ba_torchrl.envs.factory import make_resolved, make_vector_env
 from ba_torchrl.errors import ConfigError
 
 Source = Literal["expert", "deconstruction"]
@@ -45,8 +45,7 @@ def collect_demonstrations(
     """Play episodes with the expert.
 
     Args:
-        env: a vector of environments made with ``expert=True``, and with ``deconstruct=True`` for
-            the source "deconstruction".
+        env: a vector of environments made with `source_config`.
         episodes: number of episodes to play.
         seed: of the first episodes; environment i starts from ``seed + i``.
         source: "expert", or "deconstruction" for episodes reversed in time. Episodes that cannot be
@@ -198,9 +197,10 @@ def check_turn_noise(noise: float, source: Source, turns: Sequence[int], name: s
         raise ConfigError(f"{name}: the actions have no turns; leave it at 0")
 
 
-def source_config(source: Source) -> dict[str, bool]:
-    """Return the fields of `EnvConfig` that a source of demonstrations needs."""
-    return {"expert": True, **({"deconstruct": True} if source == "deconstruction" else {})}
+def source_config(source: Source) -> dict[str, Any]:
+    """Return the keywords of `make_vector_env` with which a source makes its environments."""
+    is_reversed = source == "deconstruction"
+    return {"expert": True, "make": DeconstructionEnv if is_reversed else make_resolved}
 
 
 class ExpertScores(NamedTuple):

@@ -1,5 +1,6 @@
 """Time reversal: episodes that take a structure apart become demonstrations that build it.
 
+`DeconstructionEnv` takes structures apart and observes the action that reverses the last one.
 `reverse_episode` works on recorded episodes, without a simulator. `replay_scores` measures whether
 the reversed actions build the structure.
 """
@@ -8,13 +9,22 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Binary, Unbounded
 
+from ba_torchrl.actions import PICK
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
-from ba_torchrl.envs.factory import make
+from ba_torchrl.envs.open_loop import OpenLoopEnv
+from ba_torchrl.envs.scene import Scene
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.structures.deconstruction import Deconstruction
+from ba_torchrl.tasks.structures.open_loop import StructureTask
+from ba_torchrl.tasks.structures.undo import UndoRecorder
 
 _ENDS = (
     keys.REWARD,
@@ -25,7 +35,94 @@ _ENDS = (
     keys.FAULT,
     keys.STEP_COUNT,
 )
-_EXTRA = (keys.UNDO_ACTION, keys.UNDO_IN_HAND, keys.CAN_UNDO, keys.EXPERT_ACTION)
+UNDO_ACTION = "undo_action"
+"""Key, like ``action``: the inverse of the last action."""
+UNDO_IN_HAND = "undo_in_hand"
+"""Key, like ``in_hand``: the in-hand image after the inverse action, if that is a pick."""
+CAN_UNDO = "can_undo"
+"""Key, [1] bool: the last action has an inverse, since it moved exactly one object."""
+_EXTRA = (UNDO_ACTION, UNDO_IN_HAND, CAN_UNDO, keys.EXPERT_ACTION)
+
+
+class DeconstructionEnv(OpenLoopEnv):
+    """An open-loop environment whose episodes start with the structure and take it apart.
+
+    Every observation contains the action that reverses the last one.
+
+    Raises:
+        ConfigError: as for `OpenLoopEnv`, or the task has no structure.
+    """
+
+    def __init__(self, resolved: ResolvedEnv) -> None:
+        check_has_structure(resolved.task_id)
+        super().__init__(resolved)
+
+    def _build_scene(self, scale: float, *, window: bool | None = None) -> Scene:
+        scene = super()._build_scene(scale, window=window)
+        scene.task = Deconstruction(scene.task)
+        return scene
+
+    def _make_specs(self) -> None:
+        super()._make_specs()
+        undo = {
+            UNDO_ACTION: Unbounded(self.action_spec.shape, device="cpu", dtype=torch.float32),
+            CAN_UNDO: Binary(1, device="cpu", dtype=torch.bool),
+        }
+        if self.config.obs_type == "pixel":
+            undo[UNDO_IN_HAND] = self.observation_spec[keys.IN_HAND].clone()
+        self.observation_spec.update(undo)
+
+    def _act(self, scene: Scene, action: np.ndarray) -> None:
+        controller = scene.controller
+        before = UndoRecorder.record(scene.task.objects, controller.held, controller.grasp)
+        heights = self._heightmap(scene)
+        super()._act(scene, action)
+        self._memory = {name: value for name, value in self._memory.items() if name != "undo"}
+        command = before.undo_command(controller.held, controller.grasp, scene.task.lowest_tool_m)
+        if command is None:
+            return
+        undo = self.actions.encode(command)
+        command, image = self.actions.decode(undo), None
+        if before.held is not None:  # the inverse of a place is a pick, which has an in-hand image
+            now = self._heightmap(scene)
+            position = self._position(scene, command, PICK, now)
+            image = self._draw_in_hand(now, heights, position, command)
+        self._memory["undo"] = undo, image
+
+    def _observe(self, scene: Scene) -> dict[str, Tensor]:
+        observation = super()._observe(scene)
+        action, image = self._memory.get("undo", (None, None))
+        observation[CAN_UNDO] = torch.tensor([action is not None], device="cpu")
+        if action is None:
+            action = np.zeros(self.actions.size, dtype=np.float32)
+        observation[UNDO_ACTION] = torch.from_numpy(action)
+        if self.config.obs_type == "pixel":
+            observation[UNDO_IN_HAND] = torch.zeros_like(observation[keys.IN_HAND])
+            if image is not None:
+                observation[UNDO_IN_HAND] = torch.from_numpy(image.astype(np.float32))
+        return observation
+
+
+def make_deconstruction_env(task: str, **config: Any) -> DeconstructionEnv:
+    """Make an environment that takes structures apart.
+
+    Args:
+        task: id of an open-loop task with a structure.
+        config: fields of `EnvConfig`.
+    """
+    check_has_structure(task)
+    return DeconstructionEnv(resolve_env(task, config))
+
+
+def check_has_structure(task: str) -> None:
+    """Check that a task has a structure that can be taken apart.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    if not issubclass(TASKS[task], StructureTask):
+        possible = ", ".join(name for name in TASKS if issubclass(TASKS[name], StructureTask))
+        raise ConfigError(f"deconstruction has no meaning for {task}; it is for {possible}")
 
 
 def is_reversible(episode: TensorDictBase) -> bool:
@@ -37,7 +134,7 @@ def is_reversible(episode: TensorDictBase) -> bool:
     holding = episode[keys.HOLDING].flatten().tolist()
     return (
         bool(episode[keys.NEXT, keys.SUCCESS][-1])
-        and bool(episode[keys.NEXT, keys.CAN_UNDO].all())
+        and bool(episode[keys.NEXT, CAN_UNDO].all())
         and holding == [i % 2 == 1 for i in range(len(holding))]
         and not bool(episode[keys.NEXT, keys.HOLDING][-1])
     )
@@ -51,7 +148,7 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
     structure, has the reward and terminates.
 
     Args:
-        episode: steps [T] of an environment with ``deconstruct=True``.
+        episode: steps [T] of a `DeconstructionEnv`.
 
     Raises:
         ValueError: the episode is not `is_reversible`.
@@ -67,7 +164,7 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
         # the reversed episode picks the object held in state t from the scene of state t + 1
         shown = torch.where(
             episode[keys.HOLDING][..., None, None],
-            following[keys.UNDO_IN_HAND],
+            following[UNDO_IN_HAND],
             episode[keys.IN_HAND],
         )
         after[keys.IN_HAND] = shown.flip(0)
@@ -87,7 +184,7 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
             }
         )
     after[keys.REWARD] = last.to(torch.float32)
-    before[keys.ACTION] = following[keys.UNDO_ACTION].flip(0)
+    before[keys.ACTION] = following[UNDO_ACTION].flip(0)
     before[keys.NEXT] = after
     return before
 
@@ -111,7 +208,7 @@ def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> 
         seed: of the first episode.
         config: other fields of `EnvConfig`.
     """
-    env = make(task, **{**config, "seed": seed, "deconstruct": True, "expert": True})
+    env = make_deconstruction_env(task, **{**config, "seed": seed, "expert": True})
     lengths, reached = [], 0
     try:
         for _ in range(episodes):
@@ -131,7 +228,7 @@ def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> 
     return ReplayScores(kept / episodes, reached / kept, sum(lengths) / kept)
 
 
-def _play(env: ManipulationEnv, actions: Tensor) -> bool:
+def _play(env: DeconstructionEnv, actions: Tensor) -> bool:
     """Return whether actions [T, A] build the structure, completed by the last one."""
     scene = env.scene
     deconstruction, scene.task = scene.task, scene.task.task

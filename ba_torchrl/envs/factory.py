@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -45,6 +45,7 @@ def make_vector_env(
     *,
     workers: WorkerOptions | None = None,
     register_modules: Sequence[str | ModuleType] = (),
+    make: Callable[[ResolvedEnv], ManipulationEnv] = make_resolved,
     **options: Any,
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.
@@ -59,6 +60,7 @@ def make_vector_env(
         register_modules: modules outside the package that each process imports before it makes its
             environment, such as ``["my_tasks"]``. Those that register the task and the robot are
             found without being named.
+        make: makes one environment.
         options: as for `make`, and single fields of `ba_torchrl.config.WorkerOptions`, such as
             ``parallel=False`` or ``timeout_s=120``.
 
@@ -74,5 +76,5 @@ def make_vector_env(
     if workers.parallel and workers.start_method == "spawn":
         resolved.check_spawned_process_knows()
     return make_vector(
-        partial(make_resolved, resolved), num_envs, seed=resolved.config.seed, workers=workers
+        partial(make, resolved), num_envs, seed=resolved.config.seed, workers=workers
     )

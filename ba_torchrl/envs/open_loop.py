@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
-from torchrl.data import Binary, Bounded, Unbounded
+from torchrl.data import Bounded
 
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
 from ba_torchrl.config import EnvConfig
@@ -28,7 +27,6 @@ from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics, World
 from ba_torchrl.tasks.base import Task
-from ba_torchrl.tasks.structures.undo import UndoRecorder
 from ba_torchrl.tasks.workspace import ActionLimits
 
 DISPLAY_POINT = RelativePoint(-0.3, 0.3, 0.15)
@@ -107,19 +105,6 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         low, high = torch.from_numpy(np.array(self.actions.ranges, dtype=np.float32).T)
         return Bounded(low, high, (self.actions.size,), device="cpu", dtype=torch.float32)
 
-    def _make_specs(self) -> None:
-        super()._make_specs()
-        if self.config.deconstruct:
-            undo = {
-                keys.UNDO_ACTION: Unbounded(
-                    self.action_spec.shape, device="cpu", dtype=torch.float32
-                ),
-                keys.CAN_UNDO: Binary(1, device="cpu", dtype=torch.bool),
-            }
-            if self.config.obs_type == "pixel":
-                undo[keys.UNDO_IN_HAND] = self.observation_spec[keys.IN_HAND].clone()
-            self.observation_spec.update(undo)
-
     def _declare_images(self) -> dict[str, ImageSpec]:
         highest_m, patch = self.workspace.z[1], self.config.in_hand_size
         if self._in_hand_kind.channels == 1:
@@ -142,7 +127,6 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         command = self.actions.decode(action)
         controller = scene.controller
         controller.is_out_of_reach = False
-        before_action = self._record_undo(scene)
         holding = controller.held is not None
         primitive = command.primitive
         if primitive is None:
@@ -162,27 +146,12 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         controller.update_grasp()
         if controller.held is None:
             self._memory = {}
-        if before_action is not None:
-            self._memory = self._remember_undo(scene, *before_action)
 
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         size = self.config.in_hand_size
         empty = np.zeros((self._in_hand_kind.channels, size, size))
         heights = np.clip(self._heightmap(scene), 0.0, self.workspace.z[1])
         return {keys.PIXELS: heights[None], keys.IN_HAND: self._memory.get("in_hand", empty)}
-
-    def _observe(self, scene: Scene) -> dict[str, torch.Tensor]:
-        observation = super()._observe(scene)
-        if self.config.deconstruct:
-            undo, image = self._memory.get("undo", (None, None))
-            observation[keys.CAN_UNDO] = torch.tensor([undo is not None], device="cpu")
-            action = np.zeros(self.actions.size, dtype=np.float32) if undo is None else undo
-            observation[keys.UNDO_ACTION] = torch.from_numpy(action)
-            if self.config.obs_type == "pixel":
-                observation[keys.UNDO_IN_HAND] = torch.zeros_like(observation[keys.IN_HAND])
-                if image is not None:
-                    observation[keys.UNDO_IN_HAND] = torch.from_numpy(image.astype(np.float32))
-        return observation
 
     def _is_holding(self, scene: Scene) -> bool:
         return scene.controller.held is not None
@@ -209,38 +178,6 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
     def _call_on_contact(self) -> None:
         if self.on_contact is not None:
             self.on_contact()
-
-    def _record_undo(self, scene: Scene) -> tuple[UndoRecorder, np.ndarray] | None:
-        """Return the recorder and the heightmap before an action; None without deconstruction."""
-        if not self.config.deconstruct:
-            return None
-        controller = scene.controller
-        recorder = UndoRecorder.record(scene.task.objects, controller.held, controller.grasp)
-        return recorder, self._heightmap(scene)
-
-    def _remember_undo(
-        self, scene: Scene, before: UndoRecorder, heights: np.ndarray
-    ) -> dict[str, Any]:
-        """Return the memory with the action that undoes the last one.
-
-        Args:
-            scene: the scene after the action.
-            before: the recorder before the action.
-            heights: the heightmap before the action.
-        """
-        memory = {name: value for name, value in self._memory.items() if name != "undo"}
-        command = before.undo_command(
-            scene.controller.held, scene.controller.grasp, scene.task.lowest_tool_m
-        )
-        if command is None:
-            return memory
-        action = self.actions.encode(command)
-        command, image = self.actions.decode(action), None
-        if before.held is not None:  # the inverse of a place is a pick, which has an in-hand image
-            now = self._heightmap(scene)
-            position = self._position(scene, command, PICK, now)
-            image = self._draw_in_hand(now, heights, position, command)
-        return {**memory, "undo": (action, image)}
 
     def _heightmap(self, scene: Scene) -> np.ndarray:
         return scene.camera.heightmap(

@@ -19,7 +19,7 @@ from ba_torchrl.sim.geometry import Matrix, Vector, bullet_compose
 from ba_torchrl.sim.vision.framing import Viewpoint, fit_viewpoint
 from ba_torchrl.sim.vision.rgb import FOV_DEG
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 
 YAW_DEG = 78.0
 PITCH_DEG = -36.0

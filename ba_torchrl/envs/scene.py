@@ -16,7 +16,7 @@ from ba_torchrl.sim.snapshots import PortableSnapshot, Snapshot
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import FINE_PHYSICS, Physics, World
 from ba_torchrl.tasks.base import Task, TaskSettings
-from ba_torchrl.tasks.clutter.tray import Tray
+from ba_torchrl.tasks.terrain.tray import Tray
 from ba_torchrl.tasks.workspace import Workspace
 
 MARK_M = 1e-3
@@ -118,8 +118,6 @@ def build_scene(
     terrain = Tray(world, settings.workspace) if config.close_loop_tray else None
     robot = ROBOTS[config.robot](world)
     task = task_class(settings, world, robot, terrain)
-    if config.deconstruct:
-        task = task.deconstruction()
     world.seal()
     return Scene(world, robot, task, make_controller(robot, task), HeightCamera(world.bodies))
 

@@ -219,6 +219,3 @@ def _check_task_supports(task_id: str, config: EnvConfig) -> None:
         raise ConfigError(
             f"close_loop_tray: the tray has no room for {task_id}; it is for {fitting}"
         )
-    if config.deconstruct and not task_class.can_be_deconstructed:
-        possible = ", ".join(name for name in TASKS if TASKS[name].can_be_deconstructed)
-        raise ConfigError(f"'deconstruct' has no meaning for {task_id}; it is for {possible}")

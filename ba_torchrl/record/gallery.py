@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ba_torchrl import make
+from ba_torchrl.data.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import keys
 from ba_torchrl.record.headings import tasks_by_heading
 from ba_torchrl.record.video import FrameRecorder
@@ -51,7 +52,8 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
             state; those between show grasps and releases if the task is open-loop.
         deconstruct: whether the episode takes the structure apart.
     """
-    env = make(task, expert=True, seed=seed, deconstruct=deconstruct)
+    make_env = make_deconstruction_env if deconstruct else make
+    env = make_env(task, expert=True, seed=seed)
     recorder = FrameRecorder(env)
     try:
         state = env.reset()

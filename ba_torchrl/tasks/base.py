@@ -1,7 +1,11 @@
-"""Task: bodies, their random poses, the goal, and an expert that reaches it."""
+"""Task: bodies, their random poses, the goal, and an expert that reaches it.
+
+`OpenLoopTask` and `CloseLoopTask` add the defaults of the two kinds of control.
+"""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,19 +15,29 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand, PickPlaceCommand
 from ba_torchrl.config import TaskParameters
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, PlacementError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import YawPose
+from ba_torchrl.sim.geometry import Matrix, YawPose
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.terrain import Flat, Terrain
+from ba_torchrl.tasks.terrain.flat import Flat, Terrain
 from ba_torchrl.tasks.workspace import ActionLimits, Spacing, Workspace
 
 TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks")
 
 BLOCK_M = 0.05
 """Edge of a block at scale 1."""
+
+RED: Color = (0.82, 0.22, 0.2, 1.0)
+BLUE: Color = (0.2, 0.4, 0.8, 1.0)
+GREEN: Color = (0.35, 0.7, 0.35, 1.0)
+ORANGE: Color = (0.9, 0.55, 0.15, 1.0)
+
+PAIR_ATTEMPTS = 2000
+"""Random layouts before a `PlacementError`. The least likely one, that of two pulling blocks with
+fixed orientations, is found in 1 of 30 attempts."""
 
 SCALE_STEP = 0.02
 """Step of the scales between the ends of `object_scale_range`."""
@@ -86,8 +100,6 @@ class Task(ABC):
     """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False
     """Whether the objects fit the tray of `close_loop_tray`."""
-    can_be_deconstructed: ClassVar[bool] = False
-    """Whether `deconstruction` returns the reversed task."""
 
     Parameters: ClassVar[type[TaskParameters]] = TaskParameters
     """Model of the task's own parameters; its fields are keywords of `ba_torchrl.make`."""
@@ -209,14 +221,6 @@ class Task(ABC):
         Called when the bodies are at rest after an action, before `evaluate` and the observation.
         """
 
-    def deconstruction(self) -> Task:
-        """Return the task that takes this task's structure apart, in the same world.
-
-        Raises:
-            NotImplementedError: the task has none; see `can_be_deconstructed`.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no deconstruction")
-
     def get_state(self) -> Any:
         """Return the state of the task besides the poses of its bodies."""
         return None
@@ -281,6 +285,97 @@ class Task(ABC):
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Place a body on the ground."""
         self.terrain.stand(body, xy, yaw_rad)
+
+
+class OpenLoopTask(Task):
+    """A task whose actions are picks and places (appendix A.1, G.1).
+
+    Without a z component in the action, `pick_height_m` and `place_height_m` return the height of
+    the tool from the highest point in a window around the target.
+    """
+
+    control = "open_loop"
+    workspace = Workspace(x=(0.25, 0.65), y=(-0.2, 0.2), z=(0.0, 0.4))
+    scale_range = (0.6, 0.6)
+    scale_limits = (0.55, 1.1)
+    finger_opening: ClassVar[float] = 1.0
+    """Opening of the gripper before a pick, 0 to 1."""
+
+    def lowest_tool_m(self, xy: tuple[float, float], rotation: Matrix | None = None) -> float:
+        """Return the least height of a pick, at which the fingers close above the ground, metres.
+
+        Args:
+            xy: position of the tool, metres.
+            rotation: rotation of the tool; None if it points down.
+        """
+        return self.terrain.lowest_tool_m(self.robot.gripper, xy, rotation)
+
+    def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
+        """Return the height of the tool for a pick without z, metres.
+
+        Args:
+            top_m: height of the highest point in the window around the target.
+            xy: position of the target.
+        """
+        return max(top_m - self.block_m / 2, self.lowest_tool_m(xy))
+
+    def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
+        """Return the height of the tool for a place without z, metres.
+
+        Args:
+            top_m: height of the highest point in the window around the target.
+            xy: position of the target.
+        """
+        return top_m + self.block_m / 2
+
+    def window_m(self, held: Body | None) -> float:
+        """Return half the width of the square window around the target, metres.
+
+        Args:
+            held: the body in the gripper.
+        """
+        return self.block_m / 2
+
+
+class CloseLoopTask(Task):
+    """A task whose actions are small displacements of the gripper (appendix A.2, G.2)."""
+
+    control = "close_loop"
+    max_steps = 50
+    workspace = Workspace(x=(0.3, 0.6), y=(-0.15, 0.15), z=(0.01, 0.25))
+    scale_range = (1.0, 1.0)
+    scale_limits = (0.6, 1.2)
+
+    def cube(self, color: Color = RED) -> Box:
+        """Return the shape of a cubic block."""
+        return Box(size_m=(self.block_m,) * 3, color=color)
+
+    def random_pair(
+        self, rng: np.random.Generator, paddings_m: tuple[float, float], distance_m: float
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return two random points of the ground at least ``distance_m`` apart.
+
+        With fixed orientations both have the same x, so that a gripper that cannot turn can push an
+        object from one to the other.
+
+        Args:
+            rng: random generator.
+            paddings_m: twice the least distance of each point from the border.
+            distance_m: least distance between the points.
+
+        Raises:
+            PlacementError: the workspace is too small for them.
+        """
+        for _ in range(PAIR_ATTEMPTS):
+            first, second = (self.random_point(rng, padding) for padding in paddings_m)
+            if not self.settings.random_orientation:
+                second = (first[0], second[1])
+            if math.dist(first, second) >= distance_m:
+                return first, second
+        raise PlacementError(
+            f"no room for two objects {distance_m:.3f} m apart: enlarge `workspace` or lower "
+            "`object_scale_range`"
+        )
 
 
 def check_scales(task_id: str, scales: tuple[float, float]) -> None:

@@ -15,8 +15,8 @@ from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import Quaternion, yaw_quaternion
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.clearance import passing_height_m
-from ba_torchrl.tasks.footprints import narrowest, outline
+from ba_torchrl.tasks.manipulation.clearance import passing_height_m
+from ba_torchrl.tasks.manipulation.footprints import narrowest, outline
 from ba_torchrl.testing.episodes import action_at, expert_policy, make_small, random_actions
 
 MAX_STEPS = 60

@@ -27,14 +27,14 @@ from ba_torchrl.training.config import ExperimentConfig
 logger = logging.getLogger(__name__)
 
 
-def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
+def make_env(config: ExperimentConfig, seed: int, **changes: Any) -> EnvBase:
     """Return the environments of a run, ready to be reset.
 
     Args:
         config: of the run.
         seed: of the first environment.
-        changes: fields of `EnvConfig` and `WorkerOptions` that differ from the run's; by default,
-            failed processes are waited for.
+        changes: keywords of `make_vector_env` that differ from the run's; by default, failed
+            processes are waited for.
     """
     options = {**config.env, "seed": seed, "wait_for_restarts": True, **changes}
     return make_vector_env(

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from ba_torchrl.config import MAX_SEED, Model, parse
-from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.data.time_reversal import check_has_structure
 from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError, as_os_error
 from ba_torchrl.plugins import load_plugins
@@ -227,7 +227,7 @@ PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixe
 VideoFile = Annotated[
     Text, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))
 ]
-Structures = list[Annotated[str, checked(lambda task: resolve_env(task, {"deconstruct": True}))]]
+Structures = list[Annotated[str, checked(check_has_structure)]]
 """Ids of tasks whose structures can be deconstructed."""
 
 

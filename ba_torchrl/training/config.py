@@ -19,8 +19,8 @@ from ba_torchrl.data.demos import (
     Source,
     check_noise,
     check_turn_noise,
-    source_config,
 )
+from ba_torchrl.data.time_reversal import check_has_structure
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import MAIN, load_plugins
@@ -271,7 +271,6 @@ class ExperimentConfig(WorkerOptions):
             yield f"algorithm.{message}"
 
     def _check_demonstrations(self) -> None:
-        source = source_config(self.demonstrations_source)
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
         check_turn_noise(
             self.demonstrations_turn_noise,
@@ -279,8 +278,8 @@ class ExperimentConfig(WorkerOptions):
             self.resolved_env.actions.turns,
             "demonstrations_turn_noise",
         )
-        if self.demonstrations:
-            _ = resolve_env(self.task, {**self.env, **source}, "env")
+        if self.demonstrations and self.demonstrations_source == "deconstruction":
+            check_has_structure(self.task)
         if self.demonstrations_path is not None:
             if not self.demonstrations:
                 raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")

@@ -100,13 +100,12 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
     "changed", [{"holding": torch.ones(3, 1)}, {"holding": 1}, {"episode_lengths": torch.ones(0)}]
 )
 def test_folders_with_other_tensors_are_refused(collected, tmp_path, changed):
-    source, episodes = collected
-    env = {**ENV, **source_config(source)}
-    save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=env, seed=0)
+    _, episodes = collected
+    save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)
     write_state(tmp_path / "demos", {**read_state(tmp_path / "demos"), **changed})
     seal(tmp_path / "demos")
     with pytest.raises(ConfigError, match="does not hold episodes"):
-        load_demonstrations(tmp_path / "demos", task=TASK, env=env)
+        load_demonstrations(tmp_path / "demos", task=TASK, env=ENV)
 
 
 def test_demonstrations_are_not_overwritten(collected, tmp_path):

@@ -7,9 +7,14 @@ from tensordict import TensorDict
 
 import ba_torchrl
 from ba_torchrl.actions import PICK, PLACE
-from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import collect_episodes
-from ba_torchrl.data.time_reversal import is_reversible, replay_scores, reverse_episode
+from ba_torchrl.data.time_reversal import (
+    is_reversible,
+    make_deconstruction_env,
+    replay_scores,
+    reverse_episode,
+)
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -211,7 +216,7 @@ def test_structures_with_fixed_orientations_are_built_without_a_yaw():
 def test_reversed_episodes_equal_their_replay_in_the_simulator(mode):
     """Their actions, executed in an environment, give the observations of the reversed episode."""
     config = {"seed": 5, "in_hand_mode": mode}
-    env = ba_torchrl.make(TASK, deconstruct=True, expert=True, **config)
+    env = make_deconstruction_env(TASK, expert=True, **config)
     plain = ba_torchrl.make(TASK, expert=True, **config)
     try:
         apart = env.rollout(10, lambda td: td.set("action", td["expert_action"].clone()))
@@ -245,7 +250,7 @@ def test_reversed_episodes_equal_their_replay_in_the_simulator(mode):
 
 
 def test_a_deconstruction_starts_with_the_structure_and_ends_apart():
-    env = ba_torchrl.make("open_loop/house_building_3", deconstruct=True, expert=True, seed=0)
+    env = make_deconstruction_env("open_loop/house_building_3", expert=True, seed=0)
     try:
         state = env.reset()
         task = env.scene.task
@@ -270,7 +275,7 @@ def test_a_deconstruction_starts_with_the_structure_and_ends_apart():
 
 def test_episodes_are_collected_in_a_vector_of_environments():
     env = ba_torchrl.make_vector_env(
-        TASK, 2, parallel=False, expert=True, deconstruct=True, seed=0, obs_size=64
+        TASK, 2, parallel=False, seed=0, obs_size=64, **source_config("deconstruction")
     )
     try:
         episodes = collect_demonstrations(env, 3, seed=0, source="deconstruction")
@@ -291,4 +296,4 @@ def test_episodes_are_collected_in_a_vector_of_environments():
 
 def test_tasks_without_a_structure_refuse_deconstruction():
     with pytest.raises(ConfigError, match="no meaning for close_loop/block_picking"):
-        ba_torchrl.make("close_loop/block_picking", deconstruct=True)
+        make_deconstruction_env("close_loop/block_picking")

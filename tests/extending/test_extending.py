@@ -10,6 +10,7 @@ import torch
 
 import ba_torchrl
 from ba_torchrl import testing
+from ba_torchrl.data.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import downward
@@ -72,7 +73,7 @@ def test_a_structure_has_its_fewest_steps_and_its_deconstruction():
     assert env.scene.task.planner.blueprint.optimal_steps == 4
     assert play(env, 3) == (3, 12)
     env.close()
-    apart = ba_torchrl.make("mine/bridge", seed=0, expert=True, deconstruct=True)
+    apart = make_deconstruction_env("mine/bridge", seed=0, expert=True)
     assert play(apart, 1)[0] == 1
     apart.close()
 

@@ -51,9 +51,9 @@ def test_a_changed_number_is_found(case):
 
 
 def test_a_refusal_of_the_configuration_is_recorded(case):
-    refused = dataclasses.replace(case, config={"deconstruct": True})
+    refused = dataclasses.replace(case, config={"top_down_approach": True})
     record = run_case(refused)
-    assert record["facts"]["refused"].startswith("'deconstruct' has no meaning")
+    assert record["facts"]["refused"].startswith("'top_down_approach' is for open-loop")
 
 
 def test_every_task_has_cases_and_names_are_unique():

@@ -18,7 +18,7 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.clearance import (
+from ba_torchrl.tasks.manipulation.clearance import (
     INNER_MARGIN_M,
     OUTER_MARGIN_M,
     SIDE_MARGIN_M,
@@ -33,7 +33,7 @@ from ba_torchrl.tasks.clearance import (
     tips_below_tool_m,
     tool_clearances_m,
 )
-from ba_torchrl.tasks.footprints import Rectangle
+from ba_torchrl.tasks.manipulation.footprints import Rectangle
 
 EDGE_M = 0.03
 GRIPPER = Gripper(

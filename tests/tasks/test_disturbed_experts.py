@@ -8,8 +8,8 @@ from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.footprints import outline
-from ba_torchrl.tasks.motion_primitives import grasped_body
+from ba_torchrl.tasks.manipulation.footprints import outline
+from ba_torchrl.tasks.manipulation.primitives import grasped_body
 from ba_torchrl.testing.episodes import expert_policy
 from ba_torchrl.testing.progress import close_around_object
 

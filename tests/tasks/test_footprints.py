@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.tasks.footprints import Rectangle, gap_m, gaps_m, narrowest
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, gaps_m, narrowest
 from ba_torchrl.tasks.workspace import Workspace
 from tests.tasks.packing.scenes import BIN
 

@@ -15,11 +15,11 @@ from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.bumps import Bumps
-from ba_torchrl.tasks.footprints import Rectangle, gap_m, outline
-from ba_torchrl.tasks.ramps import GAP_M, RampLayout, Ramps
-from ba_torchrl.tasks.sloped_terrain import footprint, lowest_plane
-from ba_torchrl.tasks.terrain import Flat
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
+from ba_torchrl.tasks.terrain.bumps import Bumps
+from ba_torchrl.tasks.terrain.flat import Flat
+from ba_torchrl.tasks.terrain.ramps import EDGE_MARGIN_M, GAP_M, RampLayout, Ramps
+from ba_torchrl.tasks.terrain.sloped import footprint, lowest_plane
 from ba_torchrl.tasks.workspace import Spacing, Workspace
 
 WORKSPACE = Workspace((0.25, 0.65), (-0.1, 0.3), (0.0, 0.4))  # its centre is off the x axis
@@ -364,14 +364,15 @@ def test_an_object_on_a_ramp_is_grasped_along_its_normal(make_env):
 
 
 def test_a_gap_narrower_than_the_pieces_is_refused(world):
-    ramps = Ramps(world, WORKSPACE, least_gap_m=0.1)
+    ramps = Ramps(world, WORKSPACE)
+    ramps.reserve(0.1 - 2 * EDGE_MARGIN_M)
     world.seal()
     rng = np.random.default_rng(0)
     for _ in range(50):
         ramps.initialize_episode(rng)
         assert 0.1 <= sum(ramps.layout.distances_m) <= GAP_M[1]
     with pytest.raises(ValueError, match="wider"):
-        Ramps(World(), WORKSPACE, least_gap_m=0.25)
+        Ramps(World(), WORKSPACE).reserve(0.25)
 
 
 def test_footprints_are_rotated_outlines(make_env):

@@ -8,8 +8,8 @@ from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.motion_primitives import CLOSED, OPEN, can_descend, grasp
-from ba_torchrl.tasks.transport import TRAVEL_CLEARANCE_M, pick_up, travel
+from ba_torchrl.tasks.manipulation.primitives import CLOSED, OPEN, can_descend, grasp
+from ba_torchrl.tasks.manipulation.transport import TRAVEL_CLEARANCE_M, pick_up, travel
 from ba_torchrl.tasks.workspace import ActionLimits
 
 LIMITS = ActionLimits(0.05, math.pi / 4)

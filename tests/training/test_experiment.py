@@ -204,7 +204,7 @@ FERM = {
         ({"num_envs": 0}, "num_envs"),
         ({"total_update": 5}, "Did you mean 'total_updates'"),
         ({"device": "cuda:99"}, "device: use device=cpu"),
-        ({"demonstrations_source": "deconstruction"}, "'deconstruct' has no meaning"),
+        ({"demonstrations_source": "deconstruction"}, "deconstruction has no meaning"),
         ({"demonstrations_path": "/no/such/folder"}, "no demonstrations at"),
         (
             {"demonstrations": 0, **NO_PRETRAINING, "demonstrations_path": "/a"},

@@ -18,9 +18,9 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+import torchrl
 from torch import multiprocessing as mp
 
-import torchrl
 from ba_torchrl.envs.vector.launcher import start_process
 from ba_torchrl.errors import WorkerError
 

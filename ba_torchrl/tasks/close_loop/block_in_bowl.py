@@ -12,11 +12,9 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.meshes import bowl_parts, centroid
 from ba_torchrl.sim.shapes import Solid
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.colors import BLUE
-from ba_torchrl.tasks.motion_primitives import CLOSED, OPEN, grasped_body, move_toward
-from ba_torchrl.tasks.transport import pick_up, travel
+from ba_torchrl.tasks.base import BLUE, TASKS, CloseLoopTask
+from ba_torchrl.tasks.manipulation.primitives import CLOSED, OPEN, grasped_body, move_toward
+from ba_torchrl.tasks.manipulation.transport import pick_up, travel
 from ba_torchrl.tasks.workspace import Spacing
 
 RELEASE_GAP_M = 4e-3

@@ -10,9 +10,8 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import grasp, grasped_body, lift
+from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.manipulation.primitives import grasp, grasped_body, lift
 
 
 @TASKS.register("close_loop/block_picking")

@@ -11,10 +11,8 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.shapes import Box
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.colors import BLUE, RED
-from ba_torchrl.tasks.motion_primitives import (
+from ba_torchrl.tasks.base import BLUE, RED, TASKS, CloseLoopTask
+from ba_torchrl.tasks.manipulation.primitives import (
     STANDOFF_M,
     behind_point,
     has_room_behind,

@@ -12,10 +12,8 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.shapes import Decal
-from ba_torchrl.tasks.base import BLOCK_M, TASKS
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.colors import GREEN
-from ba_torchrl.tasks.motion_primitives import push
+from ba_torchrl.tasks.base import BLOCK_M, GREEN, TASKS, CloseLoopTask
+from ba_torchrl.tasks.manipulation.primitives import push
 
 
 @TASKS.register("close_loop/block_pushing")

@@ -14,10 +14,9 @@ from ba_torchrl.sim.contacts import contacts, gap_m, vertical_force_n
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, transform_mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.clearance import finger_extent_m
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import (
+from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.manipulation.clearance import finger_extent_m
+from ba_torchrl.tasks.manipulation.primitives import (
     CLOSED,
     IS_CLOSED,
     OPEN,
@@ -27,7 +26,7 @@ from ba_torchrl.tasks.motion_primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
-from ba_torchrl.tasks.transport import pick_up
+from ba_torchrl.tasks.manipulation.transport import pick_up
 
 WALL_COLOR: Color = (0.72, 0.7, 0.66, 1.0)
 BASE_COLOR: Color = (0.86, 0.85, 0.82, 1.0)

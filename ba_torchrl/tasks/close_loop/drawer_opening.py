@@ -15,10 +15,13 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, rod_mesh, transform_mesh
 from ba_torchrl.sim.shapes import Color, Solid
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.clearance import SIDE_MARGIN_M, passing_height_m, tips_below_tool_m
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import (
+from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.manipulation.clearance import (
+    SIDE_MARGIN_M,
+    passing_height_m,
+    tips_below_tool_m,
+)
+from ba_torchrl.tasks.manipulation.primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
     CLOSED,

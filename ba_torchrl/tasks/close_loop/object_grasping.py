@@ -9,12 +9,11 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop_task import CloseLoopControl
+from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.push_planner import NEAR_M, Push, PushPlanner
-from ba_torchrl.tasks.grasps import TopDownGrasp
-from ba_torchrl.tasks.motion_primitives import (
+from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
+from ba_torchrl.tasks.manipulation.primitives import (
     ALIGNED_M,
     ALIGNED_RAD,
     CLOSED,
@@ -32,7 +31,7 @@ WALL_PIXELS = 25
 
 
 @TASKS.register("close_loop/object_grasping")
-class ObjectGrasping(ClutterTask, CloseLoopControl):
+class ObjectGrasping(ClutterTask, CloseLoopTask):
     """Objects: 1 to 15 random objects in a tray, five by default.
 
     Goal: an object is held and the tool is higher than 15 cm. The episode ends early when an object

@@ -19,7 +19,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import Task, TaskSettings
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clutter.grasp_planner import GraspPlanner
-from ba_torchrl.tasks.clutter.tray import Tray
+from ba_torchrl.tasks.terrain.tray import Tray
 
 DROP_Z_M = 0.2
 """Height from which objects are dropped."""

@@ -11,7 +11,7 @@ import numpy as np
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Vector, YawPose
 from ba_torchrl.tasks.clutter.grasp_planner import PIXEL_M, GraspPlanner
-from ba_torchrl.tasks.clutter.tray import Tray
+from ba_torchrl.tasks.terrain.tray import Tray
 from ba_torchrl.tasks.workspace import ActionLimits
 
 STANDOFF_M = 5.5e-3

@@ -16,11 +16,10 @@ from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.footprints import Rectangle, narrowest, outline
+from ba_torchrl.tasks.manipulation.commands import no_op, perturbed_pick, pick_command
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, narrowest, outline
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.perturbation import perturbed_pick
-from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 
 BIN_M = (0.176, 0.144, 0.08)
 """Outer extents of the bin, at the appendix's size."""

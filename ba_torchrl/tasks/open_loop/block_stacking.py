@@ -14,8 +14,13 @@ BLOCKS = {"cube": cube, "cylinder": cylinder}
 """Pieces by `object_type`."""
 
 
-class StackedBlocks:
-    """Mixin of a `StructureTask`: Block Stacking on any terrain."""
+@TASKS.register("open_loop/block_stacking")
+class BlockStacking(StructureTask):
+    """Objects: two to eight cubes or cylinders of 3 cm, four by default.
+
+    Goal: the blocks form a stack, released. The episode ends early when a cylinder tips over or a
+    block leaves the workspace. Appendix A.1.
+    """
 
     class Parameters(TaskParameters):
         """The shape of the blocks."""
@@ -37,12 +42,3 @@ class StackedBlocks:
         """Return the stack."""
         block = BLOCKS[self.settings.parameters.object_type](self.block_m)
         return tower(*[block] * self.settings.num_objects)
-
-
-@TASKS.register("open_loop/block_stacking")
-class BlockStacking(StackedBlocks, StructureTask):
-    """Objects: two to eight cubes or cylinders of 3 cm, four by default.
-
-    Goal: the blocks form a stack, released. The episode ends early when a cylinder tips over or a
-    block leaves the workspace. Appendix A.1.
-    """

@@ -15,12 +15,12 @@ from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.clearance import half_gap_m, outline_clearances_m
-from ba_torchrl.tasks.footprints import Rectangle
-from ba_torchrl.tasks.grasps import TopDownGrasp
+from ba_torchrl.tasks.manipulation.clearance import half_gap_m, outline_clearances_m
+from ba_torchrl.tasks.manipulation.commands import no_op, pick_command
+from ba_torchrl.tasks.manipulation.footprints import Rectangle
+from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.pick_place_commands import no_op, pick_command
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
 TRAY_M = (0.24, 0.16, 0.05)

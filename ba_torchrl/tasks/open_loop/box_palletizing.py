@@ -16,19 +16,19 @@ from ba_torchrl.sim.geometry import Pose, Vector
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.footprints import Rectangle, gap_m, narrowest, outline
-from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
-from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.packing.tilted_grasps import TiltedGrasp, tilted_grasp
-from ba_torchrl.tasks.perturbation import perturbed_pick
-from ba_torchrl.tasks.pick_place_commands import (
+from ba_torchrl.tasks.manipulation.commands import (
     LEVEL_RAD,
     carrying_pose,
     no_op,
+    perturbed_pick,
     pick_command,
     place_command,
     swaps_fingers,
 )
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest, outline
+from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
+from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
+from ba_torchrl.tasks.packing.tilted_grasps import TiltedGrasp, tilted_grasp
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 from ba_torchrl.tasks.structures.parts import CUBOID
 from ba_torchrl.tasks.structures.tilted_grasps import is_reachable, release_pose
@@ -85,8 +85,15 @@ def slots(layer: int) -> list[tuple[float, float, float]]:
     return [(-y, x, 0.0) for x, y in places]
 
 
-class Palletizing:
-    """Mixin of a `PackingTask`: Box Palletizing on any terrain."""
+@TASKS.register("open_loop/box_palletizing")
+class BoxPalletizing(PackingTask):
+    """Objects: 6, 12 or 18 boxes of 7.2 x 4.5 x 4.5 cm, 18 by default, and a pallet.
+
+    Goal: each slot of each layer on the pallet of 23.2 x 19.2 x 3 cm has its box, released. A box
+    is stacked if it lies in a slot and all layers below it are full. The boxes arrive one at a
+    time, when all earlier ones are stacked and none is held. The episode ends early when a box
+    leaves the workspace. Appendix A.1.
+    """
 
     scale_limits = (0.75, 1.0)
     max_steps = 40
@@ -367,14 +374,3 @@ class Palletizing:
         site = Rectangle(*arrival[0], arrival[1], width, length)
         others = [outline(body) for body in self.pool.active if body is not held]
         return min((gap_m(site, other) for other in others), default=math.inf)
-
-
-@TASKS.register("open_loop/box_palletizing")
-class BoxPalletizing(Palletizing, PackingTask):
-    """Objects: 6, 12 or 18 boxes of 7.2 x 4.5 x 4.5 cm, 18 by default, and a pallet.
-
-    Goal: each slot of each layer on the pallet of 23.2 x 19.2 x 3 cm has its box, released. A box
-    is stacked if it lies in a slot and all layers below it are full. The boxes arrive one at a
-    time, when all earlier ones are stacked and none is held. The episode ends early when a box
-    leaves the workspace. Appendix A.1.
-    """

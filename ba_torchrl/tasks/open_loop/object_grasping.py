@@ -10,11 +10,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ba_torchrl.actions import PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import downward_pose
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import TASKS, OpenLoopTask
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import DEEPEST_M, PIXEL_M, YAWS
-from ba_torchrl.tasks.open_loop_task import OpenLoopControl
-from ba_torchrl.tasks.pick_place_commands import pick_command
+from ba_torchrl.tasks.manipulation.commands import pick_command
 
 OBJECT_WIDTH_M = 0.045
 """Assumed width of the object between the fingers, for picks without z."""
@@ -34,7 +33,7 @@ COST_TOLERANCE = 60.0
 
 
 @TASKS.register("open_loop/object_grasping")
-class ObjectGrasping(ClutterTask, OpenLoopControl):
+class ObjectGrasping(ClutterTask, OpenLoopTask):
     """Objects: 1 to 20 random objects in a tray, 15 by default.
 
     Goal: an object is held. An episode is a single pick, after which it ends. Appendix A.1.

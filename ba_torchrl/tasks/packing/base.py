@@ -15,13 +15,12 @@ from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, merge_meshes, transform_mesh
 from ba_torchrl.sim.shapes import Color, Solid
-from ba_torchrl.tasks.base import Task
+from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.clearance import half_gap_m, hand_rectangle, outline_clearances_m
-from ba_torchrl.tasks.footprints import Rectangle, gaps_m, narrowest, outline
-from ba_torchrl.tasks.grasps import TopDownGrasp
-from ba_torchrl.tasks.open_loop_task import OpenLoopControl
-from ba_torchrl.tasks.pick_place_commands import place_command
+from ba_torchrl.tasks.manipulation.clearance import half_gap_m, hand_rectangle, outline_clearances_m
+from ba_torchrl.tasks.manipulation.commands import place_command
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gaps_m, narrowest, outline
+from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 
 SCALE = 0.8
 """Scale at which the objects have the sizes of appendix A.1."""
@@ -74,7 +73,7 @@ def open_box(size_m: Vector, wall_m: float, floor_m: float, color: Color) -> Blo
     )
 
 
-class PackingTask(OpenLoopControl, Task):
+class PackingTask(OpenLoopTask):
     """A task with objects of a pool on the floor, and a static container."""
 
     scale_range = (SCALE, SCALE)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.tasks.base import Task
-from ba_torchrl.tasks.footprints import Rectangle, gap_m
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 
 LAYOUTS = 10
 """Random layouts before a `PlacementError`."""

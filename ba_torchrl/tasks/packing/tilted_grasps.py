@@ -19,7 +19,7 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import tool_clearances_m
+from ba_torchrl.tasks.manipulation.clearance import tool_clearances_m
 from ba_torchrl.tasks.structures.parts import CUBOID
 from ba_torchrl.tasks.structures.tilted_grasps import is_reachable
 

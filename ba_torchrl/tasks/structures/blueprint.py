@@ -11,6 +11,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Quaternion, Vector, axes_quaternion, cross, quaternion_matrix
 from ba_torchrl.sim.shapes import Shape
@@ -71,6 +73,12 @@ class Piece:
         if abs(y_axis[2]) <= abs(x_axis[2]):
             x_axis = cross(y_axis, z_axis)
         return axes_quaternion(x_axis, z_axis)
+
+    @property
+    def grasped_width_m(self) -> float:
+        """Extent between the fingers."""
+        yaw = self.grasp_yaws_rad[0]
+        return float(np.ptp(self.shape.vertices[:, :2] @ (math.cos(yaw), math.sin(yaw))))
 
     def grasp_yaws(self, body: Body) -> list[float]:
         """Return the yaws of the gripper at which the fingers close on a body."""

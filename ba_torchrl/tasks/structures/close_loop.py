@@ -12,19 +12,22 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.shapes import Color
-from ba_torchrl.tasks.base import Task
-from ba_torchrl.tasks.clearance import grasp_clearance_m
-from ba_torchrl.tasks.close_loop_task import CloseLoopControl
-from ba_torchrl.tasks.colors import BLUE, GREEN, RED
-from ba_torchrl.tasks.motion_primitives import OPEN, grasped_body, lift, nearest_equivalent_yaw
+from ba_torchrl.tasks.base import BLUE, GREEN, RED, CloseLoopTask
+from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m
+from ba_torchrl.tasks.manipulation.primitives import (
+    OPEN,
+    grasped_body,
+    lift,
+    nearest_equivalent_yaw,
+)
+from ba_torchrl.tasks.manipulation.transport import carry_to, pick_up
 from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import Blueprint
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.goal import StructureGoal
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.structures.structure import Structure
-from ba_torchrl.tasks.terrain import Terrain
-from ba_torchrl.tasks.transport import carry_to, pick_up
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import ActionLimits, Spacing
 
 BLOCKED_COST_M = 1.0
@@ -34,7 +37,7 @@ COLORS: tuple[Color, ...] = (RED, BLUE, (0.9, 0.6, 0.2, 1.0), GREEN)
 """Colors of the cubes, from the bottom up."""
 
 
-class CloseLoopStructureTask(StructureGoal, CloseLoopControl, Task):
+class CloseLoopStructureTask(StructureGoal, CloseLoopTask):
     """Pieces at random poses on the ground; success when they form the blueprint's structure.
 
     The episode ends when a piece that must stay upright tips over: a gripper that points down

@@ -17,16 +17,15 @@ from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, wor
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, YawPose, downward_pose, quaternion_yaw
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import TaskSettings
-from ba_torchrl.tasks.footprints import extents_m, separation_m
-from ba_torchrl.tasks.open_loop_task import OpenLoopTask
-from ba_torchrl.tasks.pick_place_commands import no_op, pick_command, place_command
+from ba_torchrl.tasks.base import OpenLoopTask, TaskSettings
+from ba_torchrl.tasks.manipulation.commands import no_op, pick_command, place_command
+from ba_torchrl.tasks.manipulation.footprints import extents_m, separation_m
 from ba_torchrl.tasks.structures.assignment import mean_position
 from ba_torchrl.tasks.structures.blueprint import Slot
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.structures.tilted_grasps import release_pose
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import Spacing
 
 APART_BLOCKS = 2.4

@@ -10,8 +10,8 @@ import numpy as np
 
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.geometry import Pose
-from ba_torchrl.tasks.footprints import Rectangle, gap_m, outline
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import Region
 
 LEVEL_M = 1e-3

@@ -20,17 +20,17 @@ from ba_torchrl.sim.geometry import (
     quaternion_yaw,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import (
+from ba_torchrl.tasks.manipulation.clearance import (
     grasp_clearance_m,
     hand_clearance_m,
     path_clearance_m,
     tool_clearances_m,
 )
-from ba_torchrl.tasks.pick_place_commands import LEVEL_RAD
+from ba_torchrl.tasks.manipulation.commands import LEVEL_RAD
 from ba_torchrl.tasks.structures.blocking import GraspCandidate, edge_grasps
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.structures.tilted_grasps import is_reachable, tilted_tools
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import ActionLimits
 
 RAISE_BLOCKS = 0.3

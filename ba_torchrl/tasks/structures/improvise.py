@@ -17,7 +17,7 @@ from ba_torchrl.sim.assets.hulls import convex_hull, surface_samples, volume_and
 from ba_torchrl.sim.assets.random_shapes import UNIT_M, read_shape, shape_path
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
-from ba_torchrl.tasks.colors import BLUE
+from ba_torchrl.tasks.base import BLUE
 from ba_torchrl.tasks.structures.blueprint import Piece, Span
 from ba_torchrl.tasks.structures.parts import CUBOID
 

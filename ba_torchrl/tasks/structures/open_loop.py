@@ -10,10 +10,8 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.tasks.base import Task
-from ba_torchrl.tasks.open_loop_task import OpenLoopControl
+from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint
-from ba_torchrl.tasks.structures.deconstruction import Deconstruction
 from ba_torchrl.tasks.structures.goal import StructureGoal
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.structure import Structure
@@ -22,10 +20,9 @@ WINDOW_SHARE = 0.375
 """Half the width of the window for a long piece, as a multiple of its length."""
 
 
-class StructureTask(StructureGoal, OpenLoopControl, Task):
+class StructureTask(StructureGoal, OpenLoopTask):
     """Pieces at random poses on the ground; success when they form the blueprint's structure."""
 
-    can_be_deconstructed = True
     tipped_rad: ClassVar[float] = UPRIGHT_RAD
     """Tilt at which a piece that must stay upright, such as a roof, ends the episode."""
     clears_blocked_pieces: ClassVar[bool] = False
@@ -44,6 +41,7 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
     def load_scene(self) -> None:
         """Load the pieces."""
         self.structure = Structure(self.blueprint(), self.world, self.block_m, self.terrain)
+        self.terrain.reserve(self.structure.widest_base_m(of_all=True))
         self.expert = PickPlaceExpert(
             self.structure,
             self.robot,
@@ -56,6 +54,7 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
     def choose_objects(self, rng: np.random.Generator) -> None:
         """Draw the variants of the pieces."""
         self.structure.draw(rng)
+        self.terrain.reserve(self.structure.widest_base_m())
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Place the pieces at random poses, apart from each other.
@@ -70,10 +69,6 @@ class StructureTask(StructureGoal, OpenLoopControl, Task):
             lambda body: self._random_yaw_of(body, rng),
             base=self.structure.base_body(),
         )
-
-    def deconstruction(self) -> Deconstruction:
-        """Return the task that takes the structure apart."""
-        return Deconstruction(self)
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""

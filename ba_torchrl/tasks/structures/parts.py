@@ -11,7 +11,7 @@ from dataclasses import replace
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, transform_mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
-from ba_torchrl.tasks.colors import BLUE, GREEN, ORANGE, RED
+from ba_torchrl.tasks.base import BLUE, GREEN, ORANGE, RED
 from ba_torchrl.tasks.structures.blueprint import Piece, Span
 from ba_torchrl.tasks.workspace import Spacing
 

@@ -18,10 +18,10 @@ from ba_torchrl.sim.geometry import (
     quaternion_yaw,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.perturbation import perturbed_pick
-from ba_torchrl.tasks.pick_place_commands import (
+from ba_torchrl.tasks.manipulation.commands import (
     carrying_pose,
     no_op,
+    perturbed_pick,
     pick_command,
     place_command,
     swaps_fingers,
@@ -36,7 +36,7 @@ from ba_torchrl.tasks.structures.tilted_grasps import (
     is_reachable,
     release_pose,
 )
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import ActionLimits
 
 SITE_GAP_M = 0.01

@@ -16,7 +16,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
 from ba_torchrl.tasks.structures.planner import StructurePlanner
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import Spacing
 
 
@@ -106,6 +106,16 @@ class Structure:
             spacings.append(Spacing(padding_m, distance_m))
             largest_radius_m = max(largest_radius_m, radius)
         return spacings
+
+    def widest_base_m(self, *, of_all: bool = False) -> float:
+        """Return the largest extent between the fingers of the pieces that stand on the ground.
+
+        Args:
+            of_all: whether all variants are considered, instead of those of the episode.
+        """
+        kinds = {slot.piece.kind for slot in self.blueprint.slots if not slot.on}
+        pieces = [*self._fixed.values(), *self._pool_pieces] if of_all else self.pieces.values()
+        return max(piece.grasped_width_m for piece in pieces if piece.kind in kinds)
 
     def base_body(self) -> Body:
         """Return a body that can fill the first slot."""

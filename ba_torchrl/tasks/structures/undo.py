@@ -9,7 +9,7 @@ from typing import NamedTuple
 from ba_torchrl.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import ORIGIN, Matrix, Pose, tool_rotation
-from ba_torchrl.tasks.pick_place_commands import pick_command, place_command
+from ba_torchrl.tasks.manipulation.commands import pick_command, place_command
 
 LowestToolHeight = Callable[[tuple[float, float], Matrix], float]
 """Function of x and y of the tool and its rotation, which returns its least height."""

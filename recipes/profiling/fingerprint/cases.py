@@ -43,7 +43,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "colors": {"rgb": True, "floor_color": [0.2, 0.4, 0.1], "workspace_color": [0.9, 0.8, 0.7]},
     "cylinder": {"object_type": "cylinder"},
     "household": {"object_set": "household"},
-    "deconstruct": {"deconstruct": True},
     "tray": {"close_loop_tray": True},
     "steps_of_control": {"dpos": 0.03, "drot": math.pi / 8},
     "view_scale": {"view_scale": 1.0},

@@ -6,7 +6,7 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
 from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.parts import cube
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 
 HEIGHT_M = 0.03
 

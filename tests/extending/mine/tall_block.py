@@ -4,9 +4,8 @@ import math
 
 from ba_torchrl.config import TaskParameters
 from ba_torchrl.sim.shapes import Box
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.motion_primitives import CLOSED, grasp, move_toward
+from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.manipulation.primitives import CLOSED, grasp, move_toward
 
 
 @TASKS.register("mine/tall_block")

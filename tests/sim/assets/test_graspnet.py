@@ -13,8 +13,8 @@ from ba_torchrl.sim.assets import decomposition, graspnet, hulls
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.assets.graspnet import graspable_scale
 from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, transform_mesh, write_obj
-from ba_torchrl.tasks.close_loop_task import CloseLoopTask
-from ba_torchrl.tasks.clutter.tray import profile
+from ba_torchrl.tasks.base import CloseLoopTask
+from ba_torchrl.tasks.terrain.tray import profile
 
 
 def write_objects(root, **meshes):

@@ -12,7 +12,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.assets.household import ITEMS
 from ba_torchrl.sim.meshes import box_mesh, write_obj
 from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M
+from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
 
 TASK = "close_loop/object_grasping"
 NO_OP = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])

@@ -10,7 +10,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M, RIM_Z_M, Tray, profile
+from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M, RIM_Z_M, Tray, profile
 from ba_torchrl.tasks.workspace import Workspace
 
 CENTER = (0.45, 0.02)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ba_torchrl.tasks.footprints import Rectangle
+from ba_torchrl.tasks.manipulation.footprints import Rectangle
 from ba_torchrl.tasks.open_loop.bottle_arrangement import slots as bottle_slots
 from tests.tasks.packing.scenes import BOTTLES
 

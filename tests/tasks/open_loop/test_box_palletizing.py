@@ -9,7 +9,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.actions import PLACE
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.tasks.footprints import Rectangle, gap_m
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 from ba_torchrl.tasks.open_loop.box_palletizing import BOX_M, PALLET_M, SLOT_M, slots
 from tests.tasks.packing.scenes import BOXES, QUARTER_TURN, follow
 

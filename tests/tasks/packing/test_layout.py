@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ba_torchrl.errors import PlacementError
-from ba_torchrl.tasks.footprints import Rectangle, gap_m
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 from ba_torchrl.tasks.packing.layout import Footprint, scatter
 from tests.tasks.packing.scenes import BIN
 

@@ -10,7 +10,7 @@ from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, Span
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.parts import CUBE, CUBOID, ROOF
 from ba_torchrl.tasks.structures.planner import StructurePlanner
-from ba_torchrl.tasks.terrain import Flat
+from ba_torchrl.tasks.terrain.flat import Flat
 from ba_torchrl.tasks.workspace import Area, Workspace
 
 B = 0.03

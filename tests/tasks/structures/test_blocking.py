@@ -9,7 +9,7 @@ from ba_torchrl.sim.meshes import box_mesh, transform_mesh
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.clearance import path_clearance_m
+from ba_torchrl.tasks.manipulation.clearance import path_clearance_m
 from ba_torchrl.tasks.structures.blocking import edge_grasps
 
 CUBE = Box(size_m=(0.03, 0.03, 0.03))

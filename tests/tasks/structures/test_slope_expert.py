@@ -19,8 +19,8 @@ from ba_torchrl.sim.geometry import (
     yaw_quaternion,
 )
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.ramps import EDGE_MARGIN_M, GAP_M
 from ba_torchrl.tasks.structures.parts import CUBOID
+from ba_torchrl.tasks.terrain.ramps import EDGE_MARGIN_M, GAP_M
 
 OFF_CENTRE_M = 0.025
 IMPROVISED = "ramp/improvise_house_building_3"

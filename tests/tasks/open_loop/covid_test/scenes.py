@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ba_torchrl.actions import PLACE, PickPlaceCommand
-from ba_torchrl.tasks.covid_layout import USED_BOX
+from ba_torchrl.tasks.open_loop.covid_test import USED_BOX
 
 TASK = "open_loop/covid_test"
 FIXED = {"random_orientation": False, "action_sequence": "pxy"}

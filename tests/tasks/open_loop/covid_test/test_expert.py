@@ -8,7 +8,7 @@ import torch
 
 from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import vertical_extent
-from ba_torchrl.tasks.covid_layout import NEW_BOX, SHEET_M
+from ba_torchrl.tasks.open_loop.covid_test import NEW_BOX, SHEET_M
 from tests.tasks.open_loop.covid_test.scenes import (
     FIXED,
     carry_out_tests,

@@ -8,7 +8,7 @@ import pytest
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import vertical_extent
-from ba_torchrl.tasks.covid_layout import NEW_BOX, SHEET_M, TEST_AREA, USED_BOX, WALL_M
+from ba_torchrl.tasks.open_loop.covid_test import NEW_BOX, SHEET_M, TEST_AREA, USED_BOX, WALL_M
 from tests.tasks.open_loop.covid_test.scenes import FIXED, TASK, local, outline
 
 

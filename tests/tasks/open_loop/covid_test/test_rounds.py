@@ -6,7 +6,7 @@ import pytest
 
 from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.geometry import downward
-from ba_torchrl.tasks.covid_layout import SHEET_M, USED_BOX, WALL_M
+from ba_torchrl.tasks.open_loop.covid_test import SHEET_M, USED_BOX, WALL_M
 from tests.tasks.open_loop.covid_test.scenes import (
     carry_out_tests,
     follow,

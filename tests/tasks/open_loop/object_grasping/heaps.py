@@ -4,7 +4,7 @@ import hashlib
 
 import torch
 
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M
+from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
 
 TASK = "open_loop/object_grasping"
 CENTER = (0.45, 0.0)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ba_torchrl.actions import PICK, PLACE
-from ba_torchrl.tasks.clutter.tray import FLOOR_Z_M
+from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
 from tests.tasks.open_loop.object_grasping.heaps import CENTER, NO_OP, names, play, with_brick
 
 

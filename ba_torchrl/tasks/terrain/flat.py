@@ -94,6 +94,13 @@ class Terrain(ABC):
         """
         return np.zeros(len(points))
 
+    def reserve(self, width_m: float) -> None:  # noqa: B027 -- optional
+        """Leave space for a structure in the next episodes.
+
+        Args:
+            width_m: largest extent between the fingers of its pieces that stand on the ground.
+        """
+
     def initialize_episode(self, rng: np.random.Generator) -> None:  # noqa: B027 -- optional
         """Draw the random parts of the terrain, before the objects are placed."""
 

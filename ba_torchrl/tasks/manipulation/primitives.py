@@ -14,7 +14,7 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import grasp_clearance_m, half_gap_m, passing_height_m
+from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m, half_gap_m, passing_height_m
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0

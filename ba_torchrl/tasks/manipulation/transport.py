@@ -1,6 +1,6 @@
 """Motion primitives of the close-loop experts that pick, carry and place over obstacles.
 
-Like `ba_torchrl.tasks.motion_primitives`, each is a function of the present scene.
+Like `ba_torchrl.tasks.manipulation.primitives`, each is a function of the present scene.
 """
 
 from __future__ import annotations
@@ -12,8 +12,13 @@ from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.clearance import finger_extent_m, grasp_clearance_m, tips_below_tool_m
-from ba_torchrl.tasks.motion_primitives import (
+from ba_torchrl.tasks.manipulation.clearance import (
+    finger_extent_m,
+    grasp_clearance_m,
+    tips_below_tool_m,
+)
+from ba_torchrl.tasks.manipulation.commands import carrying_pose
+from ba_torchrl.tasks.manipulation.primitives import (
     ALIGNED_RAD,
     CLOSED,
     DESCENT_OFFSET_M,
@@ -24,7 +29,6 @@ from ba_torchrl.tasks.motion_primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
-from ba_torchrl.tasks.pick_place_commands import carrying_pose
 from ba_torchrl.tasks.workspace import ActionLimits
 
 TRAVEL_CLEARANCE_M = 0.02

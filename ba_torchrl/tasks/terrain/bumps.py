@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.footprints import Rectangle
-from ba_torchrl.tasks.sloped_terrain import OnSlopes, SlopedTerrain
+from ba_torchrl.tasks.manipulation.footprints import Rectangle
+from ba_torchrl.tasks.terrain.sloped import SlopedTerrain
 from ba_torchrl.tasks.workspace import Area, OrientedArea, Spacing, Workspace
 
 SLOPE_RAD = (0.0, math.pi / 12)
@@ -226,28 +226,6 @@ class Bumps(SlopedTerrain):
             body.place((x, y, 0.0), layout.heading_rad)
         x, y, yaw = layout.platform
         self.platform.place((x, y, (self.top_m - UNDERGROUND_M) / 2), yaw)
-
-
-class OnBumps(OnSlopes):
-    """Mixin of an open-loop task: the goal is on a platform on a bumpy surface (appendix C).
-
-    All objects start beside the platform.
-    """
-
-    default_in_hand_size: ClassVar[int] = 40  # appendix G.1
-    platform_m: ClassVar[tuple[float, float]]
-    """Extents of the platform at the default scale of the objects."""
-
-    def make_terrain(self) -> Bumps:
-        """Load the pyramids and the platform."""
-        unit = self.settings.scale / self.scale_range[0]
-        size_m = (unit * self.platform_m[0], unit * self.platform_m[1])
-        return Bumps(
-            self.world,
-            self.settings.workspace,
-            size_m,
-            random_orientation=self.settings.random_orientation,
-        )
 
 
 def _pyramid(base_m: float, slope_rad: float, color: Color) -> Solid:

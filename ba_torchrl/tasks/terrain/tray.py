@@ -13,7 +13,7 @@ from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import Workspace
 
 FLOOR_Z_M = 2e-3

@@ -6,7 +6,6 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,11 +21,9 @@ from ba_torchrl.sim.geometry import (
     surface_quaternion,
 )
 from ba_torchrl.sim.robots.gripper import FLOOR_CLEARANCE_M, Gripper
-from ba_torchrl.tasks.terrain import Terrain
+from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Spacing
 
-ON_SIDE_RAD = math.pi / 3
-"""Tilt of a piece that has tipped over on a slope. No grasp turns it upright."""
 PROBE_M = 1e-4
 """Distance at which the slope at a point is measured."""
 FLAT_M = 2e-4
@@ -251,15 +248,6 @@ class SlopedTerrain(Terrain):
             self.heights_m(points) - heights,
         )
         return heights, slopes, above
-
-
-class OnSlopes:
-    """Mixin of an open-loop task on a terrain with slopes, in six degrees of freedom."""
-
-    default_action_sequence: ClassVar[str | None] = "pxyzrrr"
-    default_in_hand_mode: ClassVar[str] = "proj"
-    required_action_components: ClassVar[frozenset[str]] = frozenset(("z", "rz", "ry", "rx"))
-    tipped_rad: ClassVar[float] = ON_SIDE_RAD
 
 
 def footprint(body: Body, xy: tuple[float, float], yaw_rad: float) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, quaternion_product, yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.sloped_terrain import OnSlopes, SlopedTerrain, footprint
-from ba_torchrl.tasks.structures.blueprint import Piece
+from ba_torchrl.tasks.terrain.sloped import SlopedTerrain, footprint
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Area, OrientedArea, Workspace
 
 GAP_M = (0.04, 0.2)
@@ -58,26 +57,16 @@ class Ramps(SlopedTerrain):
     Args:
         world: not sealed yet.
         workspace: bounds of the task.
-        least_gap_m: least distance between the ramps, of all episodes.
-
-    Raises:
-        ValueError: the least distance is larger than the largest.
     """
 
-    def __init__(
-        self, world: World, workspace: Workspace, *, least_gap_m: float = GAP_M[0]
-    ) -> None:
-        if least_gap_m > GAP_M[1]:
-            raise ValueError(
-                f"pieces of {least_gap_m:.3f} m are wider than the widest gap, {GAP_M[1]} m"
-            )
+    def __init__(self, world: World, workspace: Workspace) -> None:
         super().__init__(world, workspace)
         radius_m = math.hypot(*(high - low for low, high in self.spawn_area)) / 2 + BORDER_M
         length_m = radius_m / math.cos(SLOPE_RAD[1])
         self.size_m = (2 * radius_m, length_m, length_m * math.tan(SLOPE_RAD[1]) + BORDER_M)
         """Extents of a ramp along its edge, up the slope and perpendicular to it."""
-        self.least_gap_m = least_gap_m
-        """Least distance between the ramps in the next episode, if it is above that of `GAP_M`."""
+        self.least_gap_m = GAP_M[0]
+        """Least distance between the ramps in the next episode."""
         shapes = [
             Box(size_m=self.size_m, mass_kg=0.0, friction=FRICTION, color=color) for color in COLORS
         ]
@@ -109,9 +98,22 @@ class Ramps(SlopedTerrain):
         """The whole workspace; `uneven_m` prefers the ramps."""
         return self.spawn_area
 
+    def reserve(self, width_m: float) -> None:
+        """Leave a gap between the ramps of the next episodes in which such a piece can be grasped.
+
+        Raises:
+            ValueError: the widest gap is too narrow.
+        """
+        needed_m = width_m + 2 * EDGE_MARGIN_M
+        if needed_m > GAP_M[1]:
+            raise ValueError(
+                f"pieces of {needed_m:.3f} m are wider than the widest gap, {GAP_M[1]} m"
+            )
+        self.least_gap_m = max(GAP_M[0], needed_m)
+
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Draw gap, heading, slopes and heights."""
-        gap = float(rng.uniform(max(GAP_M[0], self.least_gap_m), GAP_M[1]))
+        gap = float(rng.uniform(self.least_gap_m, GAP_M[1]))
         offset = float(rng.uniform(-1.0, 1.0)) * OFFSET_SHARE * (GAP_M[1] - gap)
         heading = float(rng.uniform(0.0, 2 * math.pi))
         edges, slopes = (tuple(rng.uniform(*ends, size=2).tolist()) for ends in (EDGE_M, SLOPE_RAD))
@@ -196,35 +198,3 @@ class Ramps(SlopedTerrain):
             tilt = (math.sin(half), 0.0, 0.0, math.cos(half))
             orientation = quaternion_product(yaw_quaternion(layout.heading_rad + turn), tilt)
             ramp.set_pose(*Pose((x, y, layout.edges_m[i]), orientation).compose(from_edge))
-
-
-class OnRamps(OnSlopes):
-    """Mixin of an open-loop structure task: the structure stands between two ramps (appendix C).
-
-    The pieces start on the ramps or between them, where one piece of the lowest layer always is.
-    The gap is at least as wide as the episode's pieces of that layer need.
-    """
-
-    def make_terrain(self) -> Ramps:
-        """Load the ramps."""
-        bases = [slot.piece for slot in self.blueprint().slots if not slot.on]
-        widest = _needed_gap_m(piece for base in bases for piece in base.variants or (base,))
-        return Ramps(self.world, self.settings.workspace, least_gap_m=widest)
-
-    def choose_objects(self, rng: np.random.Generator) -> None:
-        """Draw the variants of the pieces, and set the least gap that they need."""
-        super().choose_objects(rng)
-        kinds = {slot.piece.kind for slot in self.structure.blueprint.slots if not slot.on}
-        bases = (piece for piece in self.structure.pieces.values() if piece.kind in kinds)
-        self.terrain.least_gap_m = _needed_gap_m(bases)
-
-
-def _needed_gap_m(pieces: Iterable[Piece]) -> float:
-    """Return the distance between ramps that a grasp of each of these pieces between them needs."""
-    return max(map(_grasped_width_m, pieces)) + 2 * EDGE_MARGIN_M
-
-
-def _grasped_width_m(piece: Piece) -> float:
-    """Return the extent of a piece between the fingers."""
-    yaw = piece.grasp_yaws_rad[0]
-    return float(np.ptp(piece.shape.vertices[:, :2] @ (math.cos(yaw), math.sin(yaw))))

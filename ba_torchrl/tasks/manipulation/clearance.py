@@ -16,7 +16,7 @@ from ba_torchrl.sim.bodies import Body, planar_extents, vertical_extent, world_v
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, Vector, downward, rotation_array
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
-from ba_torchrl.tasks.footprints import Rectangle, extents_m, gaps_m, separation_m
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, extents_m, gaps_m, separation_m
 
 Range = tuple[float, float]
 """Ends of an interval along the direction in which the fingers close."""

@@ -1,0 +1,1 @@
+"""What the experts of several tasks share: grasps, clearances, commands and motions."""

@@ -1,0 +1,1 @@
+"""Support surfaces of the objects: the floor, the tray, ramps and bumps."""
