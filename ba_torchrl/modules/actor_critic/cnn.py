@@ -103,14 +103,7 @@ class CNNConfig(ImageNetworkConfig):
     width: float = Field(default=1.0, gt=0)
 
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules.
-
-        Args:
-            spec: the images and the action.
-
-        Raises:
-            ValueError: the image size is not 64 or 128, or the image is not depth or height.
-        """
+        """Return freshly initialised modules."""
         self.check_images(spec)
         features = scaled_width(_WIDTHS[-1], self.width)
         networks = ActorCritic(

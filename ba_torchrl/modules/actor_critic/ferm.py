@@ -60,14 +60,7 @@ class FERMConfig(ImageNetworkConfig):
     features: int = Field(default=50, ge=1)
 
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules; actor and encoder share the trunk.
-
-        Args:
-            spec: the images and the action.
-
-        Raises:
-            ValueError: the image size is not 64 or 128, or the image is not depth or height.
-        """
+        """Return freshly initialised modules; actor and encoder share the trunk."""
         self.check_images(spec)
         widths = [scaled_width(width, self.width) for width in _WIDTHS]
         width, hidden, size = widths[-1], scaled_width(_HIDDEN, self.width), spec.action_size

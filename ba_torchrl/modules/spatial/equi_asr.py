@@ -200,15 +200,7 @@ class EquiASRConfig(ASRNetworkConfig):
     scene_head: SceneHead = "pool"
 
     def build(self, spec: SpatialSpec) -> ASR:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components: x, y and rz.
-
-        Raises:
-            ImportError: escnn is missing; the message names the fix.
-            ValueError: a size does not fit, or the action has other components.
-        """
+        """Return a freshly initialised network for x, y and rz."""
         require_yaw("equi_asr", spec)
         levels, patch_size = self._planar_layout("equi_asr", spec)
         gspace = planar_rotations_and_flips(self.group_order)

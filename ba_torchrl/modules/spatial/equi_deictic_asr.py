@@ -56,15 +56,7 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
     swap_fingers: bool = True
 
     def build(self, spec: SpatialSpec) -> ASR:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components: x, y, z, rz, ry and rx.
-
-        Raises:
-            ImportError: escnn is missing; the message names the fix.
-            ValueError: a size does not fit, or the action has other components.
-        """
+        """Return a freshly initialised network for x, y, z, rz, ry and rx."""
         name = "equi_deictic_asr"
         if not is_six_dof(spec):
             raise ValueError(
