@@ -11,14 +11,18 @@ from ba_torchrl._malloc import tune_malloc
 
 tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
 
+from functools import partial  # noqa: E402
+from typing import Annotated  # noqa: E402
+
 import hydra  # noqa: E402
 
 from ba_torchrl.config import StrictModel  # noqa: E402
 from ba_torchrl.training.command_line import (  # noqa: E402
     Count,
-    OutputFile,
     Plugins,
     Text,
+    check_writable_file,
+    checked,
     command,
 )
 from ba_torchrl.training.config import usable_device  # noqa: E402
@@ -26,11 +30,12 @@ from profiling.comparison import columns_of_changes  # noqa: E402
 from profiling.speed_file import (  # noqa: E402
     Machine,
     SpeedFile,
-    check_output,
     read_speed_file,
     write_speed_file,
 )
-from profiling.table import COLUMNS, as_markdown, measure  # noqa: E402
+from profiling.table import COLUMNS, CompileMode, Precision, as_markdown, measure  # noqa: E402
+
+JsonFile = Annotated[Text, checked(partial(check_writable_file, suffixes=(".json",)))]
 
 
 class Settings(StrictModel):
@@ -40,9 +45,9 @@ class Settings(StrictModel):
     which: Text
     repeats: Count
     device: Text
-    precision: Text
-    compile_mode: Text | None
-    output: OutputFile | None
+    precision: Precision
+    compile_mode: CompileMode | None
+    output: JsonFile | None
     compare: Text | None
     profile: bool
 
@@ -53,24 +58,11 @@ def main(settings: Settings) -> None:
     """Measure, print a table, and write or compare it."""
     device = usable_device(settings.device)
     old = None if settings.compare is None else read_speed_file(settings.compare)
-    if settings.output is not None:
-        check_output(settings.output)
     where = Machine.here(device)  # includes the load before the measurement
     profiles: dict[str, str] | None = {} if settings.profile else None
-    rows = measure(
-        settings.which,
-        settings.repeats,
-        profiles=profiles,
-        device=device,
-        precision=settings.precision,
-        compile_mode=settings.compile_mode,
-    )
-    content = SpeedFile(
-        machine=where,
-        precision=settings.precision,
-        compile_mode=settings.compile_mode,
-        rows=rows,
-    )
+    learners = {"precision": settings.precision, "compile_mode": settings.compile_mode}
+    rows = measure(settings.which, settings.repeats, profiles=profiles, device=device, **learners)
+    content = SpeedFile(machine=where, rows=rows, **learners)
     if settings.output is not None:
         write_speed_file(settings.output, content)
     for work, operations in (profiles or {}).items():

@@ -90,7 +90,16 @@ class NetworkConfig(Protocol):
     flag."""
 
     def build(self, spec: Any) -> Any:
-        """Return freshly initialised modules for an `ActorCriticSpec`, or for a `SpatialSpec`."""
+        """Return freshly initialised modules.
+
+        Args:
+            spec: images and action, an `ActorCriticSpec` or a `SpatialSpec`.
+
+        Raises:
+            ImportError: escnn is missing; the message names the fix.
+            ValueError: the network does not support the size or kind of an image or the components
+                of the action, or they do not fit its hyper-parameters.
+        """
         ...
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -174,14 +174,6 @@ class Critic(nn.Module):
         )
 
 
-class Losses(NamedTuple):
-    """Losses of an update, scalars."""
-
-    qvalue: Tensor
-    actor: Tensor
-    alpha: Tensor
-
-
 class EscnnSACfD:
     """Networks, optimisers and the update.
 
@@ -209,8 +201,8 @@ class EscnnSACfD:
             )
         }
 
-    def update(self, batch: TensorDictBase) -> Losses:
-        """Train critic, actor and temperature, in this order, and move the target.
+    def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Train critic, actor and temperature, move the target, and return the three losses.
 
         Args:
             batch: transitions [B] with ``is_expert``; the behaviour term imitates ``action``.
@@ -224,7 +216,7 @@ class EscnnSACfD:
         with torch.no_grad():
             for old, new in zip(self.target.parameters(), self.critic.parameters(), strict=True):
                 old.lerp_(new, TAU)
-        return Losses(qvalue.detach(), actor.detach(), alpha.detach())
+        return qvalue.detach(), actor.detach(), alpha.detach()
 
     def qvalue_loss(self, batch: TensorDictBase) -> Tensor:
         """Return the squared errors of both values, averaged over the batch and added."""

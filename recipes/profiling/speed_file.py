@@ -19,7 +19,6 @@ from ba_torchrl.modules.layers import Precision
 from ba_torchrl.record.results import now, versions
 from profiling.table import Row
 
-SUFFIX = ".json"
 SHOWN_PACKAGES = ("torch", "torchrl", "pybullet")
 _REPOSITORY = Path(__file__).parents[2]
 
@@ -110,16 +109,6 @@ def read_speed_file(path: str | Path) -> SpeedFile:
         raise ConfigError(
             f"{path} is not a file that recipes/speed.py wrote ({where}: {first['msg']})"
         ) from None
-
-
-def check_output(path: str) -> None:
-    """Check the name of a file of rows.
-
-    Raises:
-        ConfigError: the suffix is another one.
-    """
-    if Path(path).suffix != SUFFIX:
-        raise ConfigError(f"output: the file ends in {SUFFIX}, not {Path(path).name!r}")
 
 
 def _commit() -> str | None:

@@ -6,7 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -149,16 +149,12 @@ def seconds(call: Callable[[], Any], device: torch.device = CPU) -> float:
         call: the timed function.
         device: where it computes; its work ends within the measured time.
     """
-    _synchronize(device)
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda _: None
+    wait(device)
     start = time.perf_counter()
     call()
-    _synchronize(device)
+    wait(device)
     return time.perf_counter() - start
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def operations(call: Callable[[], Any]) -> str:
@@ -179,11 +175,11 @@ class Measurement:
     """A function that measures rows of the table, and the arguments for which it is called."""
 
     function: Callable[..., list[Row]]
-    over: Callable[[], Iterable[tuple[Any, ...]]] | None
+    over: Callable[[], Iterable[tuple[Any, ...]]]
 
 
 def measurement(
-    name: str, over: Callable[[], Iterable[tuple[Any, ...]]] | None = None
+    name: str, over: Callable[[], Iterable[tuple[Any, ...]]] = lambda: [()]
 ) -> Callable[[Callable[..., list[Row]]], Callable[..., list[Row]]]:
     """Return a decorator that adds a function's rows to the table.
 
@@ -200,58 +196,33 @@ def measurement(
     return decorate
 
 
-def measure(
-    which: str,
-    repeats: int,
-    progress: bool = True,
-    profiles: dict[str, str] | None = None,
-    device: torch.device = CPU,
-    precision: Precision = "auto",
-    compile_mode: CompileMode | None = None,
-) -> list[Row]:
+def measure(which: str, repeats: int, progress: bool = True, **options: Any) -> list[Row]:
     """Measure one group of the table, a single measurement, or "all".
 
     Args:
         which: the group, or the measurement as "group/name".
-        repeats: rounds of each measurement.
+        repeats: rounds of each measurement, 1 or more.
         progress: show a progress bar.
-        profiles: receives a profile of each timed call, by name; None for no profiles.
-        device: of the learners.
-        precision: of the learners' networks.
-        compile_mode: of the learners, see `ExperimentConfig`.
+        options: of `Bench`.
 
     Raises:
-        ConfigError: ``which``, ``precision`` or ``compile_mode`` is unknown, or ``repeats`` is
-            below 1.
+        ConfigError: ``which`` is unknown.
     """
     known = (*GROUPS, "all", *MEASUREMENTS)
     if which not in known:
         raise ConfigError(f"which: {which!r} is none of {', '.join(known)}")
-    for name, value, type_ in (
-        ("precision", precision, Precision),
-        ("compile_mode", compile_mode, CompileMode),
-    ):
-        if value is not None and value not in get_args(type_):
-            raise ConfigError(f"{name}: {value!r} is none of {', '.join(get_args(type_))}")
-    if repeats < 1:
-        raise ConfigError(f"repeats must be 1 or more, got {repeats}")
     jobs = [
         (MEASUREMENTS[name].function, arguments)
         for group in GROUPS
         for name in MEASUREMENTS
         if name.startswith(f"{group}/") and which in (group, name, "all")
-        for arguments in _arguments(MEASUREMENTS[name])
+        for arguments in MEASUREMENTS[name].over()
     ]
     rows: list[Row] = []
     with tqdm(total=len(jobs) * repeats, disable=not progress, unit="round") as bar:
         for function, arguments in jobs:
-            bench = Bench(repeats, bar, profiles, device, precision, compile_mode)
-            rows += function(bench, *arguments)
+            rows += function(Bench(repeats, bar, **options), *arguments)
     return rows
-
-
-def _arguments(entry: Measurement) -> list[tuple[Any, ...]]:
-    return [()] if entry.over is None else list(entry.over())
 
 
 def timed_row(
@@ -298,24 +269,17 @@ def digits(value: float | None) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def _share(row: Row) -> str:
-    return "" if row.share_of_limit is None else f"{row.share_of_limit:.0%}"
-
-
-def _budget(row: Row) -> Budget:
-    return row.budget or Budget("", None, None)
-
-
+_NO_BUDGET = Budget("", None, None)
 COLUMNS: dict[str, Callable[[Row], str]] = {
     "work": lambda row: row.work,
     "median": lambda row: f"{digits(statistics.median(row.values))} {row.unit}",
     "mean": lambda row: digits(statistics.fmean(row.values)),
     "least": lambda row: digits(min(row.values)),
     "units": lambda row: digits(row.multiple),
-    "share of the limit": _share,
-    "reference": lambda row: _budget(row).reference,
-    "must": lambda row: digits(_budget(row).must),
-    "aim": lambda row: digits(_budget(row).aim),
+    "share of the limit": lambda row: f"{row.share_of_limit:.0%}" if row.limit_s else "",
+    "reference": lambda row: (row.budget or _NO_BUDGET).reference,
+    "must": lambda row: digits((row.budget or _NO_BUDGET).must),
+    "aim": lambda row: digits((row.budget or _NO_BUDGET).aim),
     "notes": lambda row: row.notes,
 }
 """Columns of the table; docs/performance.md describes them."""

@@ -59,10 +59,9 @@ def collection(bench: Bench, task: str, num_envs: int) -> list[Row]:
         times = bench.time_against({"units": partial(_repeat, unit)}, calls)
     unit_s = [value / UNIT_STEPS for value in times["units"]]
     frames = STEPS * num_envs
-    plural = "environment" if num_envs == 1 else "environments"
     return [
         Row(
-            f"{task}, collection, {num_envs} {plural}, {name}",
+            f"{task}, collection, {_number(num_envs, 'environment')}, {name}",
             "frames/s",
             [frames / value for value in times[name]],
             unit_s=unit_s,
@@ -119,16 +118,19 @@ def run_collection(bench: Bench, name: str, workers: int) -> list[Row]:
             start = time.perf_counter()
             _repeat(unit)
             units.append((time.perf_counter() - start) / UNIT_STEPS)
-    plural = "worker" if workers == 1 else "workers"
     return [
         Row(
-            f"{TASKS[0]}, collector={name}, {workers} {plural}",
+            f"{TASKS[0]}, collector={name}, {_number(workers, 'worker')}",
             "frames/s",
             [count / duration for count, duration in zip(frames, seconds, strict=True)],
             unit_s=units,
             notes=f"{ENVS_PER_WORKER} environments per worker",
         )
     ]
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _repeat(unit: SimulationUnit) -> None:

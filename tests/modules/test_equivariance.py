@@ -1,6 +1,7 @@
 """Rotation equivariance of the equivariant networks: exact for quarter turns, close for C8."""
 
 import math
+from itertools import product
 
 import pytest
 import torch
@@ -25,6 +26,14 @@ def turn_action(action, sequence, quarters):
     x, y = sequence.index("x"), sequence.index("y")
     for _ in range(quarters):
         action[..., x], action[..., y] = -action[..., y], action[..., x].clone()
+    return action
+
+
+def reflect_action(action, sequence):
+    """Reflect the y axis: dy and the yaw change their signs."""
+    action = action.clone()
+    for letter in set(sequence) & set("yr"):
+        action[..., sequence.index(letter)] *= -1
     return action
 
 
@@ -60,9 +69,17 @@ def steps(networks, size, action_size, n=3):
         (64, "pxyzr", 8, {"depth_reference": "floor", "negative_slope": 0.1}),
         (64, "pxyzr", 8, {"name": "equi_strided"}),
         (128, "pxyz", 4, {"name": "equi_strided"}),
+        (64, "pxyzr", 4, {"reflections": True}),
+        (64, "pxyz", 8, {"reflections": True}),
+        (64, "rzypx", 4, {"reflections": True}),
+        (128, "pxyzr", 4, {"reflections": True}),
     ],
 )
-def test_every_quarter_turn_is_exact(size, sequence, group_order, options, trained):
+def test_quarter_turns_and_reflections_are_exact(size, sequence, group_order, options, trained):
+    def move(action, quarters, flips):
+        action = reflect_action(action, sequence) if flips else action
+        return turn_action(action, sequence, quarters)
+
     networks = build(size, sequence, group_order=group_order, **options)
     if trained:
         steps(networks, size, len(sequence))
@@ -72,19 +89,27 @@ def test_every_quarter_turn_is_exact(size, sequence, group_order, options, train
         loc, scale = networks.actor(pixels, holding)
         values = networks.critic(networks.encoder(pixels, holding), action)
         assert loc.abs().max() > 1e-3
-        for quarters in range(0, 4, 1 if group_order > 2 else 2):
-            turned = torch.rot90(pixels, quarters, (-2, -1))
-            turned_loc, turned_scale = networks.actor(turned, holding)
+        turns = range(0, 4, 1 if group_order > 2 else 2)
+        for quarters, flips in product(turns, (False, True)[: 1 + ("reflections" in options)]):
+            image = pixels.flip(-1) if flips else pixels
+            image = torch.rot90(image, quarters, (-2, -1))
+            moved_loc, moved_scale = networks.actor(image, holding)
             tolerance = {"atol": 2e-5 * float(loc.abs().max()), "rtol": 1e-4}
-            torch.testing.assert_close(
-                turned_loc, turn_action(loc, sequence, quarters), **tolerance
-            )
-            torch.testing.assert_close(turned_scale, scale, rtol=1e-4, atol=0)
-            turned_values = networks.critic(
-                networks.encoder(turned, holding), turn_action(action, sequence, quarters)
-            )
+            torch.testing.assert_close(moved_loc, move(loc, quarters, flips), **tolerance)
+            torch.testing.assert_close(moved_scale, scale, rtol=1e-4, atol=0)
+            features = networks.encoder(image, holding)
+            moved_values = networks.critic(features, move(action, quarters, flips))
             tolerance["atol"] = 2e-5 * float(values.abs().max())
-            torch.testing.assert_close(turned_values, values, **tolerance)
+            torch.testing.assert_close(moved_values, values, **tolerance)
+
+
+def test_the_cyclic_group_is_not_equivariant_to_reflections():
+    networks = build(64, group_order=4)
+    pixels, holding = torch.rand(3, 1, 64, 64), torch.ones(3, 1, dtype=torch.bool)
+    with torch.no_grad():
+        loc, _ = networks.actor(pixels, holding)
+        reflected, _ = networks.actor(pixels.flip(-1), holding)
+    assert not torch.allclose(reflected, reflect_action(loc, "pxyzr"), rtol=1e-2)
 
 
 @pytest.mark.parametrize("trained", [False, True])

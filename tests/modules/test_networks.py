@@ -8,8 +8,8 @@ import sys
 import pytest
 import torch
 from pydantic import ValidationError
-from torchrl.objectives import LossModule
 
+from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.layers import compute_dtype
 from tests.specs import actor_critic_spec
@@ -35,10 +35,6 @@ def small(name, size=64, sequence="pxyzr", **fields):
 
 def count(module):
     return sum(parameter.numel() for parameter in module.parameters())
-
-
-def test_registry_holds_the_networks():
-    assert {"cnn", "equi"} <= set(NETWORKS)
 
 
 @pytest.mark.parametrize(
@@ -132,86 +128,39 @@ def test_bfloat16_is_close_to_float32(name):
     assert {p.grad.dtype for p in rough.actor.parameters() if p.grad is not None} == {torch.float32}
 
 
-def test_auto_precision_follows_the_hardware(monkeypatch):
-    from ba_torchrl.modules import layers
-
-    cpu = torch.device("cpu")
-    for variable in ("ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA"):
-        monkeypatch.delenv(variable, raising=False)
-    for flags, expected in [
-        ({"amx_bf16": True}, torch.bfloat16),
-        ({"amx_bf16": True, "avx512_bf16": True, "cpu_name": "Intel Xeon"}, torch.bfloat16),
-        ({"avx512_bf16": True, "cpu_name": "AMD Zen 4"}, torch.bfloat16),
-        ({"avx512_bf16": True, "cpu_name": "Intel Xeon"}, torch.float32),
-        ({"avx2": True, "amx_bf16": False}, torch.float32),
-    ]:
-        layers._bfloat16_is_fast.cache_clear()
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags)
-        assert compute_dtype("auto", cpu) is expected
-    layers._bfloat16_is_fast.cache_clear()
-    assert compute_dtype("float32", cpu) is torch.float32
-    assert compute_dtype("bfloat16", cpu) is torch.bfloat16
-    assert compute_dtype("auto", torch.device("meta")) is torch.float32
+INTEL = {"amx_bf16": True, "avx512_bf16": True, "cpu_name": "Intel Xeon"}
+AMD = {"avx512_bf16": True, "cpu_name": "AMD Zen 4"}
 
 
 @pytest.mark.parametrize("variable", ["ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA"])
 @pytest.mark.parametrize(
-    ("allowed", "with_amx", "on_amd"),
+    ("flags", "allowed", "is_fast"),
     [
-        ("DEFAULT", torch.bfloat16, torch.bfloat16),
-        ("avx512_core_amx", torch.bfloat16, torch.bfloat16),
-        ("AVX10_1_512_AMX", torch.bfloat16, torch.bfloat16),
-        ("AVX512_CORE_FP16", torch.float32, torch.bfloat16),
-        ("AVX512_CORE_BF16", torch.float32, torch.bfloat16),
-        ("AVX512_CORE", torch.float32, torch.float32),
-        ("AVX2", torch.float32, torch.float32),
+        ({"amx_bf16": True}, None, True),
+        ({"avx512_bf16": True, "cpu_name": "Intel Xeon"}, None, False),
+        ({"avx2": True, "amx_bf16": False}, None, False),
+        *((INTEL, allowed, True) for allowed in (None, "DEFAULT", "avx512_core_amx")),
+        (INTEL, "AVX10_1_512_AMX", True),
+        *((INTEL, f"AVX512_CORE{end}", False) for end in ("_FP16", "_BF16", "")),
+        *((AMD, allowed, True) for allowed in (None, "AVX512_CORE_FP16", "AVX512_CORE_BF16")),
+        *((AMD, allowed, False) for allowed in ("AVX512_CORE", "AVX2")),
     ],
 )
-def test_auto_precision_uses_the_instructions_that_onednn_may_use(
-    variable, allowed, with_amx, on_amd, monkeypatch
+def test_auto_precision_uses_the_instructions_that_are_fast_and_allowed(
+    flags, allowed, is_fast, variable, monkeypatch
 ):
-    from ba_torchrl.modules import layers
-
-    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
-    monkeypatch.setenv(variable, allowed)
-    intel = {"amx_bf16": True, "avx512_bf16": True, "cpu_name": "Intel Xeon"}
-    amd = {"avx512_bf16": True, "cpu_name": "AMD Zen 4"}
-    for flags, expected in [(intel, with_amx), (amd, on_amd)]:
-        layers._bfloat16_is_fast.cache_clear()
-        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda flags=flags: flags)
-        assert compute_dtype("auto", torch.device("cpu")) is expected
+    for name in ("ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA"):
+        monkeypatch.delenv(name, raising=False)
+    if allowed is not None:
+        monkeypatch.setenv(variable, allowed)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: flags)
     layers._bfloat16_is_fast.cache_clear()
-
-
-def test_functional_calls_use_the_given_parameters():
-    """TorchRL's target networks run the same module on other weights."""
-
-    class Holder(LossModule):
-        net: object
-        net_params: object
-        target_net_params: object
-
-    from tensordict import TensorDict
-    from tensordict.nn import TensorDictModule
-
-    encoder = small("equi", precision="float32").encoder
-    holder = Holder()
-    module = TensorDictModule(encoder, ["pixels", "holding"], ["features"])
-    holder.convert_to_functional(module, "net", create_target_params=True)
-    holder._has_update_associated["net"] = True
-    data = TensorDict({"pixels": torch.rand(2, 1, 64, 64), "holding": torch.ones(2, 1)}, [2])
-
-    def features(params):
-        with params.to_module(holder.net, preserve_module_state=False), torch.no_grad():
-            return holder.net(data.clone())["features"]
-
-    start = features(holder.net_params)
-    assert torch.equal(features(holder.target_net_params), start)
-    with torch.no_grad():
-        for value in holder.net_params.values(True, True):
-            value.mul_(2)
-    assert torch.equal(features(holder.target_net_params), start)
-    assert not torch.allclose(features(holder.net_params), start)
+    cpu = torch.device("cpu")
+    assert compute_dtype("auto", cpu) is (torch.bfloat16 if is_fast else torch.float32)
+    layers._bfloat16_is_fast.cache_clear()
+    assert compute_dtype("float32", cpu) is torch.float32
+    assert compute_dtype("bfloat16", cpu) is torch.bfloat16
+    assert compute_dtype("auto", torch.device("meta")) is torch.float32
 
 
 def test_config_errors():
@@ -227,6 +176,8 @@ def test_config_errors():
         NETWORKS["equi"](n_hidden=6).build(actor_critic_spec(64, "pxyzr"))
     with pytest.raises(ValueError, match="needs x and y"):
         NETWORKS["equi"](n_hidden=8).build(actor_critic_spec(64, "pz"))
+    with pytest.raises(ValueError, match="group_order of at least 3"):
+        NETWORKS["equi"](group_order=2, reflections=True).build(actor_critic_spec())
     for name in ACTOR_CRITICS:
         with pytest.raises(ValueError, match=r"64 or 128 px, got 90; set obs_size"):
             NETWORKS[name]().build(actor_critic_spec(90, "pxyzr"))
@@ -244,6 +195,7 @@ def test_missing_escnn_names_the_fix():
 import sys
 sys.modules["escnn"] = None
 from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from tests.specs import actor_critic_spec, spatial_spec
 actor_critic, spatial = actor_critic_spec(), spatial_spec()

@@ -52,19 +52,6 @@ def encode(heights, z, angles, pixel_m=PIXEL_M):
     return project(heights, pixel_m, z, cells.unflatten(0, z.shape))
 
 
-@pytest.mark.parametrize("size", [8, 11])
-def test_the_encoding_equals_a_loop_over_voxels(size):
-    heights, (z, angles) = heightmaps(size), poses(6)
-    images = encode(torch.from_numpy(heights), z, angles)
-    assert images.shape == (4, 6, 3, size, size)
-    assert images.dtype == torch.float32
-    for b, k in np.ndindex(4, 6):
-        expected = project_by_loops(
-            heights[b].round(5), PIXEL_M, float(z[b, k]), *angles[b, k].tolist()
-        )
-        np.testing.assert_array_equal(images[b, k], expected)
-
-
 @pytest.mark.parametrize("size", [24, 40])
 def test_the_encoding_equals_the_in_hand_image_at_the_same_pose(size):
     heights, (z, angles) = heightmaps(size), poses(9)
@@ -198,8 +185,8 @@ def seen(heights, size, yaw_rad):
 
 
 @pytest.mark.parametrize("size", [24, 40])
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-@pytest.mark.parametrize("yaw", [0.0, 5 * math.pi / 16, math.pi / 4])
+@pytest.mark.parametrize("quarters", [1, 2])
+@pytest.mark.parametrize("yaw", [0.0, 5 * math.pi / 16])
 def test_rotating_the_scene_by_quarter_turns_equals_rotating_the_tool(size, quarters, yaw):
     turn = quarters * math.pi / 2
     straight, turned = seen(scene(0.0), size, yaw + turn), seen(scene(-turn), size, yaw)
@@ -218,6 +205,7 @@ def share_of_differences(images, others):
     return differs[..., is_shown].float().mean(dim=(0, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [math.pi / 4, 1.0, 2.5])
 @pytest.mark.parametrize("size", [24, 40])
 def test_rotating_the_scene_equals_rotating_the_tool_within_a_voxel(size, turn):

@@ -12,7 +12,7 @@ from escnn import nn as enn
 
 from ba_torchrl.modules.spatial.base import yaws_rad
 from ba_torchrl.modules.spatial.in_hand import InHandMap, InHandVector
-from ba_torchrl.modules.spatial.views import centre_fit, patches, sample, sampling_grid
+from ba_torchrl.modules.spatial.views import centre_fit, patches
 from ba_torchrl.modules.steerable.layers import (
     DynamicSteerableConv2d,
     SteerableConv2d,
@@ -61,23 +61,6 @@ def test_a_rotated_patch_equals_the_in_hand_image_of_the_environment():
         patch = patches(image, torch.tensor([[13, 17]]), 24, yaw[None])
         expected = crop(image[0, 0].numpy(), (13.5, 17.5), 24, float(yaw))
         np.testing.assert_allclose(patch[0, 0].numpy(), expected, atol=2e-5)
-
-
-def test_an_odd_patch_is_a_crop_and_an_even_patch_averages_four_pixels():
-    image = torch.rand(1, 1, 16, 16)
-    odd = patches(image, torch.tensor([[5, 9]]), 5)[0, 0]
-    torch.testing.assert_close(odd, image[0, 0, 3:8, 7:12], atol=1e-5, rtol=0)
-    even = patches(image, torch.tensor([[5, 9]]), 4)[0, 0]
-    expected = torch.nn.functional.avg_pool2d(image[..., 3:8, 7:12], 2, stride=1)[0, 0]
-    torch.testing.assert_close(even, expected, atol=1e-5, rtol=0)
-
-
-def test_a_view_at_a_quarter_turn_shows_the_scene_rotated_back():
-    image = torch.rand(1, 1, 12, 12)
-    grid = sampling_grid(torch.full((1, 2), 6.0), torch.tensor([math.pi / 2]), 12, 12)
-    torch.testing.assert_close(
-        sample(image, grid), torch.rot90(image, -1, (-2, -1)), atol=1e-5, rtol=0
-    )
 
 
 def test_yaws_span_half_a_turn_or_a_whole_one():
@@ -136,30 +119,6 @@ def test_dynamic_filter_equals_a_loop_over_escnn_layers(group, kernel_size):
     assert layer(x[:0], coefficients[:0]).shape == (0, *x.shape[1:])
 
 
-def test_gradient_of_the_dynamic_filter_equals_that_of_a_loop():
-    torch.manual_seed(0)
-    _, layer, coefficients = dynamic()
-    x = torch.randn(4, layer.count * layer.size, 6, 6)
-    target = torch.randn_like(x)
-
-    def gradients(apply):
-        inputs = x.clone().requires_grad_(), coefficients.clone().requires_grad_()
-        (apply(*inputs) * target).sum().backward()
-        return [tensor.grad for tensor in inputs]
-
-    def loop(x, coefficients):
-        filters, biases = layer.filters(coefficients)
-        return torch.cat(
-            [
-                torch.nn.functional.conv2d(a[None], w, b, padding=1)
-                for a, w, b in zip(x, filters, biases, strict=True)
-            ]
-        )
-
-    for actual, expected in zip(gradients(layer), gradients(loop), strict=True):
-        torch.testing.assert_close(actual, expected, atol=1e-4, rtol=1e-4)
-
-
 def test_zero_features_give_a_he_initialised_filter():
     torch.manual_seed(0)
     gspace, layer, _ = dynamic(count=16)
@@ -187,28 +146,3 @@ def test_values_of_yaws_shift_by_one_per_step(half, order, size):
     assert (group.order(), representation.size) == (order, size)
     step = representation(group.element(1))
     np.testing.assert_allclose(step, np.roll(np.eye(size), 1, axis=0), atol=1e-12)
-
-
-def test_a_layer_of_dihedral_fields_is_equivariant_under_turns_and_flips():
-    """The lift to regular fields permutes eight channels, and their maximum is invariant."""
-    torch.manual_seed(0)
-    gspace = planar_rotations_and_flips(4)
-    layer = SteerableConv2d(
-        gspace, [(gspace.trivial_repr, 1)], [(gspace.regular_repr, 2)], 3, padding=1
-    )
-    x = torch.randn(1, 1, 10, 10)
-    with torch.no_grad():
-        plain = layer(x).unflatten(1, (2, 8))
-        for move in (
-            lambda t: torch.rot90(t, 1, (-2, -1)),
-            lambda t: t.flip(-1),
-            lambda t: t.flip(-2),
-        ):
-            moved = layer(move(x)).unflatten(1, (2, 8))
-            torch.testing.assert_close(
-                moved.amax(dim=2), move(plain.amax(dim=2)), atol=1e-5, rtol=1e-5
-            )
-            torch.testing.assert_close(
-                moved.sort(dim=2).values, move(plain).sort(dim=2).values, atol=1e-5, rtol=1e-5
-            )
-            assert (moved - move(plain)).abs().max() > 0.1

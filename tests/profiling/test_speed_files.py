@@ -1,6 +1,5 @@
 """Files of measured rows: written, read, compared; only documented errors."""
 
-import importlib.util
 import json
 import subprocess
 from pathlib import Path
@@ -8,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hypothesis import strategies as st
 
 from ba_torchrl.errors import ConfigError
@@ -22,6 +20,7 @@ from profiling.speed_file import (
 )
 from profiling.table import COLUMNS, Budget, Row, as_markdown
 from tests.fuzz.values import JSON, check, examples
+from tests.recipes import recipe
 
 ROOT = Path(__file__).parents[2]
 ROWS = [
@@ -99,26 +98,12 @@ def test_damaged_files_are_refused(tmp_path, count):
     check(count, st.one_of(st.binary(max_size=40), JSON), prop)
 
 
-@pytest.fixture
-def recipe(monkeypatch, tmp_path):
-    """A function that runs the recipe in a folder of its own, with arguments."""
+def test_the_recipe_writes_a_file_and_compares_with_it(monkeypatch, tmp_path, content, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["speed.py"])
-    spec = importlib.util.spec_from_file_location("speed", ROOT / "recipes" / "speed.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-
-    def run(*arguments):
-        with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
-            module.main.__wrapped__(compose("speed", overrides=list(arguments)))
-
-    return run
-
-
-def test_the_recipe_writes_a_file_and_compares_with_it(recipe, tmp_path, content, capsys):
     old = Row("depth image, 128 px, compiled", "ms", [1e3] * 20, unit_s=[1e-3] * 20)
     write_speed_file(tmp_path / "old.json", SpeedFile(machine=content.machine, rows=[old]))
     recipe(
+        "speed",
         "which=simulation/depth_image",
         "repeats=1",
         "compare=old.json",
@@ -151,16 +136,21 @@ def test_the_recipe_writes_a_file_and_compares_with_it(recipe, tmp_path, content
     [
         (["compare=none.json"], "error: cannot read none.json: No such file or directory"),
         (["compare=."], "error: cannot read .: Is a directory"),
-        (["output=speed.csv"], "error: output: the file ends in .json, not 'speed.csv'"),
+        (
+            ["output=speed.csv"],
+            "error: invalid settings: output: the name of the file ends in .json",
+        ),
         (["repeats=few"], "error: invalid settings: repeats: Input should be a valid integer"),
+        (["precision=float16"], "error: invalid settings: precision: Input should be 'auto', "),
         (["device=nothing"], "error: device: use device=cpu or device=auto"),
     ],
 )
 def test_mistakes_are_reported_in_one_line_before_the_measurement(
-    arguments, message, recipe, capsys
+    arguments, message, monkeypatch, tmp_path, capsys
 ):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        recipe(*arguments)
+        recipe("speed", *arguments)
     assert ended.value.code == 2
     out, error = capsys.readouterr()
     assert error.startswith(message)

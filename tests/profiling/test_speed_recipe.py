@@ -66,11 +66,6 @@ def test_the_recipe_prints_the_simulation_rows(tmp_path):
     assert all(float(cell) > 0 for cell in picking[3:6])
 
 
-def test_an_unknown_precision_is_an_error():
-    with pytest.raises(ConfigError, match=r"precision: .* none of auto, float32, bfloat16"):
-        measure("memory", repeats=1, progress=False, precision="float16")
-
-
 def test_memory_is_counted():
     rows = measure("memory", repeats=2, progress=False)
     assert [row.unit for row in rows] == ["MB", "MB"]
@@ -132,8 +127,6 @@ def test_every_measurement_belongs_to_a_group():
     assert {name.split("/")[0] for name in MEASUREMENTS} == set(GROUPS)
     with pytest.raises(ConfigError, match="simulation, learning, throughput, memory, all"):
         measure("speed", repeats=1)
-    with pytest.raises(ConfigError, match="1 or more"):
-        measure("memory", repeats=0)
 
 
 def test_one_measurement_can_be_chosen():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 
 import torch
 from pydantic import Field
@@ -22,49 +23,54 @@ _WIDTHS = (16, 32, 64, 128, 256, 256, 128)
 _HIDDEN = 128
 
 
-class CNNActor(nn.Module):
-    """Gaussian policy: an image trunk and one linear layer each for mean and log-std.
+class PlainActor(nn.Module):
+    """Gaussian policy: an image trunk, and one network each for mean and log-std.
 
     Args:
         trunk: the image trunk.
-        features: its output size.
-        action_size: number of action components.
+        head: from its features to those of the policy.
+        loc: from these to the mean, before the squashing.
+        log_std: from these to the log standard deviation.
     """
 
-    def __init__(self, trunk: ImageTrunk, features: int, action_size: int) -> None:
+    def __init__(
+        self, trunk: ImageTrunk, head: nn.Module, loc: nn.Module, log_std: nn.Module
+    ) -> None:
         super().__init__()
         self.trunk = trunk
-        self.loc = nn.Linear(features, action_size)
-        self.log_std = nn.Linear(features, action_size)
+        self.head = head
+        self.loc = loc
+        self.log_std = log_std
 
     def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
-        features = self.trunk(pixels, holding)
+        features = self.head(self.trunk(pixels, holding))
         return self.loc(features), scale_from_log_std(self.log_std(features))
 
 
-class CNNTwinCritic(nn.Module):
+class PlainTwinCritic(nn.Module):
     """Two value heads on shared features.
 
     Args:
-        features: size of the features.
-        action_size: number of action components.
-        hidden: width of each head's hidden layer.
+        heads: from features and action to one value each.
     """
 
-    def __init__(self, features: int, action_size: int, hidden: int) -> None:
+    def __init__(self, heads: Iterable[nn.Module]) -> None:
         super().__init__()
-        self.heads = nn.ModuleList(
-            nn.Sequential(
-                nn.Linear(features + action_size, hidden), nn.ReLU(), nn.Linear(hidden, 1)
-            )
-            for _ in range(2)
-        )
+        self.heads = nn.ModuleList(heads)
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Return twin values [..., 2] of features [..., F] and action [..., A]."""
         x = torch.cat([features, action], dim=-1)
         return torch.cat([head(x) for head in self.heads], dim=-1)
+
+
+def mlp(*sizes: int) -> nn.Sequential:
+    """Return linear layers between these sizes, with ReLUs between them."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in itertools.pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
 
 
 def plain_trunk(
@@ -97,18 +103,11 @@ class CNNConfig(ImageNetworkConfig):
     width: float = Field(default=1.0, gt=0)
 
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules.
-
-        Args:
-            spec: the images and the action.
-
-        Raises:
-            ValueError: the image size is not 64 or 128, or the image is not depth or height.
-        """
+        """Return freshly initialised modules."""
         self.check_images(spec)
         features = scaled_width(_WIDTHS[-1], self.width)
         networks = ActorCritic(
-            actor=CNNActor(self._trunk(spec), features, spec.action_size),
+            actor=self._actor(spec, features),
             encoder=self._trunk(spec),
             critic=self._critic(spec, features),
         )
@@ -116,10 +115,15 @@ class CNNConfig(ImageNetworkConfig):
             network.apply(initialise_plain)
         return networks
 
+    def _actor(self, spec: ActorCriticSpec, features: int) -> PlainActor:
+        trunk = self._trunk(spec)
+        loc, log_std = (nn.Linear(features, spec.action_size) for _ in range(2))
+        return PlainActor(trunk, nn.Identity(), loc, log_std)
+
     def _critic(self, spec: ActorCriticSpec, features: int) -> nn.Module:
         hidden = scaled_width(_HIDDEN, self.width)
         if spec.critics is None:
-            return CNNTwinCritic(features, spec.action_size, hidden)
+            return PlainTwinCritic(mlp(features + spec.action_size, hidden, 1) for _ in range(2))
         first = nn.Linear(features + spec.action_size, spec.critics * hidden)
         return EnsembleCritic(first, spec.critics, hidden)
 

@@ -156,7 +156,8 @@ class EquivariantConfig(ImageNetworkConfig):
     Args:
         group_order: number of rotations n of the group, at least 2; the default is that of the
             reference implementation.
-        reflections: the group is the dihedral group D_n instead of the cyclic group C_n.
+        reflections: the group is the dihedral group D_n, with n at least 3, instead of the cyclic
+            group C_n.
         n_hidden: number of regular fields of the last layers; the default is that of the reference
             implementation. The first layer has an eighth of it
             at 128 px, and a quarter at 64 px, where the first stage is left out.
@@ -167,17 +168,7 @@ class EquivariantConfig(ImageNetworkConfig):
     n_hidden: int = Field(default=64, ge=4)
 
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules.
-
-        Args:
-            spec: the images and the action.
-
-        Raises:
-            ImportError: escnn is missing; the message names the fix.
-            ValueError: the image size is not 64 or 128, the image is not depth or height,
-                ``n_hidden`` does not divide into whole fields, the action lacks x or y, or the
-                group is D_2.
-        """
+        """Return freshly initialised modules for an action with x and y."""
         self.check_images(spec)
         if self.reflections and self.group_order < 3:
             raise ValueError("reflections need a group_order of at least 3")

@@ -209,14 +209,7 @@ class ASRConfig(ASRNetworkConfig, PoseGridConfig):
     """
 
     def build(self, spec: SpatialSpec) -> ASR:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components: x, y and rz, or x, y, z, rz, ry and rx.
-
-        Raises:
-            ValueError: a size does not fit, or the action has other components.
-        """
+        """Return a freshly initialised network for x, y and rz, or x, y, z, rz, ry and rx."""
         if is_six_dof(spec):
             return self._build_for_poses(spec)
         require_yaw("asr", spec)

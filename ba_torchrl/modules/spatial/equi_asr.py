@@ -74,49 +74,32 @@ SCENE_COPIES = 2
 later levels then have the 256 input channels of the plain networks."""
 
 
-class InvariantSceneVector(nn.Sequential):
-    """A vector that does not change when the scene feature map rotates with the scene.
-
-    Two linear layers on the maximum and the mean of each channel.
+class SceneVector(nn.Sequential):
+    """A vector of the scene feature map: two linear layers.
 
     Args:
+        head: "pool" for the maximum and the mean of each channel, so that the vector does not
+            change when the map rotates with the scene; "flatten" for the flattened map.
         channels: of the map, each invariant except for the positions.
+        image_size: rows and columns of the heightmap.
         width: factor on the layers' widths, 1024 and 512.
     """
 
-    def __init__(self, channels: int, width: float) -> None:
+    def __init__(self, head: SceneHead, channels: int, image_size: int, width: float) -> None:
         wide, narrow = scaled_width(1024, width), scaled_width(512, width)
-        super().__init__(nn.Linear(2 * channels, wide), nn.ReLU(), nn.Linear(wide, narrow))
+        pixels = (image_size // UNET_STRIDE) ** 2
+        inputs = 2 * channels if head == "pool" else SCENE_COPIES * channels * pixels
+        super().__init__(nn.Linear(inputs, wide), nn.ReLU(), nn.Linear(wide, narrow))
+        self.head = head
         self.out_features = narrow
 
     def forward(self, scene: Tensor) -> Tensor:
         """Return float32 [B, out_features] of a map [B, C, h, w]."""
         scene = scene.float()
-        return super().forward(
-            torch.cat([scene.amax(dim=(-2, -1)), scene.mean(dim=(-2, -1))], dim=1)
-        )
-
-
-class FlattenedSceneVector(nn.Sequential):
-    """A vector of the scene feature map with its positions, which changes when the map rotates.
-
-    Two linear layers on the flattened map, as in the reference implementation.
-
-    Args:
-        channels: of the map.
-        image_size: rows and columns of the heightmap.
-        width: factor on the layers' widths, 1024 and 512.
-    """
-
-    def __init__(self, channels: int, image_size: int, width: float) -> None:
-        wide, narrow = scaled_width(1024, width), scaled_width(512, width)
-        inputs = SCENE_COPIES * channels * (image_size // UNET_STRIDE) ** 2
-        super().__init__(nn.Linear(inputs, wide), nn.ReLU(), nn.Linear(wide, narrow))
-        self.out_features = narrow
-
-    def forward(self, scene: Tensor) -> Tensor:
-        """Return float32 [B, out_features] of a map [B, C, h, w]."""
-        return super().forward(scene.float().repeat(1, SCENE_COPIES, 1, 1).flatten(1))
+        if self.head == "flatten":
+            return super().forward(scene.repeat(1, SCENE_COPIES, 1, 1).flatten(1))
+        largest, mean = scene.amax(dim=(-2, -1)), scene.mean(dim=(-2, -1))
+        return super().forward(torch.cat([largest, mean], dim=1))
 
 
 class EquivariantYawValues(nn.Module):
@@ -198,22 +181,6 @@ class EquivariantYawValues(nn.Module):
         return self.coefficients(F.relu(torch.cat([self.scene(scene), hand], dim=1)))
 
 
-def yaw_scene_vector(
-    head: SceneHead, channels: int, image_size: int, width: float
-) -> InvariantSceneVector | FlattenedSceneVector:
-    """Return the layers from the scene feature map to the vector that the yaw values use.
-
-    Args:
-        head: how the map is read.
-        channels: of the map, each invariant except for the positions.
-        image_size: rows and columns of the heightmap.
-        width: factor on the layers' widths.
-    """
-    if head == "flatten":
-        return FlattenedSceneVector(channels, image_size, width)
-    return InvariantSceneVector(channels, width)
-
-
 @NETWORKS.register("equi_asr")
 class EquiASRConfig(ASRNetworkConfig):
     """Hyper-parameters of the equivariant network that chooses a pixel, then a yaw.
@@ -233,26 +200,13 @@ class EquiASRConfig(ASRNetworkConfig):
     scene_head: SceneHead = "pool"
 
     def build(self, spec: SpatialSpec) -> ASR:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components: x, y and rz.
-
-        Raises:
-            ImportError: escnn is missing; the message names the fix.
-            ValueError: a size does not fit, or the action has other components.
-        """
+        """Return a freshly initialised network for x, y and rz."""
         require_yaw("equi_asr", spec)
         levels, patch_size = self._planar_layout("equi_asr", spec)
         gspace = planar_rotations_and_flips(self.group_order)
         positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
         gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
-        scene = partial(
-            yaw_scene_vector,
-            self.scene_head,
-            positions.scene_channels,
-            spec.image_size,
-            self.width,
-        )
+        channels = positions.scene_channels
+        scene = partial(SceneVector, self.scene_head, channels, spec.image_size, self.width)
         yaws = EquivariantYawValues(gspace, yaw_repr, spec, self, patch_size, scene)
         return ASR(positions, [(PatchView(patch_size), yaws)], levels)

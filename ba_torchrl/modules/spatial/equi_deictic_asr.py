@@ -13,9 +13,8 @@ from ba_torchrl.modules.spatial.base import SpatialSpec
 from ba_torchrl.modules.spatial.equi_asr import (
     SCENE_COPIES,
     EquivariantYawValues,
-    InvariantSceneVector,
     SceneHead,
-    yaw_scene_vector,
+    SceneVector,
 )
 from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
 from ba_torchrl.modules.spatial.pose_values import FingerSymmetricValues, PoseValues, SceneMapVector
@@ -57,15 +56,7 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
     swap_fingers: bool = True
 
     def build(self, spec: SpatialSpec) -> ASR:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components: x, y, z, rz, ry and rx.
-
-        Raises:
-            ImportError: escnn is missing; the message names the fix.
-            ValueError: a size does not fit, or the action has other components.
-        """
+        """Return a freshly initialised network for x, y, z, rz, ry and rx."""
         name = "equi_deictic_asr"
         if not is_six_dof(spec):
             raise ValueError(
@@ -79,7 +70,7 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
         positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
         gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
         channels = positions.scene_channels
-        scene = partial(yaw_scene_vector, self.scene_head, channels, spec.image_size, self.width)
+        scene = partial(SceneVector, self.scene_head, channels, spec.image_size, self.width)
         yaws = EquivariantYawValues(gspace, yaw_repr, spec, in_voxels, patch_size, scene)
         grid = self.pose_grid(self.num_rotations, spec.half_rotation)
         views = (
@@ -92,7 +83,7 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
             scene = (
                 SceneMapVector(channels, spec.image_size, self.width, copies=SCENE_COPIES)
                 if self.scene_head == "flatten"
-                else InvariantSceneVector(channels, self.width)
+                else SceneVector("pool", channels, spec.image_size, self.width)
             )
             values = PoseValues(spec, in_voxels, view.channels, 1, patch_size, scene)
             if self.swap_fingers and spec.half_rotation:

@@ -59,14 +59,7 @@ class FCNConfig(SpatialImageConfig):
     num_rotations: int = Field(default=16, ge=2)
 
     def build(self, spec: SpatialSpec) -> FCN:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components, x, y and perhaps rz.
-
-        Raises:
-            ValueError: a size does not fit, or the action has other components.
-        """
+        """Return a freshly initialised network for x, y and perhaps rz."""
         num_yaws = self.num_rotations if has_yaw("fcn", spec) else None
         require_unet_size("fcn", spec.image_size)
         return FCN(PlainPixelValues(spec, self, num_yaws or 1), spec.image_size, num_yaws)
@@ -91,16 +84,7 @@ class EquiFCNConfig(SpatialImageConfig):
     group_order: int | None = Field(default=None, ge=2)
 
     def build(self, spec: SpatialSpec) -> FCN:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components, x, y and perhaps rz.
-
-        Raises:
-            ImportError: escnn is missing; the message names the fix.
-            ValueError: a size does not fit, the action has other components, or a group order is
-                given for an action with a yaw.
-        """
+        """Return a freshly initialised network for x, y and perhaps rz."""
         yaw = has_yaw("equi_fcn", spec)
         require_unet_size("equi_fcn", spec.image_size)
         if not yaw:

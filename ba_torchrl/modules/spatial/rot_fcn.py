@@ -69,14 +69,7 @@ class RotFCNConfig(SpatialImageConfig):
     num_rotations: int = Field(default=16, ge=2)
 
     def build(self, spec: SpatialSpec) -> RotFCN:
-        """Return a freshly initialised network.
-
-        Args:
-            spec: shapes and the action's components: x, y and rz.
-
-        Raises:
-            ValueError: a size does not fit, or the action has other components.
-        """
+        """Return a freshly initialised network for x, y and rz."""
         require_yaw("rot_fcn", spec)
         if spec.image_size % 2:
             raise ValueError(
