@@ -21,9 +21,9 @@ from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.vision.depth import point_cloud
-from ba_torchrl.sim.vision.fingers import finger_boxes
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_rgbd
+from ba_torchrl.sim.vision.views import finger_boxes
 from ba_torchrl.tasks.workspace import Workspace
 
 OBSERVATIONS: Registry[type[Observation]] = Registry("observation", "ba_torchrl.envs")

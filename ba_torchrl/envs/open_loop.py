@@ -20,8 +20,7 @@ from ba_torchrl.envs.rendering import ArmDisplay, RelativePoint
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.control.limits import PickPlaceLimits
-from ba_torchrl.sim.control.pick_place import PickPlace
+from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits
 from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView

@@ -16,8 +16,7 @@ import pybullet
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.bodies import world_vertices
 from ba_torchrl.sim.geometry import Matrix, Vector, bullet_compose
-from ba_torchrl.sim.vision.framing import Viewpoint, fit_viewpoint
-from ba_torchrl.sim.vision.rgb import FOV_DEG
+from ba_torchrl.sim.vision.rgb import FOV_DEG, Viewpoint, fit_viewpoint
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain.flat import Terrain
 

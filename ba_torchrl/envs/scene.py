@@ -12,9 +12,8 @@ from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.shapes import Decal
-from ba_torchrl.sim.snapshots import PortableSnapshot, Snapshot
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.sim.world import FINE_PHYSICS, Physics, World
+from ba_torchrl.sim.world import FINE_PHYSICS, Physics, PortableSnapshot, Snapshot, World
 from ba_torchrl.tasks.base import Task, TaskSettings
 from ba_torchrl.tasks.terrain.tray import Tray
 from ba_torchrl.tasks.workspace import Workspace

@@ -15,7 +15,7 @@ from PIL import Image
 from ba_torchrl import make
 from ba_torchrl.data.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import keys
-from ba_torchrl.record.headings import tasks_by_heading
+from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.record.video import FrameRecorder
 
 _CELL_IN = 1.62
@@ -46,8 +46,6 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
     """Play an episode with the expert and render it.
 
     Args:
-        task: id of the task.
-        seed: of the episode.
         pictures: largest number of images. They are evenly spaced from the initial to the final
             state; those between show grasps and releases if the task is open-loop.
         deconstruct: whether the episode takes the structure apart.
@@ -74,13 +72,7 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
 
 
 def strip_figure(name: str, strip: Strip, path: str | Path) -> Path:
-    """Write a row of images: the policy's first observation, then the expert's episode.
-
-    Args:
-        name: title.
-        strip: the episode, from `expert_strip`.
-        path: the PNG to write.
-    """
+    """Write a row of images: the policy's first observation, then the expert's episode."""
     images = [strip.first_image, *strip.pictures]
     sheet = _Sheet(len(images) * _CELL_IN, _TITLE_IN + _CELL_IN)
     sheet.add_row(name, images, 0.0, 0.0)
@@ -92,8 +84,6 @@ def overview_figure(strips: Mapping[str, Strip], path: str | Path, columns: int 
 
     Args:
         strips: the episode from `expert_strip`, by task.
-        path: the PNG to write.
-        columns: number of tasks per row.
     """
     groups = tasks_by_heading(strips)
     row_in, pair_in = _TITLE_IN + _CELL_IN, 2 * _CELL_IN + _SPACE_IN
@@ -120,12 +110,7 @@ def _titles(tasks: Sequence[str]) -> dict[str, str]:
 
 
 class _Sheet:
-    """A figure with images and headings at given positions, measured from its upper left corner.
-
-    Args:
-        width_in: width, inches.
-        height_in: height, inches.
-    """
+    """A figure with images and headings at given positions, measured from its upper left corner."""
 
     def __init__(self, width_in: float, height_in: float) -> None:
         self.size_in = np.array([width_in, height_in])
@@ -142,7 +127,6 @@ class _Sheet:
         """Add a title of the height `_TITLE_IN` and square images of the width `_CELL_IN`.
 
         Args:
-            title: text above the images.
             images: [H, W] or [H, W, 3] each.
             left_in: left edge of the row.
             top_in: upper edge of the title.

@@ -41,7 +41,6 @@ def make_logger(
     Args:
         backend: "csv", "tensorboard" or "wandb".
         run_dir: folder of the run, for the logger's files.
-        name: of the run.
         config: of the run, logged as hyper-parameters; may be nested.
 
     Raises:
@@ -75,11 +74,7 @@ def limit_library_logs() -> None:
 
 
 def progress_bar(**settings: Any) -> tqdm:
-    """Return a progress bar, with fewer updates if it is written to a file.
-
-    Args:
-        settings: keyword arguments of ``tqdm``.
-    """
+    """Return a progress bar, with fewer updates if it is written to a file."""
     return tqdm(mininterval=0.1 if sys.stderr.isatty() else FILE_INTERVAL_S, **settings)
 
 
@@ -93,7 +88,6 @@ class ScalarLog:
     Args:
         run_dir: folder of the run, which is created if needed.
         backend: "csv" for the file only; "tensorboard" or "wandb" for an additional logger.
-        config: of the run, for the backend.
 
     Raises:
         ImportError: the package of the backend is missing.

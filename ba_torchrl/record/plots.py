@@ -46,9 +46,6 @@ def plot_learning_curve(
             example mean minus and plus standard error. Or the ``scalars.csv`` of a run, of which
             the success rates are plotted.
         path: of the PNG; its folder is created if needed.
-        title: title of the axes.
-        xlabel: label of the x axis.
-        ylabel: label of the y axis.
         ylim: limits of the y axis; None for automatic limits.
 
     Returns:

@@ -48,7 +48,6 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
     The page contains the curves and tables, and links to the videos.
 
     Args:
-        roots: folders that are searched for runs.
         folder: of the report, which is created if needed.
 
     Returns:

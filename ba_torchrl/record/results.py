@@ -175,13 +175,7 @@ def differences(
     second: Mapping[str, Any],
     ignored: Collection[str] = NON_LEARNING_FIELDS,
 ) -> dict[str, tuple[Any, Any]]:
-    """Return the settings in which the configurations of two runs differ, with both values.
-
-    Args:
-        first: a configuration, defaults included.
-        second: another.
-        ignored: fields that may differ.
-    """
+    """Return the settings in which the configurations of two runs differ, with both values."""
     a, b = (
         flat({key: value for key, value in config.items() if key not in ignored})
         for config in (first, second)

@@ -131,9 +131,6 @@ class Section:
 def load_sections(roots: Iterable[str | Path]) -> tuple[list[Section], list[Path]]:
     """Read every finished run below some folders.
 
-    Args:
-        roots: folders.
-
     Returns:
         Sections in the order of the benchmarks' names, runs without a benchmark last; and the
         folders of unfinished runs, those with a damaged result included.

@@ -24,7 +24,6 @@ class FrameRecorder:
     scene after the step, recorded by `record`.
 
     Args:
-        env: the environment.
         width: number of columns of a frame.
         height: number of rows of a frame.
     """
@@ -52,7 +51,6 @@ def check_video(path: str | Path, fps: float) -> None:
 
     Args:
         path: ends in ``.mp4`` or ``.gif``.
-        fps: frames per second.
 
     Raises:
         ConfigError: the suffix is unknown, or ``fps`` is not a number from `MIN_FPS` to `MAX_FPS`.
@@ -72,7 +70,6 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
         path: ends in ``.mp4`` (H.264) or ``.gif``; its folder is created if needed.
         frames: [T, H, W, 3] uint8, or a sequence of T images of equal size. For ``.mp4``, an odd
             height or width is padded with a copy of the last row or column.
-        fps: frames per second.
 
     Returns:
         The path.

@@ -47,12 +47,9 @@ class ArticulatedLink(Body):
     """One of the two rigid links of an articulated body.
 
     Args:
-        client: PyBullet's client id.
-        body_id: PyBullet's id of the articulated body.
         links: PyBullet's link indices of the convex parts, where the first defines the frame; -1
             is the fixed base.
         shape: geometry, mass and material, in the frame of the fixed link at joint position 0.
-        name: used in error messages.
     """
 
     def __init__(
@@ -62,18 +59,7 @@ class ArticulatedLink(Body):
         self.client, self.id, self.links = client, body_id, tuple(links)
         self.shape, self.name = shape, name
         self.is_hidden = False
-        for link in links:
-            pybullet.changeDynamics(
-                self.id,
-                link,
-                lateralFriction=shape.friction,
-                frictionAnchor=1,
-                physicsClientId=client,
-            )
-        if -1 in self.links and shape.collision_margin_m is not None:
-            pybullet.changeDynamics(
-                self.id, -1, collisionMargin=shape.collision_margin_m, physicsClientId=client
-            )
+        self._set_material()
 
     @property
     def is_static(self) -> bool:
@@ -98,10 +84,6 @@ class ArticulatedLink(Body):
     def set_pose(self, position: Vector, orientation: Quaternion) -> None:
         """Teleport the articulated body; possible only through its fixed link.
 
-        Args:
-            position: of the fixed link, metres.
-            orientation: unit quaternion (x, y, z, w).
-
         Raises:
             ValueError: this is the sliding link.
             RuntimeError: the pose is fixed, see `World.fixed_poses`.
@@ -114,12 +96,7 @@ class ArticulatedLink(Body):
         )
 
     def is_still(self, speed_m_s: float, spin_rad_s: float) -> bool:
-        """Whether the joint velocity is within the limit.
-
-        Args:
-            speed_m_s: limit of the joint velocity.
-            spin_rad_s: unused; the link does not rotate.
-        """
+        """Whether the joint velocity is within the limit; the link does not rotate."""
         if self.is_static:
             return True
         state = pybullet.getJointState(self.id, self.links[0], physicsClientId=self.client)
@@ -130,15 +107,6 @@ class ArticulatedLink(Body):
         points = contacts(self.client, self.id, other.id)
         return is_any_within(point for point in points if point.link in self.links)
 
-    def rebuild_collision_pairs(self) -> None:
-        """Enable collisions of the link, whose pairs `World` has removed."""
-        # PyBullet's default collision groups: static bodies do not collide with each other
-        group, mask = (2, ~2) if self.is_static else (1, -1)
-        for link in self.links:
-            pybullet.setCollisionFilterGroupMask(
-                self.id, link, group, mask, physicsClientId=self.client
-            )
-
 
 class ArticulatedBody:
     """A fixed link and a sliding link: one PyBullet body with one prismatic joint.
@@ -148,12 +116,8 @@ class ArticulatedBody:
     states would not repeat exactly.
 
     Args:
-        client: PyBullet's client id.
-        base: shape of the fixed link.
         slider: shape of the sliding link, in the frame of the fixed link at joint position 0. Its
             centre of mass has no effect.
-        joint: axis, limits and friction.
-        name: used in error messages.
 
     Raises:
         ValueError: the base has a mass, or the slider has none.
@@ -233,12 +197,7 @@ class ArticulatedBody:
         return pybullet.getJointState(self.id, 0, physicsClientId=self.client)[0]
 
     def place(self, position: Vector, yaw_rad: float = 0.0, travel_m: float = 0.0) -> None:
-        """Teleport the body to an upright pose and a joint position, with zero velocities.
-
-        Args:
-            position: of the fixed link, metres.
-            yaw_rad: heading of the fixed link's x axis.
-            travel_m: joint position.
+        """Teleport the fixed link to an upright pose and the joint to a position, at rest.
 
         Raises:
             ValueError: the joint position is outside of the joint limits.

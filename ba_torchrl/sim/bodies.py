@@ -9,7 +9,6 @@ from typing import NoReturn
 import numpy as np
 import pybullet
 
-from ba_torchrl.sim.activation import set_asleep
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
@@ -22,6 +21,20 @@ from ba_torchrl.sim.geometry import (
 )
 from ba_torchrl.sim.shapes import Shape
 
+_ASLEEP = pybullet.ACTIVATION_STATE_ENABLE_SLEEPING | pybullet.ACTIVATION_STATE_SLEEP
+_AWAKE = pybullet.ACTIVATION_STATE_DISABLE_SLEEPING | pybullet.ACTIVATION_STATE_WAKE_UP
+
+
+def set_asleep(client: int, body_id: int, is_asleep: bool) -> None:
+    """Set whether a body is simulated, from the end of the next physics step on.
+
+    A sleeping body is simulated again as soon as a moving one touches it; one that is not asleep
+    never sleeps. No saved state contains this.
+    """
+    state = _ASLEEP if is_asleep else _AWAKE
+    pybullet.changeDynamics(body_id, -1, activationState=state, physicsClientId=client)
+
+
 Interval = tuple[float, float]
 """Lower and upper end."""
 MAX_FRAMES = 256
@@ -29,13 +42,7 @@ MAX_FRAMES = 256
 
 
 class Body:
-    """A rigid body in a PyBullet client.
-
-    Args:
-        client: PyBullet's client id.
-        shape: geometry, mass and material.
-        name: used in error messages.
-    """
+    """A rigid body in a PyBullet client."""
 
     _surface: _Surface | None = None
     """The surface at the pose at which it was last measured."""
@@ -45,6 +52,8 @@ class Body:
     """Whether the body is not in the scene; see `set_inactive`."""
     has_slept = False
     """Whether the body was ever inactive."""
+    links: tuple[int, ...] = (-1,)
+    """PyBullet's indices of its links; -1 is the base."""
 
     def __init__(self, client: int, shape: Shape, name: str) -> None:
         self.client = client
@@ -63,23 +72,28 @@ class Body:
             baseInertialFramePosition=shape.center_of_mass_m,
             physicsClientId=client,
         )
-        pybullet.changeDynamics(
-            self.id,
-            -1,
-            lateralFriction=shape.friction,
-            frictionAnchor=1,  # prevents slow sliding of held and stacked bodies
-            physicsClientId=client,
-        )
-        if shape.collision_margin_m is not None:
-            pybullet.changeDynamics(
-                self.id, -1, collisionMargin=shape.collision_margin_m, physicsClientId=client
-            )
+        self._set_material()
 
     def __repr__(self) -> str:
         return f"Body({self.name!r})"
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(f"{self!r} cannot be copied without its world: copy the environment")
+
+    def _set_material(self) -> None:
+        for link in self.links:
+            pybullet.changeDynamics(
+                self.id,
+                link,
+                lateralFriction=self.shape.friction,
+                frictionAnchor=1,  # prevents slow sliding of held and stacked bodies
+                physicsClientId=self.client,
+            )
+        margin_m = self.shape.collision_margin_m
+        if -1 in self.links and margin_m is not None:
+            pybullet.changeDynamics(
+                self.id, -1, collisionMargin=margin_m, physicsClientId=self.client
+            )
 
     @property
     def is_static(self) -> bool:
@@ -105,11 +119,7 @@ class Body:
             raise RuntimeError(f"{self.name} cannot move here: its pose is fixed")
 
     def fix_pose(self, is_fixed: bool) -> None:
-        """Read the pose once and return it until this is called with False.
-
-        Args:
-            is_fixed: whether the body cannot move.
-        """
+        """Read the pose once and return it until this is called with False."""
         self._fixed_pose = self._read_pose() if is_fixed else None
 
     @property
@@ -128,20 +138,11 @@ class Body:
         return quaternion_tilt(self.pose.orientation)
 
     def place(self, position: Vector, yaw_rad: float = 0.0) -> None:
-        """Teleport the body to an upright pose and set its velocity to zero.
-
-        Args:
-            position: of the frame of the geometry, metres.
-            yaw_rad: heading of the body's x axis.
-        """
+        """Teleport the frame of the geometry to an upright pose, with zero velocity."""
         self.set_pose(position, yaw_quaternion(yaw_rad))
 
     def set_pose(self, position: Vector, orientation: Quaternion) -> None:
-        """Teleport the body to a pose and set its velocity to zero.
-
-        Args:
-            position: of the frame of the geometry, metres.
-            orientation: unit quaternion (x, y, z, w).
+        """Teleport the frame of the geometry to a pose, with zero velocity.
 
         Raises:
             RuntimeError: the pose is fixed, see `World.fixed_poses`.
@@ -157,12 +158,7 @@ class Body:
         )
 
     def is_still(self, speed_m_s: float, spin_rad_s: float) -> bool:
-        """Whether the velocities are within limits.
-
-        Args:
-            speed_m_s: limit of the L1 norm of the linear velocity.
-            spin_rad_s: limit of the L1 norm of the angular velocity.
-        """
+        """Whether the L1 norms of the linear and angular velocities are within limits."""
         v, w = pybullet.getBaseVelocity(self.id, physicsClientId=self.client)
         return (
             abs(v[0]) + abs(v[1]) + abs(v[2]) <= speed_m_s
@@ -197,12 +193,7 @@ class Body:
 
 
 class _Surface:
-    """A body's visual surface at one pose.
-
-    Args:
-        body: the body.
-        pose: of the frame of its geometry.
-    """
+    """A body's visual surface at one pose."""
 
     def __init__(self, body: Body, pose: Pose) -> None:
         self.pose = pose
@@ -247,12 +238,7 @@ def vertical_extent(body: Body) -> tuple[float, float]:
 def planar_extents(body: Body, frame: PlanarFrame) -> tuple[Interval, Interval]:
     """Return the intervals that a body's vertices cover along the axes of a horizontal frame.
 
-    Args:
-        body: the body.
-        frame: the frame, relative to the world.
-
-    Returns:
-        Lower and upper end along the x axis, and along the y axis, metres.
+    They are the lower and upper end along the x axis, and along the y axis, metres.
     """
     return _surface(body).planar_extents(frame)
 

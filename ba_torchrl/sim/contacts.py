@@ -56,13 +56,7 @@ class Contact(NamedTuple):
 
 
 def contacts(client: int, body_id: int, other_id: int = -1) -> list[Contact]:
-    """Return the contact points of a body.
-
-    Args:
-        client: PyBullet's client id.
-        body_id: PyBullet's id of the body.
-        other_id: PyBullet's id of the other body; -1 stands for all bodies.
-    """
+    """Return the contact points of a body, by default with all bodies."""
     points = pybullet.getContactPoints(body_id, other_id, physicsClientId=client)
     return [Contact._make(point) for point in points]
 
@@ -70,11 +64,8 @@ def contacts(client: int, body_id: int, other_id: int = -1) -> list[Contact]:
 def outer_contacts(client: int, *body_ids: int) -> list[Contact]:
     """Return the contact points of a group of bodies, except those between two bodies of the group.
 
-    Contacts of a body with itself, such as those between two fingers, are included.
-
-    Args:
-        client: PyBullet's client id.
-        body_ids: PyBullet's ids of the bodies, such as a robot and the body that it holds.
+    The group is, for example, a robot and the body that it holds. Contacts of a body with itself,
+    such as those between two fingers, are included.
     """
     return [
         contact
@@ -87,14 +78,10 @@ def outer_contacts(client: int, *body_ids: int) -> list[Contact]:
 def nearest_points(
     client: int, body_id: int, other_id: int, up_to_m: float, link: int | None = None
 ) -> list[Contact]:
-    """Return the closest points of two bodies at their current poses.
+    """Return the closest points of two bodies or robots at their current poses.
 
-    Args:
-        client: PyBullet's client id.
-        body_id: PyBullet's id of the first body or robot.
-        other_id: PyBullet's id of the second body or robot.
-        up_to_m: pairs of links that are farther apart than this are omitted.
-        link: link of the first body; None stands for all links.
+    Pairs of links that are farther apart than ``up_to_m`` are omitted. ``link`` is one of the first
+    body; None stands for all of them.
     """
     links = {} if link is None else {"linkIndexA": link}
     points = pybullet.getClosestPoints(body_id, other_id, up_to_m, physicsClientId=client, **links)
@@ -102,16 +89,9 @@ def nearest_points(
 
 
 def gap_m(client: int, body_id: int, other_id: int, up_to_m: float = 0.1) -> float:
-    """Return the distance between two bodies at their current poses.
+    """Return the distance between two bodies or robots at their current poses.
 
-    Args:
-        client: PyBullet's client id.
-        body_id: PyBullet's id of the first body or robot.
-        other_id: PyBullet's id of the second body or robot.
-        up_to_m: limit of the search.
-
-    Returns:
-        Metres; infinity beyond the limit, negative if the bodies penetrate each other.
+    It is infinity beyond ``up_to_m``, and negative if the bodies penetrate each other.
     """
     points = nearest_points(client, body_id, other_id, up_to_m)
     return min((point.distance_m for point in points), default=math.inf)

@@ -104,11 +104,9 @@ def matrix_quaternion(rows: Matrix) -> Quaternion:
 
 
 def surface_quaternion(normal: Vector, yaw_rad: float = 0.0) -> Quaternion:
-    """Return the orientation of a frame on a surface.
+    """Return the orientation of a frame on a surface with a unit normal that is not horizontal.
 
-    Args:
-        normal: unit normal of the surface, not horizontal; the z axis of the frame.
-        yaw_rad: heading of the x axis in the horizontal plane.
+    Its z axis is the normal, and ``yaw_rad`` the heading of its x axis in the horizontal plane.
     """
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     x_axis = perpendicular((cos, sin, -(cos * normal[0] + sin * normal[1]) / normal[2]), normal)
@@ -127,8 +125,7 @@ def axes_quaternion(x_axis: Vector, z_axis: Vector) -> Quaternion:
 def downward(yaw_rad: float) -> Matrix:
     """Return the rotation of a tool that points straight down.
 
-    Args:
-        yaw_rad: heading of the line along which the fingers open; 0 is the world's x axis.
+    Its fingers open along a line with heading ``yaw_rad``; 0 is the world's x axis.
     """
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return ((cos, sin, 0.0), (sin, -cos, 0.0), (0.0, 0.0, -1.0))
@@ -147,11 +144,7 @@ def tool_rotation(rz_rad: float, ry_rad: float = 0.0, rx_rad: float = 0.0) -> Ma
 def tool_angles(orientation: Quaternion) -> Vector:
     """Return the angles rz, ry and rx of `tool_rotation` for an orientation of the tool.
 
-    Args:
-        orientation: unit quaternion of the tool frame.
-
-    Returns:
-        rz and rx in [-pi, pi], ry in [-pi/2, pi/2].
+    rz and rx are in [-pi, pi], ry in [-pi/2, pi/2].
     """
     (m00, _, _), (m10, _, _), (m20, m21, m22) = quaternion_matrix(orientation)
     return math.atan2(m10, m00), math.asin(min(max(-m20, -1.0), 1.0)), math.atan2(-m21, -m22)
@@ -167,14 +160,7 @@ class Pose(NamedTuple):
     orientation: Quaternion = IDENTITY
 
     def compose(self, inner: Pose) -> Pose:
-        """Return this pose times ``inner``.
-
-        Args:
-            inner: pose relative to this frame.
-
-        Returns:
-            The same pose relative to the outer frame.
-        """
+        """Return the pose ``inner`` of this frame relative to the outer frame."""
         rows = quaternion_matrix(self.orientation)
         position = tuple(
             p + dot(row, inner.position) for p, row in zip(self.position, rows, strict=True)
@@ -196,12 +182,7 @@ class Pose(NamedTuple):
         return vectors @ rotation_array(self.orientation).T
 
     def moved_to(self, position: Vector, turn_rad: float = 0.0) -> Pose:
-        """Return the pose with another position, rotated about the vertical.
-
-        Args:
-            position: in the outer frame, metres.
-            turn_rad: rotation about the outer frame's z axis.
-        """
+        """Return the pose at another position, rotated about the outer frame's z axis."""
         return Pose(position, quaternion_product(yaw_quaternion(turn_rad), self.orientation))
 
     @property
@@ -255,14 +236,9 @@ def cross(a: Sequence[float], b: Sequence[float]) -> Vector:
 
 
 def perpendicular(vector: Vector, axis: Vector) -> Vector:
-    """Return the normalised component of a vector that is perpendicular to an axis.
+    """Return the normalised component of a vector that is perpendicular to a unit vector.
 
-    Args:
-        vector: any vector.
-        axis: unit vector.
-
-    Returns:
-        A unit vector; zero if the vector is parallel to the axis.
+    It is zero if the vectors are parallel.
     """
     along = dot(vector, axis)
     rest = tuple(v - along * a for v, a in zip(vector, axis, strict=True))

@@ -21,11 +21,7 @@ class Mesh(NamedTuple):
 
 
 def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
-    """Return a box centred at the origin.
-
-    Args:
-        size_m: edge lengths along x, y and z.
-    """
+    """Return a box with edge lengths along x, y and z, centred at the origin."""
     corners = np.array(
         [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
     ) * np.asarray(size_m)
@@ -35,13 +31,7 @@ def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
 
 
 def transform_mesh(mesh: Mesh, offset_m: tuple[float, float, float], yaw_rad: float = 0.0) -> Mesh:
-    """Return the mesh, rotated about the z axis and then translated.
-
-    Args:
-        mesh: the mesh.
-        offset_m: translation.
-        yaw_rad: angle of the rotation.
-    """
+    """Return the mesh, rotated about the z axis and then translated."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return Mesh(mesh.vertices @ rotation.T + np.asarray(offset_m), mesh.faces)
@@ -57,12 +47,7 @@ def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def write_obj(path: Path, parts: Sequence[Mesh]) -> None:
-    """Write a Wavefront OBJ file with one object for each mesh.
-
-    Args:
-        path: of the file.
-        parts: the meshes; the unit of the file is the metre.
-    """
+    """Write a Wavefront OBJ file, whose unit is the metre, with one object for each mesh."""
     lines, start = [], 1
     for number, (vertices, faces) in enumerate(parts):
         lines.append(f"o part{number}")
@@ -77,9 +62,6 @@ def read_obj(content: bytes) -> list[Mesh]:
 
     Texture coordinates, normals, colours, materials and groups have no effect; each mesh holds the
     vertices that its faces use, in their order.
-
-    Args:
-        content: content of the file.
 
     Raises:
         ValueError: a vertex or a face cannot be read.
@@ -116,11 +98,8 @@ def read_obj(content: bytes) -> list[Mesh]:
 def polygon_triangles(corners: np.ndarray) -> list[tuple[int, int, int]]:
     """Return triangles that fill a polygon, which need not be convex, by clipping its ears.
 
-    Args:
-        corners: [N, 3], metres, approximately in a plane.
-
-    Returns:
-        N - 2 triples of indices of corners, with the orientation of the polygon.
+    The corners [N, 3] are approximately in a plane. The N - 2 triples of their indices have the
+    orientation of the polygon.
     """
     from_first = corners - corners[0]
     normal = np.cross(from_first, np.roll(from_first, -1, axis=0)).sum(axis=0)
@@ -160,10 +139,7 @@ def gable_mesh(size_m: tuple[float, float, float], eaves_m: float = 0.0) -> Mesh
 def rod_mesh(length_m: float, diameter_m: float, sides: int = 16) -> Mesh:
     """Return a cylinder along y, centred at the origin, with a regular polygon as cross-section.
 
-    Args:
-        length_m: length along y.
-        diameter_m: diameter of the polygon's circumscribed circle.
-        sides: number of sides of the polygon.
+    ``diameter_m`` is that of the polygon's circumscribed circle.
     """
     angles = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([np.sin(angles), np.zeros(sides), np.cos(angles)], axis=1) * diameter_m / 2
@@ -181,10 +157,7 @@ def rod_mesh(length_m: float, diameter_m: float, sides: int = 16) -> Mesh:
 def prism_mesh(corners_m: Sequence[tuple[float, float]], low_m: float, high_m: float) -> Mesh:
     """Return a prism along z.
 
-    Args:
-        corners_m: x and y of the corners of the convex base, counter-clockwise.
-        low_m: height of the lower face.
-        high_m: height of the upper face.
+    The x and y of the corners of its convex base are counter-clockwise.
     """
     count = len(corners_m)
     vertices = [(x, y, z) for z in (low_m, high_m) for x, y in corners_m]
@@ -194,10 +167,8 @@ def prism_mesh(corners_m: Sequence[tuple[float, float]], low_m: float, high_m: f
 def ring_parts(section_m: Sequence[tuple[float, float]], segments: int) -> list[Mesh]:
     """Return a ring about the z axis as convex segments.
 
-    Args:
-        section_m: radius and height of the corners of the convex cross-section, counter-clockwise
-            in the plane of radius (first axis) and height (second axis).
-        segments: number of segments.
+    The corners of the convex cross-section are counter-clockwise in the plane of radius (first
+    axis) and height (second axis).
     """
     angles = np.arange(segments + 1) * (2 * np.pi / segments)
     ends = [
@@ -225,7 +196,6 @@ def bowl_parts(
 
     Args:
         radius_m: outer radius of the rim.
-        height_m: height of the rim.
         foot_radius_m: radius of the foot.
         floor_m: thickness of the foot, whose upper face is the floor of the bowl.
         wall_m: horizontal thickness of the wall.
@@ -256,10 +226,8 @@ def centroid(parts: Sequence[Mesh]) -> tuple[float, float, float]:
 def _obj_corners(values: Sequence[bytes], num_vertices: int) -> list[int]:
     """Return the vertex indices of a face, from 0.
 
-    Args:
-        values: the corners as OBJ writes them: an index from 1, or a negative one that counts back
-            from the last vertex read so far, with or without a texture coordinate and a normal.
-        num_vertices: number of vertices read so far.
+    OBJ writes a corner as an index from 1, or a negative one that counts back from the last vertex
+    read so far, with or without a texture coordinate and a normal.
     """
     if len(values) < 3:
         raise ValueError("a face needs three corners")
@@ -292,9 +260,7 @@ def _triangles(points: np.ndarray, polygons: Sequence[Sequence[int]]) -> np.ndar
 def _is_ear(corners: np.ndarray, polygon: np.ndarray) -> bool:
     """Return whether a triangle of successive corners of a polygon contains no other corner.
 
-    Args:
-        corners: [3, 2].
-        polygon: [N, 2], counter-clockwise.
+    The polygon [N, 2] is counter-clockwise.
     """
     edges = np.roll(corners, -1, axis=0) - corners
     if edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0] <= 0:
@@ -307,11 +273,9 @@ def _is_ear(corners: np.ndarray, polygon: np.ndarray) -> bool:
 
 
 def _prism_faces(count: int) -> np.ndarray:
-    """Return the faces of a prism.
+    """Return the faces of a prism whose first vertices are the corners of the base.
 
-    Args:
-        count: number of corners of the base; they are the first vertices, followed by those of the
-            upper face.
+    Those of the upper face follow.
     """
     caps = [(0, i + 1, i) for i in range(1, count - 1)]
     caps += [(count, count + i, count + i + 1) for i in range(1, count - 1)]
@@ -325,9 +289,7 @@ def _prism_faces(count: int) -> np.ndarray:
 def frame_parts(size_m: tuple[float, float, float], wall_m: float) -> list[Mesh]:
     """Return four vertical walls around a rectangle, their bounding box centred at the origin.
 
-    Args:
-        size_m: outer extents along x, y and z.
-        wall_m: thickness of the walls.
+    ``size_m`` has the outer extents along x, y and z.
     """
     x, y, z = size_m
     along_x, along_y = box_mesh((x - 2 * wall_m, wall_m, z)), box_mesh((wall_m, y, z))
@@ -341,9 +303,8 @@ def frame_parts(size_m: tuple[float, float, float], wall_m: float) -> list[Mesh]
 def lathe_parts(profile_m: Sequence[tuple[float, float]], sides: int = 16) -> list[Mesh]:
     """Return a solid of revolution about the z axis as convex parts, one above the other.
 
-    Args:
-        profile_m: radius and height of the corners of the profile, from the bottom to the top.
-        sides: number of sides of the polygons that approximate circles.
+    The profile has radius and height of its corners, from the bottom to the top. Polygons with a
+    number of sides approximate circles.
     """
     angles = 2 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)

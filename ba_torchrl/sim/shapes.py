@@ -7,15 +7,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import pybullet
 
 from ba_torchrl.sim.geometry import Vector
-from ba_torchrl.sim.mesh_lists import mesh_lists
 from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, write_obj
 
 Color = tuple[float, float, float, float]
@@ -26,8 +25,6 @@ class Shape(ABC):
     """Geometry, mass and material of a body.
 
     Args:
-        mass_kg: 0 for a static body.
-        friction: lateral friction coefficient.
         color: red, green, blue, alpha in [0, 1].
         center_of_mass_m: in the frame of the geometry, metres.
     """
@@ -72,11 +69,7 @@ class Shape(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Box(Shape):
-    """A box with its centre at the origin.
-
-    Args:
-        size_m: edge lengths along x, y and z.
-    """
+    """A box with edge lengths along x, y and z, its centre at the origin."""
 
     size_m: Vector
 
@@ -104,8 +97,7 @@ class Box(Shape):
 class Decal(Box):
     """A thin coloured sheet without collision geometry, such as a goal area on the floor.
 
-    Args:
-        recess_depth_m: depth images show a recess of this depth in the floor in its place.
+    Depth images show a recess of the depth ``recess_depth_m`` in the floor in its place.
     """
 
     recess_depth_m: float = 0.0
@@ -118,13 +110,10 @@ class Decal(Box):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid(Shape):
-    """A body that consists of convex parts, so that it can be concave or hollow.
+    """A body that consists of convex parts in a common frame, so that it can be concave or hollow.
 
-    The collision geometry is the convex hull of each part.
-
-    Args:
-        parts: surfaces of the parts, in a common frame.
-        surface: visual surface; None uses the parts.
+    The collision geometry is the convex hull of each part. Without a visual surface, the parts are
+    visible.
     """
 
     parts: tuple[Mesh, ...]
@@ -171,3 +160,44 @@ def _obj_file(parts: Sequence[Mesh]) -> Iterator[str]:
         path = Path(folder) / "mesh.obj"
         write_obj(path, parts)
         yield str(path)
+
+
+class MeshLists(NamedTuple):
+    """A triangle mesh for PyBullet, with flat shading."""
+
+    vertices: list[list[float]]
+    """Position of each vertex, [V][3] metres."""
+    corners: list[list[float]]
+    """Position of each corner of each face, [3 F][3] metres."""
+    normals: list[list[float]]
+    """Unit normal of the face of each corner, [3 F][3]; zero for a face without area."""
+    indices: list[int]
+    """The numbers of the corners, [3 F]."""
+
+
+def mesh_lists(mesh: Mesh) -> MeshLists:
+    """Return the lists of a mesh; those of equal meshes are the same objects.
+
+    PyBullet never releases the vertices and normals that are passed to it, so that new lists for
+    each world would fill the memory.
+    """
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+    return _lists(vertices.tobytes(), faces.tobytes())
+
+
+@cache
+def _lists(vertex_data: bytes, face_data: bytes) -> MeshLists:
+    vertices = np.frombuffer(vertex_data).reshape(-1, 3)
+    faces = np.frombuffer(face_data, dtype=np.int64).reshape(-1, 3)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    shared = vertices.tolist()
+    return MeshLists(
+        vertices=shared,
+        corners=[shared[vertex] for vertex in faces.ravel().tolist()],
+        normals=[normal for normal in normals.tolist() for _ in range(3)],
+        indices=list(range(faces.size)),
+    )

@@ -3,22 +3,79 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import re
+import socket
+import sys
+import tempfile
 import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NoReturn, Protocol, Self
 
 import pybullet
 import pybullet_data
 
 from ba_torchrl.errors import SimulationError
-from ba_torchrl.sim.activation import set_asleep
-from ba_torchrl.sim.articulated import ArticulatedBody, ArticulatedLink, PrismaticJoint
-from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.display import connect_window
-from ba_torchrl.sim.model_files import loading
+from ba_torchrl.sim.articulated import ArticulatedBody, PrismaticJoint
+from ba_torchrl.sim.bodies import Body, set_asleep
 from ba_torchrl.sim.shapes import Color, Shape
-from ba_torchrl.sim.snapshots import PortableSnapshot, Snapshot
+
+
+class Snapshot:
+    """A state of a world in PyBullet's memory, freed when this object is deleted.
+
+    The connection is the finalizer of the world that owns the client.
+    """
+
+    def __init__(self, client: int, connection: weakref.finalize) -> None:
+        self.client = client
+        self.connection = connection
+        self.id = pybullet.saveState(physicsClientId=client)
+        weakref.finalize(self, _remove_state, self.id, client, connection)
+
+    def load(self, client: int) -> None:
+        """Load the state into the client that it is of."""
+        pybullet.restoreState(self.id, physicsClientId=client)
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a state of get_state is of one process and needs no copy, since it never changes; to "
+            "keep or send the state of an environment, copy or pickle the environment"
+        )
+
+
+@dataclass(frozen=True)
+class PortableSnapshot:
+    """A state of a world as bytes, for worlds with the same bodies in this or another process."""
+
+    content: bytes
+
+    @classmethod
+    def of(cls, client: int) -> Self:
+        """Return the present state of a client."""
+        with _temporary_file() as path:
+            pybullet.saveBullet(path, physicsClientId=client)
+            return cls(Path(path).read_bytes())
+
+    def load(self, client: int) -> None:
+        """Load the state into a client with the same bodies."""
+        with _temporary_file() as path:
+            Path(path).write_bytes(self.content)
+            pybullet.restoreState(fileName=path, physicsClientId=client)
+
+
+@contextlib.contextmanager
+def _temporary_file() -> Iterator[str]:
+    with tempfile.TemporaryDirectory(prefix="ba_torchrl-") as folder:
+        yield f"{folder}/world.bullet"
+
+
+def _remove_state(state: int, client: int, connection: weakref.finalize) -> None:
+    if connection.alive:  # otherwise the client id may already belong to another world
+        pybullet.removeState(state, physicsClientId=client)
+
 
 MAX_CLIENTS = 1024
 """Number of worlds that a process can have, a limit of PyBullet."""
@@ -69,7 +126,6 @@ class World:
     worlds.
 
     Args:
-        physics: settings of the physics engine.
         window: show the simulation in PyBullet's window, of which a process can have one.
         floor_color: red, green, blue, alpha of the floor; None keeps PyBullet's blue chequered
             texture.
@@ -138,10 +194,6 @@ class World:
     def add(self, shape: Shape, name: str) -> Body:
         """Load a body; possible only before `seal`.
 
-        Args:
-            shape: geometry, mass and material.
-            name: used in error messages.
-
         Raises:
             SimulationError: the world is sealed.
         """
@@ -156,12 +208,6 @@ class World:
         """Load a fixed body with a sliding part; possible only before `seal`.
 
         Both links are added to `bodies`.
-
-        Args:
-            base: shape of the fixed link.
-            slider: shape of the sliding link.
-            joint: axis, limits and friction of the joint between the two.
-            name: used in error messages.
 
         Raises:
             SimulationError: the world is sealed.
@@ -258,11 +304,7 @@ class World:
                 body.fix_pose(False)
 
     def is_still(self, except_for: Body | None = None) -> bool:
-        """Whether no visible body exceeds the speeds of a body at rest.
-
-        Args:
-            except_for: a body that may move.
-        """
+        """Whether no visible body exceeds the speeds of a body at rest."""
         # the body that moved at the last call is probably the one that still moves
         last = self._moved_last
         if last is not None and last is not except_for and self._moves(last):
@@ -272,14 +314,7 @@ class World:
         return self._moved_last is None
 
     def settle(self, max_steps: int = 200) -> bool:
-        """Step until `is_still` holds in two consecutive steps.
-
-        Args:
-            max_steps: largest number of steps.
-
-        Returns:
-            Whether the bodies came to rest within ``max_steps``.
-        """
+        """Step until `is_still` holds in two consecutive steps; return whether it does."""
         sleepers = [sleeper for sleeper in self.sleepers if sleeper.is_possible()]
         still, are_asleep = 0, False
         try:
@@ -335,19 +370,17 @@ class World:
         separating direction of each pair of convex hulls, such as a finger and a block, and the
         order in which pairs came close. Removing all pairs resets both.
         """
-        pybullet.setCollisionFilterGroupMask(self.floor, -1, 0, 0, physicsClientId=self.client)
-        for body in self.bodies:
-            for link in body.links if isinstance(body, ArticulatedLink) else (-1,):
-                pybullet.setCollisionFilterGroupMask(
-                    body.id, link, 0, 0, physicsClientId=self.client
-                )
+        links = [(self.floor, -1, True)]
+        links += [(body.id, link, body.is_static) for body in self.bodies for link in body.links]
+        for body_id, link, _ in links:
+            pybullet.setCollisionFilterGroupMask(body_id, link, 0, 0, physicsClientId=self.client)
         self.detect_collisions()
-        _enable_collisions(self.client, self.floor, is_static=True)
-        for body in self.bodies:
-            if isinstance(body, ArticulatedLink):
-                body.rebuild_collision_pairs()
-            else:
-                _enable_collisions(self.client, body.id, body.is_static)
+        for body_id, link, is_static in links:
+            # PyBullet's default collision groups: static bodies do not collide with each other
+            group, mask = (2, ~2) if is_static else (1, -1)
+            pybullet.setCollisionFilterGroupMask(
+                body_id, link, group, mask, physicsClientId=self.client
+            )
 
     def _moves(self, body: Body) -> bool:
         """Whether a body is visible and exceeds the speeds of a body at rest."""
@@ -373,12 +406,6 @@ def _set_asleep(sleepers: Iterable[Sleeper], are_asleep: bool) -> None:
         sleeper.set_asleep(are_asleep)
 
 
-def _enable_collisions(client: int, body: int, is_static: bool) -> None:
-    # PyBullet's default collision groups: static bodies do not collide with each other
-    group, mask = (2, ~2) if is_static else (1, -1)
-    pybullet.setCollisionFilterGroupMask(body, -1, group, mask, physicsClientId=client)
-
-
 def count_clients() -> int:
     """Return the number of open connections to PyBullet in this process."""
     return sum(map(pybullet.isConnected, range(MAX_CLIENTS)))
@@ -387,3 +414,86 @@ def count_clients() -> int:
 def _disconnect(client: int) -> None:
     if pybullet.isConnected(physicsClientId=client):
         pybullet.disconnect(physicsClientId=client)
+
+
+@contextlib.contextmanager
+def loading(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Replace PyBullet's error, which gives no reason, by one that does.
+
+    Raises:
+        OSError: the file cannot be opened: it is missing, or too many files are open.
+        SimulationError: it can be opened, but PyBullet does not load it.
+    """
+    try:
+        yield
+    except pybullet.error as error:
+        with open(path, "rb"):
+            raise SimulationError(f"PyBullet cannot load {path}: {error}") from error
+
+
+_TIMEOUT_S = 3.0
+_FIRST_TCP_PORT = 6000
+_GREETING = b"l\0\x0b\0\0\0\0\0\0\0\0\0"
+"""Request of a connection: little endian, X11, without authorization."""
+
+
+def why_no_display() -> str | None:
+    """Return why no window can be opened, None if the display answers.
+
+    PyBullet would end the process without a display, and wait for one that does not answer.
+    """
+    name = os.environ.get("DISPLAY", "")
+    if not name:
+        return "DISPLAY is not set"
+    match = re.fullmatch(r"(?P<host>.*):(?P<number>\d+)(\.\d+)?", name)
+    if match is None:
+        return f"DISPLAY={name} is not the name of a display"
+    number = int(match["number"])
+    try:
+        with _connect(match["host"], number) as connection:
+            connection.settimeout(_TIMEOUT_S)
+            connection.sendall(_GREETING)
+            if connection.recv(1):
+                return None
+    except OSError as error:
+        return f"DISPLAY={name} does not answer: {error}"
+    return f"DISPLAY={name} closed the connection"
+
+
+def connect_window() -> int:
+    """Open PyBullet's window and return its client.
+
+    Raises:
+        SimulationError: there is no display, or the process already has a window.
+    """
+    reason = why_no_display() if sys.platform.startswith("linux") else None
+    if reason is not None:
+        raise SimulationError(
+            f"render=True opens a window, but there is no display ({reason}): use "
+            "env.render() for images, or run under a virtual display such as xvfb-run"
+        )
+    try:
+        client = pybullet.connect(pybullet.GUI, options="--width=960 --height=720")
+    except pybullet.error as error:
+        raise SimulationError(
+            f"PyBullet cannot open a window ({error}): a process can have only one"
+        ) from None
+    if client >= 0:
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+    return client
+
+
+def _connect(host: str, number: int) -> socket.socket:
+    if host not in ("", "unix"):
+        return socket.create_connection((host, _FIRST_TCP_PORT + number), _TIMEOUT_S)
+    path = f"/tmp/.X11-unix/X{number}"
+    for address in (path, f"\0{path}"):  # a file, or Linux's abstract name
+        connection = socket.socket(socket.AF_UNIX)
+        connection.settimeout(_TIMEOUT_S)
+        try:
+            connection.connect(address)
+        except OSError:
+            connection.close()
+        else:
+            return connection
+    raise ConnectionRefusedError(f"no server at {path}")

@@ -115,10 +115,8 @@ def check_progress(
     object that is dropped, often flush with another body (open loop). Tasks of one step are exempt.
 
     Args:
-        task: id of the task.
         episodes: number of episodes for each disturbance, with those that it ends.
         max_unsolved_rate: largest share of the episodes that reach the step limit.
-        config: fields of `EnvConfig`.
     """
     if TASKS[task].terminates_at_limit:
         return
@@ -147,7 +145,6 @@ def play_disturbed(env: ManipulationEnv, seed: int, disturb: Disturb) -> Disturb
     Args:
         env: the environment, with an expert.
         seed: of the episode and of the disturbance.
-        disturb: the disturbance.
     """
     state = disturb(env, env.reset(seed=seed), np.random.default_rng(seed))
     if state[keys.DONE]:

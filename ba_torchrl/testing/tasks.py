@@ -48,7 +48,6 @@ def check_task(
 
     Args:
         task: id of a registered task.
-        robot: name of the robot.
         episodes: number of episodes that the expert plays, both from the start and after random
             actions.
         min_success_rate: least success rate of the expert from the start.
@@ -243,12 +242,8 @@ def check_expert(
     """Check the expert's success rate and steps, and the rewards and ends of its episodes.
 
     Args:
-        task: id of the task.
-        episodes: number of episodes.
-        min_success_rate: least success rate.
         max_typical_steps: largest mean (close loop) or median (open loop) number of steps of solved
             episodes; None for no limit.
-        config: fields of `EnvConfig`.
     """
     env = make_small(task, expert=True, **config)
     try:
@@ -282,10 +277,7 @@ def check_recovery(task: str, *, episodes: int, min_success_rate: float, **confi
     """Check the expert's success rate after random actions; one-step tasks are exempt.
 
     Args:
-        task: id of the task.
         episodes: number of episodes, without those that end during the random actions.
-        min_success_rate: least success rate.
-        config: fields of `EnvConfig`.
     """
     if TASKS[task].terminates_at_limit:
         return

@@ -6,7 +6,7 @@ from ba_torchrl import make
 from ba_torchrl.envs import keys
 from ba_torchrl.record import gallery
 from ba_torchrl.record.gallery import Strip, expert_strip, overview_figure, strip_figure
-from ba_torchrl.record.headings import tasks_by_heading
+from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.record.video import FrameRecorder
 from tests.recipes import recipe
 

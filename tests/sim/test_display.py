@@ -7,9 +7,8 @@ import time
 import pytest
 
 from ba_torchrl.errors import SimulationError
-from ba_torchrl.sim import display
-from ba_torchrl.sim.display import why_no_display
-from ba_torchrl.sim.world import World
+from ba_torchrl.sim import world as display
+from ba_torchrl.sim.world import World, why_no_display
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ ANGLES = [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (1.0, -0.2, 0.5), (3.0, 1.2, -2.8)
 FLIP = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
-@pytest.fixture(params=range(5))
+@pytest.fixture(params=range(2))
 def rng(request):
     return np.random.default_rng(request.param)
 
@@ -81,20 +81,10 @@ def test_tool_rotation_and_tool_angles(angles):
     tool = Rotation.from_euler("ZYX", angles) * FLIP
     np.testing.assert_allclose(tool_rotation(*angles), tool.as_matrix(), atol=1e-12)
     assert tool_angles(tuple(tool.as_quat())) == pytest.approx(angles, abs=1e-9)
-
-
-def test_downward_equals_tool_rotation_without_tilt():
-    down = Rotation.from_euler("z", 2.2) * FLIP
-    np.testing.assert_allclose(downward(2.2), down.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(tool_rotation(2.2), down.as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(
-        quaternion_matrix(downward_quaternion(2.2)), down.as_matrix(), atol=1e-12
-    )
-
-
-def test_yaw_quaternion_and_quaternion_yaw():
-    assert yaw_quaternion(0.8) == pytest.approx(Rotation.from_euler("z", 0.8).as_quat())
-    assert quaternion_yaw(yaw_quaternion(-2.9)) == pytest.approx(-2.9)
+    down = (Rotation.from_euler("z", angles[0]) * FLIP).as_matrix()
+    np.testing.assert_allclose(downward(angles[0]), down, atol=1e-12)
+    np.testing.assert_allclose(quaternion_matrix(downward_quaternion(angles[0])), down, atol=1e-12)
+    assert yaw_quaternion(angles[0]) == pytest.approx(Rotation.from_euler("z", angles[0]).as_quat())
 
 
 def test_pose_compose_and_inverse(rng):
@@ -187,9 +177,8 @@ def test_half_turns_have_a_quaternion(turn):
     assert np.array(found) == pytest.approx(np.array(matrix), abs=1e-12)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5, math.pi / 2, math.pi])
-@pytest.mark.parametrize("slope", [0.0, 0.1, math.pi / 6, 1.2])
-@pytest.mark.parametrize("bearing", [0.0, 0.7, math.pi / 2, -2.0])
+@pytest.mark.parametrize("yaw", [0.0, -2.5, math.pi])
+@pytest.mark.parametrize(("slope", "bearing"), [(0.0, 0.0), (0.1, 0.7), (1.2, -2.0)])
 def test_a_frame_on_a_surface_has_its_normal_and_heading(yaw, slope, bearing):
     normal = (
         math.sin(slope) * math.cos(bearing),

@@ -6,9 +6,8 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.mesh_lists import mesh_lists
 from ba_torchrl.sim.meshes import Mesh, gable_mesh, rod_mesh, write_obj
-from ba_torchrl.sim.shapes import Solid
+from ba_torchrl.sim.shapes import Solid, mesh_lists
 from ba_torchrl.sim.world import World
 
 MESHES = {"gable": gable_mesh((0.04, 0.1, 0.03)), "rod": rod_mesh(0.1, 0.02)}

@@ -9,8 +9,7 @@ import pytest
 import ba_torchrl
 from ba_torchrl.data.demos import expert_scores
 from ba_torchrl.sim.robots import ur5
-from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.robots.gripper import measured_gripper
+from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
 
 MODELS = Path(ur5.__file__).parent / "models"
 WIDTH_M, WIDER_M = "0.019", "0.0285"

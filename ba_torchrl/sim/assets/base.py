@@ -88,11 +88,7 @@ class ObjectSet(Sequence[Solid], ABC):
 
 
 def load_object_set(name: str, asset_root: str | None = None) -> ObjectSet:
-    """Return an object set by its name.
-
-    Args:
-        name: a name in `OBJECT_SETS`, such as "random", "household" or "graspnet".
-        asset_root: for "graspnet": folder of the meshes.
+    """Return an object set by its name in `OBJECT_SETS`; "graspnet" reads ``asset_root``.
 
     Raises:
         ConfigError: the name is unknown, or the folder is missing or not readable.

@@ -44,15 +44,11 @@ def cache_folder() -> Path:
 
 
 def cached_parts(content: bytes, recipe: str, make: Callable[[], Decomposition]) -> Decomposition:
-    """Return convex parts from the cache, or compute and store them.
+    """Return convex parts of a file's content from the cache, or compute and store them.
 
     The cache is optional: one warning is given for a folder that cannot be used. Several processes
-    can request the same parts concurrently: files are written atomically.
-
-    Args:
-        content: content of the file from which the parts are computed.
-        recipe: identifies the computation and its parameters; it is part of the cache key.
-        make: computes the parts.
+    can request the same parts concurrently: files are written atomically. ``recipe`` identifies the
+    computation and its parameters; it is part of the cache key.
     """
     key = hashlib.sha256(recipe.encode() + b"\0" + content).hexdigest()
     try:

@@ -45,15 +45,7 @@ def convex_parts(mesh: Mesh, path: Path) -> Decomposition:
 
     Holes of the surface through which V-HACD does not find the inside are closed with flat faces.
     The parts are computed at unit size, so that the size and the position of the mesh have no
-    effect.
-
-    Args:
-        mesh: the mesh, metres.
-        path: its file, used in messages.
-
-    Returns:
-        The parts, relative to the centre of the mesh's bounding box, and a note if they differ from
-        the mesh in a way that matters for grasping.
+    effect. They are relative to the centre of the mesh's bounding box.
 
     Raises:
         ConfigError: the mesh has no volume, or its decomposition fails.
@@ -116,13 +108,7 @@ def _unit_parts(mesh: Mesh, path: Path) -> Decomposition:
 
 
 def _difference(parts: list[Mesh], mesh: Mesh, volume: float) -> str:
-    """Return what tells the parts of a mesh from the mesh, empty if they are equal enough.
-
-    Args:
-        parts: the convex parts.
-        mesh: the mesh at unit size.
-        volume: of the solid inside the mesh.
-    """
+    """Return what tells the parts of a mesh from the mesh, empty if they are equal enough."""
     if not parts:
         return "no part has a volume"
     points = merge_meshes(parts).vertices

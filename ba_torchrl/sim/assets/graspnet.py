@@ -69,9 +69,6 @@ class GraspNet(ObjectSet):
     cached on disk. Holes of its surface are closed with flat faces where they leave the object
     hollow, and a warning tells so.
 
-    Args:
-        asset_root: folder with one sub-folder for each object.
-
     Raises:
         ConfigError: the folder or a mesh file is missing or cannot be read.
     """
@@ -127,14 +124,11 @@ class GraspNet(ObjectSet):
 
 
 def graspable_scale(extents_m: Sequence[float]) -> float:
-    """Return the scale at which a mesh is graspable.
+    """Return the scale at which a mesh with an axis-aligned bounding box is graspable.
 
     The mesh is scaled by 0.8 until its second-largest extent is at most 15 cm, then by 0.85 until
     the volume of its bounding box is at most 0.6 litres, then by 1 / 0.95 until its smallest extent
     is at least 1.4 cm.
-
-    Args:
-        extents_m: extents of the axis-aligned bounding box.
     """
     smallest, middle, _ = sorted(extents_m)
     scale = WIDTH_FACTOR ** _num_factors(middle / MAX_WIDTH_M, 1 / WIDTH_FACTOR)
@@ -148,11 +142,6 @@ def graspable_scale(extents_m: Sequence[float]) -> float:
 
 def check_size(mesh: Mesh, path: Path, max_length_m: float = MAX_LENGTH_M) -> None:
     """Check that a mesh is a solid that fits into the tray at its graspable scale.
-
-    Args:
-        mesh: the mesh, metres.
-        path: its file, used in error messages.
-        max_length_m: greatest length after scaling.
 
     Raises:
         ConfigError: the mesh is flat, its length is outside of `MESH_LENGTHS_M`, or its scaled

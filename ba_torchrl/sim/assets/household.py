@@ -24,10 +24,7 @@ Profile = Sequence[tuple[float, float]]
 def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
     """Return a hollow solid of revolution with a bottom and an open top.
 
-    Args:
-        profile: outer surface, with strictly increasing heights, metres.
-        wall_m: thickness of the wall.
-        bottom_m: thickness of the bottom.
+    The heights of the profile, its outer surface, increase strictly.
     """
     (radius, z), (next_radius, next_z) = profile[0], profile[1]
     inside = radius + (next_radius - radius) * bottom_m / (next_z - z)
@@ -42,12 +39,7 @@ def vessel(profile: Profile, wall_m: float, bottom_m: float) -> list[Mesh]:
 
 
 def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
-    """Return a box.
-
-    Args:
-        size: edge lengths, metres.
-        at: position of the centre, metres.
-    """
+    """Return a box with its edge lengths and the position of its centre, metres."""
     return transform_mesh(box_mesh(size), at)
 
 

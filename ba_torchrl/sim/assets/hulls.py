@@ -66,14 +66,11 @@ def convex_hull(points: np.ndarray) -> Mesh:
 
 
 def simplified_hull(hull: Mesh) -> Mesh:
-    """Return the convex hull of a selection of vertices, so that contacts are computed quickly.
+    """Return the hull of a selection of a hull's vertices, so that contacts are computed quickly.
 
     The vertices that are left out lie at most 1 % of the hull's length outside of the facets of the
     result (0.8 % for a ball with 30,000 vertices, 0.03 % for a cylinder). A hull with at most
     `MAX_HULL_VERTICES` vertices is returned as it is.
-
-    Args:
-        hull: a convex hull, metres.
     """
     if len(hull.vertices) <= MAX_HULL_VERTICES:
         return hull
@@ -165,11 +162,9 @@ def narrowest_width(points: np.ndarray) -> float:
 
 
 def _antipodal_score(resting: Mesh, center_xy: np.ndarray) -> tuple[float, float]:
-    """Return `StablePose.antipodal_score` of a body, and the yaw of the best grasp axis.
+    """Return `StablePose.antipodal_score` and the yaw of the best grasp axis.
 
-    Args:
-        resting: the body in its stable pose on the plane z = 0.
-        center_xy: its centre of mass.
+    The body rests on the plane z = 0 with its centre of mass above ``center_xy``.
     """
     points, normals = surface_samples(resting, NUM_SAMPLES)
     low, high = GRASP_Z_M
@@ -195,10 +190,7 @@ def _most_outside(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return for each point the facet it is farthest outside of, and its distance from the plane.
 
-    Args:
-        points: [N, 3], metres.
-        normals: [F, 3], outward.
-        offsets: [F], distances of the planes from the origin.
+    A facet has an outward normal [F, 3] and the distance [F] of its plane from the origin.
     """
     facets, distances = [], []
     for block in np.array_split(points, len(points) // 10_000 + 1):  # bounds the memory

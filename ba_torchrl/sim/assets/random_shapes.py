@@ -82,11 +82,7 @@ class RandomShapes(ObjectSet):
 
 
 def shape_path(number: int) -> Path:
-    """Return the mesh file of a random shape.
-
-    Args:
-        number: 0 to 999.
-    """
+    """Return the mesh file of a random shape."""
     return Path(pybullet_data.getDataPath(), "random_urdfs", f"{number:03d}", f"{number:03d}.obj")
 
 
@@ -99,11 +95,7 @@ def read_shape(number: int) -> Mesh:
 def scaled_candidate(number: int) -> Candidate | None:
     """Return the scale at which a random shape is graspable in every stable pose.
 
-    Args:
-        number: 0 to 999.
-
-    Returns:
-        None if the shape does not satisfy the limits at any scale.
+    It is None if the shape does not satisfy the limits at any scale.
     """
     mesh = read_shape(number)
     try:

@@ -15,7 +15,11 @@ The number of physics steps of a motion is bounded. There are three cases:
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
+from ba_torchrl.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import (
     Contact,
@@ -27,17 +31,8 @@ from ba_torchrl.sim.contacts import (
     vertical_direction,
     vertical_force_n,
 )
-from ba_torchrl.sim.control.held_body import (
-    FirmGrasp,
-    place_in_tool_frame,
-    pose_in_tool_frame,
-    rebuild_grasp_contacts,
-    slip,
-)
-from ba_torchrl.sim.control.limits import MotionLimits
-from ba_torchrl.sim.control.paths import Path, quintic_time_scaling
-from ba_torchrl.sim.geometry import Pose, Vector, YawPose, downward
-from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.geometry import Pose, Vector, YawPose, bullet_compose, bullet_inverse, downward
+from ba_torchrl.sim.robots.base import DISTANT_M, Robot
 
 OPENING_TOLERANCE = 0.02
 """Tolerance within which a target opening counts as reached."""
@@ -45,14 +40,56 @@ STALL_FRACTION = 0.1
 """Fingers that move at less than this fraction of their commanded speed are in contact."""
 
 
+@dataclass(frozen=True)
+class MotionLimits:
+    """Limits of close-loop control."""
+
+    contact_speed_m_s: float = 0.4
+    """Maximum speed where contacts are possible and nothing is held."""
+    contact_speed_rad_s: float = 6.0
+    deceleration_m_s2: float = 4.0
+    """Less than the floor's friction times gravity: otherwise a pushed body slides ahead."""
+    held_time_s: float = 0.1
+    """Duration of a displacement of 5 cm with a held body; it is proportional to the square root of
+    the displacement."""
+    max_vertical_force_n: float = 40.0
+    """The tool yields when the sum of the vertical contact forces of the hand and the held body
+    exceeds this."""
+    max_lateral_force_n: float = 150.0
+    """The same for the lateral contact forces."""
+    yield_m: float = 1e-3
+    """Displacement of a tool that yields."""
+    press_stride_m: float = 5e-4
+    """Displacement per step of a downward motion that starts in contact."""
+    max_press_steps: int = 8
+    path_sample_m: float = 0.01
+    """Distance between the samples at which a path is checked for contacts."""
+    path_sample_rad: float = 0.14
+    path_margin_m: float = 1e-3
+    """Distance of a contact point below which a sample is not free. Bullet has contact points of
+    two boxes when they touch, and of other shapes from a distance of up to 0.8 mm."""
+    max_slip_m: float = 5e-4
+    """Displacement of a held body in the tool frame, perpendicular to the closing axis, above which
+    it has slipped: in one simulated motion, or since then in all teleports. A cube has up to 0.2 mm
+    in its first lift."""
+    max_turn_rad: float = 0.02
+    """The same for the rotation of a held body in the tool frame."""
+    max_fall_fraction: float = 0.25
+    """Displacement of a held body in the step after a teleport above which it slips, as a fraction
+    of a falling body's."""
+    max_regrasp_steps: int = 4
+    """Maximum number of further physics steps in which a teleported body comes to rest in the
+    gripper."""
+    max_gripper_steps: int = 60
+    """Maximum number of physics steps for opening or closing the gripper."""
+
+
 class CloseLoopController:
     """Moves a tool that points straight down, and opens and closes the gripper.
 
     Args:
-        robot: the robot.
         teleport: teleport the arm, and a firmly held body, along the free part of a path instead of
             simulating it.
-        limits: speeds and forces.
     """
 
     def __init__(
@@ -70,10 +107,6 @@ class CloseLoopController:
 
     def reset(self, pose: YawPose, opening: float = 1.0) -> None:
         """Teleport the tool to a pose, without simulation.
-
-        Args:
-            pose: position and yaw of the tool.
-            opening: of the gripper, 0 to 1.
 
         Raises:
             ValueError: the pose is out of reach.
@@ -102,10 +135,6 @@ class CloseLoopController:
         The motion ends early where the pose is out of reach. Where a contact force exceeds its
         limit, the tool yields by a small distance and continues without the motion against the
         force: it slides along surfaces.
-
-        Args:
-            position: target of the tool point, metres.
-            yaw_rad: target yaw of the tool.
         """
         self.is_out_of_reach = False
         self._unwind_wrist()
@@ -117,11 +146,7 @@ class CloseLoopController:
             self._move_held(path, held)
 
     def grip(self, opening: float) -> None:
-        """Open or close the fingers until they reach an opening or are stopped by a contact.
-
-        Args:
-            opening: target, 0 to 1.
-        """
+        """Open or close the fingers until they reach an opening or are stopped by a contact."""
         if abs(opening - self._target_opening) < 1e-3:
             return
         self._target_opening = opening
@@ -178,14 +203,7 @@ class CloseLoopController:
 
         A body that turns in this step has too few contacts with the fingers. Those at its new pose
         are added, the body is placed at its pose in the tool frame again, and another step is
-        simulated.
-
-        Args:
-            held: the held body.
-            grasp: its pose in the tool frame.
-
-        Returns:
-            Whether the body rests in the gripper after at most `max_regrasp_steps` further steps.
+        simulated. Return whether it rests after at most `max_regrasp_steps` further steps.
         """
         physics, limits = self.world.physics, self.limits
         max_slip_m = limits.max_fall_fraction * physics.gravity_m_s2 * physics.time_step_s**2
@@ -223,16 +241,10 @@ class CloseLoopController:
             self.robot.teleport(joints)
 
     def _teleport_free_part(self, path: Path, held: Body | None) -> float:
-        """Teleport to the last sample before the first contact.
+        """Teleport to the last sample before the first contact; return its fraction of the path.
 
-        A held body, and the arm with it, stay where they are if the first sample is in contact.
-
-        Args:
-            path: the path.
-            held: the held body, which keeps its pose in the tool frame.
-
-        Returns:
-            The fraction of the path at that sample.
+        A held body keeps its pose in the tool frame. It and the arm stay where they are if the
+        first sample is in contact.
         """
         start = self.robot.measured_joints()
         grasp = None if held is None else pose_in_tool_frame(self.robot, held)
@@ -270,8 +282,7 @@ class CloseLoopController:
     def _press_down(self, path: Path) -> float:
         """Start a downward motion in contact with small displacements.
 
-        Returns:
-            The fraction of the path that was reached; 1 if a force limit ended the motion.
+        Return the fraction of the path that was reached; 1 if a force limit ended the motion.
         """
         stride = self.limits.press_stride_m / max(path.length_m, self.limits.press_stride_m)
         fraction = 0.0
@@ -293,12 +304,7 @@ class CloseLoopController:
     def _contact_profile(self, path: Path, remaining: float) -> list[float]:
         """Return the time scaling for a constant speed followed by a constant deceleration.
 
-        Args:
-            path: the path.
-            remaining: fraction of the path that the motion covers, at its end.
-
-        Returns:
-            For each physics step, the covered fraction of this part, ending with 1.
+        It has the covered fraction of the remaining part of the path after each physics step.
         """
         limits, dt = self.limits, self.world.physics.time_step_s
         length = path.length_m * remaining
@@ -321,19 +327,12 @@ class CloseLoopController:
         return [fraction(i / count) for i in range(1, count + 1)]
 
     def _simulate_path(self, path: Path, fractions: list[float], held: Body | None) -> bool:
-        """Simulate a motion along the path.
+        """Simulate a motion along fractions of the path, one for each physics step.
 
         The motion ends where the path is out of reach. If a force limit is exceeded, the last
         displacement is reverted, and the rest of the path yields to the force: its component
-        against the force is removed. If nothing remains of it, the motion ends.
-
-        Args:
-            path: the path.
-            fractions: of the path, one for each physics step.
-            held: the held body.
-
-        Returns:
-            Whether the motion reached the last fraction.
+        against the force is removed. If nothing remains of it, the motion ends. Return whether it
+        reached the last fraction.
         """
         robot, limits = self.robot, self.limits
         vertical_n = limits.max_vertical_force_n
@@ -367,20 +366,19 @@ class CloseLoopController:
         return has_arrived
 
     def _outer_contacts(self, held: Body | None) -> list[Contact]:
-        """Return the contacts of the hand and the held body with other bodies."""
-        inner = () if held is None else (held.id,)
-        return outer_contacts(self.world.client, self.robot.id, *inner)
+        return hand_contacts(self.robot, held)
+
+
+def hand_contacts(robot: Robot, held: Body | None) -> list[Contact]:
+    """Return the contacts of the hand and the held body with other bodies."""
+    held_ids = () if held is None else (held.id,)
+    return outer_contacts(robot.client, robot.id, *held_ids)
 
 
 def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:
     """Simulate a motion of the fingers until they reach an opening or are stopped by a contact.
 
     The motors then keep the target, so that the fingers press on what they touch.
-
-    Args:
-        robot: the robot.
-        opening: target, 0 to 1.
-        max_steps: maximum number of physics steps.
     """
     stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open_position
     target = robot.opening()
@@ -397,3 +395,102 @@ def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:
         if stalled_steps >= 2:
             break
     robot.command_opening(opening)
+
+
+TILT_RAD = 0.001
+"""Angle about each axis at which a corner of a face is the deepest point in the opposite face."""
+_TILTS = [
+    Pose((0.0, 0.0, 0.0), (0.0, a * TILT_RAD / 2, b * TILT_RAD / 2, 1.0))
+    for a, b in product((1, -1), repeat=2)
+]
+"""Rotations of the tool frame about the axes perpendicular to the closing axis."""
+
+
+class FirmGrasp(NamedTuple):
+    """A grasp in which a simulated motion did not move the body."""
+
+    body: Body
+    pose: Pose
+    """Pose of the body in the tool frame at the end of that motion."""
+
+
+def pose_in_tool_frame(robot: Robot, body: Body) -> Pose:
+    """Return the pose of a body in the tool frame."""
+    return bullet_compose(bullet_inverse(robot.tool_frame()), body.pose)
+
+
+def place_in_tool_frame(robot: Robot, body: Body, pose: Pose) -> None:
+    """Teleport a body to a pose in the tool frame, with zero velocity."""
+    body.set_pose(*bullet_compose(robot.tool_frame(), pose))
+
+
+def rebuild_grasp_contacts(robot: Robot, body: Body, pose: Pose) -> None:
+    """Place a held body in the tool frame, and replace its contacts.
+
+    Bullet does not rotate the normals of persistent contacts with the bodies, and adds at most one
+    contact to a pair of shapes in each collision detection. With one contact at a corner of each
+    finger, a body would turn. The contacts are therefore detected at four poses with small tilts,
+    at which each corner is the deepest point.
+    """
+    body.set_pose((DISTANT_M,) * 3, pose.orientation)
+    robot.world.detect_collisions()
+    for tilt in _TILTS:
+        place_in_tool_frame(robot, body, bullet_compose(tilt, pose))
+        robot.world.detect_collisions()
+    place_in_tool_frame(robot, body, pose)
+
+
+def slip(before: Pose, after: Pose) -> tuple[float, float]:
+    """Return by how much a held body has moved between the fingers.
+
+    These are the displacement perpendicular to the closing axis, metres, and the angle of rotation.
+    """
+    distance_m = math.dist(before.position[1:], after.position[1:])  # x is the closing axis
+    cosine = abs(sum(a * b for a, b in zip(before.orientation, after.orientation, strict=True)))
+    return distance_m, 2 * math.acos(min(cosine, 1.0))
+
+
+class Path:
+    """A straight line of the tool point with a proportional rotation about the vertical."""
+
+    def __init__(self, robot: Robot, start: YawPose, end: YawPose) -> None:
+        self._robot = robot
+        self._start, self._start_yaw = start
+        self._rotation_rad = wrap_angle(end[1] - start[1])
+        self.angle_rad = abs(self._rotation_rad)
+        self._set_delta(tuple(e - s for s, e in zip(self._start, end[0], strict=True)))
+
+    def _set_delta(self, delta: Vector) -> None:
+        self._delta = delta
+        self.length_m = math.hypot(*delta)
+        self.goes_down = delta[2] < -1e-4
+        self.goes_up = delta[2] > 1e-4
+
+    def yield_to(self, direction: Vector, fraction: float, distance_m: float) -> None:
+        """Displace the path after a fraction, and remove its motion against the displacement.
+
+        The direction consists of horizontal and vertical unit vectors, or zeros.
+        """
+        x, y, z = self._robot.tool_pose()[0]
+        dx, dy, dz = self._delta
+        away_x, away_y, up = direction
+        against, down = min(dx * away_x + dy * away_y, 0.0), min(dz * up, 0.0)
+        delta = dx - against * away_x, dy - against * away_y, dz - down * up
+        tool = x + distance_m * away_x, y + distance_m * away_y, z + distance_m * up
+        self._start = tuple(t - fraction * d for t, d in zip(tool, delta, strict=True))
+        self._set_delta(delta)
+
+    def remaining_m(self, fraction: float) -> float:
+        """Return the length of the rest of the path, metres."""
+        return (1 - fraction) * self.length_m
+
+    def joints_at(self, fraction: float) -> list[float] | None:
+        """Return the arm joints at a fraction of the path, 0 to 1; None if out of reach."""
+        x, y, z = (s + fraction * d for s, d in zip(self._start, self._delta, strict=True))
+        rotation = downward(self._start_yaw + fraction * self._rotation_rad)
+        return self._robot.inverse_kinematics((x, y, z), rotation, self._robot.joints)
+
+
+def quintic_time_scaling(u: float) -> float:
+    """Return the quintic from 0 to 1 with zero velocity and acceleration at both ends."""
+    return u * u * u * (10 - 15 * u + 6 * u * u)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from typing import ClassVar
 
+import numpy as np
 import pybullet
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.bodies import Body, set_asleep
 from ba_torchrl.sim.contacts import CONTACT_DISTANCE_M, contacts, is_any_within, nearest_points
 from ba_torchrl.sim.geometry import (
     IDENTITY,
@@ -20,10 +22,11 @@ from ba_torchrl.sim.geometry import (
     YawPose,
     bullet_compose,
     dot,
+    downward,
     perpendicular,
     quaternion_matrix,
 )
-from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
+from ba_torchrl.sim.robots.gripper import TIP_HEIGHT_M, Gripper
 from ba_torchrl.sim.world import World
 
 ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
@@ -40,6 +43,15 @@ GRASP_QUERY_M = 2e-3
 DISTANT_M = 10.0
 """Coordinates outside of every workspace."""
 
+_OPENINGS = tuple(np.linspace(0.0, 1.0, 9).tolist())
+_OUTLINE_SPACING_M = 5e-3
+_RAY_SPACING_M = 1e-3
+_MAX_U_M, _MAX_V_M = 0.14, 0.02
+_RAY_START_BELOW_M, _RAY_END_ABOVE_M = 0.05, 0.1
+_CHAMFER_M = 2e-3
+_RAYS_AT_ONCE = 8192
+_POSITION = (0.45, 0.0, 0.25)
+
 
 class Robot(ABC):
     """An arm with a two-finger gripper in a world.
@@ -48,10 +60,8 @@ class Robot(ABC):
     callers therefore command small displacements (see `ba_torchrl.sim.control`). Subclasses define
     the constants of the model and its inverse kinematics. The tool frame has its origin between the
     fingertips, its z axis along the approach direction and its x axis along the closing axis, the
-    line along which the fingers close.
-
-    Args:
-        world: the world into which the robot is loaded.
+    line along which the fingers close. Joint angles are in radians, openings of the gripper from 0
+    (closed) to 1 (fully open).
     """
 
     arm_joints: ClassVar[tuple[int, ...]]
@@ -103,7 +113,7 @@ class Robot(ABC):
         self.client = world.client
         self.id = self.load()
         self.joints: list[float] = [0.0] * len(self.arm_joints)
-        """Commanded arm joints, radians."""
+        """Commanded arm joints."""
         self.commanded_opening = 1.0
         """Commanded opening, 0 to 1."""
         self._finger_of_link = {
@@ -120,15 +130,12 @@ class Robot(ABC):
     def inverse_kinematics(
         self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
     ) -> list[float] | None:
-        """Return the arm joints for a pose of the tool.
+        """Return the arm joints for a pose of the tool; None if it is out of reach.
 
         Args:
             position: of the tool point, metres.
             rotation: of the tool, such as `downward(yaw_rad)`.
-            near: reference joints, radians; among equivalent solutions, the closest is returned.
-
-        Returns:
-            Joint angles in radians; None if the pose is out of reach.
+            near: reference joints; among equivalent solutions, the closest is returned.
         """
 
     # -- for subclasses ----------------------------------------------------------------------
@@ -152,12 +159,7 @@ class Robot(ABC):
     ) -> None:
         """Couple two joints by a gear constraint.
 
-        Args:
-            robot: PyBullet's id of the robot.
-            first: joint index.
-            second: joint index.
-            ratio: the velocity of the first joint is minus ``ratio`` times that of the second.
-            max_force: of the constraint.
+        The velocity of the first joint is minus ``ratio`` times that of the second.
         """
         gear = pybullet.createConstraint(
             robot,
@@ -174,47 +176,52 @@ class Robot(ABC):
             gear, gearRatio=ratio, maxForce=max_force, erp=0.5, physicsClientId=self.client
         )
 
+    def _couple_fingers(self, robot: int, ratio: float) -> None:
+        """Couple the fingers by a gear.
+
+        Without it, two fingers with limited force do not resist motion of a held body along the
+        closing axis.
+        """
+        self._add_gear(robot, *self.finger_joints, ratio=ratio)
+
     # -- arm ---------------------------------------------------------------------------------
 
     def teleport(self, joints: Sequence[float]) -> None:
-        """Set the arm joints, with zero velocities, and command them.
-
-        Args:
-            joints: radians.
-        """
+        """Set the arm joints, with zero velocities, and command them."""
         self.place_arm(joints)
         self.command(joints)
 
     def place_arm(self, joints: Sequence[float]) -> None:
-        """Set the arm joints, with zero velocities, without a change of the motors' targets.
+        """Set the arm joints, with zero velocities, without a change of the motors' targets."""
+        self._reset_joints(self.arm_joints, joints)
 
-        Args:
-            joints: radians.
-        """
-        self._set_arm([(q, 0.0) for q in joints])
-
-    def _set_arm(self, states: Sequence[tuple[float, float]]) -> None:
-        """Set positions and velocities of the arm joints."""
-        positions, velocities = ([[value] for value in row] for row in zip(*states, strict=True))
+    def _reset_joints(
+        self, indices: Sequence[int], positions: Sequence[float], velocities: Sequence[float] = ()
+    ) -> None:
+        """Set positions of joints, and their velocities, which are zero by default."""
         pybullet.resetJointStatesMultiDof(
-            self.id, self.arm_joints, positions, velocities, physicsClientId=self.client
+            self.id,
+            indices,
+            [[position] for position in positions],
+            [[velocity] for velocity in velocities or [0.0] * len(indices)],
+            physicsClientId=self.client,
+        )
+
+    def _drive(self, indices: Sequence[int], targets: Sequence[float], force: float) -> None:
+        """Set the targets of the motors of joints."""
+        pybullet.setJointMotorControlArray(
+            self.id,
+            indices,
+            pybullet.POSITION_CONTROL,
+            targets,
+            forces=[force] * len(indices),
+            positionGains=[1.0] * len(indices),
+            physicsClientId=self.client,
         )
 
     def command(self, joints: Sequence[float]) -> None:
-        """Set the targets of the arm's motors, which are reached in the next physics step.
-
-        Args:
-            joints: radians.
-        """
-        pybullet.setJointMotorControlArray(
-            self.id,
-            self.arm_joints,
-            pybullet.POSITION_CONTROL,
-            joints,
-            forces=[self.arm_force] * len(self.arm_joints),
-            positionGains=[1.0] * len(self.arm_joints),
-            physicsClientId=self.client,
-        )
+        """Set the targets of the arm's motors, which are reached in the next physics step."""
+        self._drive(self.arm_joints, joints, self.arm_force)
         self.joints = list(joints)
 
     def measured_joints(self) -> list[float]:
@@ -240,10 +247,6 @@ class Robot(ABC):
 
         The fingers, the base and the first link do not count: bodies may surround the mount. The
         state of the arm is unchanged.
-
-        Args:
-            body_ids: PyBullet's ids of the bodies.
-            joints: of the arm, radians.
         """
         states = pybullet.getJointStates(self.id, self.arm_joints, physicsClientId=self.client)
         self.place_arm(joints)
@@ -253,7 +256,7 @@ class Robot(ABC):
             for point in nearest_points(self.client, self.id, body_id, 0.0)
             if point.link > self.arm_joints[0] and point.link not in self._finger_of_link
         ]
-        self._set_arm([state[:2] for state in states])
+        self._reset_joints(self.arm_joints, *zip(*(state[:2] for state in states), strict=True))
         return is_any_within(points, 0.0)
 
     # -- gripper -----------------------------------------------------------------------------
@@ -272,39 +275,20 @@ class Robot(ABC):
         return min(max(mean / self.finger_open_position, 0.0), 1.0)
 
     def set_opening(self, opening: float) -> None:
-        """Set the opening of the fingers, with zero velocities, and command it.
-
-        Args:
-            opening: 0 to 1.
-        """
-        pybullet.resetJointStatesMultiDof(
-            self.id,
-            self.finger_joints,
-            [[sign * opening * self.finger_open_position] for sign in self.finger_open_signs],
-            [[0.0]] * len(self.finger_joints),
-            physicsClientId=self.client,
-        )
+        """Set the opening of the fingers, with zero velocities, and command it."""
+        self._reset_joints(self.finger_joints, self._finger_positions(opening))
         self.commanded_opening = opening
         self.command_opening(opening)
 
     def command_opening(self, opening: float) -> None:
-        """Set the targets of the finger motors.
-
-        Args:
-            opening: 0 to 1.
-        """
+        """Set the targets of the finger motors."""
         if self.has_flat_pads and self.commanded_opening < min(opening, self.opening()) - 1e-3:
             self.rebuild_contacts()  # the fingers grasped and now release
-        pybullet.setJointMotorControlArray(
-            self.id,
-            self.finger_joints,
-            pybullet.POSITION_CONTROL,
-            [sign * opening * self.finger_open_position for sign in self.finger_open_signs],
-            forces=[self.finger_force] * 2,
-            positionGains=[1.0] * 2,
-            physicsClientId=self.client,
-        )
+        self._drive(self.finger_joints, self._finger_positions(opening), self.finger_force)
         self.commanded_opening = opening
+
+    def _finger_positions(self, opening: float) -> list[float]:
+        return [sign * opening * self.finger_open_position for sign in self.finger_open_signs]
 
     def rebuild_contacts(self) -> None:
         """Delete and detect again the contacts of all free bodies that the fingers touch.
@@ -340,11 +324,7 @@ class Robot(ABC):
         return list(self.joints), self.commanded_opening
 
     def set_state(self, state: tuple[list[float], float]) -> None:
-        """Command the joints and the opening that `get_state` returned.
-
-        Args:
-            state: commanded joints (radians) and opening (0 to 1).
-        """
+        """Command the joints and the opening that `get_state` returned."""
         joints, self.commanded_opening = state
         self.command(joints)
         self.command_opening(self.commanded_opening)
@@ -372,9 +352,7 @@ class Robot(ABC):
     def _is_grasped(self, body: Body, touching: tuple[set[tuple[int, int]], ...]) -> bool:
         """Whether contact normals of the two fingers on a body are opposite.
 
-        Args:
-            body: the body.
-            touching: for each finger, pairs of the ids of touched bodies and the touching links.
+        ``touching`` has, for each finger, pairs of the ids of touched bodies and of its links.
         """
         axis, _, approach = zip(*quaternion_matrix(self.tool_frame().orientation), strict=True)
         left, right = (
@@ -393,3 +371,117 @@ class Robot(ABC):
             for a in left
             for b in right
         )
+
+
+REST_JOINT_RAD = 1e-3
+"""Largest deviation from the commanded joints, and largest velocity (rad/s), of an arm at rest."""
+REST_OPENING = 1e-3
+"""Largest deviation from the commanded opening of fingers at rest."""
+
+
+class RobotSleep:
+    """Puts a robot at rest into Bullet's sleeping state, in which its joints are not simulated.
+
+    Bodies that do not touch the robot move as they do beside one that is awake, except for the
+    number of solver iterations where a residual ends them early. Bullet simulates a sleeping robot
+    again as soon as a moving body touches it.
+    """
+
+    def __init__(self, robot: Robot, is_empty: Callable[[], bool]) -> None:
+        self.robot = robot
+        self.is_empty = is_empty
+
+    def is_possible(self) -> bool:
+        """Whether the robot holds and touches nothing and is at rest where it is commanded to."""
+        if not self.is_empty():
+            return False
+        robot = self.robot
+        states = pybullet.getJointStates(robot.id, robot.arm_joints, physicsClientId=robot.client)
+        return (
+            all(
+                abs(state[0] - joint) < REST_JOINT_RAD and abs(state[1]) < REST_JOINT_RAD
+                for state, joint in zip(states, robot.joints, strict=True)
+            )
+            and abs(robot.opening() - robot.commanded_opening) < REST_OPENING
+            and not contacts(robot.client, robot.id)
+        )
+
+    def set_asleep(self, is_asleep: bool) -> None:
+        """Set the state, which takes effect at the end of the next physics step."""
+        set_asleep(self.robot.client, self.robot.id, is_asleep)
+
+
+@cache
+def measured_gripper(robot: type[Robot]) -> Gripper:
+    """Return the gripper of a robot class, measured once per process.
+
+    The measurement casts rays from below in a temporary world, which takes tenths of a second. The
+    rays hit the collision shapes including their margins, as contacts do.
+    """
+    us = np.arange(0.0, _MAX_U_M + _RAY_SPACING_M / 2, _RAY_SPACING_M)
+    vs = np.arange(-_MAX_V_M, _MAX_V_M + _RAY_SPACING_M / 2, _RAY_SPACING_M)
+    with World() as world:
+        body = robot(world)
+        body.teleport(body.inverse_kinematics(_POSITION, downward(0.0)))
+        closed, opened = (_underside(body, opening, us, vs) for opening in (0.0, 1.0))
+        lines = [_underside(body, opening, us, np.zeros(1))[:, 0] for opening in _OPENINGS]
+
+    tip_arc, palm = [], np.inf
+    for heights in lines:
+        gap = us[_are_tips(heights)].min()
+        tip_arc.append((float(gap), float(heights.min())))
+        palm = min([palm, *heights[us < gap - _CHAMFER_M]])
+    tips = _are_tips(opened)
+    return Gripper(
+        half_gap_m=tip_arc[-1][0],
+        half_width_m=float(np.abs(vs[tips.any(axis=0)]).max()) + _RAY_SPACING_M / 2,
+        closed_half_m=float(us[_are_tips(closed).any(axis=1)].max()) + _RAY_SPACING_M / 2,
+        palm_height_m=float(palm),
+        tip_arc=tuple(tip_arc),
+        outline=_outline(us, opened),
+        closed_outline=_outline(us, closed),
+    )
+
+
+def _outline(us: np.ndarray, heights: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Return pairs of distance and least height around it, up to the end of the gripper."""
+    profile = heights.min(axis=1)
+    reach = us[np.isfinite(profile)].max()
+    return tuple(
+        (float(u), float(profile[np.abs(us - u) < _OUTLINE_SPACING_M / 2].min()))
+        for u in np.arange(0.0, reach + _OUTLINE_SPACING_M / 2, _OUTLINE_SPACING_M)
+    )
+
+
+def _are_tips(heights: np.ndarray) -> np.ndarray:
+    return heights < heights.min() + TIP_HEIGHT_M
+
+
+def _underside(robot: Robot, opening: float, us: np.ndarray, vs: np.ndarray) -> np.ndarray:
+    """Return the least height [U, V] of a gripper that points straight down above the tool point.
+
+    It is the lower of the two sides; infinity where no ray hits the gripper.
+
+    Args:
+        us: [U] distances along the closing axis, taken on both sides of the tool point.
+        vs: [V] coordinates perpendicular to the closing axis.
+    """
+    robot.set_opening(opening)
+    robot.world.detect_collisions()
+    (x, y, z), _ = robot.tool_pose()
+    grid = np.stack(np.meshgrid(np.concatenate([us, -us]), vs, indexing="ij"), -1).reshape(-1, 2)
+    low, high = (
+        np.column_stack([grid + np.array([x, y]), np.full(len(grid), z + height)])
+        for height in (-_RAY_START_BELOW_M, _RAY_END_ABOVE_M)
+    )
+    hits = [
+        hit
+        for i in range(0, len(grid), _RAYS_AT_ONCE)
+        for hit in pybullet.rayTestBatch(
+            low[i : i + _RAYS_AT_ONCE].tolist(),
+            high[i : i + _RAYS_AT_ONCE].tolist(),
+            physicsClientId=robot.client,
+        )
+    ]
+    heights = np.array([hit[3][2] - z if hit[0] == robot.id else np.inf for hit in hits])
+    return heights.reshape(2, len(us), len(vs)).min(axis=0)

@@ -9,8 +9,8 @@ import pybullet
 import pybullet_data
 
 from ba_torchrl.sim.geometry import Matrix, Vector, dot
-from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.world import loading
 
 _SHOULDER_HEIGHT_M = 0.36
 _UPPER_ARM_M = 0.42
@@ -66,16 +66,12 @@ class Kuka(Robot):
                 positionGain=1.0,
                 physicsClientId=self.client,
             )
-        # without the gear, two fingers with limited force do not resist motion of a held body along
-        # the closing axis
-        self._add_gear(robot, *self.finger_joints, ratio=1)
+        self._couple_fingers(robot, 1)
         return robot
 
     def set_opening(self, opening: float) -> None:
         """Set the opening of the fingers, with zero velocities, and straighten their tips."""
-        pybullet.resetJointStatesMultiDof(
-            self.id, self._tip_joints, [[0.0]] * 2, [[0.0]] * 2, physicsClientId=self.client
-        )
+        self._reset_joints(self._tip_joints, (0.0, 0.0))
         super().set_opening(opening)
 
     def inverse_kinematics(

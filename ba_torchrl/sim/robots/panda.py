@@ -10,8 +10,8 @@ import pybullet
 import pybullet_data
 
 from ba_torchrl.sim.geometry import Matrix, Vector, cross, dot, perpendicular
-from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.world import loading
 
 _SHOULDER_HEIGHT_M = 0.333
 _UPPER_ARM_M = 0.316
@@ -70,9 +70,7 @@ class Panda(Robot):
                 model, _BASE_M, useFixedBase=True, physicsClientId=self.client
             )
         self._widen_joint_limits(robot)
-        # without the gear, two fingers with limited force do not resist motion of a held body along
-        # the closing axis
-        self._add_gear(robot, *self.finger_joints, ratio=-1)
+        self._couple_fingers(robot, -1)
         return robot
 
     def inverse_kinematics(
@@ -134,12 +132,7 @@ class Panda(Robot):
     ) -> list[float]:
         """Return the joint angles for the directions of the links.
 
-        Args:
-            arm: directions of the links.
-            outwards: horizontal direction from the base to the wrist.
-            finger: direction of the closing axis.
-            approach: approach direction.
-            near: reference joints of `inverse_kinematics`.
+        ``outwards`` is the horizontal direction from the base to the wrist.
         """
         ux, uy, uz = arm.upper_arm
         horizontal = math.hypot(ux, uy)
@@ -184,15 +177,10 @@ class _ArmConfiguration(NamedTuple):
 
 
 def _solve_arm(center: Vector, approach: Vector, offset: Vector) -> _ArmConfiguration | None:
-    """Return the arm configuration for a position of joint 7 and a direction of the wrist offset.
+    """Return the arm configuration for a direction of joint 7 and of the wrist offset.
 
-    Args:
-        center: point on the axis of joint 7, relative to the shoulder, metres.
-        approach: direction of this axis.
-        offset: direction from the axis of joint 6 to that of joint 7.
-
-    Returns:
-        None if the point is out of reach.
+    It is None if the point on the axis of joint 7, relative to the shoulder, is out of reach. The
+    offset points from the axis of joint 6 to that of joint 7.
     """
     wrist = tuple(c - _WRIST_OFFSET_M * o for c, o in zip(center, offset, strict=True))
     distance = math.sqrt(dot(wrist, wrist))

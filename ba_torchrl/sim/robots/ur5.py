@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 import pybullet
 
 from ba_torchrl.sim.geometry import Matrix, Vector, cross, dot
-from ba_torchrl.sim.model_files import loading
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.world import loading
 
 _MODELS = Path(__file__).parent / "models"
 
@@ -43,7 +43,7 @@ class UR5(Robot):
     finger_span_m = 42 * 0.3 / 128
 
     def load(self) -> int:
-        """Load arm and gripper as one model and widen the joint limits of the arm."""
+        """Load arm and gripper as one model, and widen the joint limits of the arm."""
         robot = _load_joined(
             (_MODELS / "ur5_arm.urdf", _MODELS / self.gripper_model), _BASE_M, self.client
         )
@@ -119,9 +119,7 @@ class UR5ParallelJaw(UR5):
     def load(self) -> int:
         """Load the model and couple the fingers by a gear."""
         robot = super().load()
-        # without the gear, two fingers with limited force do not resist motion of a held body along
-        # the closing axis
-        self._add_gear(robot, *self.finger_joints, ratio=-1)
+        self._couple_fingers(robot, -1)
         return robot
 
 
@@ -160,28 +158,20 @@ class UR5Robotiq(UR5):
             )
         for joint, driver in self._followers.items():
             self._add_gear(robot, driver, joint, ratio=-1)
-        self._add_gear(robot, *self.finger_joints, ratio=-1)
+        self._couple_fingers(robot, -1)
         return robot
 
     def set_opening(self, opening: float) -> None:
         """Set the opening of all joints of the linkage, with zero velocities."""
-        pybullet.resetJointStatesMultiDof(
-            self.id,
-            list(self._followers),
-            [[opening * self.finger_open_position]] * len(self._followers),
-            [[0.0]] * len(self._followers),
-            physicsClientId=self.client,
-        )
+        positions = [opening * self.finger_open_position] * len(self._followers)
+        self._reset_joints(list(self._followers), positions)
         super().set_opening(opening)
 
 
 def _load_joined(models: Sequence[Path], base_m: Vector, client: int) -> int:
     """Load several URDF files as one body and return its PyBullet id.
 
-    Args:
-        models: the files; a joint can connect links of different files.
-        base_m: position of the fixed base.
-        client: PyBullet's client id.
+    A joint can connect links of different files.
     """
     joined = ElementTree.Element("robot", name="+".join(model.stem for model in models))
     materials = set()

@@ -49,13 +49,7 @@ class Renderable(Protocol):
 
 @dataclass(frozen=True)
 class PosedShape:
-    """A shape at a fixed pose, visible to cameras but not simulated.
-
-    Args:
-        shape: geometry.
-        pose: of the frame of the shape in the world.
-        is_hidden: whether cameras ignore it.
-    """
+    """A shape at a fixed pose, visible to cameras but not simulated."""
 
     shape: Shape
     pose: Pose
@@ -63,11 +57,7 @@ class PosedShape:
 
 
 class SceneMesh:
-    """Triangle mesh of the visible bodies of a set, at their current poses.
-
-    Args:
-        bodies: the bodies; those that are hidden when the mesh is requested are omitted.
-    """
+    """Triangle mesh of the bodies of a set that are visible, at their current poses."""
 
     def __init__(self, bodies: Iterable[Renderable]) -> None:
         bodies = list(bodies)
@@ -109,10 +99,9 @@ class SceneMesh:
         return is_changed
 
     def recesses(self) -> np.ndarray:
-        """Return the recesses of the visible decals.
+        """Return the recesses of the visible decals, [R, 6] float64.
 
-        Returns:
-            [R, 6] float64: x, y and half edge (metres), cos and sin of the yaw, depth (metres).
+        They are x, y and half edge (metres), cos and sin of the yaw, and depth (metres).
         """
         rows = []
         for decal in self._decals:
@@ -128,11 +117,7 @@ class SceneMesh:
     ) -> None:
         """Paint the recesses of the visible decals into an orthographic height image.
 
-        Args:
-            image: [H, W], modified in place.
-            corner_m: x and y of the outer corner of pixel (0, 0), before the rotation.
-            pixel_m: edge of a pixel.
-            yaw_rad: rotation of the image about its centre.
+        ``corner_m`` is the outer corner of pixel (0, 0), before the rotation about the centre.
         """
         half_x, half_y = (size * pixel_m / 2 for size in image.shape)
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -153,11 +138,7 @@ class SceneMesh:
             )
 
     def _collect(self, shown: list[int]) -> None:
-        """Concatenate the meshes of some bodies.
-
-        Args:
-            shown: indices of the visible bodies.
-        """
+        """Concatenate the meshes of some bodies."""
         for n in shown:
             if self._meshes[n] is None:
                 self._meshes[n] = self._bodies[n].shape.mesh()
@@ -187,11 +168,7 @@ class _TopView(NamedTuple):
 
 
 class _Layer:
-    """Bodies drawn over a height image.
-
-    Args:
-        bodies: the bodies.
-    """
+    """Bodies drawn over a height image."""
 
     def __init__(self, bodies: Iterable[Renderable]) -> None:
         self._mesh = SceneMesh(bodies)
@@ -202,9 +179,7 @@ class _Layer:
     def image(self, view: _TopView, below: np.ndarray | None) -> np.ndarray:
         """Return a height image [pixels, pixels] with the bodies, drawn again only after a change.
 
-        Args:
-            view: the square that it shows.
-            below: image without the bodies; None is the floor.
+        They are drawn over the image ``below``; None is the floor.
         """
         is_changed = self._mesh.refresh()
         if is_changed or view != self._view or below is not self._below:
@@ -251,16 +226,9 @@ class HeightCamera:
     def heightmap(
         self, center_m: tuple[float, float], side_m: float, pixels: int, yaw_rad: float = 0.0
     ) -> np.ndarray:
-        """Render a height image.
+        """Render a height image, [pixels, pixels] float64 metres above the floor.
 
-        Args:
-            center_m: x and y of the centre of the image.
-            side_m: edge of the square that the image shows.
-            pixels: number of rows and columns.
-            yaw_rad: heading of the image rows; 0 is +x.
-
-        Returns:
-            [pixels, pixels] float64, metres above the floor.
+        ``yaw_rad`` is the heading of the image rows; 0 is +x.
         """
         view = _TopView(tuple(center_m), side_m, pixels, yaw_rad)
         if view != self._view or not self._layers:
@@ -275,16 +243,7 @@ class HeightCamera:
 
 
 def depth_image(meshes: Sequence[SceneMesh], lens: Lens, pixels: int) -> np.ndarray:
-    """Render a perspective depth image.
-
-    Args:
-        meshes: what is visible besides the floor and its recesses.
-        lens: the camera.
-        pixels: number of rows and columns.
-
-    Returns:
-        [pixels, pixels] float64, metres along the optical axis, at most `FAR_M`.
-    """
+    """Render depths along the optical axis, [pixels, pixels] float64 metres, at most `FAR_M`."""
     return _depth(meshes, lens, pixels, _recesses(meshes))
 
 
@@ -310,18 +269,10 @@ def visible_points(
     pixels: int,
     bounds_m: tuple[Range, Range, Range],
 ) -> np.ndarray:
-    """Return the points that perspective cameras see, one for each pixel.
+    """Return the points [N, 3] that perspective cameras see, one for each pixel of each camera.
 
-    Points of the floor inside a recess are moved down by its depth.
-
-    Args:
-        meshes: what is visible besides the floor and its recesses.
-        lenses: the cameras.
-        pixels: number of rows and columns of each camera.
-        bounds_m: ranges of x, y and z outside of which points are omitted.
-
-    Returns:
-        [N, 3] float64, metres, ordered by camera, row and column.
+    They are ordered by camera, row and column, in metres. Points of the floor inside a recess are
+    moved down by its depth, and those outside of ``bounds_m``, ranges of x, y and z, are omitted.
     """
     recesses = _recesses(meshes)
     low, high = np.array(bounds_m, dtype=float).T.copy()
@@ -343,22 +294,12 @@ def point_cloud(
     bounds_m: tuple[Range, Range, Range],
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Return a random sample of the points that cameras see, including points of the floor.
+    """Return a random sample [count, 3] float32 of the points that cameras see, metres.
 
     The points are drawn without replacement; if there are fewer than ``count``, each is repeated
-    equally often, up to one.
-
-    Args:
-        meshes: what is visible besides the floor and its recesses.
-        lenses: the cameras, such as `side_lenses`.
-        count: number of points.
-        bounds_m: ranges of x, y and z outside of which points are omitted; the lower bound of z is
-            ignored, so that the floor is included where the workspace starts above it.
-        rng: random generator; None means one with a fixed seed, so that the same scene gives the
-            same points.
-
-    Returns:
-        [count, 3] float32, metres.
+    equally often, up to one. Those outside of ``bounds_m``, ranges of x, y and z, are omitted; the
+    lower bound of z is ignored, so that the floor is included where the workspace starts above it.
+    Without a generator, the same scene gives the same points.
 
     Raises:
         ValueError: the cameras see nothing inside the bounds.
@@ -380,18 +321,9 @@ def point_cloud(
 def splat_heightmap(
     points: np.ndarray, center_m: tuple[float, float], side_m: float, pixels: int
 ) -> np.ndarray:
-    """Return the orthographic height image of points.
+    """Return the orthographic height image [pixels, pixels] of points [N, 3], metres.
 
     Pixels without points take the value of the nearest pixel with points.
-
-    Args:
-        points: [N, 3] float64, metres.
-        center_m: x and y of the centre of the image.
-        side_m: edge of the square that the image shows.
-        pixels: number of rows and columns.
-
-    Returns:
-        [pixels, pixels] float64, metres above the floor.
     """
     image = np.zeros((pixels, pixels))
     x0, y0 = center_m[0] - side_m / 2, center_m[1] - side_m / 2

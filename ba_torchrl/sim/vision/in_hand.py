@@ -14,7 +14,7 @@ import numpy as np
 
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.geometry import euler_matrix
-from ba_torchrl.sim.vision.voxels import project
+from ba_torchrl.sim.vision.kernels import project
 
 IN_HAND_MODES: Registry[type[InHandImage]] = Registry("in_hand_mode", "ba_torchrl.sim")
 
@@ -45,15 +45,7 @@ class InHandImage(ABC):
 
     @abstractmethod
     def draw(self, view: PickView, size: int) -> np.ndarray:
-        """Return the in-hand image.
-
-        Args:
-            view: the pick.
-            size: number of rows and columns.
-
-        Returns:
-            [channels, size, size] float64.
-        """
+        """Return the in-hand image of a pick, [channels, size, size] float64."""
 
 
 @IN_HAND_MODES.register("raw")
@@ -101,16 +93,10 @@ class ProjectedImage(InHandImage):
 def crop(
     heightmap: np.ndarray, center_px: tuple[float, float], size: int, rz_rad: float = 0.0
 ) -> np.ndarray:
-    """Return a rotated square of a heightmap, interpolated bilinearly and zero outside of it.
+    """Return a square [size, size] of a heightmap, interpolated bilinearly and zero outside of it.
 
-    Args:
-        heightmap: [N, N].
-        center_px: row and column of the centre of the square.
-        size: number of rows and columns of the square.
-        rz_rad: rotation of the square, from rows towards columns of the heightmap.
-
-    Returns:
-        [size, size] float64.
+    It is rotated about its centre, given in row and column, from rows towards columns of the
+    heightmap.
     """
     offset = np.arange(size) - (size - 1) / 2
     cos, sin = math.cos(rz_rad), math.sin(rz_rad)
@@ -120,11 +106,16 @@ def crop(
     limit = np.array(padded.shape) - 2.0
     rows = np.clip(rows + 1, 0, limit[0] + 1 - 1e-9)
     columns = np.clip(columns + 1, 0, limit[1] + 1 - 1e-9)
+    return bilinear(padded, rows, columns)
+
+
+def bilinear(image: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return an image at non-negative fractional rows and columns, interpolated bilinearly."""
     i, j = rows.astype(np.int64), columns.astype(np.int64)
     u, v = rows - i, columns - j
     return (
-        (1 - u) * (1 - v) * padded[i, j]
-        + u * (1 - v) * padded[i + 1, j]
-        + (1 - u) * v * padded[i, j + 1]
-        + u * v * padded[i + 1, j + 1]
+        (1 - u) * (1 - v) * image[i, j]
+        + u * (1 - v) * image[i + 1, j]
+        + (1 - u) * v * image[i, j + 1]
+        + u * v * image[i + 1, j + 1]
     )

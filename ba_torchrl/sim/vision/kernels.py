@@ -1,7 +1,10 @@
-"""Compiled kernels that rasterise triangles, the floor and points into z-buffers.
+"""Compiled kernels that rasterise triangles, the floor and points, and project voxels.
 
 Pixels are sampled at their centres. Faces are counter-clockwise seen from outside; back faces are
-culled. Numba caches each kernel on disk and loads it at its first call.
+culled. Coordinates are in metres, and images [H, W] are modified in place. A perspective camera has
+its position ``eye`` [3], the directions of the image rows, of the image columns and of the view as
+rows of ``axes`` [3, 3], and a focal length in pixels. Numba caches each kernel on disk and loads it
+at its first call.
 """
 
 # ruff: noqa: ANN001, ANN201, ANN202 -- compiled functions
@@ -14,16 +17,16 @@ import numpy as np
 
 from ba_torchrl._jit import njit
 
+TIE_TOLERANCE = 1e-9
+"""Voxels. A rotated voxel centre this close to halfway between two cells belongs to the upper one,
+so that rounding errors of the rotation do not decide."""
+
 
 @njit()
 def transform(vertices, owner, poses, out):
-    """Transform vertices into the world frame.
+    """Transform vertices [V, 3] from the frames of their bodies into the world frame.
 
-    Args:
-        vertices: [V, 3] in the frames of their bodies, metres.
-        owner: [V] index of each vertex's body.
-        poses: [B, 7] position and quaternion (x, y, z, w) of each body.
-        out: [V, 3] result.
+    ``owner`` [V] has the index of each vertex's body, ``poses`` [B, 7] position and quaternion.
     """
     for v in range(vertices.shape[0]):
         x, y, z, qx, qy, qz, qw = poses[owner[v]]
@@ -49,13 +52,7 @@ def rotate_about(vertices, x0, y0, yaw):
 def rasterize_heights(vertices, faces, x0, y0, pixel, image):
     """Rasterise faces into an orthographic height image: the maximum of old and new heights.
 
-    Args:
-        vertices: [V, 3] metres.
-        faces: [F, 3] vertex indices.
-        x0: of the outer corner of pixel (0, 0).
-        y0: of the outer corner of pixel (0, 0).
-        pixel: edge of a pixel, metres.
-        image: [H, W] heights, modified in place.
+    The outer corner of pixel (0, 0) is at (x0, y0); ``pixel`` is the edge of a pixel.
     """
     rows, cols = image.shape
     for f in range(faces.shape[0]):
@@ -93,12 +90,8 @@ def paint_square(
 ) -> None:
     """Set the pixels whose centres lie in a rotated square.
 
-    Args:
-        image: [H, W], modified in place.
-        center_px: row and column of the square's centre; that of pixel (i, j) is (i+1/2, j+1/2).
-        half_px: half the edge of the square.
-        yaw_rad: rotation from rows towards columns.
-        value: new value of the pixels.
+    The centre of the square has a row and a column; that of pixel (i, j) is (i+1/2, j+1/2). The
+    rotation is from rows towards columns.
     """
     half_diagonal = half_px * math.sqrt(2)
     x, y = center_px
@@ -119,10 +112,7 @@ def paint_square(
 def recess_depth_at(x, y, recesses):
     """Return the depth of the floor's recess at a point; 0 outside of recesses.
 
-    Args:
-        x: of the point.
-        y: of the point.
-        recesses: [R, 6] x, y, half edge, cos and sin of the yaw, and depth of square recesses.
+    A row of ``recesses`` [R, 6] has x, y, half edge, cos and sin of the yaw, and depth of a square.
     """
     depth = 0.0
     for d in range(recesses.shape[0]):
@@ -138,14 +128,6 @@ def rasterize_floor(eye, axes, focal, far, recesses, depth):
     """Set a perspective depth image to the depth of the floor.
 
     A ray that hits the floor inside a recess continues to the plane at the bottom of the recess.
-
-    Args:
-        eye: [3] position of the camera.
-        axes: [3, 3] directions of the image rows, of the image columns and of the view, as rows.
-        focal: focal length, pixels.
-        far: far plane, metres.
-        recesses: [R, 6] as for `recess_depth_at`.
-        depth: [H, W] result, metres.
     """
     rows, cols = depth.shape
     for i in range(rows):
@@ -165,17 +147,7 @@ def rasterize_floor(eye, axes, focal, far, recesses, depth):
 def _rasterize_triangle(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
     """Rasterise a triangle into a depth image: the minimum of old and new depths.
 
-    Args:
-        ap: row of corner a, pixels.
-        aq: column of corner a, pixels.
-        ad: depth of corner a, metres.
-        bp: row of corner b.
-        bq: column of corner b.
-        bd: depth of corner b.
-        cp: row of corner c.
-        cq: column of corner c.
-        cd: depth of corner c.
-        depth: [H, W] modified in place.
+    Each of the corners a, b and c has a row p and a column q (pixels) and a depth d (metres).
     """
     area = (bp - ap) * (cq - aq) - (cp - ap) * (bq - aq)
     if area <= 1e-12:
@@ -197,14 +169,7 @@ def _rasterize_triangle(ap, aq, ad, bp, bq, bd, cp, cq, cd, depth):
 def rasterize_depth(vertices, faces, eye, axes, focal, near, depth):
     """Rasterise faces into a perspective depth image: the minimum of old and new depths.
 
-    Args:
-        vertices: [V, 3] metres.
-        faces: [F, 3] vertex indices.
-        eye: [3] position of the camera.
-        axes: [3, 3] directions of the image rows, of the image columns and of the view, as rows.
-        focal: focal length, pixels.
-        near: near plane, metres, at which triangles are clipped.
-        depth: [H, W] modified in place, metres.
+    Triangles are clipped at the near plane.
     """
     rows, cols = depth.shape
     camera = np.empty_like(vertices)  # in the camera frame: along rows, along columns, depth
@@ -241,21 +206,9 @@ def rasterize_depth(vertices, faces, eye, axes, focal, near, depth):
 def unproject(depth, eye, axes, focal, recesses, low, high, out, start):
     """Convert a perspective depth image to points in the world frame.
 
-    Points of the floor inside a recess are moved down by its depth.
-
-    Args:
-        depth: [H, W] metres.
-        eye: [3] position of the camera.
-        axes: [3, 3] directions of the image rows, of the image columns and of the view, as rows.
-        focal: focal length, pixels.
-        recesses: [R, 6] as for `recess_depth_at`.
-        low: [3] lower corner of the box that the points must lie in.
-        high: [3] upper corner of this box.
-        out: [N, 3] the points are written from row ``start`` on.
-        start: first row to write.
-
-    Returns:
-        The row after the last point.
+    Points of the floor inside a recess are moved down by its depth. Those between the corners
+    ``low`` and ``high`` of a box are written to ``out`` [N, 3] from row ``start`` on. The result is
+    the row after the last point.
     """
     rows, cols = depth.shape
     count = start
@@ -277,18 +230,10 @@ def unproject(depth, eye, axes, focal, recesses, low, high, out, start):
 
 @njit()
 def splat(points, count, x0, y0, pixel, image):
-    """Set a height image to the greatest height of the points in each pixel.
+    """Set a height image to the greatest height of the first ``count`` points in each pixel.
 
     Pixels without points take the value of the nearest pixel with points. Without any points, the
-    image is unchanged.
-
-    Args:
-        points: [N, 3] metres.
-        count: number of points to use, from the start.
-        x0: of the outer corner of pixel (0, 0).
-        y0: of the outer corner of pixel (0, 0).
-        pixel: edge of a pixel, metres.
-        image: [H, W] heights, modified in place.
+    image is unchanged. The geometry of the image is that of `rasterize_heights`.
     """
     rows, cols = image.shape
     heights = np.full((rows, cols), -np.inf)
@@ -322,3 +267,56 @@ def splat(points, count, x0, y0, pixel, image):
                         if distance < best:
                             best = distance
                             image[i, j] = heights[k, column[k, j]]
+
+
+@njit()
+def project(heights, levels, rotation):
+    """Return the numbers of occupied voxels along the three axes of the tool frame, [3, n, n].
+
+    A voxel is occupied if its level [n], the height of its centre, is below the height of its pixel
+    [n, n]. Occupied voxels are rotated about the centre of the cube into the nearest cells of the
+    tool frame, whose rotation is relative to the heightmap, and the cells are filtered by a median
+    with a kernel of 2 x 2 x 2, where a tie is occupied: the kernel of cell (i, j, k) starts at
+    (i - 1, j - 1, k - 1), and the border is replicated.
+    """
+    n = len(levels)
+    middle = (n - 1) / 2
+    voxels = np.zeros((n, n, n), dtype=np.uint8)
+    for i in range(n):
+        for j in range(n):
+            a, b = i - middle, j - middle
+            for k in range(n):
+                if not heights[i, j] > levels[k]:
+                    break
+                c = k - middle
+                x = _cell(a * rotation[0, 0] + b * rotation[1, 0] + c * rotation[2, 0] + middle)
+                y = _cell(a * rotation[0, 1] + b * rotation[1, 1] + c * rotation[2, 1] + middle)
+                z = _cell(a * rotation[0, 2] + b * rotation[1, 2] + c * rotation[2, 2] + middle)
+                if 0 <= x < n and 0 <= y < n and 0 <= z < n:
+                    voxels[x, y, z] = 1
+    sums = np.zeros((3, n, n))
+    for i in range(n):
+        before_i = max(i - 1, 0)
+        for j in range(n):
+            before_j = max(j - 1, 0)
+            previous = 0
+            for k in range(n):
+                count = (
+                    voxels[before_i, before_j, k]
+                    + voxels[before_i, j, k]
+                    + voxels[i, before_j, k]
+                    + voxels[i, j, k]
+                )
+                if k == 0:
+                    previous = count
+                if previous + count >= 4:
+                    sums[0, j, k] += 1
+                    sums[1, i, k] += 1
+                    sums[2, i, j] += 1
+                previous = count
+    return sums
+
+
+@njit(inline="always")
+def _cell(position):
+    return math.floor(position + 0.5 + TIE_TOLERANCE)

@@ -22,10 +22,7 @@ FAR_M = 10.0
 class Lens:
     """Pose and field of view of a perspective camera with square images.
 
-    Args:
-        eye_m: position of the camera.
-        target_m: point at the centre of the image.
-        fov_rad: field of view between opposite edges of the image.
+    The field of view is between opposite edges of the image.
     """
 
     eye_m: Vector
@@ -44,33 +41,18 @@ class Lens:
         return np.stack([down, np.cross(down, forward), forward])
 
     def focal_px(self, pixels: int) -> float:
-        """Return the focal length in pixels.
-
-        Args:
-            pixels: number of rows and columns of the image.
-        """
+        """Return the focal length in pixels."""
         return pixels / 2 / math.tan(self.fov_rad / 2)
 
     def heights_m(self, depth: np.ndarray) -> np.ndarray:
-        """Convert a depth image to heights above the floor.
-
-        Args:
-            depth: [N, N] metres.
-
-        Returns:
-            [N, N] metres.
-        """
+        """Convert a depth image [N, N] to heights above the floor, metres."""
         pixels = len(depth)
         offsets = (np.arange(pixels) + 0.5 - pixels / 2) / self.focal_px(pixels)
         slope = self.axes[2, 2] + offsets[:, None] * self.axes[0, 2] + offsets * self.axes[1, 2]
         return self.eye_m[2] + depth * slope
 
     def plane_depth_range_m(self, z_m: float) -> Range:
-        """Return the least and greatest depth of a horizontal plane in the image.
-
-        Args:
-            z_m: height of the plane.
-        """
+        """Return the least and greatest depth of a horizontal plane in the image."""
         edge = math.tan(self.fov_rad / 2)
         descents = [
             -(self.axes[2, 2] + p * self.axes[0, 2] + q * self.axes[1, 2])
@@ -84,22 +66,13 @@ class Lens:
 
 
 def oblique_lens(center_m: tuple[float, float]) -> Lens:
-    """Return the camera opposite the robot, 0.81 m from the workspace centre at 47 degrees.
-
-    Args:
-        center_m: x and y of the workspace centre.
-    """
+    """Return the camera opposite the robot, 0.81 m from the workspace centre at 47 degrees."""
     x, y = center_m
     return Lens((x + 0.55, y, 0.6), (x, y, 0.0), math.radians(40))
 
 
 def side_lenses(center_m: tuple[float, float], width_m: float) -> tuple[Lens, Lens]:
-    """Return two cameras at y offsets of -0.5 and 0.5 m, 1 m high, that show a square of the floor.
-
-    Args:
-        center_m: x and y of the centre of the square.
-        width_m: edge of the square.
-    """
+    """Return two cameras at y offsets of -0.5 and 0.5 m, 1 m high, that show a square."""
     x, y = center_m
     # the corners of the edge closest to the camera determine the field of view
     below, lateral = 1.0, 0.5 - width_m / 2

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pybullet
 
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.shapes import Decal
-from ba_torchrl.sim.vision.framing import Viewpoint
+from ba_torchrl.sim.vision.in_hand import bilinear
 from ba_torchrl.sim.vision.lens import Lens
 from ba_torchrl.sim.world import World
 
@@ -39,6 +40,56 @@ FOV_DEG = 28.0
 """Vertical field of view of `render_rgb`."""
 
 
+class Viewpoint(NamedTuple):
+    """A camera pose that looks at a target."""
+
+    target_m: Vector
+    """Point at the centre of the image."""
+    distance_m: float
+    """From the target to the camera."""
+    yaw_deg: float
+    pitch_deg: float
+    """Negative angles look down."""
+
+    def view_matrix(self) -> tuple[float, ...]:
+        """Return PyBullet's view matrix."""
+        return pybullet.computeViewMatrixFromYawPitchRoll(*self, 0.0, 2)
+
+
+def fit_viewpoint(
+    points_m: np.ndarray,
+    yaw_deg: float,
+    pitch_deg: float,
+    fov_deg: float,
+    aspect: float,
+    margin: float = 0.0,
+) -> Viewpoint:
+    """Return the nearest camera pose at which an image of a perspective camera shows all points.
+
+    Where the image is wider than the points [N, 3], they are near its centre. Where it is higher,
+    the lowest point is at the lower margin, which leaves space for the arm above. The margin is a
+    fraction of the width and height of the image.
+    """
+    view = Viewpoint((0.0, 0.0, 0.0), 1.0, yaw_deg, pitch_deg).view_matrix()
+    axes = np.reshape(view, (4, 4)).T[:3, :3]  # rows: right, up, backward
+    right, up, backward = axes @ np.asarray(points_m, dtype=float).T
+    half_height = (1 - 2 * margin) * math.tan(math.radians(fov_deg) / 2)
+    half_width = half_height * aspect
+    # In camera axes with the camera at c, the right edge requires
+    # right - c_right <= half_width * (c_backward - backward); the other edges are similar.
+    to_right = (right + half_width * backward).max()
+    to_left = (half_width * backward - right).max()
+    to_top = (up + half_height * backward).max()
+    to_bottom = (half_height * backward - up).max()
+    c_backward = max(
+        (to_right + to_left) / (2 * half_width), (to_top + to_bottom) / (2 * half_height)
+    )
+    camera = np.array([(to_right - to_left) / 2, half_height * c_backward - to_bottom, c_backward])
+    distance = float(c_backward - (backward.min() + backward.max()) / 2)
+    target = (camera - (0.0, 0.0, distance)) @ axes
+    return Viewpoint(tuple(target.tolist()), distance, yaw_deg, pitch_deg)
+
+
 def render_rgb(
     world: World,
     viewpoint: Viewpoint,
@@ -46,17 +97,9 @@ def render_rgb(
     height: int = 360,
     floor_rgb: tuple[float, float, float] | None = DEFAULT_FLOOR_RGB,
 ) -> np.ndarray:
-    """Render the scene with the robot, in colour and with shadows on the floor.
+    """Render the scene with the robot and shadows on the floor, [height, width, 3] uint8.
 
-    Args:
-        world: the scene.
-        viewpoint: pose of the camera.
-        width: number of columns.
-        height: number of rows.
-        floor_rgb: colour of the floor, each component from 0 to 1; None keeps that of PyBullet.
-
-    Returns:
-        [height, width, 3] uint8.
+    The components of the floor's colour are from 0 to 1; None keeps that of PyBullet.
     """
     view = viewpoint.view_matrix()
     projection = pybullet.computeProjectionMatrixFOV(FOV_DEG, width / height, 0.05, 10.0)
@@ -75,16 +118,10 @@ def render_rgb(
 
 
 def render_rgbd(world: World, lens: Lens, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render a colour and a depth image of the scene with the robot.
+    """Render colours and depths of the scene with the robot.
 
-    Args:
-        world: the scene.
-        lens: the camera, such as `ba_torchrl.sim.vision.lens.oblique_lens`.
-        pixels: number of rows and columns.
-
-    Returns:
-        Colours, [pixels, pixels, 3] uint8, and depths along the optical axis, [pixels, pixels]
-        float64 metres, at most the far plane of `RGBD_RANGE_M`.
+    They are [pixels, pixels, 3] uint8, and [pixels, pixels] float64 metres along the optical axis,
+    at most the far plane of `RGBD_RANGE_M`.
     """
     near, far = RGBD_RANGE_M
     view = pybullet.computeViewMatrix(lens.eye_m, lens.target_m, (-lens.axes[0]).tolist())
@@ -104,18 +141,9 @@ def _render(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render an image with TinyRenderer.
 
-    Args:
-        world: the scene.
-        width: number of columns.
-        height: number of rows.
-        view: PyBullet's view matrix.
-        projection: PyBullet's projection matrix.
-        links: distinguish the links of a body in the segmentation.
-
-    Returns:
-        Colours [H, W, 3] uint8, PyBullet's depth buffer [H, W] and the segmentation [H, W]:
-        PyBullet's body id, or -1 for none. With ``links``, the bits from 24 on are the link index
-        plus one.
+    Return colours [H, W, 3] uint8, PyBullet's depth buffer [H, W] and the segmentation [H, W]:
+    PyBullet's body id, or -1 for none. With ``links``, the bits from 24 on are the link index plus
+    one.
     """
     projection = list(projection)
     # TinyRenderer samples pixels half a pixel away from their centres
@@ -146,18 +174,7 @@ def _decals(world: World) -> list[int]:
 def _floor_points(
     view: Sequence[float], width: int, height: int, rows: np.ndarray, cols: np.ndarray
 ) -> np.ndarray:
-    """Return the points of the floor that pixels show.
-
-    Args:
-        view: PyBullet's view matrix.
-        width: number of columns of the image.
-        height: number of rows of the image.
-        rows: [N] of the pixels.
-        cols: [N] of the pixels.
-
-    Returns:
-        [N, 2] x and y, metres.
-    """
+    """Return x and y [N, 2] of the points of the floor that pixels show, metres."""
     pose = np.reshape(view, (4, 4)).T
     rotation = pose[:3, :3]  # rows: right, up, backward
     eye = -rotation.T @ pose[:3, 3]
@@ -169,16 +186,7 @@ def _floor_points(
 
 
 def _shadow(world: World, target_m: Vector, points: np.ndarray) -> np.ndarray:
-    """Return the fraction of the light that is blocked at points of the floor.
-
-    Args:
-        world: the scene.
-        target_m: point at the centre of the image.
-        points: [N, 2] x and y, metres.
-
-    Returns:
-        [N] from 0 (lit) to 1 (full shadow).
-    """
+    """Return the share of the light, 0 to 1, that is blocked at points [N, 2] of the floor."""
     size, half = _SHADOW_PIXELS, _SHADOW_WIDTH_M / 2
     toward = np.array(_LIGHT_DIRECTION) / np.linalg.norm(_LIGHT_DIRECTION)
     right = np.cross((1.0, 0.0, 0.0), toward)
@@ -196,14 +204,7 @@ def _shadow(world: World, target_m: Vector, points: np.ndarray) -> np.ndarray:
     scale = size / _SHADOW_WIDTH_M * _LIGHT_DISTANCE_M / -(offset @ toward)
     col = np.clip(size / 2 + offset @ right * scale - 0.5, 0, size - 1.001)
     row = np.clip(size / 2 - offset @ up * scale - 0.5, 0, size - 1.001)
-    i, j = row.astype(int), col.astype(int)
-    u, v = row - i, col - j
-    return (
-        (1 - u) * (1 - v) * soft[i, j]
-        + u * (1 - v) * soft[i + 1, j]
-        + (1 - u) * v * soft[i, j + 1]
-        + u * v * soft[i + 1, j + 1]
-    )
+    return bilinear(soft, row, col)
 
 
 def _blurred(image: np.ndarray) -> np.ndarray:
@@ -219,12 +220,7 @@ def _blurred(image: np.ndarray) -> np.ndarray:
 
 
 def _smooth_edges(image: np.ndarray, segmentation: np.ndarray) -> np.ndarray:
-    """Return an image with the borders between its segments blurred (anti-aliasing).
-
-    Args:
-        image: [H, W, 3] colours.
-        segmentation: [H, W] from `_render`.
-    """
+    """Return an image with the borders between its segments blurred (anti-aliasing)."""
     edge = np.zeros(segmentation.shape, dtype=bool)
     for axis in (0, 1):
         differs = np.diff(segmentation, axis=axis) != 0

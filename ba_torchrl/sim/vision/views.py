@@ -29,14 +29,17 @@ from typing import ClassVar
 import numpy as np
 
 from ba_torchrl.registry import Registry
-from ba_torchrl.sim.geometry import YawPose
+from ba_torchrl.sim.geometry import Pose, YawPose, yaw_quaternion
+from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
+    PosedShape,
+    SceneMesh,
     depth_image,
     splat_heightmap,
     visible_points,
 )
-from ba_torchrl.sim.vision.fingers import FINGER_SQUARE_HALF_M, draw_fingers, finger_boxes
+from ba_torchrl.sim.vision.kernels import paint_square
 from ba_torchrl.sim.vision.lens import Lens, Range, oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import render_rgbd
 from ba_torchrl.sim.world import World
@@ -50,6 +53,51 @@ FIXED_CAMERA_CLEARANCE_M = 0.04
 default."""
 
 
+FINGER_SQUARE_HALF_M = 5 * 0.3 / 128
+"""Half the edge of the square that represents a finger."""
+FINGER_LENGTH_M = 0.1
+"""Height of the box that represents a finger in oblique views."""
+
+
+def finger_boxes(tool: YawPose, offset_m: float) -> SceneMesh:
+    """Return the mesh of two boxes that represent the fingers.
+
+    Their lower ends have the height of the tool, their axes the distance ``offset_m`` from it.
+    """
+    (x, y, z), yaw = tool
+    box = Box(size_m=(2 * FINGER_SQUARE_HALF_M, 2 * FINGER_SQUARE_HALF_M, FINGER_LENGTH_M))
+    return SceneMesh(
+        PosedShape(
+            box,
+            Pose(
+                (x + side * math.cos(yaw), y + side * math.sin(yaw), z + FINGER_LENGTH_M / 2),
+                yaw_quaternion(yaw),
+            ),
+        )
+        for side in (-offset_m, offset_m)
+    )
+
+
+def draw_fingers(
+    image: np.ndarray,
+    tool_px: tuple[float, float],
+    offset_px: float,
+    half_px: float,
+    yaw_rad: float,
+    value: float,
+) -> None:
+    """Paint the squares that represent the fingers into an image.
+
+    Args:
+        tool_px: row and column of the tool point.
+        offset_px: distance between each square's centre and the tool point.
+        yaw_rad: heading of the closing axis, from rows towards columns.
+    """
+    for side in (-offset_px, offset_px):
+        center = (tool_px[0] + side * math.cos(yaw_rad), tool_px[1] + side * math.sin(yaw_rad))
+        paint_square(image, center, half_px, yaw_rad, value)
+
+
 @dataclass(frozen=True)
 class ViewSetup:
     """Parameters that are the same for all images of an environment.
@@ -57,9 +105,7 @@ class ViewSetup:
     Args:
         center_m: x and y of the workspace centre.
         z_m: lower and upper bound of z in the workspace.
-        workspace_m: width of the workspace.
         width_m: width of the square that an orthographic image shows.
-        pixels: number of rows and columns.
         camera_height_m: height above the tool of cameras that follow the tool.
         finger_span_m: distance between the squares of the fully open fingers.
     """
@@ -80,15 +126,7 @@ class ViewSetup:
 
 @dataclass(frozen=True)
 class ViewInput:
-    """The state of the scene from which an image is rendered.
-
-    Args:
-        setup: parameters of the view.
-        world: used for colour images.
-        camera: used for depth and height images.
-        tool: position and yaw of the tool.
-        opening: of the gripper, 0 to 1.
-    """
+    """The state of the scene from which an image is rendered."""
 
     setup: ViewSetup
     world: World
@@ -174,18 +212,7 @@ class TopDown(View):
         turn_rad: float,
         camera_z_m: float,
     ) -> np.ndarray:
-        """Convert a height image to the values of the view and draw the fingers.
-
-        Args:
-            scene: the scene.
-            heights: [H, W] metres.
-            center_m: x and y of the centre of the image.
-            turn_rad: heading of the image rows.
-            camera_z_m: height of the camera.
-
-        Returns:
-            [1, H, W] metres.
-        """
+        """Convert heights [H, W] to the values [1, H, W] of the view and draw the fingers."""
         setup, ((x, y, z), yaw) = scene.setup, scene.tool
         low, high = self.range_m(setup)
         if self.shows_height:
@@ -212,10 +239,8 @@ class PointSplat(View):
     """Points seen by two cameras at the sides of the workspace, projected from above the tool.
 
     Only points below the fingers are used, as the arm of a real robot would occlude others. Pixels
-    without points take the value of the nearest pixel with points.
-
-    Args:
-        shows_height: use heights above the floor as values instead of depths below the tool.
+    without points take the value of the nearest pixel with points. Values are depths below the tool
+    or heights above the floor.
     """
 
     shows_height: bool
@@ -260,9 +285,6 @@ class PerspectiveTopDown(View):
 
     The values are depths along the optical axis, so that the floor has a constant value. The
     fingers are drawn at the projections of their tips.
-
-    Args:
-        fov_rad: field of view.
     """
 
     fov_rad: float
@@ -293,9 +315,7 @@ class PerspectiveTopDown(View):
 class Oblique(View):
     """A perspective camera opposite the robot that looks at the workspace centre.
 
-    Args:
-        shows_height: use heights above the floor as values instead of depths along the optical
-            axis.
+    Values are depths along the optical axis or heights above the floor.
     """
 
     shows_height: bool

@@ -11,7 +11,7 @@ import numpy as np
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, vertical_extent
-from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from ba_torchrl.sim.geometry import Pose, Vector
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS

@@ -9,7 +9,7 @@ import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from ba_torchrl.sim.geometry import (
     PlanarFrame,
     Pose,

@@ -6,8 +6,7 @@ import math
 
 from ba_torchrl.actions import MAX_TILT_RAD
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.control.approach import approach_point, plan_approach
-from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.pick_place import PickPlaceLimits, approach_point, plan_approach
 from ba_torchrl.sim.geometry import (
     Pose,
     Quaternion,

@@ -47,13 +47,6 @@ def test_graspnet_takes_one_object_from_each_folder(tmp_path):
     assert volume == pytest.approx(0.02 * 0.03 * (0.08 + 0.06), rel=0.2)
 
 
-def test_the_textured_mesh_file_is_preferred(tmp_path):
-    root = write_objects(tmp_path / "models", a=box_mesh((0.05, 0.05, 0.05)))
-    write_obj(tmp_path / "models/a/nontextured.obj", [box_mesh((0.04, 0.04, 0.04))])
-    extents = np.ptp(load_object_set("graspnet", root)[0].mesh().vertices, axis=0)
-    np.testing.assert_allclose(extents, 0.04)
-
-
 def test_a_folder_is_needed_and_must_hold_meshes(tmp_path):
     with pytest.raises(ConfigError, match=r"asset_root.*sub-folder"):
         load_object_set("graspnet")

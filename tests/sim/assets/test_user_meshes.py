@@ -11,7 +11,7 @@ import pytest
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.assets import graspnet, hulls
 from ba_torchrl.sim.assets.base import load_object_set
-from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, write_obj
+from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes
 
 CORNERS = [(0, 0), (60, 0), (60, 30), (30, 30), (30, 60), (0, 60)]  # mm, of an L
 VERTICES = [(x / 1000, y / 1000, z) for z in (0.0, 0.04) for x, y in CORNERS]
@@ -308,14 +308,3 @@ def test_walls_that_become_thicker_are_reported(tmp_path, caplog):
         shape = load(tmp_path, Mesh(np.asarray(tube.vertices), np.asarray(tube.faces)))
     assert volume(shape) > 1.5 * tube.volume
     assert "walls thinner than" in caplog.text
-
-
-@pytest.mark.parametrize("count", [2500, 30_000])
-def test_dense_convex_meshes_are_simplified(tmp_path, count):
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    points *= (0.02, 0.03, 0.04) / np.linalg.norm(points, axis=1, keepdims=True)
-    (tmp_path / "007").mkdir()
-    write_obj(tmp_path / "007" / "a.obj", [hulls.convex_hull(points)])
-    (part,) = load_object_set("graspnet", str(tmp_path))[0].parts
-    assert len(part.vertices) <= hulls.MAX_HULL_VERTICES
-    np.testing.assert_allclose(np.ptp(part.vertices, axis=0), (0.04, 0.06, 0.08), rtol=0.01)

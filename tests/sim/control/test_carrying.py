@@ -6,8 +6,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.control.close_loop import CloseLoopController
-from ba_torchrl.sim.control.held_body import pose_in_tool_frame, slip
+from ba_torchrl.sim.control.close_loop import CloseLoopController, pose_in_tool_frame, slip
 from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box

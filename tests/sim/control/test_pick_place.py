@@ -7,9 +7,8 @@ import pybullet
 import pytest
 
 from ba_torchrl.sim.bodies import vertical_extent
-from ba_torchrl.sim.control.limits import PickPlaceLimits
-from ba_torchrl.sim.control.pick_place import PickPlace
-from ba_torchrl.sim.control.tool_motion import PEAK_ACCELERATION, quintic_time_scaling
+from ba_torchrl.sim.control.close_loop import quintic_time_scaling
+from ba_torchrl.sim.control.pick_place import PEAK_ACCELERATION, PickPlace, PickPlaceLimits
 from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
@@ -292,21 +291,6 @@ def test_peak_acceleration_of_quintic_time_scaling():
     assert values[-1] == 1.0
     assert np.abs(acceleration).max() == pytest.approx(PEAK_ACCELERATION, rel=1e-3)
     assert PickPlaceLimits().held_acceleration_m_s2 < PickPlaceLimits().acceleration_m_s2
-
-
-def test_tool_rotation_is_a_product_of_rotations():
-    rz, ry, rx = 0.7, -0.3, 0.4
-    turns = [
-        np.reshape(
-            pybullet.getMatrixFromQuaternion(pybullet.getQuaternionFromAxisAngle(axis, angle)),
-            (3, 3),
-        )
-        for axis, angle in (((0, 0, 1), rz), ((0, 1, 0), ry), ((1, 0, 0), rx))
-    ]
-    down = np.diag([1.0, -1.0, -1.0])
-    np.testing.assert_allclose(
-        tool_rotation(rz, ry, rx), turns[0] @ turns[1] @ turns[2] @ down, atol=1e-6
-    )
 
 
 @pytest.mark.parametrize("rise_m", [0.0, 1e-4, 3e-4])

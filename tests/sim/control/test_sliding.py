@@ -12,8 +12,7 @@ from ba_torchrl.sim.contacts import (
     vertical_direction,
     vertical_force_n,
 )
-from ba_torchrl.sim.control.close_loop import CloseLoopController
-from ba_torchrl.sim.control.paths import Path
+from ba_torchrl.sim.control.close_loop import CloseLoopController, Path
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World

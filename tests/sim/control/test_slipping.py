@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from ba_torchrl.sim.control.limits import PickPlaceLimits
+from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from tests.sim.control.ramp_scene import CUBE_M, LONG_M, RampScene
 
 TILT_RAD = 0.5

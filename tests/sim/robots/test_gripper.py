@@ -7,8 +7,8 @@ import pybullet
 import pytest
 
 from ba_torchrl.sim.geometry import downward, tool_rotation
-from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.robots.gripper import GRASP_HEIGHT_M, Gripper, measured_gripper
+from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
+from ba_torchrl.sim.robots.gripper import GRASP_HEIGHT_M, Gripper
 from ba_torchrl.sim.world import World
 
 POSITION = (0.45, 0.0, 0.25)

@@ -4,8 +4,7 @@ import pybullet
 import pytest
 
 import ba_torchrl
-from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.robots.sleep import RobotSleep
+from ba_torchrl.sim.robots.base import ROBOTS, RobotSleep
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import Physics, World
 

@@ -14,7 +14,6 @@ from ba_torchrl.sim.vision.depth import (
     PosedShape,
     SceneMesh,
     depth_image,
-    paint_square,
 )
 from ba_torchrl.sim.vision.lens import Lens, oblique_lens, side_lenses
 from ba_torchrl.sim.world import World
@@ -67,28 +66,6 @@ def test_a_tilted_box_shows_its_slope():
         np.testing.assert_allclose(image[:, 50], expected, atol=1e-9)
 
 
-def test_recesses_appear_only_where_the_floor_is_visible():
-    with World() as world:
-        box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
-        goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), "goal")
-        box.place((0.02, 0.0, 0.025))
-        goal.place((0.0, 0.0, 0.0))
-        image = HeightCamera([box, goal]).heightmap((0.0, 0.0), 0.2, 100)
-    assert image[60, 50] == pytest.approx(0.05)
-    assert image[30, 50] == pytest.approx(-0.02)
-    assert image[10, 50] == 0.0
-
-
-def test_paint_square_turns_with_the_image():
-    image = np.zeros((32, 32))
-    paint_square(image, (16 + 6.0, 16 - 3.0), 4.0, 0.3, 1.0)
-    turned = np.zeros((32, 32))
-    # +90 degrees about z: (row, column) offsets (6, -3) become (3, 6)
-    paint_square(turned, (16 + 3.0, 16 + 6.0), 4.0, 0.3 + math.pi / 2, 1.0)
-    np.testing.assert_array_equal(np.rot90(image), turned)
-    assert image.sum() == pytest.approx(64, abs=6)
-
-
 def test_a_rotated_camera_equals_a_world_rotated_the_other_way():
     yaw, (cx, cy) = 0.7, (0.42, 0.03)
     things = [((0.07, 0.03), 0.2), ((-0.06, 0.05), 1.1)]
@@ -111,16 +88,6 @@ def test_a_rotated_camera_equals_a_world_rotated_the_other_way():
         images.append(camera.heightmap((cx, cy), 0.3, 96, yaw if turned else 0.0))
     np.testing.assert_allclose(images[0], images[1], atol=1e-12)
     assert {-0.02, 0.0, 0.05} == set(images[0].round(9).ravel())
-
-
-def test_a_rotated_camera_equals_analytic_boxes():
-    size, yaw = (0.12, 0.03, 0.02), 2.2
-    box = placed(size, (0.02, 0.05, 0.01), yaw_quaternion(0.5))
-    image = HeightCamera([box]).heightmap((0.0, 0.0), 0.2, 64, yaw)
-    x = math.cos(yaw) * 0.02 + math.sin(yaw) * 0.05
-    y = math.cos(yaw) * 0.05 - math.sin(yaw) * 0.02
-    expected = box_heights([((x, y), 0.5 - yaw, size, 0.02)], (0.0, 0.0), 0.2, 64)
-    np.testing.assert_allclose(image, expected, atol=1e-9)
 
 
 def test_hidden_bodies_are_left_out_until_they_are_shown_again():

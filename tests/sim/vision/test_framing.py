@@ -6,7 +6,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.sim.vision.framing import fit_viewpoint
+from ba_torchrl.sim.vision.rgb import fit_viewpoint
 
 FOV_DEG = 40.0
 BOX = np.array(list(itertools.product((0.25, 0.65), (-0.2, 0.2), (0.0, 0.15))))
@@ -22,7 +22,7 @@ def image_coordinates(points, viewpoint, aspect):
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.1])
-@pytest.mark.parametrize("aspect", [0.5, 1.0, 4 / 3, 4.0])
+@pytest.mark.parametrize("aspect", [0.5, 4.0])
 @pytest.mark.parametrize(("yaw_deg", "pitch_deg"), [(78, -33), (-20, -60), (200, -5)])
 def test_the_points_fill_the_image_up_to_the_margin(yaw_deg, pitch_deg, aspect, margin):
     viewpoint = fit_viewpoint(BOX, yaw_deg, pitch_deg, FOV_DEG, aspect, margin)

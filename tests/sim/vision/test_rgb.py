@@ -4,9 +4,8 @@ import numpy as np
 
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import SceneMesh, depth_image
-from ba_torchrl.sim.vision.framing import Viewpoint
 from ba_torchrl.sim.vision.lens import oblique_lens
-from ba_torchrl.sim.vision.rgb import render_rgb, render_rgbd
+from ba_torchrl.sim.vision.rgb import Viewpoint, render_rgb, render_rgbd
 from ba_torchrl.sim.world import World
 from tests.sim.vision.boxes import CENTER, ray_depths
 

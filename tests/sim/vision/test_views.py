@@ -10,10 +10,10 @@ from ba_torchrl.errors import UnknownNameError
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera, PosedShape
-from ba_torchrl.sim.vision.fingers import FINGER_SQUARE_HALF_M
 from ba_torchrl.sim.vision.kernels import paint_square
 from ba_torchrl.sim.vision.lens import oblique_lens
 from ba_torchrl.sim.vision.views import (
+    FINGER_SQUARE_HALF_M,
     MAX_RECESS_M,
     VIEWS,
     ViewInput,

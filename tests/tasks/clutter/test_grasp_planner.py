@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ba_torchrl.sim.geometry import Pose
-from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.robots.gripper import Gripper, measured_gripper
+from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
+from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.clutter import grasp_planner
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M, DEEPEST_M, PIXEL_M, GraspPlanner
