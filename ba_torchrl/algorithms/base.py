@@ -65,8 +65,6 @@ class Algorithm(ABC):
     exploration type RANDOM and is greedy under DETERMINISTIC."""
     updates: int = 0
     """Gradient updates so far."""
-    collects_expert_action: ClassVar[bool] = False
-    """Whether the expert's action is collected in every state that the policy visits."""
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the action nearest to a given one among those that the policy can choose.
@@ -80,12 +78,12 @@ class Algorithm(ABC):
         return action
 
     @abstractmethod
-    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDictBase:
+    def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDictBase:
         """Return collected data as the transitions [N] that the replay stores.
 
         Args:
             data: steps of any batch shape, those of an episode in order.
-            is_expert: whether they are demonstrations.
+            is_demonstration: whether they are demonstrations.
         """
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
@@ -95,7 +93,7 @@ class Algorithm(ABC):
             episodes: TensorDicts [T].
         """
         for episode in episodes:
-            self.extend(self.to_transitions(episode, is_expert=True))
+            self.extend(self.to_transitions(episode, is_demonstration=True))
 
     @abstractmethod
     def extend(self, transitions: TensorDictBase) -> None:

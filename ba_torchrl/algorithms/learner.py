@@ -30,7 +30,7 @@ from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device, decoded_on_device, to_device
-from ba_torchrl.data.transitions import as_transitions
+from ba_torchrl.data.transitions import WITH_TARGET, as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
@@ -130,7 +130,7 @@ class Learner(Algorithm):
             name = ALGORITHMS.name_of(type(self.config))
             raise ConfigError(f"init: algorithm {name!r} has no actor for cloning to initialise")
         loss = BehaviourCloningLoss(policy, "kl", self.config.init_entropy_weight)
-        loss.set_keys(action=keys.EXPERT_ACTION if self.has_expert_action else keys.ACTION)
+        loss.set_keys(action=keys.TARGET_ACTION)
         return loss
 
     def make_acting_transforms(self) -> Mapping[str, nn.Module]:
@@ -201,32 +201,15 @@ class Learner(Algorithm):
 
     # -- data --------------------------------------------------------------------------------
 
-    @property
-    def imitates_demonstrations(self) -> bool:
-        """Whether a term of the loss is for transitions with ``is_expert`` only, by default True.
-        Without such a term, random actions of demonstrations count as demonstrations too."""
-        return True
-
-    @property
-    def has_expert_action(self) -> bool:
-        """Whether stored transitions have ``expert_action``, the action that is imitated, beside
-        the executed one; by default if it is collected, and with ``init="bc"``."""
-        return self.collects_expert_action or self.config.init == "bc"
-
-    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+    def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
         """Return collected data as the transitions [N] that the replay stores.
 
         Raises:
             KeyError: an entry is missing.
         """
-        label = None
-        if self.has_expert_action:
-            is_labelled = self.collects_expert_action and not is_expert
-            is_labelled |= keys.EXPERT_ACTION in data
-            label = keys.EXPERT_ACTION if is_labelled else keys.ACTION
-        if is_expert and not self.imitates_demonstrations:
-            data = data.exclude(keys.IS_EXPERT)
-        return as_transitions(data, self.images, is_expert=is_expert, label=label)
+        return as_transitions(
+            data, self.images, is_demonstration=is_demonstration, imitates=self.config.imitates
+        )
 
     def extend(self, transitions: TensorDictBase) -> None:
         """Add transitions [N], and augmented copies if configured, to the replay, except those with
@@ -251,7 +234,11 @@ class Learner(Algorithm):
         if sampler is not None:
             sampler.anneal(self._annealing_progress())
         batch, device = self.replay.sample(), self.problem.device
-        rows = batch[keys.IS_EXPERT].reshape(-1).nonzero()[:, 0] if demonstrations_only else None
+        rows = (
+            batch[keys.IS_DEMONSTRATION].reshape(-1).nonzero()[:, 0]
+            if demonstrations_only
+            else None
+        )
         if device.type == "cpu":
             batch = self.augmentation(batch)
         else:
@@ -390,10 +377,12 @@ class Learner(Algorithm):
             ConfigError: its transitions have other entries than those of this learner.
         """
         self.replay.loads(folder)
-        is_stored = keys.EXPERT_ACTION in self.replay.stored_keys
-        if len(self.replay) and is_stored != self.has_expert_action:
-            raise ConfigError(
-                f"the saved transitions {'have' if is_stored else 'lack'} the entry "
-                f"{keys.EXPERT_ACTION!r}: another version of the library wrote them; start the run "
-                "again in another run_dir"
-            )
+        has_target = self.config.imitates in WITH_TARGET
+        expected = {keys.IS_DEMONSTRATION: True, keys.TARGET_ACTION: has_target}
+        for key, is_expected in expected.items():
+            if len(self.replay) and (key in self.replay.stored_keys) != is_expected:
+                raise ConfigError(
+                    f"the saved transitions {'lack' if is_expected else 'have'} the entry {key!r}: "
+                    "another version of the library wrote them; start the run again in another "
+                    "run_dir"
+                )

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from ba_torchrl.algorithms.base import AlgorithmConfig, NetworkConfig
 from ba_torchrl.config import changed
 from ba_torchrl.data.replay.make import ReplayKind
+from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 
 Init = Literal["random", "bc"]
@@ -84,6 +85,12 @@ class LearnerConfig(AlgorithmConfig):
             yield from changed(self, _OF_PRIORITIES, "without replay='prioritized'")
         elif self.importance_weighted == "none":
             yield from changed(self, ["importance_norm"], "with importance_weighted='none'")
+
+    @property
+    def imitates(self) -> Imitation:
+        """Which action the loss imitates, and on which transitions; by default the executed action
+        of demonstrations, and with ``init="bc"`` the expert's."""
+        return "expert" if self.init == "bc" else "executed"
 
     @property
     def init_entropy_weight(self) -> float:

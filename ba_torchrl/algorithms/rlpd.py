@@ -25,6 +25,7 @@ from ba_torchrl.algorithms.learner_config import LearnerConfig
 from ba_torchrl.algorithms.seeds import SeedUse
 from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
@@ -75,6 +76,11 @@ class RLPDConfig(LearnerConfig):
             yield from changed(self, ["augmentation_probability"], "without augmentation")
 
     @property
+    def imitates(self) -> Imitation:
+        """No action, except with ``init="bc"``: all transitions have the same loss."""
+        return "expert" if self.init == "bc" else "none"
+
+    @property
     def init_entropy_weight(self) -> float:
         """The initial entropy temperature, so that the cloned policy explores."""
         return self.alpha_init
@@ -104,11 +110,6 @@ class RLPD(Learner):
 
     config: RLPDConfig
     loss: RLPDLoss
-
-    @property
-    def imitates_demonstrations(self) -> bool:
-        """False: half of every batch is demonstrations, and all transitions have the same loss."""
-        return False
 
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and ensemble."""

@@ -31,6 +31,7 @@ from ba_torchrl.data.augmentation.views import (
 )
 from ba_torchrl.data.episode_assembler import EpisodeAssembler
 from ba_torchrl.data.files import read_state, write_state
+from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
@@ -140,6 +141,11 @@ class SACConfig(LearnerConfig):
             yield f"contrastive_weight has no effect on the encoder of the policy of {name!r}"
 
     @property
+    def imitates(self) -> Imitation:
+        """The expert's action, on demonstrations: the behaviour term."""
+        return "expert"
+
+    @property
     def init_entropy_weight(self) -> float:
         """The initial entropy temperature, so that the cloned policy explores."""
         return self.alpha_init
@@ -233,7 +239,7 @@ class SAC(Learner):
             target_views=config.target_views,
             contrastive=self._make_contrastive(networks.encoder),
         )
-        loss.set_keys(expert_action=keys.EXPERT_ACTION)
+        loss.set_keys(target_action=keys.TARGET_ACTION)
         if not config.bootstrap_truncated:
             loss.set_keys(terminated=loss.tensor_keys.done)
         return loss.make_value_estimator(gamma=config.gamma)
@@ -320,22 +326,17 @@ class SAC(Learner):
             seed=self.problem.derived_seed(use),
         )
 
-    @property
-    def has_expert_action(self) -> bool:
-        """True: the behaviour term reads it."""
-        return True
-
-    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+    def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
         """Return collected data as the transitions [N] that the replay stores; if successes are
         imitated, those of the episodes that have ended."""
-        if is_expert or self.episodes is None:
-            return super().to_transitions(data, is_expert=is_expert)
+        if is_demonstration or self.episodes is None:
+            return super().to_transitions(data, is_demonstration=is_demonstration)
         data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
         copies = 1 + self.config.stored_copies
         stored = self.replay.num_demonstrations + copies * int(data[keys.IS_EXPERT].sum())
         if stored > self.config.buffer_size // 2:  # demonstrations are never overwritten
             data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
-        return super().to_transitions(data, is_expert=True)
+        return super().to_transitions(data, is_demonstration=True)
 
     def save_replay(self, folder: Path) -> None:
         """Write the replay, and the transitions of unfinished episodes if there are any, into a

@@ -109,7 +109,7 @@ class LevelDQNLoss(TransitionLoss):
             single level, see `SingleLevelValues`.
         demonstrations: "dqfd" `large_margin` and "adet" `cross_entropy`, means over the
             demonstrations in the batch; "sdqfd" `strict_large_margin`, a mean over the batch, with
-            zero for other samples; or "none" for plain DQN, which needs no expert flag.
+            zero for other samples; or "none" for plain DQN, which needs no demonstration flag.
         demonstration_weight: weight of that term.
         margin: margin of "dqfd" and "sdqfd".
         first_beta: inverse temperature of "adet" at the first level.
@@ -128,7 +128,7 @@ class LevelDQNLoss(TransitionLoss):
         reward: NestedKey = keys.REWARD
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
-        is_expert: NestedKey = keys.IS_EXPERT
+        is_demonstration: NestedKey = keys.IS_DEMONSTRATION
         value: NestedKey = "state_value"
         priority: NestedKey = keys.TD_ERROR
         priority_weight: NestedKey = "priority_weight"
@@ -176,7 +176,9 @@ class LevelDQNLoss(TransitionLoss):
 
     def _required_keys(self) -> list[NestedKey]:
         names = self._transition_keys(self.value_network.in_keys)
-        return names if self.demonstrations == "none" else [*names, self.tensor_keys.is_expert]
+        return (
+            names if self.demonstrations == "none" else [*names, self.tensor_keys.is_demonstration]
+        )
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -192,7 +194,7 @@ class LevelDQNLoss(TransitionLoss):
             ``target_value`` (means over the batch; levels averaged).
 
         Raises:
-            KeyError: an entry is missing, such as the expert flag if there is a term on
+            KeyError: an entry is missing, such as the demonstration flag if there is a term on
                 demonstrations.
         """
         target = self._target(tensordict)
@@ -208,16 +210,16 @@ class LevelDQNLoss(TransitionLoss):
         errors = weighted(errors, None if td_weights is None else td_weights[:, None, None])
         difference = (q.detach() - target[..., None]).abs().mean(dim=-1)
         tensordict.set(self.tensor_keys.priority, difference)
-        demonstration, is_expert = self._demonstration_losses(tensordict, levels)
+        demonstration, is_demonstration = self._demonstration_losses(tensordict, levels)
         of_batch = self._reduce_demonstrations(
-            weighted(demonstration, weights.of("all")), is_expert, self.reduction
+            weighted(demonstration, weights.of("all")), is_demonstration, self.reduction
         )
         return TensorDict(
             {
                 "loss_qvalue": self._sum_over_levels(errors[:, 0]),
                 "loss_demonstration": self.demonstration_weight * of_batch,
                 "demonstration_error": self._reduce_demonstrations(
-                    demonstration.detach(), is_expert, "mean"
+                    demonstration.detach(), is_demonstration, "mean"
                 ),
                 "td_error": difference.mean(),
                 "q_value": q.detach().mean(),
@@ -248,16 +250,18 @@ class LevelDQNLoss(TransitionLoss):
         losses = levels[0][0].new_zeros(len(levels[0][0]))
         if self.demonstrations == "none":
             return losses, torch.zeros_like(losses, dtype=torch.bool)
-        is_expert = tensordict[self.tensor_keys.is_expert].reshape(-1)
-        if is_expert.device.type != "cpu" or torch.compiler.is_compiling():  # for static shapes
+        is_demonstration = tensordict[self.tensor_keys.is_demonstration].reshape(-1)
+        if (
+            is_demonstration.device.type != "cpu" or torch.compiler.is_compiling()
+        ):  # for static shapes
             terms = torch.stack([self._term(i, *level) for i, level in enumerate(levels)])
-            return torch.where(is_expert, terms.sum(dim=0), 0.0), is_expert
-        rows = is_expert.nonzero()[:, 0]
+            return torch.where(is_demonstration, terms.sum(dim=0), 0.0), is_demonstration
+        rows = is_demonstration.nonzero()[:, 0]
         if len(rows):
             of_experts = [(q[rows], chosen[rows]) for q, chosen in levels]
             terms = torch.stack([self._term(i, *level) for i, level in enumerate(of_experts)])
             losses = losses.index_put((rows,), terms.sum(dim=0))
-        return losses, is_expert
+        return losses, is_demonstration
 
     def _term(self, level: int, q: Tensor, chosen: Tensor) -> Tensor:
         """Return the losses [n] of a level's values [n, N] and the experts' choices [n]."""
@@ -267,9 +271,9 @@ class LevelDQNLoss(TransitionLoss):
         return term(q, chosen, self.margin)
 
     def _reduce_demonstrations(
-        self, losses: Tensor, is_expert: Tensor, reduction: Reduction
+        self, losses: Tensor, is_demonstration: Tensor, reduction: Reduction
     ) -> Tensor:
         """Return losses [B] reduced over the demonstrations, for "sdqfd" over the batch."""
         if self.demonstrations == "sdqfd":
             return reduce_loss(losses, reduction)
-        return reduce_over(losses, is_expert, reduction)
+        return reduce_over(losses, is_demonstration, reduction)

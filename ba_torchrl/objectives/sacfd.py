@@ -38,7 +38,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                       * mean over demonstrations of w_i d(a, e_i)
         loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
-    e_i is the expert's action in s_i: a_i, unless ``set_keys(expert_action=...)`` names another
+    e_i is the expert's action in s_i: a_i, unless ``set_keys(target_action=...)`` names another
     entry. d(a, e_i) is the mean over components of (a - e_i)^2, or another `action_distance`.
     Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
 
@@ -65,8 +65,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         alpha_init: initial entropy temperature.
         target_entropy: entropy that the temperature is tuned for, nats.
         entropy_backup: whether y has the entropy term; without it, y is the return alone.
-        demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
-            flag in the batch.
+        demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no flag of
+            demonstrations in the batch.
         demonstration_distance: of the behaviour term.
         reduction: of the samples' losses; the formulas above are "mean".
         weighted_terms: terms that the importance weights multiply.
@@ -89,8 +89,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         reward: NestedKey = keys.REWARD
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
-        is_expert: NestedKey = keys.IS_EXPERT
-        expert_action: NestedKey | None = None
+        is_demonstration: NestedKey = keys.IS_DEMONSTRATION
+        target_action: NestedKey | None = None
         state_action_value: NestedKey = "state_action_value"
         value: NestedKey = "state_value"
         priority: NestedKey = keys.TD_ERROR
@@ -157,7 +157,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
             "demonstration_weight", float(demonstration_weight), device=device
         )
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
-        self._needs_expert_flag = demonstration_weight != 0
+        self._needs_demonstration_flag = demonstration_weight != 0
         self.demonstration_distance: ActionDistance = demonstration_distance
         self.entropy_backup = entropy_backup
         self.views = views
@@ -172,15 +172,15 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         return self.log_alpha.detach().exp()
 
     @property
-    def _label_key(self) -> NestedKey:
+    def _target_key(self) -> NestedKey:
         names = self.tensor_keys
-        return names.action if names.expert_action is None else names.expert_action
+        return names.action if names.target_action is None else names.target_action
 
     def _required_keys(self) -> list[NestedKey]:
         observation = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
-        names = [*self._transition_keys(observation), self._label_key]
-        if self._needs_expert_flag:
-            names.append(self.tensor_keys.is_expert)
+        names = [*self._transition_keys(observation), self._target_key]
+        if self._needs_demonstration_flag:
+            names.append(self.tensor_keys.is_demonstration)
         return list(dict.fromkeys(names))
 
     @dispatch
@@ -197,8 +197,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
             twin values of the stored actions).
 
         Raises:
-            KeyError: an entry is missing, such as the expert flag if the behaviour term has a
-                weight.
+            KeyError: an entry is missing, such as the flag of demonstrations if the behaviour term
+                has a weight.
         """
         weights = self._importance_weights(tensordict)
         target = self._target(tensordict)
@@ -218,9 +218,11 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         # action.
         q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
         policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
-        is_expert = self._expert_flag(tensordict)
+        is_demonstration = self._demonstration_flag(tensordict)
         error = self._demonstration_error(tensordict, sample)
-        demonstration = reduce_over(weighted(error, weights.of("all")), is_expert, self.reduction)
+        demonstration = reduce_over(
+            weighted(error, weights.of("all")), is_demonstration, self.reduction
+        )
         policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
         loss_actor = policy_term + self.demonstration_weight * demonstration
         log_prob = self._over_views(log_prob.detach())
@@ -233,7 +235,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 "loss_alpha": loss_alpha,
                 "alpha": self.alpha,
                 "entropy": -log_prob.mean(),
-                "demonstration_error": reduce_over(error.detach(), is_expert, "mean"),
+                "demonstration_error": reduce_over(error.detach(), is_demonstration, "mean"),
                 "q_value": q.detach().mean(),
             }
         )
@@ -292,22 +294,22 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
 
     def _demonstration_error(self, tensordict: TensorDictBase, sample: Tensor) -> Tensor:
         """Return the distance [..., B] of drawn actions from the expert's."""
-        expert_action = self._for_views(tensordict[self._label_key])
-        distance = action_distance(sample, expert_action, self.demonstration_distance)
+        target_action = self._for_views(tensordict[self._target_key])
+        distance = action_distance(sample, target_action, self.demonstration_distance)
         return self._over_views(distance)
 
-    def _expert_flag(self, tensordict: TensorDictBase) -> Tensor:
+    def _demonstration_flag(self, tensordict: TensorDictBase) -> Tensor:
         """Return the flag of demonstrations, bool [..., B]; False for plain SAC without it.
 
         Raises:
             KeyError: the flag is absent, and the behaviour term needs it.
         """
-        flag = tensordict.get(self.tensor_keys.is_expert, None)
+        flag = tensordict.get(self.tensor_keys.is_demonstration, None)
         if flag is not None:
             return flag.reshape(tensordict.batch_size)
-        if self._needs_expert_flag:
+        if self._needs_demonstration_flag:
             raise KeyError(
-                f"the batch lacks {self.tensor_keys.is_expert!r}, which the behaviour term "
+                f"the batch lacks {self.tensor_keys.is_demonstration!r}, which the behaviour term "
                 "needs; for plain SAC set demonstration_weight=0"
             )
         action = tensordict[self.tensor_keys.action]

@@ -66,7 +66,7 @@ def start_collection(
         device=config.torch_device,
         num_envs=config.num_envs,
         seed=seed,
-        make_env=partial(_make_some_envs, values, algorithm.collects_expert_action),
+        make_env=partial(_make_some_envs, values, algorithm.config.imitates == "expert_everywhere"),
         make_policy=partial(_make_policy, values),
         workers=config.workers,
     )

@@ -228,7 +228,7 @@ class Experiment:
         progress.faults += int((following[keys.FAULT] & is_present).sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
-        self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
+        self.algorithm.extend(self.algorithm.to_transitions(data, is_demonstration=False))
         return progress.env_steps // self.config.num_envs - steps_before
 
     def _update(self, take_update: Callable[[], TensorDict]) -> None:

@@ -270,7 +270,7 @@ def _replay_memory(
     storage = FrameStorage(CAPACITY, codecs(high))
     stored = 0
     for number in bench.rounds():
-        data = as_transitions(episodes[number], storage.codecs, is_expert=True)
+        data = as_transitions(episodes[number], storage.codecs, is_demonstration=True)
         storage.set(torch.arange(stored, stored + len(data)), data)
         stored += len(data)
     megabytes = storage.nbytes / stored * CAPACITY / 1e6

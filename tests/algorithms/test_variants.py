@@ -179,7 +179,7 @@ def test_contrastive_pretraining_trains_the_encoder_only():
 def test_contrastive_pretraining_and_behaviour_cloning_go_together():
     ferm = build("ferm_sacfd", "ferm", init="bc")
     demonstrations = transitions(ferm)
-    demonstrations[keys.IS_EXPERT] = torch.ones_like(demonstrations[keys.IS_EXPERT])
+    demonstrations[keys.IS_DEMONSTRATION] = torch.ones_like(demonstrations[keys.IS_DEMONSTRATION])
     ferm.extend(demonstrations)
     before = parameters(ferm)
     scalars = [ferm.pretrain_update() for _ in range(60)]
