@@ -18,10 +18,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.learner_config import LearnerConfig
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys

@@ -16,9 +16,7 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import IQLLoss, SoftUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.learner_config import LearnerConfig
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue

@@ -11,10 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import HardUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.learner_config import LearnerConfig
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
 from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
@@ -70,7 +67,7 @@ class SpatialQConfig(LearnerConfig):
     included."""
 
     def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """As for `AlgorithmConfig`: fields of another replay, of other terms on demonstrations, and
+        """As for `LearnerConfig`: fields of another replay, of other terms on demonstrations, and
         of other augmentations."""
         yield from super().without_effect(network)
         kind = f"with demonstrations={self.demonstrations!r}"

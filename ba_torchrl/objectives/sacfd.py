@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import get_args
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.base import (
+    ImportanceWeights,
     Reduction,
     TransitionLoss,
     WeightedTerms,
@@ -23,10 +28,9 @@ from ba_torchrl.objectives.base import (
     weighted,
 )
 from ba_torchrl.objectives.imitation import ActionDistance, action_distance
-from ba_torchrl.objectives.shared_encoder import SharedEncoderCritics
 
 
-class SACfDLoss(SharedEncoderCritics, TransitionLoss):
+class SACfDLoss(TransitionLoss):
     """Soft Actor-Critic with a behaviour term on the demonstrations in the batch (appendix G.2).
 
     With twin values q_1 and q_2 of the stored action, an action a ~ pi drawn from the policy, and
@@ -150,7 +154,16 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
         super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
-        self._convert_networks(actor_network, encoder_network, qvalue_network)
+        self.convert_to_functional(actor_network, "actor_network")
+        self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
+        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
+        # Parameters that the actor shares with the encoder are constants in the actor's terms, so
+        # that the critics alone train them. The constants share the parameters' memory: the
+        # networks are on their device before, and the loss is neither copied nor moved afterwards.
+        shared = set(encoder_network.parameters())
+        for key, parameter in list(self.actor_network_params.items(True, True)):
+            if parameter in shared:
+                self.actor_network_params.set(key, parameter.data)
         device = self._default_device
         self.register_coeff_buffer("target_entropy", float(target_entropy), device=device)
         self.register_coeff_buffer(
@@ -201,23 +214,15 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 has a weight.
         """
         weights = self._importance_weights(tensordict)
-        target = self._target(tensordict)
-
         state = self._observation(tensordict, self.views)
         features = self._features(state, self.encoder_network_params)
-        action = self._for_views(tensordict[self.tensor_keys.action])
-        q = self._values(features, action, self.qvalue_network_params)
-        error = q - self._for_views(target)
-        squared = self._over_views(error.square().sum(dim=-1))
-        loss_qvalue = self._reduced(squared, weights.of("critic"))
-        priority = self._over_views(error.detach().abs().mean(dim=-1))
-        tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
+        loss_qvalue, values = self._critic_terms(tensordict, features, weights)
 
         sample, log_prob = self._sample_action(state)
         # Detached features and heads: the gradient reaches the actor's parameters only, through the
         # action.
         q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
-        policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
+        policy_term = self._over_views(self.alpha * log_prob - self._policy_value(q_pi))
         is_demonstration = self._demonstration_flag(tensordict)
         error = self._demonstration_error(tensordict, sample)
         demonstration = reduce_over(
@@ -236,9 +241,34 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 "alpha": self.alpha,
                 "entropy": -log_prob.mean(),
                 "demonstration_error": reduce_over(error.detach(), is_demonstration, "mean"),
-                "q_value": q.detach().mean(),
+                **values,
             }
         )
+
+    def _critic_terms(
+        self, tensordict: TensorDictBase, features: Tensor, weights: ImportanceWeights
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the critics' loss and the diagnostics of their values; write the priority."""
+        target = self._for_views(self._target(tensordict))
+        action = self._for_views(tensordict[self.tensor_keys.action])
+        q = self._values(features, action, self.qvalue_network_params)
+        error = q - target
+        priority = self._over_views(error.detach().abs().mean(dim=-1))
+        tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
+        squared = self._over_views(error.square().sum(dim=-1))
+        return self._reduced(squared, weights.of("critic")), self._diagnostics(q.detach())
+
+    def _diagnostics(self, q: Tensor) -> dict[str, Tensor]:
+        """Return scalars of the values [..., K] of the stored actions."""
+        return {"q_value": q.mean()}
+
+    def _target_value(self, q: Tensor) -> Tensor:
+        """Return the value [...] of the target critics' values [..., K]."""
+        return q.amin(dim=-1)
+
+    def _policy_value(self, q: Tensor) -> Tensor:
+        """Return the value [...] that the policy maximises, of the critics' values [..., K]."""
+        return q.amin(dim=-1)
 
     def contrastive_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Return ``loss_contrastive``, the contrastive loss of the encoder.
@@ -267,12 +297,32 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         action, log_prob = self._sample_action(following)
         features = self._features(following, self.target_encoder_network_params)
         q = self._values(features, action, self.target_qvalue_network_params)
-        value = q.amin(dim=-1)
+        value = self._target_value(q)
         if self.entropy_backup:
             value = value - self.alpha * log_prob
         if self.target_views > 1:
             value = value.mean(dim=-1)
         return self.value_estimator.value_estimate(tensordict, next_value=value.unsqueeze(-1))
+
+    def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return an action [..., A] drawn with gradient and its log-probability [...]."""
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            observation = tensordict.select(*self.actor_network.in_keys)
+            return compute_rsample_log_prob(self.actor_network.get_dist(observation))
+
+    def _features(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        with params.to_module(self.encoder_network, preserve_module_state=False):
+            observation = tensordict.select(*self.encoder_network.in_keys)
+            return self.encoder_network(observation)[self.encoder_network.out_keys[0]]
+
+    def _values(self, features: Tensor, action: Tensor, params: TensorDictBase) -> Tensor:
+        """Return the values [..., K] of an action at given features."""
+        inputs = TensorDict(
+            {self.encoder_network.out_keys[0]: features, self.tensor_keys.action: action},
+            batch_size=action.shape[:-1],
+        )
+        with params.to_module(self.qvalue_network, preserve_module_state=False):
+            return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
 
     def _observation(self, tensordict: TensorDictBase, views: int) -> TensorDictBase:
         """Return the observation [..., B], or [..., B, views] if it has several views."""
@@ -317,3 +367,46 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
 
     def _reduced(self, losses: Tensor, weights: Tensor | None) -> Tensor:
         return reduce_loss(weighted(losses, weights), self.reduction)
+
+
+class BilinearInfoNCE(nn.Module):
+    """InfoNCE with a learnt bilinear similarity (CURL: Srinivas et al., 2020, section 4;
+    FERM, appendix G.2).
+
+    The similarity of anchor i and positive j is a_i W p_j. The loss of anchor i is the
+    cross-entropy of these similarities over all positives of the batch with the label i.
+
+    Args:
+        features: size of the encoder's features.
+    """
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.rand(features, features))
+
+    def forward(self, anchors: Tensor, positives: Tensor) -> Tensor:
+        """Return the losses [B] of anchors [B, F] and their positives [B, F]."""
+        similarities = anchors @ self.weight @ positives.mT
+        labels = torch.arange(len(anchors), device=anchors.device)
+        return F.cross_entropy(similarities, labels, reduction="none")
+
+
+class SoftUpdateByNetwork(SoftUpdate):
+    """TorchRL's soft update, in which some networks have other rates.
+
+    Args:
+        loss_module: with target networks.
+        tau: weight of the online parameters.
+        taus: other weights, by the name of the network in the loss, such as "encoder_network".
+    """
+
+    def __init__(self, loss_module: LossModule, *, tau: float, taus: Mapping[str, float]) -> None:
+        super().__init__(loss_module, tau=tau)
+        self.tau = tau
+        self.taus = {f"{name}_params": value for name, value in taus.items()}
+
+    def step(self) -> None:
+        """Move every target towards its online network."""
+        for name, source in self._sources.items():
+            target = self._targets.get(f"target_{name}")
+            target.data.lerp_(source.data, self.taus.get(name, self.tau))

@@ -12,8 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.algorithms.base import Algorithm
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import Learner, SeedUse
 from ba_torchrl.data.demo_files import load_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import is_success
@@ -48,7 +47,7 @@ def make_env(config: ExperimentConfig, seed: int, **changes: bool) -> EnvBase:
 
 def start_collection(
     config: ExperimentConfig,
-    algorithm: Algorithm,
+    algorithm: Learner,
     seed: int,
     positions: Sequence[Position] | None,
 ) -> Collection:
@@ -92,7 +91,7 @@ def _read(values: dict[str, Any], **changes: int | str) -> ExperimentConfig:
 
 def gather_demonstrations(
     config: ExperimentConfig,
-    algorithm: Algorithm,
+    algorithm: Learner,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
     """Return the episodes [T] of a run's demonstrations, read from a folder or played now.

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
 
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import ScalarLog, progress_bar

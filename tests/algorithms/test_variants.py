@@ -16,7 +16,7 @@ from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.views import RandomViews
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
+from ba_torchrl.objectives.sacfd import SoftUpdateByNetwork
 from ba_torchrl.training import hydra_schema
 from tests.algorithms import tiny
 from tests.specs import close_loop_images, open_loop_images

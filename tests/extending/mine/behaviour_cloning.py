@@ -7,9 +7,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule
 
-from ba_torchrl.algorithms.base import ALGORITHMS
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.learner_config import LearnerConfig
+from ba_torchrl.algorithms.base import ALGORITHMS, Learner, LearnerConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import ActorCriticSpec
 
