@@ -221,4 +221,6 @@ def test_the_quick_start_in_six_degrees_of_freedom_composes(network):
 def test_the_quick_starts_of_close_loop_take_another_network(name):
     config = experiment(name, "network=cnn", "env.max_steps=20")
     assert config.resolved_env.config.max_steps == 20
-    assert config.resolved_env.config.obs_size == {"quickstart": 64, "quickstart_stacking": 128}[name]
+    assert (
+        config.resolved_env.config.obs_size == {"quickstart": 64, "quickstart_stacking": 128}[name]
+    )

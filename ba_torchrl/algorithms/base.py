@@ -49,7 +49,6 @@ from ba_torchrl.registry import Registry
 __all__ = [
     "ALGORITHMS",
     "NETWORKS",
-    "Algorithm",
     "Control",
     "Learner",
     "LearnerConfig",
@@ -662,6 +661,3 @@ class Learner(ABC):
                     "another version of the library wrote them; start the run again in another "
                     "run_dir"
                 )
-
-
-Algorithm = Learner

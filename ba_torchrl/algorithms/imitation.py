@@ -22,8 +22,8 @@ from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConf
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
+from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialPolicy, spatial_policy
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
 

@@ -20,9 +20,7 @@ from ba_torchrl.algorithms.sac import SAC, SACConfig
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
-from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
-from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
 from ba_torchrl.objectives.rlpd import RLPDLoss
 
 
