@@ -15,7 +15,7 @@ import hydra  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
 
 from ba_torchrl import make_vector_env  # noqa: E402
-from ba_torchrl.algorithms.seeds import SeedUse  # noqa: E402
+from ba_torchrl.algorithms.base import SeedUse  # noqa: E402
 from ba_torchrl.config import StrictModel  # noqa: E402
 from ba_torchrl.record.logging import progress_bar  # noqa: E402
 from ba_torchrl.record.video import write_video  # noqa: E402

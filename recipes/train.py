@@ -1,6 +1,6 @@
 """Train a policy.
 
-python recipes/train.py task=close_loop/block_picking algorithm=sacfd_per network=equi seed=0
+python recipes/train.py task=close_loop/block_picking algorithm=sacfd rotation=none network=equi
 python recipes/train.py --config-name quickstart
 python recipes/train.py task=close_loop/block_picking run_dir=runs/mine resume=true
 python recipes/train.py plugins=[my_tasks] task=mine/push_far

@@ -111,7 +111,7 @@ def batch(experts=(True, False, True, False), weights=(0.2, 0.8, 0.4, 0.1)):
         },
     }
     if experts is not None:
-        data[keys.IS_EXPERT] = flag(*experts)
+        data[keys.IS_DEMONSTRATION] = flag(*experts)
     if weights is not None:
         data["priority_weight"] = torch.tensor(weights, dtype=torch.float64)
     return TensorDict(data, [4])

@@ -78,9 +78,9 @@ def samples(task):
     drawn = {}
     for kind in ("uniform", "prioritized", "symmetric"):
         replay = make_replay(kind, 50, 6, codecs=make_codecs(images), seed=0)
-        for is_expert in (True, False):
+        for is_demonstration in (True, False):
             for episode in episodes:
-                replay.extend(as_transitions(episode, images, is_expert=is_expert))
+                replay.extend(as_transitions(episode, images, is_demonstration=is_demonstration))
         batch = replay.sample()
         if kind == "prioritized":  # TorchRL's buffer moves the errors to the default device
             errors = batch[keys.NEXT, keys.REWARD].flatten()

@@ -80,9 +80,9 @@ def test_a_script_trains_and_prints_its_evaluation(run, recorded, capsys):
     ((made, before),) = weights
     changed = [not torch.equal(p, q) for p, q in zip(made.parameters(), before, strict=True)]
     assert sum(changed) > len(changed) / 2
-    is_expert = found["replay"].storage.column(keys.IS_EXPERT)
-    assert is_expert.any()
-    assert (~is_expert).sum() == 4  # two updates with a step of two environments each
+    is_demonstration = found["replay"].storage.column(keys.IS_DEMONSTRATION)
+    assert is_demonstration.any()
+    assert (~is_demonstration).sum() == 4  # two updates with a step of two environments each
     assert found["explorations"].count(ExplorationType.RANDOM) == 2
     assert ExplorationType.DETERMINISTIC in found["explorations"]
 

@@ -16,9 +16,8 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import IQLLoss, SoftUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.learner_config import LearnerConfig
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem
+from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from ba_torchrl.modules.actor_critic.gaussian_policy import truncated_gaussian_policy
@@ -49,6 +48,11 @@ class IQLConfig(LearnerConfig):
     tau: float = Field(default=0.005, gt=0, le=1)
     """Weight of the critics in the update of their targets."""
 
+    @property
+    def imitates(self) -> Imitation:
+        """No action, except with ``init="bc"``: all transitions have the same loss."""
+        return "expert" if self.init == "bc" else "none"
+
     def build(self, network: NetworkConfig, problem: Problem) -> IQL:
         """Return a freshly initialised learner."""
         return IQL(self, network, problem)
@@ -73,11 +77,6 @@ class IQL(Learner):
 
     config: IQLConfig
     loss: IQLLoss
-
-    @property
-    def imitates_demonstrations(self) -> bool:
-        """False: all transitions have the same loss."""
-        return False
 
     def make_networks(self, network: NetworkConfig) -> IQLNetworks:
         """Return actor, critics and state value."""

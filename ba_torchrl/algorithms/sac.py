@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import torch
 from pydantic import Field, model_validator
@@ -16,10 +16,15 @@ from torchrl.data import Bounded
 from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner, LossFunction
-from ba_torchrl.algorithms.learner_config import LearnerConfig
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import (
+    ALGORITHMS,
+    Control,
+    Learner,
+    LearnerConfig,
+    LossFunction,
+    Problem,
+    SeedUse,
+)
 from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.augmentation.stored import StoredCopies
@@ -31,14 +36,15 @@ from ba_torchrl.data.augmentation.views import (
 )
 from ba_torchrl.data.episode_assembler import EpisodeAssembler
 from ba_torchrl.data.files import read_state, write_state
+from ba_torchrl.data.transitions import WITH_TARGET, Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
-from ba_torchrl.objectives.contrastive import BilinearInfoNCE
 from ba_torchrl.objectives.imitation import ActionDistance
-from ba_torchrl.objectives.sacfd import SACfDLoss
-from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
+from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SACfDLoss, SoftUpdateByNetwork
+
+Loss = TypeVar("Loss", bound=SACfDLoss)
 
 _REPLAY, _EPISODES = "replay", "episodes"
 """Folders of a saved replay, if successes are imitated."""
@@ -120,7 +126,7 @@ class SACConfig(LearnerConfig):
         return self
 
     def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """As for `AlgorithmConfig`: fields of other augmentations, of a term without weight, and a
+        """As for `LearnerConfig`: fields of other augmentations, of a term without weight, and a
         contrastive loss that does not reach the policy."""
         yield from super().without_effect(network)
         if self.augmentation == "none" or self.stored_copies:
@@ -140,13 +146,18 @@ class SACConfig(LearnerConfig):
             yield f"contrastive_weight has no effect on the encoder of the policy of {name!r}"
 
     @property
+    def imitates(self) -> Imitation:
+        """The expert's action, on demonstrations: the behaviour term."""
+        return "expert"
+
+    @property
     def init_entropy_weight(self) -> float:
         """The initial entropy temperature, so that the cloned policy explores."""
         return self.alpha_init
 
     @property
     def pretraining_option(self) -> str | None:
-        """As for `AlgorithmConfig`."""
+        """As for `LearnerConfig`."""
         if self.pretraining == "contrastive":
             return "pretraining: 'contrastive'"
         return super().pretraining_option
@@ -182,10 +193,14 @@ class SAC(Learner):
             return self.images
         return cropped_images(self.images, self.config.crop_size)
 
+    @property
+    def network_spec(self) -> ActorCriticSpec:
+        """What the networks see and compute."""
+        return ActorCriticSpec(self.seen_images, self.problem.actions.sequence)
+
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and critic."""
-        spec = ActorCriticSpec(self.seen_images, self.problem.actions.sequence)
-        networks = network.build(spec)
+        networks = network.build(self.network_spec)
         for module in networks:  # before the loss, since networks may share parameters
             module.to(self.problem.device)
         return networks
@@ -211,8 +226,18 @@ class SAC(Learner):
 
     def make_loss(self, networks: ActorCritic) -> SACfDLoss:
         """Return the loss of actor, critics, temperature and, if configured, encoder."""
+        return self.loss_of(SACfDLoss, networks)
+
+    def loss_of(self, kind: type[Loss], networks: ActorCritic, **options: Any) -> Loss:
+        """Return the loss of actor, critics, temperature and, if configured, encoder.
+
+        Args:
+            kind: its class.
+            networks: actor, encoder and critic.
+            options: that only this class has.
+        """
         config = self.config
-        loss = SACfDLoss(
+        loss = kind(
             self.make_policy(networks),
             TensorDictModule(
                 networks.encoder, in_keys=self.observation_keys, out_keys=["critic_features"]
@@ -232,8 +257,10 @@ class SAC(Learner):
             views=config.views,
             target_views=config.target_views,
             contrastive=self._make_contrastive(networks.encoder),
+            **options,
         )
-        loss.set_keys(expert_action=keys.EXPERT_ACTION)
+        if config.imitates in WITH_TARGET:
+            loss.set_keys(target_action=keys.TARGET_ACTION)
         if not config.bootstrap_truncated:
             loss.set_keys(terminated=loss.tensor_keys.done)
         return loss.make_value_estimator(gamma=config.gamma)
@@ -320,22 +347,17 @@ class SAC(Learner):
             seed=self.problem.derived_seed(use),
         )
 
-    @property
-    def has_expert_action(self) -> bool:
-        """True: the behaviour term reads it."""
-        return True
-
-    def to_transitions(self, data: TensorDictBase, *, is_expert: bool) -> TensorDict:
+    def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
         """Return collected data as the transitions [N] that the replay stores; if successes are
         imitated, those of the episodes that have ended."""
-        if is_expert or self.episodes is None:
-            return super().to_transitions(data, is_expert=is_expert)
+        if is_demonstration or self.episodes is None:
+            return super().to_transitions(data, is_demonstration=is_demonstration)
         data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
         copies = 1 + self.config.stored_copies
         stored = self.replay.num_demonstrations + copies * int(data[keys.IS_EXPERT].sum())
         if stored > self.config.buffer_size // 2:  # demonstrations are never overwritten
             data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
-        return super().to_transitions(data, is_expert=True)
+        return super().to_transitions(data, is_demonstration=True)
 
     def save_replay(self, folder: Path) -> None:
         """Write the replay, and the transitions of unfinished episodes if there are any, into a

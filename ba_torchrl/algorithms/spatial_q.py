@@ -11,14 +11,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import HardUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Problem
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.learner_config import LearnerConfig
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
 from ba_torchrl.config import changed
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
 from ba_torchrl.data.replay.make import ReplayKind
+from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial.policy import SpatialPolicy, SpatialValues, spatial_policy
 from ba_torchrl.objectives.dqn import Demonstrations, LevelDQNLoss
@@ -69,7 +67,7 @@ class SpatialQConfig(LearnerConfig):
     included."""
 
     def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """As for `AlgorithmConfig`: fields of another replay, of other terms on demonstrations, and
+        """As for `LearnerConfig`: fields of another replay, of other terms on demonstrations, and
         of other augmentations."""
         yield from super().without_effect(network)
         kind = f"with demonstrations={self.demonstrations!r}"
@@ -83,6 +81,11 @@ class SpatialQConfig(LearnerConfig):
             yield from changed(self, ["augmentation_probability"], "without augmentation")
         if self.augmentation != "cn":
             yield from changed(self, ["augmentation_order"], "without augmentation='cn'")
+
+    @property
+    def imitates(self) -> Imitation:
+        """The executed action, which is on the grid of actions; none without such a term."""
+        return "none" if self.demonstrations == "none" else "executed"
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
         """Return a freshly initialised learner.
@@ -111,11 +114,6 @@ class SpatialQ(Learner):
     def __init__(self, config: SpatialQConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)
         self._set_epsilon()
-
-    @property
-    def imitates_demonstrations(self) -> bool:
-        """Whether the loss has a term on demonstrations."""
-        return self.config.demonstrations != "none"
 
     def make_networks(self, network: NetworkConfig) -> SpatialValues:
         """Return the network, wrapped as values of the environment's actions."""

@@ -3,30 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 
 from ba_torchrl.envs import keys
+
+Imitation = Literal["none", "executed", "expert", "expert_everywhere"]
+"""Which action an algorithm imitates, and on which transitions:
+
+- "none": no action. All transitions of a demonstration are one.
+- "executed": ``action``, on demonstrations, except where it is a random action.
+- "expert": ``target_action``, on demonstrations: the expert's action, or, in episodes without
+  ``expert_action``, as "executed".
+- "expert_everywhere": the same, and the expert's action in every state that the policy visits, in
+  which the environment then returns it.
+"""
+WITH_TARGET = frozenset({"expert", "expert_everywhere"})
+"""Those for which the replay stores ``target_action``."""
 
 
 def as_transitions(
     tensordict: TensorDictBase,
     images: Iterable[str],
     *,
-    is_expert: bool,
-    label: NestedKey | None = None,
+    is_demonstration: bool,
+    imitates: Imitation = "executed",
 ) -> TensorDict:
     """Return the transitions [N] of a rollout with the entries that the replay stores.
 
     Args:
         tensordict: transitions of any batch shape.
         images: keys of the images to store.
-        is_expert: whether the transitions are demonstrations. Those whose entry ``is_expert`` is
-            False are not, unless ``label`` is ``expert_action``.
-        label: entry with the action to imitate, stored as ``expert_action``: ``expert_action`` if
-            the expert's action is known, ``action`` for the executed one; None to store none.
+        is_demonstration: whether they are those of demonstrations.
+        imitates: the imitated action, stored as ``target_action`` if it is not the executed one.
 
     Raises:
         KeyError: an entry is missing.
@@ -35,9 +46,13 @@ def as_transitions(
     state = [*images, keys.HOLDING]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
     out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))
-    out[keys.IS_EXPERT] = torch.full((len(flat), 1), is_expert, device="cpu")
-    if is_expert and label != keys.EXPERT_ACTION and keys.IS_EXPERT in flat:
-        out[keys.IS_EXPERT] = flat[keys.IS_EXPERT].clone()
-    if label is not None:
-        out[keys.EXPERT_ACTION] = flat[label].clone()
+    out[keys.IS_DEMONSTRATION] = torch.full((len(flat), 1), is_demonstration, device="cpu")
+    if imitates in WITH_TARGET:
+        is_needed = imitates == "expert_everywhere" and not is_demonstration
+        has_expert = is_needed or keys.EXPERT_ACTION in flat
+        out[keys.TARGET_ACTION] = flat[keys.EXPERT_ACTION if has_expert else keys.ACTION].clone()
+    else:
+        has_expert = False
+    if is_demonstration and imitates != "none" and not has_expert and keys.IS_EXPERT in flat:
+        out[keys.IS_DEMONSTRATION] = flat[keys.IS_EXPERT].clone()
     return out

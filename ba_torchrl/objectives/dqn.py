@@ -23,7 +23,6 @@ from ba_torchrl.objectives.base import (
     reduce_over,
     weighted,
 )
-from ba_torchrl.objectives.single_level import SingleLevelValues
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
 """The loss on demonstrated actions that is added to the TD loss."""
@@ -45,6 +44,46 @@ class LevelValues(Protocol):
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return the greedy choices, level after level, and the last one's value [B, 1]."""
         ...
+
+
+class SingleLevelValues(nn.Module):
+    """The action values of a TorchRL `QValueActor` as a single level of choices.
+
+    Args:
+        actor: with the action space "one_hot" or "categorical".
+
+    Raises:
+        ValueError: the actor has another action space.
+    """
+
+    def __init__(self, actor: QValueActor) -> None:
+        super().__init__()
+        values, choice = actor[0], actor[1]
+        if choice.action_space not in ("one_hot", "categorical"):
+            raise ValueError(
+                f"the action space must be one_hot or categorical, got {choice.action_space!r}"
+            )
+        self.values = values
+        self.is_one_hot = choice.action_space == "one_hot"
+        self.in_keys: list[NestedKey] = list(values.in_keys)
+        self._value_key = choice.in_keys[0]
+
+    def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the choices [B, 1] of greatest value, and their values [B, 1]."""
+        value, best = self._action_values(observation).max(dim=1, keepdim=True)
+        return best, value
+
+    def forward(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the values of all actions [B, N], and the index of the given action [B]."""
+        *observation, action = observation_and_action
+        chosen = action.long().argmax(dim=-1) if self.is_one_hot else action.reshape(len(action))
+        return [(self._action_values(observation), chosen.long())]
+
+    def _action_values(self, observation: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
+        data = TensorDict({}, [len(observation[0])])
+        for key, value in zip(self.in_keys, observation, strict=True):
+            data.set(key, value)
+        return self.values(data)[self._value_key]
 
 
 def large_margin(q: Tensor, chosen: Tensor, margin: float) -> Tensor:
@@ -109,7 +148,7 @@ class LevelDQNLoss(TransitionLoss):
             single level, see `SingleLevelValues`.
         demonstrations: "dqfd" `large_margin` and "adet" `cross_entropy`, means over the
             demonstrations in the batch; "sdqfd" `strict_large_margin`, a mean over the batch, with
-            zero for other samples; or "none" for plain DQN, which needs no expert flag.
+            zero for other samples; or "none" for plain DQN, which needs no demonstration flag.
         demonstration_weight: weight of that term.
         margin: margin of "dqfd" and "sdqfd".
         first_beta: inverse temperature of "adet" at the first level.
@@ -128,7 +167,7 @@ class LevelDQNLoss(TransitionLoss):
         reward: NestedKey = keys.REWARD
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
-        is_expert: NestedKey = keys.IS_EXPERT
+        is_demonstration: NestedKey = keys.IS_DEMONSTRATION
         value: NestedKey = "state_value"
         priority: NestedKey = keys.TD_ERROR
         priority_weight: NestedKey = "priority_weight"
@@ -176,7 +215,9 @@ class LevelDQNLoss(TransitionLoss):
 
     def _required_keys(self) -> list[NestedKey]:
         names = self._transition_keys(self.value_network.in_keys)
-        return names if self.demonstrations == "none" else [*names, self.tensor_keys.is_expert]
+        return (
+            names if self.demonstrations == "none" else [*names, self.tensor_keys.is_demonstration]
+        )
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -192,7 +233,7 @@ class LevelDQNLoss(TransitionLoss):
             ``target_value`` (means over the batch; levels averaged).
 
         Raises:
-            KeyError: an entry is missing, such as the expert flag if there is a term on
+            KeyError: an entry is missing, such as the demonstration flag if there is a term on
                 demonstrations.
         """
         target = self._target(tensordict)
@@ -208,16 +249,16 @@ class LevelDQNLoss(TransitionLoss):
         errors = weighted(errors, None if td_weights is None else td_weights[:, None, None])
         difference = (q.detach() - target[..., None]).abs().mean(dim=-1)
         tensordict.set(self.tensor_keys.priority, difference)
-        demonstration, is_expert = self._demonstration_losses(tensordict, levels)
+        demonstration, is_demonstration = self._demonstration_losses(tensordict, levels)
         of_batch = self._reduce_demonstrations(
-            weighted(demonstration, weights.of("all")), is_expert, self.reduction
+            weighted(demonstration, weights.of("all")), is_demonstration, self.reduction
         )
         return TensorDict(
             {
                 "loss_qvalue": self._sum_over_levels(errors[:, 0]),
                 "loss_demonstration": self.demonstration_weight * of_batch,
                 "demonstration_error": self._reduce_demonstrations(
-                    demonstration.detach(), is_expert, "mean"
+                    demonstration.detach(), is_demonstration, "mean"
                 ),
                 "td_error": difference.mean(),
                 "q_value": q.detach().mean(),
@@ -248,16 +289,18 @@ class LevelDQNLoss(TransitionLoss):
         losses = levels[0][0].new_zeros(len(levels[0][0]))
         if self.demonstrations == "none":
             return losses, torch.zeros_like(losses, dtype=torch.bool)
-        is_expert = tensordict[self.tensor_keys.is_expert].reshape(-1)
-        if is_expert.device.type != "cpu" or torch.compiler.is_compiling():  # for static shapes
+        is_demonstration = tensordict[self.tensor_keys.is_demonstration].reshape(-1)
+        if (
+            is_demonstration.device.type != "cpu" or torch.compiler.is_compiling()
+        ):  # for static shapes
             terms = torch.stack([self._term(i, *level) for i, level in enumerate(levels)])
-            return torch.where(is_expert, terms.sum(dim=0), 0.0), is_expert
-        rows = is_expert.nonzero()[:, 0]
+            return torch.where(is_demonstration, terms.sum(dim=0), 0.0), is_demonstration
+        rows = is_demonstration.nonzero()[:, 0]
         if len(rows):
             of_experts = [(q[rows], chosen[rows]) for q, chosen in levels]
             terms = torch.stack([self._term(i, *level) for i, level in enumerate(of_experts)])
             losses = losses.index_put((rows,), terms.sum(dim=0))
-        return losses, is_expert
+        return losses, is_demonstration
 
     def _term(self, level: int, q: Tensor, chosen: Tensor) -> Tensor:
         """Return the losses [n] of a level's values [n, N] and the experts' choices [n]."""
@@ -267,9 +310,9 @@ class LevelDQNLoss(TransitionLoss):
         return term(q, chosen, self.margin)
 
     def _reduce_demonstrations(
-        self, losses: Tensor, is_expert: Tensor, reduction: Reduction
+        self, losses: Tensor, is_demonstration: Tensor, reduction: Reduction
     ) -> Tensor:
         """Return losses [B] reduced over the demonstrations, for "sdqfd" over the batch."""
         if self.demonstrations == "sdqfd":
             return reduce_loss(losses, reduction)
-        return reduce_over(losses, is_expert, reduction)
+        return reduce_over(losses, is_demonstration, reduction)

@@ -126,6 +126,15 @@ class LevelCrossEntropyLoss(LossModule):
         value_network: computes the values of the levels.
     """
 
+    @dataclass
+    class _AcceptedKeys:
+        """Entries that ``set_keys`` can rename."""
+
+        action: NestedKey = keys.ACTION
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
     value_network: nn.Module
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
@@ -135,7 +144,11 @@ class LevelCrossEntropyLoss(LossModule):
     def __init__(self, value_network: LevelValues) -> None:
         super().__init__()
         self.convert_to_functional(value_network, "value_network")
-        self.in_keys = [*value_network.in_keys, keys.ACTION]
+        self._forward_value_estimator_keys()
+
+    def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
+        """Recompute `in_keys`; the loss has no value estimator."""
+        self.in_keys = [*self.value_network.in_keys, self.tensor_keys.action]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_bc``, and the fraction of choices that are the expert's as ``accuracy``.

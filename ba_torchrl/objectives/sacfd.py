@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import get_args
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.base import (
+    ImportanceWeights,
     Reduction,
     TransitionLoss,
     WeightedTerms,
@@ -23,10 +28,9 @@ from ba_torchrl.objectives.base import (
     weighted,
 )
 from ba_torchrl.objectives.imitation import ActionDistance, action_distance
-from ba_torchrl.objectives.shared_encoder import SharedEncoderCritics
 
 
-class SACfDLoss(SharedEncoderCritics, TransitionLoss):
+class SACfDLoss(TransitionLoss):
     """Soft Actor-Critic with a behaviour term on the demonstrations in the batch (appendix G.2).
 
     With twin values q_1 and q_2 of the stored action, an action a ~ pi drawn from the policy, and
@@ -38,7 +42,7 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                       * mean over demonstrations of w_i d(a, e_i)
         loss_alpha  = mean_i -w_i log_alpha (log pi(a | s_i) + target_entropy)
 
-    e_i is the expert's action in s_i: a_i, unless ``set_keys(expert_action=...)`` names another
+    e_i is the expert's action in s_i: a_i, unless ``set_keys(target_action=...)`` names another
     entry. d(a, e_i) is the mean over components of (a - e_i)^2, or another `action_distance`.
     Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
 
@@ -65,8 +69,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         alpha_init: initial entropy temperature.
         target_entropy: entropy that the temperature is tuned for, nats.
         entropy_backup: whether y has the entropy term; without it, y is the return alone.
-        demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no expert
-            flag in the batch.
+        demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no flag of
+            demonstrations in the batch.
         demonstration_distance: of the behaviour term.
         reduction: of the samples' losses; the formulas above are "mean".
         weighted_terms: terms that the importance weights multiply.
@@ -89,8 +93,8 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         reward: NestedKey = keys.REWARD
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
-        is_expert: NestedKey = keys.IS_EXPERT
-        expert_action: NestedKey | None = None
+        is_demonstration: NestedKey = keys.IS_DEMONSTRATION
+        target_action: NestedKey | None = None
         state_action_value: NestedKey = "state_action_value"
         value: NestedKey = "state_value"
         priority: NestedKey = keys.TD_ERROR
@@ -150,14 +154,23 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
         super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
-        self._convert_networks(actor_network, encoder_network, qvalue_network)
+        self.convert_to_functional(actor_network, "actor_network")
+        self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
+        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
+        # Parameters that the actor shares with the encoder are constants in the actor's terms, so
+        # that the critics alone train them. The constants share the parameters' memory: the
+        # networks are on their device before, and the loss is neither copied nor moved afterwards.
+        shared = set(encoder_network.parameters())
+        for key, parameter in list(self.actor_network_params.items(True, True)):
+            if parameter in shared:
+                self.actor_network_params.set(key, parameter.data)
         device = self._default_device
         self.register_coeff_buffer("target_entropy", float(target_entropy), device=device)
         self.register_coeff_buffer(
             "demonstration_weight", float(demonstration_weight), device=device
         )
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
-        self._needs_expert_flag = demonstration_weight != 0
+        self._needs_demonstration_flag = demonstration_weight != 0
         self.demonstration_distance: ActionDistance = demonstration_distance
         self.entropy_backup = entropy_backup
         self.views = views
@@ -172,15 +185,15 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         return self.log_alpha.detach().exp()
 
     @property
-    def _label_key(self) -> NestedKey:
+    def _target_key(self) -> NestedKey:
         names = self.tensor_keys
-        return names.action if names.expert_action is None else names.expert_action
+        return names.action if names.target_action is None else names.target_action
 
     def _required_keys(self) -> list[NestedKey]:
         observation = [*self.actor_network.in_keys, *self.encoder_network.in_keys]
-        names = [*self._transition_keys(observation), self._label_key]
-        if self._needs_expert_flag:
-            names.append(self.tensor_keys.is_expert)
+        names = [*self._transition_keys(observation), self._target_key]
+        if self._needs_demonstration_flag:
+            names.append(self.tensor_keys.is_demonstration)
         return list(dict.fromkeys(names))
 
     @dispatch
@@ -197,30 +210,24 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
             twin values of the stored actions).
 
         Raises:
-            KeyError: an entry is missing, such as the expert flag if the behaviour term has a
-                weight.
+            KeyError: an entry is missing, such as the flag of demonstrations if the behaviour term
+                has a weight.
         """
         weights = self._importance_weights(tensordict)
-        target = self._target(tensordict)
-
         state = self._observation(tensordict, self.views)
         features = self._features(state, self.encoder_network_params)
-        action = self._for_views(tensordict[self.tensor_keys.action])
-        q = self._values(features, action, self.qvalue_network_params)
-        error = q - self._for_views(target)
-        squared = self._over_views(error.square().sum(dim=-1))
-        loss_qvalue = self._reduced(squared, weights.of("critic"))
-        priority = self._over_views(error.detach().abs().mean(dim=-1))
-        tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
+        loss_qvalue, values = self._critic_terms(tensordict, features, weights)
 
         sample, log_prob = self._sample_action(state)
         # Detached features and heads: the gradient reaches the actor's parameters only, through the
         # action.
         q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
-        policy_term = self._over_views(self.alpha * log_prob - q_pi.amin(dim=-1))
-        is_expert = self._expert_flag(tensordict)
+        policy_term = self._over_views(self.alpha * log_prob - self._policy_value(q_pi))
+        is_demonstration = self._demonstration_flag(tensordict)
         error = self._demonstration_error(tensordict, sample)
-        demonstration = reduce_over(weighted(error, weights.of("all")), is_expert, self.reduction)
+        demonstration = reduce_over(
+            weighted(error, weights.of("all")), is_demonstration, self.reduction
+        )
         policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
         loss_actor = policy_term + self.demonstration_weight * demonstration
         log_prob = self._over_views(log_prob.detach())
@@ -233,10 +240,35 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
                 "loss_alpha": loss_alpha,
                 "alpha": self.alpha,
                 "entropy": -log_prob.mean(),
-                "demonstration_error": reduce_over(error.detach(), is_expert, "mean"),
-                "q_value": q.detach().mean(),
+                "demonstration_error": reduce_over(error.detach(), is_demonstration, "mean"),
+                **values,
             }
         )
+
+    def _critic_terms(
+        self, tensordict: TensorDictBase, features: Tensor, weights: ImportanceWeights
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the critics' loss and the diagnostics of their values; write the priority."""
+        target = self._for_views(self._target(tensordict))
+        action = self._for_views(tensordict[self.tensor_keys.action])
+        q = self._values(features, action, self.qvalue_network_params)
+        error = q - target
+        priority = self._over_views(error.detach().abs().mean(dim=-1))
+        tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
+        squared = self._over_views(error.square().sum(dim=-1))
+        return self._reduced(squared, weights.of("critic")), self._diagnostics(q.detach())
+
+    def _diagnostics(self, q: Tensor) -> dict[str, Tensor]:
+        """Return scalars of the values [..., K] of the stored actions."""
+        return {"q_value": q.mean()}
+
+    def _target_value(self, q: Tensor) -> Tensor:
+        """Return the value [...] of the target critics' values [..., K]."""
+        return q.amin(dim=-1)
+
+    def _policy_value(self, q: Tensor) -> Tensor:
+        """Return the value [...] that the policy maximises, of the critics' values [..., K]."""
+        return q.amin(dim=-1)
 
     def contrastive_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Return ``loss_contrastive``, the contrastive loss of the encoder.
@@ -265,12 +297,32 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
         action, log_prob = self._sample_action(following)
         features = self._features(following, self.target_encoder_network_params)
         q = self._values(features, action, self.target_qvalue_network_params)
-        value = q.amin(dim=-1)
+        value = self._target_value(q)
         if self.entropy_backup:
             value = value - self.alpha * log_prob
         if self.target_views > 1:
             value = value.mean(dim=-1)
         return self.value_estimator.value_estimate(tensordict, next_value=value.unsqueeze(-1))
+
+    def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return an action [..., A] drawn with gradient and its log-probability [...]."""
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            observation = tensordict.select(*self.actor_network.in_keys)
+            return compute_rsample_log_prob(self.actor_network.get_dist(observation))
+
+    def _features(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        with params.to_module(self.encoder_network, preserve_module_state=False):
+            observation = tensordict.select(*self.encoder_network.in_keys)
+            return self.encoder_network(observation)[self.encoder_network.out_keys[0]]
+
+    def _values(self, features: Tensor, action: Tensor, params: TensorDictBase) -> Tensor:
+        """Return the values [..., K] of an action at given features."""
+        inputs = TensorDict(
+            {self.encoder_network.out_keys[0]: features, self.tensor_keys.action: action},
+            batch_size=action.shape[:-1],
+        )
+        with params.to_module(self.qvalue_network, preserve_module_state=False):
+            return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
 
     def _observation(self, tensordict: TensorDictBase, views: int) -> TensorDictBase:
         """Return the observation [..., B], or [..., B, views] if it has several views."""
@@ -292,22 +344,22 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
 
     def _demonstration_error(self, tensordict: TensorDictBase, sample: Tensor) -> Tensor:
         """Return the distance [..., B] of drawn actions from the expert's."""
-        expert_action = self._for_views(tensordict[self._label_key])
-        distance = action_distance(sample, expert_action, self.demonstration_distance)
+        target_action = self._for_views(tensordict[self._target_key])
+        distance = action_distance(sample, target_action, self.demonstration_distance)
         return self._over_views(distance)
 
-    def _expert_flag(self, tensordict: TensorDictBase) -> Tensor:
+    def _demonstration_flag(self, tensordict: TensorDictBase) -> Tensor:
         """Return the flag of demonstrations, bool [..., B]; False for plain SAC without it.
 
         Raises:
             KeyError: the flag is absent, and the behaviour term needs it.
         """
-        flag = tensordict.get(self.tensor_keys.is_expert, None)
+        flag = tensordict.get(self.tensor_keys.is_demonstration, None)
         if flag is not None:
             return flag.reshape(tensordict.batch_size)
-        if self._needs_expert_flag:
+        if self._needs_demonstration_flag:
             raise KeyError(
-                f"the batch lacks {self.tensor_keys.is_expert!r}, which the behaviour term "
+                f"the batch lacks {self.tensor_keys.is_demonstration!r}, which the behaviour term "
                 "needs; for plain SAC set demonstration_weight=0"
             )
         action = tensordict[self.tensor_keys.action]
@@ -315,3 +367,46 @@ class SACfDLoss(SharedEncoderCritics, TransitionLoss):
 
     def _reduced(self, losses: Tensor, weights: Tensor | None) -> Tensor:
         return reduce_loss(weighted(losses, weights), self.reduction)
+
+
+class BilinearInfoNCE(nn.Module):
+    """InfoNCE with a learnt bilinear similarity (CURL: Srinivas et al., 2020, section 4;
+    FERM, appendix G.2).
+
+    The similarity of anchor i and positive j is a_i W p_j. The loss of anchor i is the
+    cross-entropy of these similarities over all positives of the batch with the label i.
+
+    Args:
+        features: size of the encoder's features.
+    """
+
+    def __init__(self, features: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.rand(features, features))
+
+    def forward(self, anchors: Tensor, positives: Tensor) -> Tensor:
+        """Return the losses [B] of anchors [B, F] and their positives [B, F]."""
+        similarities = anchors @ self.weight @ positives.mT
+        labels = torch.arange(len(anchors), device=anchors.device)
+        return F.cross_entropy(similarities, labels, reduction="none")
+
+
+class SoftUpdateByNetwork(SoftUpdate):
+    """TorchRL's soft update, in which some networks have other rates.
+
+    Args:
+        loss_module: with target networks.
+        tau: weight of the online parameters.
+        taus: other weights, by the name of the network in the loss, such as "encoder_network".
+    """
+
+    def __init__(self, loss_module: LossModule, *, tau: float, taus: Mapping[str, float]) -> None:
+        super().__init__(loss_module, tau=tau)
+        self.tau = tau
+        self.taus = {f"{name}_params": value for name, value in taus.items()}
+
+    def step(self) -> None:
+        """Move every target towards its online network."""
+        for name, source in self._sources.items():
+            target = self._targets.get(f"target_{name}")
+            target.data.lerp_(source.data, self.taus.get(name, self.tau))

@@ -11,7 +11,7 @@ import torch
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
 from ba_torchrl import __version__
-from ba_torchrl.algorithms.base import Algorithm, Problem
+from ba_torchrl.algorithms.base import Learner, Problem
 from ba_torchrl.data.files import write_text
 from ba_torchrl.envs.factory import make_resolved
 from ba_torchrl.errors import ConfigError
@@ -41,7 +41,7 @@ class Checkpoints:
         keep_last: how many of the latest to keep.
     """
 
-    def __init__(self, folder: Path, algorithm: Algorithm, keep_last: int = 2) -> None:
+    def __init__(self, folder: Path, algorithm: Learner, keep_last: int = 2) -> None:
         self._folder = folder
         self._checkpoint = DurableCheckpoint(algorithm=algorithm)
         remove_leftovers(folder / "checkpoints")
@@ -143,7 +143,7 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
 
 def load(
     path: str | Path, which: Which = "best", **changes: Any
-) -> tuple[ExperimentConfig, Algorithm]:
+) -> tuple[ExperimentConfig, Learner]:
     """Rebuild the algorithm of a checkpoint.
 
     Args:
@@ -163,7 +163,7 @@ def load(
     return config, algorithm
 
 
-def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) -> Algorithm:
+def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) -> Learner:
     """Build the untrained algorithm of an experiment.
 
     Args:

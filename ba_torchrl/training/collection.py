@@ -12,8 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.algorithms.base import Algorithm
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import Learner, SeedUse
 from ba_torchrl.data.demo_files import load_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import is_success
@@ -48,7 +47,7 @@ def make_env(config: ExperimentConfig, seed: int, **changes: Any) -> EnvBase:
 
 def start_collection(
     config: ExperimentConfig,
-    algorithm: Algorithm,
+    algorithm: Learner,
     seed: int,
     positions: Sequence[Position] | None,
 ) -> Collection:
@@ -66,7 +65,7 @@ def start_collection(
         device=config.torch_device,
         num_envs=config.num_envs,
         seed=seed,
-        make_env=partial(_make_some_envs, values, algorithm.collects_expert_action),
+        make_env=partial(_make_some_envs, values, algorithm.config.imitates == "expert_everywhere"),
         make_policy=partial(_make_policy, values),
         workers=config.workers,
     )
@@ -92,7 +91,7 @@ def _read(values: dict[str, Any], **changes: int | str) -> ExperimentConfig:
 
 def gather_demonstrations(
     config: ExperimentConfig,
-    algorithm: Algorithm,
+    algorithm: Learner,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
     """Return the episodes [T] of a run's demonstrations, read from a folder or played now.

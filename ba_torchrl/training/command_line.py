@@ -122,7 +122,11 @@ def _name_presets(message: str, settings: DictConfig) -> str:
     """Return a message in which algorithm and network have the names of their presets."""
     if not HydraConfig.initialized():
         return message
-    for group, preset in HydraConfig.get().runtime.choices.items():
+    choices = HydraConfig.get().runtime.choices
+    for group, field in (("replay", "replay: "), ("rotation", "augmentation")):
+        if choices.get(group) not in (None, "uniform", "none") and field in message:
+            message += f"\n  {group}={choices[group]} sets it; this algorithm cannot have it"
+    for group, preset in choices.items():
         chosen = settings.get(group)
         if preset and isinstance(chosen, DictConfig) and "name" in chosen:
             message = message.replace(f"{group} {chosen.name!r}", f"{group} {preset!r}")

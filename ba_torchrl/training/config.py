@@ -10,9 +10,15 @@ from typing import Any, Literal
 import torch
 from pydantic import Field
 
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, AlgorithmConfig, NetworkConfig
+from ba_torchrl.algorithms.base import (
+    ALGORITHMS,
+    NETWORKS,
+    LearnerConfig,
+    NetworkConfig,
+    SeedUse,
+    derive_seed,
+)
 from ba_torchrl.algorithms.compilation import CompileMode
-from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
 from ba_torchrl.config import MAX_SEED, WorkerOptions, changed, parse
 from ba_torchrl.data.demo_files import check_demonstrations
 from ba_torchrl.data.demos import (
@@ -151,7 +157,7 @@ class ExperimentConfig(WorkerOptions):
         return choose(NETWORKS, self.network, "network")
 
     @cached_property
-    def algorithm_config(self) -> AlgorithmConfig:
+    def algorithm_config(self) -> LearnerConfig:
         """The algorithm's hyper-parameters."""
         return choose(ALGORITHMS, self.algorithm, "algorithm")
 
@@ -230,8 +236,8 @@ class ExperimentConfig(WorkerOptions):
         option = config.algorithm_config.pretraining_option
         if option is not None and not config.pretrain_updates:
             raise ConfigError(f"algorithm.{option} takes effect in pretrain_updates; set them")
-        capacity = config.algorithm_config.replay_capacity
-        if capacity is not None and config.min_replay > capacity:
+        capacity = config.algorithm_config.buffer_size
+        if config.min_replay > capacity:
             raise ConfigError(
                 f"min_replay: {config.min_replay} transitions are more than the replay holds "
                 f"({capacity}); the run would never start to learn"

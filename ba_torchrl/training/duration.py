@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from ba_torchrl.algorithms.precision import network_dtype
+from ba_torchrl.algorithms.base import network_dtype
 from ba_torchrl.hardware import processor
 from ba_torchrl.training.config import ExperimentConfig
 

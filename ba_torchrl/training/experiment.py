@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
 
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import ScalarLog, progress_bar
@@ -228,7 +228,7 @@ class Experiment:
         progress.faults += int((following[keys.FAULT] & is_present).sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
-        self.algorithm.extend(self.algorithm.to_transitions(data, is_expert=False))
+        self.algorithm.extend(self.algorithm.to_transitions(data, is_demonstration=False))
         return progress.env_steps // self.config.num_envs - steps_before
 
     def _update(self, take_update: Callable[[], TensorDict]) -> None:

@@ -92,8 +92,22 @@ def register(arguments: Sequence[str] = ()) -> None:
                 where = "/".join([group, *folders])
                 store.store(group=where, name=last, node=node, package=group)
     OmegaConf.register_new_resolver(
+        "if_equal",
+        lambda value, other, then, otherwise: then if value == other else otherwise,
+        replace=True,
+    )
+    OmegaConf.register_new_resolver("method", method_name, replace=True)
+    OmegaConf.register_new_resolver(
         "file_name", lambda text: text.replace("/", "_").replace(" ", "_"), replace=True
     )
+
+
+def method_name(algorithm: str, replay: str, rotation: str) -> str:
+    """Return the name of a method, such as "sacfd_per_so2": its presets joined by "_", without
+    those of uniform replay and of no rotation."""
+    defaults = ("", "uniform", "none")
+    chosen = zip((algorithm, replay, rotation), defaults, strict=True)
+    return "_".join(name for name, default in chosen if name != default)
 
 
 def preset(group: str, name: str) -> dict[str, Any]:
@@ -101,25 +115,34 @@ def preset(group: str, name: str) -> dict[str, Any]:
 
     Args:
         group: folder in ``configs``, such as "algorithm".
-        name: of a file in it, or of a plugin's entry. Hydra must have been started with that
-            ``configs`` folder.
+        name: of a file in it, or of a plugin's entry; of the group "algorithm" also of a method, as
+            `method_name` returns it. rad, drq and ferm have no behaviour term if "sac" follows:
+            "rad_sac". Hydra must have been started with that ``configs`` folder.
 
     Raises:
         ConfigError: there is no such preset; the message lists the known ones.
     """
     known = _presets(group)
-    if name not in known:
+    first = max((each for each in known if f"{name}_".startswith(f"{each}_")), key=len, default="")
+    overrides, parts = [f"+{group}={first}"], name.removeprefix(first).split("_")[1:]
+    if first in ("rad", "drq", "ferm") and parts[:1] in (["sac"], ["sacfd"]):
+        is_plain = parts.pop(0) == "sac"
+        overrides += ["algorithm.demonstration_weight=0.0"] if is_plain else []
+    for other in ("replay", "rotation") if group == "algorithm" else ():
+        if parts and parts[0] in _presets(other):
+            overrides.append(f"+{other}={parts.pop(0)}")
+    if not first or parts:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise ConfigError(f"unknown {group} {name!r}.{hint} Known: {', '.join(known)}")
-    settings = compose(overrides=[f"+{group}={name}"])
+    settings = compose(overrides=overrides)
     return OmegaConf.to_container(settings[group], resolve=True)
 
 
 def _presets(group: str) -> list[str]:
     """Return the names of a group's presets."""
     files = GlobalHydra.instance().config_loader().get_group_options(group)
-    registry = GROUPS[group]
+    registry = GROUPS.get(group, {})
     plugins = [name for name in registry if registry.plugin_module(name) is not None]
     return sorted({*files, *plugins})
 

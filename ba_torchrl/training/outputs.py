@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.episodes import Policy
 from ba_torchrl.hardware import hardware
 from ba_torchrl.record.plots import plot_learning_curve

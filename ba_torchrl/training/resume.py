@@ -19,7 +19,7 @@ from typing import Any
 
 from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 
-from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
@@ -83,7 +83,7 @@ class ResumeState:
         progress: the run's counters and curve.
     """
 
-    def __init__(self, folder: Path, algorithm: Algorithm, progress: Progress) -> None:
+    def __init__(self, folder: Path, algorithm: Learner, progress: Progress) -> None:
         self._folder = folder / _FOLDER
         self._checkpoint = DurableCheckpoint(
             algorithm=algorithm,
@@ -193,7 +193,7 @@ class _Generators(GlobalRNGState):
 class _Replay:
     """An algorithm's replay with the methods ``dump`` and ``load`` of TorchRL's checkpoints."""
 
-    def __init__(self, algorithm: Algorithm) -> None:
+    def __init__(self, algorithm: Learner) -> None:
         self._algorithm = algorithm
 
     def dump(self, path: Path) -> None:

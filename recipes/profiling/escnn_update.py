@@ -205,7 +205,7 @@ class EscnnSACfD:
         """Train critic, actor and temperature, move the target, and return the three losses.
 
         Args:
-            batch: transitions [B] with ``is_expert``; the behaviour term imitates ``action``.
+            batch: transitions [B], of which the behaviour term imitates ``action``.
         """
         qvalue = self.qvalue_loss(batch)
         self._step("qvalue", qvalue)
@@ -236,8 +236,9 @@ class EscnnSACfD:
         q = self.critic(batch[keys.PIXELS], batch[keys.HOLDING], action)
         policy = (self.log_alpha.exp().detach() * log_prob - q.amin(dim=1)).mean()
         errors = (action - batch[keys.ACTION]).square().mean(dim=1)
-        is_expert = batch[keys.IS_EXPERT][:, 0]
-        return policy + (errors * is_expert).sum() / is_expert.sum().clamp_min(1), log_prob
+        is_demonstration = batch[keys.IS_DEMONSTRATION][:, 0]
+        imitation = (errors * is_demonstration).sum() / is_demonstration.sum().clamp_min(1)
+        return policy + imitation, log_prob
 
     def _sample(self, observation: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return actions [B, A], with gradient, and their log-probabilities [B]."""

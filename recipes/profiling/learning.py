@@ -15,8 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.acting import constant_weights
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.precision import network_dtype
+from ba_torchrl.algorithms.base import Learner, network_dtype
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
 from ba_torchrl.data.replay.storage import FrameStorage
@@ -270,7 +269,7 @@ def _replay_memory(
     storage = FrameStorage(CAPACITY, codecs(high))
     stored = 0
     for number in bench.rounds():
-        data = as_transitions(episodes[number], storage.codecs, is_expert=True)
+        data = as_transitions(episodes[number], storage.codecs, is_demonstration=True)
         storage.set(torch.arange(stored, stored + len(data)), data)
         stored += len(data)
     megabytes = storage.nbytes / stored * CAPACITY / 1e6

@@ -169,7 +169,7 @@ def main(config: Config) -> float:
 
     eval_env = make_environment(config, eval_seed)
     for episode in demonstrate(config, demo_seed):
-        replay.extend(as_transitions(episode, images, is_expert=True))
+        replay.extend(as_transitions(episode, images, is_demonstration=True))
     for _ in range(config.pretrain_updates):
         update()
     env = make_environment(config, train_seed)
@@ -183,7 +183,7 @@ def main(config: Config) -> float:
         auto_register_policy_transforms=False,
     )
     for data in collector:
-        replay.extend(as_transitions(data, images, is_expert=False))
+        replay.extend(as_transitions(data, images, is_demonstration=False))
         update()
     collector.shutdown()
     bar.close()

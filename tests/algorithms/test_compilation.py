@@ -120,7 +120,7 @@ def test_the_number_of_demonstrations_does_not_change_the_graph(network, channel
     learner.stages[0](batch.copy())
     with torch.compiler.set_stance("fail_on_recompile"):
         for experts, held in ((0, 8), (3, 5), (8, 0)):
-            for key, count in ((keys.IS_EXPERT, experts), (keys.HOLDING, held)):
+            for key, count in ((keys.IS_DEMONSTRATION, experts), (keys.HOLDING, held)):
                 batch[key] = (torch.arange(8) < count).reshape(batch[key].shape).to(batch[key])
             learner.stages[0](batch.copy())
 

@@ -18,14 +18,13 @@ def visited(learner):
 def test_the_label_is_the_action_of_the_expert():
     learner = build("dagger")
     data = visited(learner)
-    stored = learner.to_transitions(data, is_expert=False)
-    assert torch.equal(stored[keys.ACTION], data[keys.EXPERT_ACTION])
-    assert keys.EXPERT_ACTION not in stored
+    stored = learner.to_transitions(data, is_demonstration=False)
+    assert torch.equal(stored[keys.TARGET_ACTION], data[keys.EXPERT_ACTION])
     del data[keys.EXPERT_ACTION]
     with pytest.raises(KeyError, match="expert_action"):
-        learner.to_transitions(data, is_expert=False)
-    stored = learner.to_transitions(data, is_expert=True)  # demonstrations without noise
-    assert torch.equal(stored[keys.ACTION], data[keys.ACTION])
+        learner.to_transitions(data, is_demonstration=False)
+    stored = learner.to_transitions(data, is_demonstration=True)  # demonstrations without noise
+    assert torch.equal(stored[keys.TARGET_ACTION], data[keys.ACTION])
 
 
 def test_the_expert_acts_with_probability_beta():
@@ -42,7 +41,7 @@ def test_the_expert_acts_with_probability_beta():
 
 def test_beta_decreases_linearly_to_zero():
     learner = build("dagger", beta_init=0.6, beta_updates=3, batch_size=4)
-    learner.extend(learner.to_transitions(visited(learner), is_expert=True))
+    learner.extend(learner.to_transitions(visited(learner), is_demonstration=True))
     betas = []
     for _ in range(5):
         betas.append(learner.policy.beta.item())
@@ -58,7 +57,7 @@ def test_beta_decreases_linearly_to_zero():
 @pytest.mark.parametrize("network", ["cnn", "equi"])
 def test_two_iterations_of_a_run(tmp_path, network):
     learner = run(tmp_path, network, {"name": "dagger", "beta_init": 0.5})
-    is_expert = learner.replay.storage.column(keys.IS_EXPERT)
+    is_expert = learner.replay.storage.column(keys.IS_DEMONSTRATION)
     assert (~is_expert).sum() == 4
     assert is_expert.any()
 
@@ -66,9 +65,9 @@ def test_two_iterations_of_a_run(tmp_path, network):
 def test_two_iterations_of_a_run_in_the_open_loop(tmp_path):
     settings = {"name": "dagger", "beta_init": 0.5}
     learner = run(tmp_path, "asr", settings, **OPEN)
-    assert (~learner.replay.storage.column(keys.IS_EXPERT)).sum() == 4
-    labels = learner.replay.storage.column(keys.ACTION)
-    is_expert = learner.replay.storage.column(keys.IS_EXPERT)[:, 0]
+    assert (~learner.replay.storage.column(keys.IS_DEMONSTRATION)).sum() == 4
+    labels = learner.replay.storage.column(keys.TARGET_ACTION)
+    is_expert = learner.replay.storage.column(keys.IS_DEMONSTRATION)[:, 0]
     nearest = learner.nearest_action(labels)
     torch.testing.assert_close(nearest[is_expert], labels[is_expert])
     assert not torch.allclose(nearest[~is_expert], labels[~is_expert], atol=1e-5)

@@ -5,7 +5,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
-from ba_torchrl.algorithms.learner import Learner
+from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.algorithms.sac import SAC
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError

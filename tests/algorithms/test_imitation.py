@@ -32,7 +32,7 @@ def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, ne
     found = losses(tmp_path, "loss_bc")
     assert found[-5:].mean() < 0.9 * found[:5].mean()
     assert losses(tmp_path, "env_steps")[-1] == 0
-    assert made.algorithm.replay.storage.column(keys.IS_EXPERT).all()
+    assert made.algorithm.replay.storage.column(keys.IS_DEMONSTRATION).all()
 
 
 def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
@@ -131,7 +131,8 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     made = make_experiment(tmp_path, network, algorithm, **settings)
     learner, imitated, episodes = made.algorithm, [], []
     loss = learner.init_loss or learner.loss
-    key = loss.tensor_keys.action if learner.init_loss else keys.ACTION
+    key = loss.tensor_keys.action
+    assert key == keys.TARGET_ACTION
     loss.register_forward_pre_hook(lambda _, args: imitated.append(args[0][key].clone()))
     store = learner.on_demonstrations
     learner.on_demonstrations = lambda each: (episodes.extend(each), store(each))
@@ -139,7 +140,7 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     played = torch.cat(episodes)
     assert not played[keys.IS_EXPERT].all()
     stored = learner.replay.storage[: len(played)]
-    assert stored[keys.IS_EXPERT].all()
+    assert stored[keys.IS_DEMONSTRATION].all()
     torch.testing.assert_close(stored[key], played[keys.EXPERT_ACTION])
     assert len(imitated) == (1 if learner.init_loss else 2)
     for label in torch.cat(imitated):
@@ -172,11 +173,11 @@ def test_what_of_demonstrations_with_noise_counts_as_demonstrated(
     assert 0 < expert.sum() < len(expert)
     if counted == "labelled":
         stored = learner.replay.storage[:]
-        assert stored[keys.IS_EXPERT].all()
-        torch.testing.assert_close(stored[keys.EXPERT_ACTION], played[keys.EXPERT_ACTION])
+        assert stored[keys.IS_DEMONSTRATION].all()
+        torch.testing.assert_close(stored[keys.TARGET_ACTION], played[keys.EXPERT_ACTION])
         torch.testing.assert_close(stored[keys.ACTION], played[keys.ACTION])
         return
-    assert keys.EXPERT_ACTION not in learner.replay.stored_keys
+    assert keys.TARGET_ACTION not in learner.replay.stored_keys
     number = len(played) if counted == "all" else int(expert.sum())
     assert learner.replay.num_demonstrations == number
     assert len(learner.replay) == len(played)
@@ -196,15 +197,15 @@ def test_a_cloned_policy_explores(name):
     assert explores > -5
 
 
-def test_rlpd_stores_labels_for_the_initialisation_only():
-    assert not build("rlpd").has_expert_action
-    assert build("rlpd", init="bc").has_expert_action
+def test_rlpd_imitates_in_the_initialisation_only():
+    assert build("rlpd").config.imitates == "none"
+    assert build("rlpd", init="bc").config.imitates == "expert"
 
 
 def demonstration_error(learner):
     """Return the greedy policy's mean squared error on the demonstrations."""
     data = learner.replay.storage[:]
-    data = data[data[keys.IS_EXPERT][:, 0]]
+    data = data[data[keys.IS_DEMONSTRATION][:, 0]]
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         seen = data.select(*learner.observation_keys)
         return float((learner.policy(seen)[keys.ACTION] - data[keys.ACTION]).square().mean())

@@ -121,6 +121,6 @@ def test_the_policy_acts_within_the_range_and_greedily_at_its_mode():
 @pytest.mark.parametrize("pretrain_updates", [2, 1])
 def test_two_updates_offline_or_online(tmp_path, network, pretrain_updates):
     learner = run(tmp_path, network, {"name": "iql"}, pretrain_updates=pretrain_updates)
-    is_expert = learner.replay.storage.column(keys.IS_EXPERT)
-    assert (~is_expert).sum() == (0 if pretrain_updates == 2 else 2)
-    assert read_scalars(tmp_path / "run")["train/env_steps"].values[-1] == (~is_expert).sum()
+    is_demonstration = learner.replay.storage.column(keys.IS_DEMONSTRATION)
+    assert (~is_demonstration).sum() == (0 if pretrain_updates == 2 else 2)
+    assert read_scalars(tmp_path / "run")["train/env_steps"].values[-1] == (~is_demonstration).sum()

@@ -41,7 +41,10 @@ def demonstrations():
     episodes = collect_demonstrations(env, 6, seed=0)
     env.close()
     return torch.cat(
-        [as_transitions(each, ["pixels"], is_expert=True, label=keys.ACTION) for each in episodes]
+        [
+            as_transitions(each, ["pixels"], is_demonstration=True, imitates="expert")
+            for each in episodes
+        ]
     )
 
 
@@ -125,7 +128,7 @@ def test_the_learning_rate_falls_linearly_over_the_run(demonstrations):
 def test_plain_sac_needs_no_demonstrations(demonstrations):
     sac = build(demonstration_weight=0.0, replay="uniform", augmentation="none")
     online = demonstrations.clone()
-    online["is_expert"] = torch.zeros_like(online["is_expert"])
+    online["is_demonstration"] = torch.zeros_like(online["is_demonstration"])
     sac.extend(online)
     scalars = sac.update()
     assert float(scalars["demonstration_error"]) == 0.0
@@ -169,19 +172,15 @@ def test_the_behaviour_term_is_against_the_action_of_the_expert():
         return float(learner.loss(data)["demonstration_error"])
 
     assert error(keys.ACTION) == error()
-    assert error(keys.EXPERT_ACTION) != error()
+    assert error(keys.TARGET_ACTION) != error()
 
 
-def test_collected_labels_must_be_there():
+def test_the_executed_action_is_the_target_where_the_expert_is_not_asked():
     learner = tiny.build("sac", batch_size=6)
-    data = tiny.transitions(learner).exclude(keys.EXPERT_ACTION)
+    data = tiny.transitions(learner)
     data[keys.NEXT, keys.FAULT] = torch.zeros(len(data), 1, dtype=torch.bool)
-    stored = learner.to_transitions(data, is_expert=False)
-    assert torch.equal(stored[keys.EXPERT_ACTION], data[keys.ACTION])
-    learner.collects_expert_action = True
-    with pytest.raises(KeyError, match="expert_action"):
-        learner.to_transitions(data, is_expert=False)
-    assert learner.to_transitions(data, is_expert=True)[keys.EXPERT_ACTION].any()
+    stored = learner.to_transitions(data, is_demonstration=False)
+    assert torch.equal(stored[keys.TARGET_ACTION], data[keys.ACTION])
 
 
 def test_a_replay_with_other_entries_is_refused(tmp_path):
@@ -189,5 +188,5 @@ def test_a_replay_with_other_entries_is_refused(tmp_path):
     learner.extend(tiny.transitions(learner))
     learner.save_replay(tmp_path / "replay")
     tiny.build("rlpd", batch_size=6).load_replay(tmp_path / "replay")
-    with pytest.raises(ConfigError, match=r"lack the entry 'expert_action'.*another run_dir"):
+    with pytest.raises(ConfigError, match=r"lack the entry 'target_action'.*another run_dir"):
         tiny.build("rlpd", batch_size=6, init="bc").load_replay(tmp_path / "replay")

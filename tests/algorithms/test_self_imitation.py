@@ -9,7 +9,7 @@ from tests.algorithms.tiny import build, make_experiment, transitions
 
 def collected(learner, done, success):
     """A step of two environments that begin an episode or are in its second step."""
-    data = transitions(learner, 2).exclude(keys.IS_EXPERT, keys.EXPERT_ACTION)
+    data = transitions(learner, 2).exclude(keys.IS_DEMONSTRATION, keys.TARGET_ACTION)
     data[keys.ENV_INDEX] = torch.arange(2)
     data[keys.STEP_COUNT] = torch.tensor([[0], [1]])
     data[keys.FAULT] = torch.zeros(2, 1, dtype=torch.bool)
@@ -23,13 +23,13 @@ def collected(learner, done, success):
 def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
     learner = build("sac", imitate_successes=True, batch_size=4, replay=replay)
     data = collected(learner, [True, False], [True, False])
-    learner.extend(learner.to_transitions(data, is_expert=False))
+    learner.extend(learner.to_transitions(data, is_demonstration=False))
     assert learner.replay_size == 1
     batch = learner.sample()
-    assert batch[keys.IS_EXPERT].all()
+    assert batch[keys.IS_DEMONSTRATION].all()
     assert float(learner.loss(batch)["demonstration_error"]) > 0
     data = collected(learner, [False, True], [False, False])
-    learner.extend(learner.to_transitions(data, is_expert=False))
+    learner.extend(learner.to_transitions(data, is_demonstration=False))
     assert learner.replay_size == 3
     assert len(learner.episodes) == 1
 
@@ -38,9 +38,9 @@ def test_successes_are_imitated_where_the_expert_would_act_otherwise():
     learner = build("sac", imitate_successes=True, batch_size=4)
     data = collected(learner, [True, True], [True, False])
     data[keys.EXPERT_ACTION] = -data[keys.ACTION]
-    stored = learner.to_transitions(data, is_expert=False)
-    assert stored[keys.IS_EXPERT][:, 0].tolist() == [True, False]
-    assert torch.equal(stored[keys.EXPERT_ACTION], data[keys.ACTION])
+    stored = learner.to_transitions(data, is_demonstration=False)
+    assert stored[keys.IS_DEMONSTRATION][:, 0].tolist() == [True, False]
+    assert torch.equal(stored[keys.TARGET_ACTION], data[keys.ACTION])
 
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
@@ -48,7 +48,7 @@ def test_successes_fill_at_most_half_of_the_replay(replay):
     learner = build("sac", imitate_successes=True, batch_size=4, replay=replay, buffer_size=8)
     data = collected(learner, [True, True], [True, True])
     for stored in (2, 4, 6, 8, 10):
-        learner.extend(learner.to_transitions(data, is_expert=False))
+        learner.extend(learner.to_transitions(data, is_demonstration=False))
         assert learner.replay.num_demonstrations == min(stored, 4)
         assert learner.replay_size == min(stored, 8)
 
@@ -56,9 +56,9 @@ def test_successes_fill_at_most_half_of_the_replay(replay):
 def test_without_the_option_transitions_are_stored_at_once():
     learner = build("sac", batch_size=4)
     data = collected(learner, [True, False], [True, False])
-    stored = learner.to_transitions(data, is_expert=False)
+    stored = learner.to_transitions(data, is_demonstration=False)
     assert len(stored) == 2
-    assert not stored[keys.IS_EXPERT].any()
+    assert not stored[keys.IS_DEMONSTRATION].any()
 
 
 @pytest.mark.parametrize(
@@ -72,15 +72,15 @@ def test_a_run_stores_whole_episodes(tmp_path, collector):
     learner = experiment.algorithm
     env_steps = experiment._progress.env_steps
     ended = learner.replay.storage.column((keys.NEXT, keys.DONE)).flatten()
-    is_expert = learner.replay.storage.column(keys.IS_EXPERT).flatten()
+    is_demonstration = learner.replay.storage.column(keys.IS_DEMONSTRATION).flatten()
     successful = learner.replay.storage.column((keys.NEXT, keys.REWARD)).flatten() > 0
     demonstrated = learner.replay_size + len(learner.episodes) - env_steps
     assert demonstrated > 0
-    assert is_expert[:demonstrated].all()
+    assert is_demonstration[:demonstrated].all()
     assert ended[-1]
     assert ended[demonstrated:].sum() > 2
     # the last transition of an episode determines the flag of all of them
     begin = 0
     for end in ended.nonzero().flatten().tolist():
-        assert (is_expert[begin : end + 1] == successful[end]).all()
+        assert (is_demonstration[begin : end + 1] == successful[end]).all()
         begin = end + 1

@@ -43,21 +43,23 @@ def transitions():
     env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
     episodes = collect_demonstrations(env, 4, seed=0, only_successful=True)
     env.close()
-    return torch.cat([as_transitions(episode, IMAGES, is_expert=True) for episode in episodes])
+    return torch.cat(
+        [as_transitions(episode, IMAGES, is_demonstration=True) for episode in episodes]
+    )
 
 
 def online(transitions):
     data = transitions.clone()
-    data["is_expert"] = torch.zeros_like(data["is_expert"])
+    data["is_demonstration"] = torch.zeros_like(data["is_demonstration"])
     return data
 
 
 def test_half_of_the_batch_are_demonstrations_once_there_are_online_transitions(transitions):
     algorithm = build()
     algorithm.extend(transitions)
-    assert algorithm.replay.sample()["is_expert"].all()
+    assert algorithm.replay.sample()["is_demonstration"].all()
     algorithm.extend(online(transitions))
-    assert algorithm.replay.sample()["is_expert"].sum() == 2
+    assert algorithm.replay.sample()["is_demonstration"].sum() == 2
     assert algorithm.replay_size == 2 * len(transitions)
 
 

@@ -72,7 +72,9 @@ def test_both_networks_learn_the_demonstrations(network, demonstrations, augment
         demonstration_weight=10.0,
     )
     algorithm.on_demonstrations(episodes)
-    data = torch.cat([as_transitions(e, ["pixels", "in_hand"], is_expert=True) for e in episodes])
+    data = torch.cat(
+        [as_transitions(e, ["pixels", "in_hand"], is_demonstration=True) for e in episodes]
+    )
     before = float(algorithm.loss(data.clone())["demonstration_error"])
     for _ in range(20):
         algorithm.update()

@@ -16,7 +16,7 @@ from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.views import RandomViews
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
+from ba_torchrl.objectives.sacfd import SoftUpdateByNetwork
 from ba_torchrl.training import hydra_schema
 from tests.algorithms import tiny
 from tests.specs import close_loop_images, open_loop_images
@@ -42,12 +42,11 @@ IMAGE, CROP = 71, 64
 
 
 @cache
-def presets():
-    """The values of every preset, by name."""
+def method(name):
+    """The values of a method, composed of presets."""
     hydra_schema.register()
-    names = sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return {name: hydra_schema.preset("algorithm", name) for name in names}
+        return hydra_schema.preset("algorithm", name)
 
 
 def network_class(network):
@@ -56,15 +55,15 @@ def network_class(network):
 
 PAIRS = [
     (preset, network)
-    for preset, values in presets().items()
+    for preset in sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
     for network in SMALL
-    if network_class(network).control in ALGORITHMS[values["name"]].controls
+    if network_class(network).control in ALGORITHMS[method(preset)["name"]].controls
     and (preset, network) != ("rlpd", "ferm")  # it builds no ensemble of critics
-]
+] + [("sacfd_per_so2", "cnn")]
 
 
 def build(preset, network, **changes):
-    values = {"batch_size": 4, "buffer_size": 60, **presets()[preset], **changes}
+    values = {"batch_size": 4, "buffer_size": 60, **method(preset), **changes}
     values |= {"batch_size": 4, "buffer_size": 60}
     name = values.pop("name")
     control = network_class(network).control
@@ -129,7 +128,7 @@ def test_the_network_of_ferm_is_refused_by_an_ensemble_of_critics():
         build("rlpd", "ferm")
 
 
-@pytest.mark.parametrize("preset", ["rad_sacfd", "drq_sacfd", "ferm_sacfd"])
+@pytest.mark.parametrize("preset", ["rad", "drq", "ferm"])
 def test_a_restored_learner_continues_the_same_views(preset):
     first, second = build(preset, "cnn"), build(preset, "cnn")
     for algorithm in (first, second):
@@ -142,25 +141,25 @@ def test_a_restored_learner_continues_the_same_views(preset):
 
 
 def test_the_options_reach_augmentation_loss_and_target_update():
-    drq = build("drq_sacfd", "cnn", shift_pixels=3, views=3)
+    drq = build("drq", "cnn", shift_pixels=3, views=3)
     assert isinstance(drq.augmentation, RandomViews)
     augmentation = drq.augmentation
     assert (augmentation.padding, augmentation.views, augmentation.target_views) == (3, 3, 2)
     assert (drq.loss.views, drq.loss.target_views) == (3, 2)
     assert drq.loss.contrastive is None
-    ferm = build("ferm_sacfd", "ferm", encoder_tau=0.2, tau=0.1)
+    ferm = build("ferm", "ferm", encoder_tau=0.2, tau=0.1)
     assert ferm.augmentation.has_positive
     assert ferm.augmentation.padding == 0
     assert ferm.loss.contrastive.weight.shape == (8, 8)
     assert isinstance(ferm.target_updater, SoftUpdateByNetwork)
     assert ferm.target_updater.tau == 0.1
     assert ferm.target_updater.taus == {"encoder_network_params": 0.2}
-    both = build("rad_sacfd", "cnn", augmentation="so2")
+    both = build("rad", "cnn", augmentation="so2")
     assert [type(part).__name__ for part in both.augmentation] == ["SO2Augmentation", "RandomViews"]
 
 
 def test_contrastive_pretraining_trains_the_encoder_only():
-    ferm = build("ferm_sacfd", "ferm", learning_rate=3e-4)
+    ferm = build("ferm", "ferm", learning_rate=3e-4)
     ferm.extend(transitions(ferm))
     before = parameters(ferm)
     scalars = ferm.pretrain_update()
@@ -177,9 +176,9 @@ def test_contrastive_pretraining_trains_the_encoder_only():
 
 
 def test_contrastive_pretraining_and_behaviour_cloning_go_together():
-    ferm = build("ferm_sacfd", "ferm", init="bc")
+    ferm = build("ferm", "ferm", init="bc")
     demonstrations = transitions(ferm)
-    demonstrations[keys.IS_EXPERT] = torch.ones_like(demonstrations[keys.IS_EXPERT])
+    demonstrations[keys.IS_DEMONSTRATION] = torch.ones_like(demonstrations[keys.IS_DEMONSTRATION])
     ferm.extend(demonstrations)
     before = parameters(ferm)
     scalars = [ferm.pretrain_update() for _ in range(60)]
@@ -206,7 +205,7 @@ def test_imitation_trains_the_convolutions_of_ferm(preset):
 
 @pytest.mark.parametrize(("pretraining", "share"), [("contrastive", 0.0), ("all", 4 / 10)])
 def test_importance_weights_start_with_the_losses_of_the_algorithm(pretraining, share, monkeypatch):
-    ferm = build("ferm_sacfd_per", "ferm", pretraining=pretraining)
+    ferm = build("ferm_per", "ferm", pretraining=pretraining)
     ferm.problem = replace(ferm.problem, pretrain_updates=4)
     ferm.extend(transitions(ferm))
     seen, sampler = [], ferm.replay.sampler
@@ -227,7 +226,7 @@ def test_pretraining_of_other_variants_takes_all_losses():
 
 
 def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_training_them():
-    ferm = build("ferm_sacfd", "ferm")
+    ferm = build("ferm", "ferm")
     ferm.extend(transitions(ferm))
     for _ in range(2):
         ferm.update()
@@ -237,7 +236,7 @@ def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_trai
     for _ in range(2):
         for key, value in encoder.items(True, True):
             assert value.data_ptr() == actor[key].data_ptr()
-        ferm.load_state_dict(build("ferm_sacfd", "ferm").state_dict())  # keeps the memory
+        ferm.load_state_dict(build("ferm", "ferm").state_dict())  # keeps the memory
     acting = ferm.policy.policy.get_submodule("module.0.module").trunk
     assert {p.data_ptr() for p in acting.parameters()} == {
         p.data_ptr() for p in encoder.values(True, True)
@@ -288,7 +287,7 @@ def test_the_learning_rate_is_restored_without_the_moments():
 
 
 def test_the_acting_policy_sees_the_centre_of_larger_images():
-    ferm = build("ferm_sacfd", "ferm")
+    ferm = build("ferm", "ferm")
     state = transitions(ferm).select(*ferm.observation_keys)
     other = state.clone()
     border = torch.ones(IMAGE, IMAGE, dtype=torch.bool)

@@ -15,6 +15,7 @@ from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
+from ba_torchrl.data.transitions import WITH_TARGET
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.config import ExperimentConfig
@@ -121,12 +122,13 @@ def transitions(algorithm, count=24):
         keys.REWARD: torch.rand(count, 1, generator=generator),
         **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
     }
-    is_expert = torch.arange(count)[:, None] % 2 == 0
+    is_demonstration = torch.arange(count)[:, None] % 2 == 0
     actions = {keys.ACTION: action}
-    if algorithm.has_expert_action:
-        actions[keys.EXPERT_ACTION] = -action / 2
+    if algorithm.config.imitates in WITH_TARGET:
+        actions[keys.TARGET_ACTION] = -action / 2
     return TensorDict(
-        {**state(), **actions, keys.IS_EXPERT: is_expert, keys.NEXT: following}, [count]
+        {**state(), **actions, keys.IS_DEMONSTRATION: is_demonstration, keys.NEXT: following},
+        [count],
     )
 
 

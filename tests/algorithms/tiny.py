@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
 from ba_torchrl.config import parse
+from ba_torchrl.data.transitions import WITH_TARGET
 from ba_torchrl.envs import keys
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
@@ -75,8 +76,8 @@ def transitions(learner, count=24):
     data = {
         **state(),
         keys.ACTION: action,
-        **({keys.EXPERT_ACTION: -action / 2} if learner.has_expert_action else {}),
-        keys.IS_EXPERT: torch.arange(count)[:, None] % 2 == 0,
+        **({keys.TARGET_ACTION: -action / 2} if learner.config.imitates in WITH_TARGET else {}),
+        keys.IS_DEMONSTRATION: torch.arange(count)[:, None] % 2 == 0,
         keys.NEXT: following,
     }
     return TensorDict(data, [count])

@@ -166,22 +166,24 @@ def test_flags_are_those_of_the_transitions_and_of_a_file(noisy, tmp_path):
     loaded = load_demonstrations(tmp_path / "demos", task=NOISY_TASK, env=env)
     for episode, other in zip(episodes, loaded, strict=True):
         for each in (episode, other):
-            stored = as_transitions(each, [keys.PIXELS], is_expert=True)
-            assert torch.equal(stored[keys.IS_EXPERT], episode[keys.IS_EXPERT])
-            assert keys.EXPERT_ACTION not in stored
-            labelled = as_transitions(each, [keys.PIXELS], is_expert=True, label=keys.EXPERT_ACTION)
-            assert labelled[keys.IS_EXPERT].all()
-            assert torch.equal(labelled[keys.EXPERT_ACTION], episode[keys.EXPERT_ACTION])
+            stored = as_transitions(each, [keys.PIXELS], is_demonstration=True)
+            assert torch.equal(stored[keys.IS_DEMONSTRATION], episode[keys.IS_EXPERT])
+            assert keys.TARGET_ACTION not in stored
+            labelled = as_transitions(
+                each, [keys.PIXELS], is_demonstration=True, imitates="expert_everywhere"
+            )
+            assert labelled[keys.IS_DEMONSTRATION].all()
+            assert torch.equal(labelled[keys.TARGET_ACTION], episode[keys.EXPERT_ACTION])
             assert torch.equal(labelled[keys.ACTION], episode[keys.ACTION])
 
 
 def test_without_labels_only_the_steps_of_the_expert_are_imitated(noisy):
     episode = noisy[0][0].exclude(keys.EXPERT_ACTION)
-    stored = as_transitions(episode, [keys.PIXELS], is_expert=True, label=keys.ACTION)
-    assert torch.equal(stored[keys.IS_EXPERT], episode[keys.IS_EXPERT])
-    assert torch.equal(stored[keys.EXPERT_ACTION], episode[keys.ACTION])
+    stored = as_transitions(episode, [keys.PIXELS], is_demonstration=True, imitates="expert")
+    assert torch.equal(stored[keys.IS_DEMONSTRATION], episode[keys.IS_EXPERT])
+    assert torch.equal(stored[keys.TARGET_ACTION], episode[keys.ACTION])
     with pytest.raises(KeyError, match="expert_action"):
-        as_transitions(episode, [keys.PIXELS], is_expert=True, label=keys.EXPERT_ACTION)
+        as_transitions(episode, [keys.PIXELS], is_demonstration=False, imitates="expert_everywhere")
 
 
 def test_labels_of_demonstrations_are_actions_that_the_policy_can_choose():

@@ -70,10 +70,10 @@ def test_results_without_observations(expert_env):
 
 def test_transitions_are_flat_and_flagged(expert_env):
     (episode,) = collect_demonstrations(expert_env, 1, seed=0)
-    out = as_transitions(episode, ["pixels"], is_expert=True)
+    out = as_transitions(episode, ["pixels"], is_demonstration=True)
     assert out.batch_size == (len(episode),)
-    assert out["is_expert"].all()
-    assert set(out.keys()) == {"pixels", "holding", "action", "next", "is_expert"}
+    assert out["is_demonstration"].all()
+    assert set(out.keys()) == {"pixels", "holding", "action", "next", "is_demonstration"}
 
 
 def test_demonstrations_are_restored_from_disk(expert_env, tmp_path):

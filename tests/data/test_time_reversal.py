@@ -289,7 +289,7 @@ def test_episodes_are_collected_in_a_vector_of_environments():
     assert [len(episode) for episode in episodes] == [4, 4, 4]
     for episode, original in zip(episodes, played, strict=True):
         assert torch.equal(episode["pixels"][0], original["next", "pixels"][-1])
-    transitions = as_transitions(episodes[0], ["pixels", "in_hand"], is_expert=True)
+    transitions = as_transitions(episodes[0], ["pixels", "in_hand"], is_demonstration=True)
     assert keys.IN_HAND in transitions
     assert (keys.NEXT, keys.IN_HAND) in transitions.keys(include_nested=True)
 

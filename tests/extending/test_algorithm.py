@@ -37,12 +37,12 @@ def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
     losses = read_scalars(tmp_path / "run")["train/loss_actor"].values
     assert losses[-10:].mean() < 0.8 * losses[:10].mean()
     stored = experiment.algorithm.replay.storage
-    is_expert = stored.column(keys.IS_EXPERT)[:, 0]
-    action, expert_action = stored.column(keys.ACTION), stored.column(keys.EXPERT_ACTION)
-    assert torch.equal(action[is_expert], expert_action[is_expert])
-    assert is_expert.all() == bool(pretrain_updates)
+    is_demonstration = stored.column(keys.IS_DEMONSTRATION)[:, 0]
+    action, target = stored.column(keys.ACTION), stored.column(keys.TARGET_ACTION)
+    assert torch.equal(action[is_demonstration], target[is_demonstration])
+    assert is_demonstration.all() == bool(pretrain_updates)
     if not pretrain_updates:  # collected by the policy, labelled by the expert
-        assert not torch.equal(action[~is_expert], expert_action[~is_expert])
+        assert not torch.equal(action[~is_demonstration], target[~is_demonstration])
     _, restored = load(tmp_path / "run")
     for a, b in zip(
         experiment.algorithm.loss.parameters(), restored.loss.parameters(), strict=True

@@ -54,7 +54,7 @@ def test_the_term_is_against_the_entry_of_the_expert():
     data["label"] = data[keys.ACTION].clone()
     data[keys.ACTION] = -data[keys.ACTION] / 3  # what was executed in place of the expert's action
     loss = make(demonstration_weight=0.3)
-    loss.set_keys(expert_action="label")
+    loss.set_keys(target_action="label")
     assert {"label", keys.ACTION} <= set(loss.in_keys)
     found, expected = loss(data), make(demonstration_weight=0.3)(executed)
     for name in ("loss_actor", "demonstration_error", "entropy"):

@@ -7,8 +7,7 @@ import torch
 from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.envs import keys
-from ba_torchrl.objectives.contrastive import BilinearInfoNCE
-from ba_torchrl.objectives.target_updates import SoftUpdateByNetwork
+from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SoftUpdateByNetwork
 from tests.linear_sac import batch, make
 
 

@@ -62,7 +62,7 @@ def batch(size=12, experts="some", seed=0):
     }
     action = torch.stack([torch.randint(n, (size,), generator=rng) for n in SIZES], dim=1).float()
     return TensorDict(
-        {**state, "action": action, "is_expert": flags, "next": following}, batch_size=[size]
+        {**state, "action": action, "is_demonstration": flags, "next": following}, batch_size=[size]
     )
 
 
@@ -102,7 +102,7 @@ def by_hand(
         priorities.append(sum(map(abs, errors)) / 2)
         sample = 0.0
         for level, (values, choice) in enumerate(zip(q, choices, strict=True)):
-            if not data["is_expert"][i]:
+            if not data["is_demonstration"][i]:
                 continue
             if kind == "sdqfd":
                 gaps = [
@@ -120,7 +120,7 @@ def by_hand(
                 log_sum = top + math.log(sum(math.exp(s - top) for s in scaled))
                 sample += log_sum - scaled[choice]
         terms.append(sample if term_weights is None else term_weights[i] * sample)
-    experts = int(data["is_expert"].sum())
+    experts = int(data["is_demonstration"].sum())
     count = len(data) if kind == "sdqfd" else max(experts, 1)
     return td, weight * sum(terms) / count, priorities
 
@@ -228,13 +228,13 @@ def test_the_target_network_gets_no_gradient_and_the_network_does():
 
 
 def test_only_plain_dqn_works_without_the_expert_flag():
-    data = batch().exclude("is_expert")
+    data = batch().exclude("is_demonstration")
     loss = make_loss(demonstrations="none")
-    assert "is_expert" not in loss.in_keys
+    assert "is_demonstration" not in loss.in_keys
     assert loss(data)["loss_demonstration"] == 0
     other = make_loss()
-    assert "is_expert" in other.in_keys
-    with pytest.raises(KeyError, match="is_expert"):
+    assert "is_demonstration" in other.in_keys
+    with pytest.raises(KeyError, match="is_demonstration"):
         other(data)
 
 
@@ -267,8 +267,8 @@ def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum(demonstra
 @pytest.mark.parametrize("demonstrations", ["dqfd", "sdqfd", "adet"])
 def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstrations):
     data = batch()
-    is_expert = data["is_expert"][:, 0]
-    assert 0 < is_expert.sum() < len(data)
+    is_demonstration = data["is_demonstration"][:, 0]
+    assert 0 < is_demonstration.sum() < len(data)
 
     def of(reduction):
         torch.manual_seed(0)
@@ -276,9 +276,9 @@ def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstr
         return loss(data.clone())["loss_demonstration"].detach()
 
     losses = of("none")
-    assert (losses[~is_expert] == 0).all()
-    assert (losses[is_expert] > 0).all()
-    share = len(data) if demonstrations == "sdqfd" else is_expert.sum()
+    assert (losses[~is_demonstration] == 0).all()
+    assert (losses[is_demonstration] > 0).all()
+    share = len(data) if demonstrations == "sdqfd" else is_demonstration.sum()
     torch.testing.assert_close(of("mean"), losses.sum() / share)
 
 
@@ -320,7 +320,7 @@ def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
         best = network(data["next", "pixels"]).max(dim=1, keepdim=True).values
         target = data["next", "reward"] + GAMMA * ~data["next", "terminated"] * best
         wanted = nn.functional.huber_loss(q.gather(1, index[:, None]), target)
-        margin = (strict_large_margin(q, index, 0.3) * data["is_expert"][:, 0]).mean()
+        margin = (strict_large_margin(q, index, 0.3) * data["is_demonstration"][:, 0]).mean()
     torch.testing.assert_close(found["loss_qvalue"], wanted)
     torch.testing.assert_close(found["demonstration_error"], margin)
     (found["loss_qvalue"] + found["loss_demonstration"]).backward()

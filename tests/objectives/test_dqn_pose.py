@@ -65,7 +65,7 @@ def batch(size=10, experts="some", seed=0):
         "done": ends[0] | ends[1],
     }
     data = TensorDict(
-        {**state(), "is_expert": flags, "next": {**state(), **following}}, batch_size=[size]
+        {**state(), "is_demonstration": flags, "next": {**state(), **following}}, batch_size=[size]
     )
     data["action"] = ACTIONS.to_action(chosen, data["holding"])
     return data, chosen.tolist()
@@ -128,10 +128,10 @@ def test_the_losses_of_five_levels_equal_loops(kind, experts):
             taken = tuple(choices[:2]) if level == 0 else (choices[level + 1],)
             errors.append(abs(q[taken] - y))
             td += 0.5 * errors[-1] ** 2 if errors[-1] < 1 else errors[-1] - 0.5
-            if data["is_expert"][i] and kind != "none":
+            if data["is_demonstration"][i] and kind != "none":
                 term += demonstration_term(kind, q, taken, level)
         priorities.append(sum(errors) / 5)
-    count = len(data) if kind == "sdqfd" else max(int(data["is_expert"].sum()), 1)
+    count = len(data) if kind == "sdqfd" else max(int(data["is_demonstration"].sum()), 1)
     out = loss(data)
     assert float(out["loss_qvalue"].detach()) == pytest.approx(td / len(data), rel=1e-5)
     assert float(out["loss_demonstration"].detach()) == pytest.approx(0.2 * term / count, rel=1e-4)

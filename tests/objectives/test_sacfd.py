@@ -89,7 +89,7 @@ def by_hand(
         actor_term += policy_weights[i] * (alpha * log_prob - min(q(x, action, ""))) / n
         alpha_term -= others[i] * math.log(alpha) * (log_prob + target_entropy) / n
         entropy -= log_prob / n
-        if keys.IS_EXPERT in data and data[keys.IS_EXPERT][i]:
+        if keys.IS_DEMONSTRATION in data and data[keys.IS_DEMONSTRATION][i]:
             experts += 1
             error = sum((a - e) ** 2 for a, e in zip(action, stored, strict=True)) / 2
             behaviour += error
@@ -188,7 +188,7 @@ def test_steps_to_next_obs_raises_gamma():
 
 def test_plain_sac_needs_no_expert_flag():
     loss = make(demonstration_weight=0.0)
-    assert keys.IS_EXPERT not in loss.in_keys
+    assert keys.IS_DEMONSTRATION not in loss.in_keys
     data = batch(experts=None)
     out = loss(data)
     expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 0)
@@ -248,7 +248,7 @@ def test_renamed_keys():
     expected = plain(data.clone())
     renames = {
         keys.ACTION: "act",
-        keys.IS_EXPERT: ("meta", "demo"),
+        keys.IS_DEMONSTRATION: ("meta", "demo"),
         (keys.NEXT, keys.REWARD): (keys.NEXT, "r"),
         (keys.NEXT, keys.TERMINATED): (keys.NEXT, "end"),
         (keys.NEXT, keys.DONE): (keys.NEXT, "stop"),
@@ -260,7 +260,7 @@ def test_renamed_keys():
     renamed.qvalue_network.in_keys[1] = "act"
     renamed.set_keys(
         action="act",
-        is_expert=("meta", "demo"),
+        is_demonstration=("meta", "demo"),
         reward="r",
         terminated="end",
         done="stop",

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.demo_files import save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.errors import ConfigError

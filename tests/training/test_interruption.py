@@ -9,7 +9,7 @@ import pytest
 import torch
 from torchrl.checkpoint import GlobalRNGState
 
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result

@@ -128,7 +128,7 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path, changes)
     first = 3 if changes else 1
     assert scalars["train/loss_qvalue"].steps.tolist() == list(range(first, 10))
     assert scalars["demonstrations/success_rate"].steps.tolist() == [0]
-    demonstrated = len(experiment.algorithm.replay.storage.column("is_expert").nonzero())
+    demonstrated = len(experiment.algorithm.replay.storage.column("is_demonstration").nonzero())
     assert experiment.algorithm.replay_size == demonstrated + 14
     assert resumable_updates(config.folder) is None
     assert not (config.folder / "resume").exists()

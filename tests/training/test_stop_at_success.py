@@ -2,7 +2,7 @@
 
 import pytest
 
-from ba_torchrl.algorithms.seeds import SeedUse
+from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.record.results import read_result
 from ba_torchrl.training import experiment as experiments
 from ba_torchrl.training.config import ExperimentConfig

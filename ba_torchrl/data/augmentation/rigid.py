@@ -153,13 +153,13 @@ class RigidAugmentation(nn.Module):
             tensordict: holds the images, ``action`` and their successors.
 
         Raises:
-            ValueError: it has ``expert_action``, which would not be transformed.
+            ValueError: it has ``target_action``, which would not be transformed.
         """
         out = tensordict.copy()
         if self.transforms == "none":
             return out
-        if keys.EXPERT_ACTION in tensordict:
-            raise ValueError(f"augmentation {self.transforms!r} does not transform expert_action")
+        if keys.TARGET_ACTION in tensordict:
+            raise ValueError(f"augmentation {self.transforms!r} does not transform target_action")
         device = tensordict[keys.ACTION].device
         action = tensordict[keys.ACTION].cpu()
         is_found, transform = self._draw_inside(action)

@@ -159,7 +159,7 @@ class SO2Augmentation(nn.Module):
 
         Args:
             tensordict: holds the images, their successors, ``action`` and, if there is one,
-                ``expert_action``.
+                ``target_action``.
         """
         (batch,) = tensordict.batch_size
         draws = torch.rand(2, batch, generator=self._generator, dtype=torch.float64, device="cpu")
@@ -170,7 +170,7 @@ class SO2Augmentation(nn.Module):
             return out
         for key in self._scene_images:
             map_pairs(out, key, chosen, lambda images: rotate_images(images, angle))
-        labels = [keys.EXPERT_ACTION] if keys.EXPERT_ACTION in tensordict else []
+        labels = [keys.TARGET_ACTION] if keys.TARGET_ACTION in tensordict else []
         for key in [keys.ACTION, *labels]:
             action = tensordict[key].clone()
             rows = to_device(chosen, action.device)[:, None]

@@ -106,8 +106,8 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
 
     @property
     def num_demonstrations(self) -> int:
-        """Number of stored transitions with the flag ``is_expert``."""
-        return int(self.storage.column(keys.IS_EXPERT).sum()) if len(self) else 0
+        """Number of stored transitions with the flag ``is_demonstration``."""
+        return int(self.storage.column(keys.IS_DEMONSTRATION).sum()) if len(self) else 0
 
     def _check_schema(self, data: TensorDictBase) -> None:
         found = {key: (value.dtype, value.shape[1:]) for key, value in data.items(True, True)}

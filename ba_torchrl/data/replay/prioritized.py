@@ -19,9 +19,9 @@ _segment_tree.install()  # also for a replay without environments
 class ExpertPrioritizedSampler(PrioritizedSampler):
     """Prioritised sampling that prefers demonstrations (appendix G.2).
 
-    A transition is drawn in proportion to p ^ alpha, with p = |td| + eps + bonus * is_expert. A new
-    one, demonstration or not, has the largest p that an update has set so far, and at least one, as
-    in Schaul et al. (2016) and the reference implementation. Each draw has the
+    A transition is drawn in proportion to p ^ alpha, with p = |td| + eps, plus the bonus for a
+    demonstration. A new one, demonstration or not, has the largest p that an update has set so far,
+    and at least one, as in Schaul et al. (2016) and the reference implementation. Each draw has the
     importance weight ``priority_weight`` = (p / p_min) ^ (-alpha beta), in (0, 1]; the loss
     normalises it over the batch.
 
@@ -47,7 +47,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         beta: float = 0.4,
         eps: float = 1e-6,
         expert_bonus: float = 1.0,
-        expert_key: NestedKey = keys.IS_EXPERT,
+        expert_key: NestedKey = keys.IS_DEMONSTRATION,
     ) -> None:
         if eps <= 0 or expert_bonus < 0:
             raise ValueError(

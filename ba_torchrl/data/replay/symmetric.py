@@ -39,8 +39,8 @@ class SymmetricSampler(StateFolder, Sampler):
         """
         if not len(storage):
             raise RuntimeError("cannot sample from an empty replay")
-        is_expert = storage.column(keys.IS_EXPERT).reshape(-1)
-        expert, online = (flags.nonzero()[:, 0] for flags in (is_expert, ~is_expert))
+        is_demonstration = storage.column(keys.IS_DEMONSTRATION).reshape(-1)
+        expert, online = (flags.nonzero()[:, 0] for flags in (is_demonstration, ~is_demonstration))
         count = batch_size // 2 if len(expert) else batch_size
         count = count if len(online) else 0
         halves = ((expert, batch_size - count), (online, count))

@@ -14,8 +14,8 @@ from ba_torchrl.errors import ConfigError
 class ExpertKeepingWriter(TensorDictRoundRobinWriter):
     """TorchRL's round-robin writer, which skips demonstrations when the storage is full.
 
-    A new transition overwrites the oldest one whose ``is_expert`` flag is not set. Data without
-    this entry are written as by TorchRL's writer.
+    A new transition overwrites the oldest one whose ``is_demonstration`` flag is not set. Data
+    without this entry are written as by TorchRL's writer.
     """
 
     def select_fitting(self, data: TensorDictBase) -> TensorDictBase:
@@ -31,7 +31,7 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         excess = 0 if indices is None else len(data) - len(indices)
         if excess <= 0:
             return data
-        others = (~data[keys.IS_EXPERT].reshape(-1)).nonzero().reshape(-1)
+        others = (~data[keys.IS_DEMONSTRATION].reshape(-1)).nonzero().reshape(-1)
         if not len(indices) or excess > len(others):
             raise ConfigError(
                 f"demonstrations fill the replay of {self._storage.max_size} transitions, and "
@@ -57,12 +57,12 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
     def _writable_indices(self, data: TensorDictBase) -> Tensor | None:
         """Return the indices to overwrite, oldest first; None if TorchRL's order applies."""
         storage = self._storage
-        if len(storage) + len(data) <= storage.max_size or keys.IS_EXPERT not in data:
+        if len(storage) + len(data) <= storage.max_size or keys.IS_DEMONSTRATION not in data:
             return None
         is_kept = torch.zeros(storage.max_size, dtype=torch.bool, device="cpu")
         if len(storage):
-            is_kept[: len(storage)] = storage.column(keys.IS_EXPERT).reshape(-1)
-        if not (is_kept.any() or data[keys.IS_EXPERT].any()):
+            is_kept[: len(storage)] = storage.column(keys.IS_DEMONSTRATION).reshape(-1)
+        if not (is_kept.any() or data[keys.IS_DEMONSTRATION].any()):
             return None
         order = (
             torch.arange(self._cursor, self._cursor + storage.max_size, device="cpu")

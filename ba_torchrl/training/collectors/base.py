@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from ba_torchrl.algorithms.base import Algorithm
+from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.config import StrictModel, WorkerOptions
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.registry import Registry
@@ -22,7 +22,7 @@ from ba_torchrl.registry import Registry
 class CollectionProblem:
     """What a collector needs of a run."""
 
-    algorithm: Algorithm
+    algorithm: Learner
     """Its policy explores, with the weights after the latest update."""
     device: torch.device
     """Device of the algorithm."""

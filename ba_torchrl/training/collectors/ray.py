@@ -15,7 +15,7 @@ from torchrl.collectors import Collector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
+from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
 from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ba_torchrl.algorithms.seeds import SeedUse, derive_seed
+from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem, CollectorConfig

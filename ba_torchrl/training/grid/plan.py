@@ -49,7 +49,9 @@ class BenchmarkConfig(StrictModel):
     tasks: list[str] = Field(min_length=1)
     """Ids of tasks."""
     algorithms: list[str] = Field(min_length=1)
-    """Names of preset files in ``configs/algorithm``."""
+    """Methods: names of preset files in ``configs/algorithm``, each followed by those in
+    ``configs/replay`` and ``configs/rotation`` that differ from "uniform" and "none":
+    "sacfd_per_so2"."""
     networks: list[str] = Field(min_length=1)
     """Names of preset files in ``configs/network``."""
     seeds: Annotated[int, Field(ge=1, le=1000)] | list[int] = 4

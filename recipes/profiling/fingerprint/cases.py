@@ -105,6 +105,17 @@ SMALL_NETWORK: dict[str, dict[str, Any]] = {
     },
 }
 
+OPEN_LOOP_METHODS = ("adet", "dqfd", "dqn", "sdqfd")
+METHODS = (
+    *OPEN_LOOP_METHODS,
+    *("bc", "dagger", "iql", "rlpd", "sac_so2", "sacfd_so2", "sacfd_per_so2"),
+    *(
+        f"{views}{method}"
+        for views in ("", "rad_", "drq_", "ferm_")
+        for method in ("sac", "sacfd", "sacfd_per")
+    ),
+)
+
 TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     "uniform": (
         CLOSE_LOOP_TASK,
@@ -132,10 +143,10 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
             "report": "best",
         },
     ),
-    "quickstart": (CLOSE_LOOP_TASK, "sacfd_per_so2_quick", "equi_small", {"file": "quickstart"}),
+    "quickstart": (CLOSE_LOOP_TASK, "sacfd_per_so2", "equi_small", {"file": "quickstart"}),
     "quickstart_open_loop": (
         OPEN_LOOP_TASK,
-        "sdqfd_quick",
+        "sdqfd",
         "equi_asr",
         {"file": "quickstart_open_loop", "env__num_objects": 2},
     ),
@@ -191,7 +202,7 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
     ),
     "processes": (CLOSE_LOOP_TASK, "sacfd_per_so2", "cnn", {"parallel": True}),
 }
-"""Variants of training: task, algorithm, network and overrides, "__" for a dot."""
+"""Variants of training: task, method, network and overrides, "__" for a dot."""
 
 
 @dataclass(frozen=True)
@@ -265,41 +276,36 @@ def _env_cases() -> Iterator[Case]:
 
 
 def _training_cases() -> Iterator[Case]:
-    """Yield every pair of an algorithm and a network preset, and some options."""
+    """Yield every pair of a method and a network preset, and some options."""
     networks = sorted(path.stem for path in (CONFIGS / "network").glob("*.yaml"))
-    for (algorithm, task), network in product(_tasks_of_algorithms().items(), networks):
-        yield _training_case(f"{algorithm} {network}", task, algorithm, network)
-    for name, (task, algorithm, network, changes) in TRAINING_OPTIONS.items():
-        yield _training_case(f"option {name}", task, algorithm, network, **changes)
+    for method, network in product(METHODS, networks):
+        task = OPEN_LOOP_TASK if method in OPEN_LOOP_METHODS else CLOSE_LOOP_TASK
+        yield _training_case(f"{method} {network}", task, method, network)
+    for name, (task, method, network, changes) in TRAINING_OPTIONS.items():
+        yield _training_case(f"option {name}", task, method, network, **changes)
 
 
-def _tasks_of_algorithms() -> dict[str, str]:
-    """Return the task of the cases of each algorithm preset."""
-    from hydra import initialize_config_dir
-
-    from ba_torchrl.algorithms.base import ALGORITHMS
-    from ba_torchrl.training import hydra_schema
-
-    hydra_schema.register()
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        presets = sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
-        names = {preset: hydra_schema.preset("algorithm", preset)["name"] for preset in presets}
-    return {
-        preset: CLOSE_LOOP_TASK if "close_loop" in ALGORITHMS[name].controls else OPEN_LOOP_TASK
-        for preset, name in names.items()
+def _choices(method: str) -> dict[str, Any]:
+    """Return the presets of a method; "sac" after the first leaves out the behaviour term."""
+    algorithm, *others = method.split("_")
+    chosen = {
+        "algorithm": algorithm,
+        "replay": "per" if "per" in others else "uniform",
+        "rotation": "so2" if "so2" in others else "none",
     }
+    return {**chosen, "algorithm.demonstration_weight": 0.0} if "sac" in others else chosen
 
 
 def _training_case(
-    name: str, task: str, algorithm: str, network: str, file: str = "train", **changes: Any
+    name: str, task: str, method: str, network: str, file: str = "train", **changes: Any
 ) -> Case:
     small = SMALL_CLOSE_LOOP if TASKS[task].control == "close_loop" else SMALL_OPEN_LOOP
-    if algorithm.startswith("ferm"):
+    if method.startswith("ferm"):
         small = {**small, "env.obs_size": 71, "algorithm.crop_size": 64}
     config = {
         "file": file,
         "task": task,
-        "algorithm": algorithm,
+        **_choices(method),
         "network": network,
         **SMALL_RUN,
         **small,

@@ -257,10 +257,10 @@ def test_the_seed_and_a_saved_state_determine_the_draws():
     assert torch.equal(second(data)["action"], following)
 
 
-def test_transitions_with_an_expert_action_beside_the_action_are_refused():
+def test_transitions_with_an_target_action_beside_the_action_are_refused():
     data = batch([(0.45, 0.05)] * 5)
-    data["expert_action"] = data["action"].clone()
-    with pytest.raises(ValueError, match="does not transform expert_action"):
+    data["target_action"] = data["action"].clone()
+    with pytest.raises(ValueError, match="does not transform target_action"):
         augmentation("se2", layout(), seed=0)(data)
 
 

@@ -113,7 +113,7 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
     data = batch(actions=len(sequence))
     x, y = sequence.index("x"), sequence.index("y")
     data[keys.ACTION] *= 0.5  # short enough never to leave the box
-    data[keys.EXPERT_ACTION] = -data[keys.ACTION]
+    data[keys.TARGET_ACTION] = -data[keys.ACTION]
     before = data.clone()
     # Images that show their action: a spot at 0.6 (dx, dy), another at its opposite.
     for i in range(len(data)):
@@ -126,7 +126,7 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
     moved = (out[keys.ACTION] - before[keys.ACTION]).abs()
     others = [i for i in range(len(sequence)) if i not in (x, y)]
     assert not moved[:, others].any()
-    torch.testing.assert_close(out[keys.EXPERT_ACTION], -out[keys.ACTION])
+    torch.testing.assert_close(out[keys.TARGET_ACTION], -out[keys.ACTION])
     assert (moved[:, [x, y]].sum(-1) > 1e-3).float().mean() > 0.9
     for i in range(len(data)):
         wanted = (0.6 * out[keys.ACTION][i, [x, y]]).tolist()

@@ -39,7 +39,7 @@ def episode(length, rng, size=8, expert=False, truncated=False):
             keys.PIXELS: frames[:-1],
             keys.HOLDING: holding[:-1],
             keys.ACTION: torch.from_numpy(rng.random((length, 5), dtype=np.float32)),
-            keys.IS_EXPERT: torch.full((length, 1), expert),
+            keys.IS_DEMONSTRATION: torch.full((length, 1), expert),
             keys.NEXT: {
                 keys.PIXELS: frames[1:],
                 keys.HOLDING: holding[1:],
@@ -58,7 +58,7 @@ def assert_same(stored, original):
     for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
         assert stored[key].dtype == torch.float32
         assert (stored[key] - original[key]).abs().max() <= QUANTIZER.max_error_m * 1.001
-    for key in (keys.HOLDING, keys.ACTION, keys.IS_EXPERT, (keys.NEXT, keys.TRUNCATED)):
+    for key in (keys.HOLDING, keys.ACTION, keys.IS_DEMONSTRATION, (keys.NEXT, keys.TRUNCATED)):
         assert torch.equal(stored[key], original[key])
 
 
@@ -206,7 +206,7 @@ def test_memory_of_expert_episodes(task):
     env.close()
     rb = make_replay("uniform", 200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
     for data in episodes:
-        rb.extend(as_transitions(data, ["pixels"], is_expert=True))
+        rb.extend(as_transitions(data, ["pixels"], is_demonstration=True))
     assert rb.storage.nbytes / len(rb) <= 5_000
     original = torch.cat(episodes)
     for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
@@ -263,7 +263,7 @@ def test_experts_are_preferred():
     rb, rng = buffer(100), np.random.default_rng(8)
     rb.extend(torch.cat([episode(50, rng, size=2, expert=True), episode(50, rng, size=2)]))
     rb.update_priority(torch.arange(100), torch.ones(100))
-    expert = torch.cat([rb.sample(500)[keys.IS_EXPERT] for _ in range(10)])
+    expert = torch.cat([rb.sample(500)[keys.IS_DEMONSTRATION] for _ in range(10)])
     wanted = 2**0.6 / (2**0.6 + 1)
     assert expert.float().mean().item() == pytest.approx(wanted, abs=0.03)
 
@@ -363,8 +363,8 @@ def test_empty_removes_everything():
 def test_column_reads_flags_without_images(monkeypatch):
     rb, rng = buffer(), np.random.default_rng(13)
     with pytest.raises(KeyError, match="empty"):
-        rb.storage.column(keys.IS_EXPERT)
+        rb.storage.column(keys.IS_DEMONSTRATION)
     rb.extend(torch.cat([episode(2, rng, expert=True), episode(2, rng)]))
     monkeypatch.setattr(FrameTable, "read", lambda *_: pytest.fail("decoded images"))
-    assert rb.storage.column(keys.IS_EXPERT).flatten().tolist() == [True, True, False, False]
+    assert rb.storage.column(keys.IS_DEMONSTRATION).flatten().tolist() == [True, True, False, False]
     rb.update_priority(torch.arange(4), torch.ones(4))

@@ -199,7 +199,7 @@ def make(flags, bonus=1.0, seed=0, capacity=None, **settings):
 
 def transitions(flags):
     flags = torch.tensor(flags)[:, None]
-    return TensorDict({keys.IS_EXPERT: flags, "x": torch.arange(len(flags))}, [len(flags)])
+    return TensorDict({keys.IS_DEMONSTRATION: flags, "x": torch.arange(len(flags))}, [len(flags)])
 
 
 FLAGS = [True, False, True, False, False, True, False, False]
@@ -370,7 +370,7 @@ def test_a_storage_of_two_dimensions():
     data = TensorDict(
         {
             "number": torch.arange(12).reshape(4, 3),
-            "is_expert": torch.zeros(4, 3, 1, dtype=torch.bool),
+            "is_demonstration": torch.zeros(4, 3, 1, dtype=torch.bool),
             "td": torch.ones(4, 3),
         },
         batch_size=[4, 3],
@@ -389,9 +389,13 @@ def test_the_bonus_in_a_storage_of_two_dimensions_is_that_of_the_experts():
     rb = TensorDictReplayBuffer(
         storage=LazyTensorStorage(6, ndim=2), sampler=sampler, batch_size=200
     )
-    is_expert = torch.zeros(2, 3, 1, dtype=torch.bool)
-    is_expert[1, 2] = True
-    rb.extend(TensorDict({"number": torch.arange(6).reshape(2, 3), "is_expert": is_expert}, [2, 3]))
+    is_demonstration = torch.zeros(2, 3, 1, dtype=torch.bool)
+    is_demonstration[1, 2] = True
+    rb.extend(
+        TensorDict(
+            {"number": torch.arange(6).reshape(2, 3), "is_demonstration": is_demonstration}, [2, 3]
+        )
+    )
     batch = rb.sample()
     assert set(batch["number"].tolist()) == set(range(6))  # new ones have the same priority
     batch["td_error"] = torch.ones(200)

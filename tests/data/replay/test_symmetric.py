@@ -10,7 +10,7 @@ from ba_torchrl.errors import ConfigError
 CODEC = HalfPrecision(0.25)
 
 
-def transitions(numbers, is_expert):
+def transitions(numbers, is_demonstration):
     """Transitions whose action and images have the value of their number."""
     count = len(numbers)
     value = torch.tensor(numbers, dtype=torch.float32)
@@ -25,7 +25,7 @@ def transitions(numbers, is_expert):
             "in_hand": image(0.01, 4),
             "holding": flag,
             "action": value[:, None],
-            "is_expert": flag | is_expert,
+            "is_demonstration": flag | is_demonstration,
             "next": {
                 "pixels": image(0.02, 8),
                 "in_hand": image(0.03, 4),
@@ -60,7 +60,7 @@ def test_half_of_every_batch_are_demonstrations():
     for _ in range(100):
         batch = made.sample()
         assert batch.batch_size == (8,)
-        assert batch["is_expert"].flatten().tolist() == [True] * 4 + [False] * 4
+        assert batch["is_demonstration"].flatten().tolist() == [True] * 4 + [False] * 4
         numbers = batch["action"].flatten().tolist()
         assert all(number < 10 for number in numbers[:4])
         assert all(number >= 50 for number in numbers[4:])
@@ -82,14 +82,14 @@ def test_it_is_a_torchrl_replay_buffer():
 
 
 def test_a_batch_of_odd_size_has_one_demonstration_more():
-    assert filled(batch_size=7).sample()["is_expert"].sum() == 4
+    assert filled(batch_size=7).sample()["is_demonstration"].sum() == 4
 
 
-@pytest.mark.parametrize("is_expert", [True, False])
-def test_one_side_fills_the_batch_while_the_other_is_empty(is_expert):
+@pytest.mark.parametrize("is_demonstration", [True, False])
+def test_one_side_fills_the_batch_while_the_other_is_empty(is_demonstration):
     made = replay()
-    made.extend(transitions(range(5), is_expert))
-    assert (made.sample()["is_expert"] == is_expert).all()
+    made.extend(transitions(range(5), is_demonstration))
+    assert (made.sample()["is_demonstration"] == is_demonstration).all()
     assert made.sample().batch_size == (8,)
 
 

@@ -10,7 +10,7 @@ from ba_torchrl.errors import ConfigError
 QUANTIZER = DepthQuantizer(0.4)
 
 
-def transitions(numbers, is_expert):
+def transitions(numbers, is_demonstration):
     """Transitions whose action is their number."""
     count = len(numbers)
     pixels = torch.zeros(count, 1, 4, 4)
@@ -18,7 +18,7 @@ def transitions(numbers, is_expert):
         {
             keys.PIXELS: pixels,
             keys.ACTION: torch.tensor(list(numbers), dtype=torch.float32)[:, None],
-            keys.IS_EXPERT: torch.full((count, 1), is_expert),
+            keys.IS_DEMONSTRATION: torch.full((count, 1), is_demonstration),
             keys.NEXT: {keys.PIXELS: pixels.clone()},
         },
         batch_size=[count],

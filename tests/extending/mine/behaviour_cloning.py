@@ -7,9 +7,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule
 
-from ba_torchrl.algorithms.base import ALGORITHMS
-from ba_torchrl.algorithms.learner import Learner
-from ba_torchrl.algorithms.learner_config import LearnerConfig
+from ba_torchrl.algorithms.base import ALGORITHMS, Learner, LearnerConfig
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import ActorCriticSpec
 
@@ -30,7 +28,7 @@ class BehaviourCloningLoss(LossModule):
         """Return the error of a batch."""
         with self.actor_network_params.to_module(self.actor_network):
             mode = self.actor_network.get_dist(tensordict).deterministic_sample
-        error = (mode - tensordict[keys.EXPERT_ACTION]).square().mean()
+        error = (mode - tensordict[keys.TARGET_ACTION]).square().mean()
         return TensorDict({"loss_actor": error})
 
 
@@ -39,6 +37,7 @@ class BehaviourCloningConfig(LearnerConfig):
     """Regression of the expert's actions, also in states that the policy visits (DAgger)."""
 
     controls: ClassVar[frozenset[str]] = frozenset({"close_loop"})
+    imitates: ClassVar[str] = "expert_everywhere"
 
     def build(self, network, problem):
         """Return the algorithm."""
@@ -47,8 +46,6 @@ class BehaviourCloningConfig(LearnerConfig):
 
 class BehaviourCloning(Learner):
     """Training of a policy by regression, with every other part of `Learner`."""
-
-    collects_expert_action = True
 
     def make_networks(self, network):
         """Return the actor of an actor-critic network."""
