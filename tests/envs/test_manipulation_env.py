@@ -130,33 +130,3 @@ def test_closing_frees_the_simulator(env):
     env.close()
     env.close(raise_if_closed=False)
     assert not pybullet.isConnected(physicsClientId=client)
-
-
-def test_dpos_and_drot_scale_the_action():
-    moved = []
-    for dpos, drot in ((0.05, 0.6), (0.01, 0.2)):
-        env = ba_torchrl.make(TASK, obs_size=16, seed=0, dpos=dpos, drot=drot)
-        state = env.reset()
-        env.step(state.set("action", torch.tensor([1.0, 1.0, 0.0, 0.0, 1.0])))
-        (x, _, _), yaw = env.scene.robot.tool_pose()
-        moved.append((x - 0.45, yaw))
-        env.close()
-    assert moved[0] == pytest.approx((0.05, 0.6), abs=1e-3)
-    assert moved[1] == pytest.approx((0.01, 0.2), abs=1e-3)
-
-
-def test_translations_are_clipped_to_the_workspace(env):
-    state = env.reset()
-    for _ in range(8):
-        state = env.step(state.set("action", torch.tensor([1.0, 1, -1, 1, 0])))["next"]
-    assert env.scene.robot.tool_pose()[0] == pytest.approx((0.6, -0.15, 0.25), abs=1e-3)
-
-
-def test_view_scale_sets_the_width_of_the_image():
-    heights = []
-    for scale in (1.5, 0.75):
-        env = ba_torchrl.make(TASK, obs_size=64, seed=0, view_scale=scale)
-        depth = env.reset()["pixels"]
-        heights.append(int((depth == 0).sum()))
-        env.close()
-    assert heights[1] == pytest.approx(4 * heights[0], rel=0.35)

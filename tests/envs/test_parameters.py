@@ -2,14 +2,16 @@
 
 import itertools
 import math
+import pickle
 
 import numpy as np
 import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.config import EnvConfig
+from ba_torchrl.config import CUSTOM_PHYSICS, EnvConfig
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
@@ -150,10 +152,8 @@ def test_half_rotation_keeps_the_yaw_within_a_half_turn(make):
     assert reached[True] == pytest.approx(math.pi / 2, abs=0.02)
 
 
-@pytest.mark.parametrize("task", ba_torchrl.list_tasks())
+@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].control == "close_loop"])
 def test_experts_stay_within_the_half_turn(make, task):
-    if TASKS[task].control != "close_loop":
-        pytest.skip("open-loop yaws are within a half turn by default")
     env = make(task, half_rotation=True, expert=True)
     successes = 0
     for _ in range(10):
@@ -164,20 +164,12 @@ def test_experts_stay_within_the_half_turn(make, task):
     assert successes >= 9
 
 
-def test_workspace_check_uses_centres_or_bounding_boxes(make):
+@pytest.mark.parametrize("task", [PICKING, "open_loop/block_stacking"])
+def test_workspace_check_uses_centres_or_bounding_boxes(make, task):
     for check, valid in (("point", True), ("bounding_box", False)):
-        env = make(workspace_check=check)
+        env = make(task, workspace_check=check)
         env.reset()
-        env.scene.task.block.place((0.59, 0.0, 0.025))
-        assert env.scene.task.is_valid() == valid
-
-
-def test_workspace_check_holds_for_open_loop_tasks_too(make):
-    for check, valid in (("point", True), ("bounding_box", False)):
-        env = make("open_loop/block_stacking", workspace_check=check)
-        env.reset()
-        edge_m = env.workspace.x[1]
-        env.scene.task.objects[0].place((edge_m - 5e-3, 0.0, 0.015))
+        env.scene.task.objects[0].place((env.workspace.x[1] - 5e-3, 0.0, 0.025))
         assert env.scene.task.is_valid() == valid
 
 
@@ -200,23 +192,35 @@ def test_in_hand_size_sets_the_size_of_in_hand_images(make):
 
 
 @pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].control == "open_loop"])
-def test_in_hand_images_have_the_size_of_the_appendix_by_default(make, task):
-    """24 pixels, and 40 on bumps (appendix G.1); projections on slopes have three channels."""
-    size, channels = 40 if task.startswith("bump/") else 24, 3 if "loop" not in task else 1
-    for given in ({}, {"in_hand_size": None}):
-        env = make(task, obs_size=32, **given)
-        assert env.images["in_hand"].shape == (channels, size, size)
-        assert env.config.in_hand_size == size
-    assert make(task, obs_size=32, in_hand_size=24).images["in_hand"].shape[1:] == (24, 24)
+def test_in_hand_images_are_those_of_the_appendix_by_default(task):
+    """24 pixels, and 40 on bumps (appendix G.1); projections on slopes."""
+    size, mode = 40 if task.startswith("bump/") else 24, "proj" if "loop" not in task else "raw"
+    for given in ({}, {"in_hand_size": None, "in_hand_mode": None}):
+        config = resolve_env(task, given).config
+        assert (config.in_hand_size, config.in_hand_mode) == (size, mode)
+    assert resolve_env(task, {"in_hand_size": 30}).config.in_hand_size == 30
 
 
-def test_a_complete_configuration_of_close_loop_is_valid(make):
-    config = make("close_loop/block_reaching", obs_size=32).config
-    assert config.in_hand_size is None
-    again = make("close_loop/block_reaching", **config.model_dump())
-    assert again.config == config
-    with pytest.raises(ConfigError, match="'in_hand_size' is for open-loop"):
-        make("close_loop/block_reaching", in_hand_size=40)
+def test_projections_have_three_channels(make):
+    assert make("open_loop/block_stacking", in_hand_mode="proj").images["in_hand"].channels == 3
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_resolved_configuration_is_valid_and_complete(task):
+    resolved = resolve_env(task, {"seed": 3})
+    again = resolve_env(task, resolved.config.model_dump())
+    assert again == resolved == pickle.loads(pickle.dumps(resolved))
+    unset = {name for name, value in resolved.config.model_dump().items() if value is None}
+    optional = {
+        "floor_color",
+        "workspace_color",
+        *CUSTOM_PHYSICS,
+        *TASKS[task].Parameters.model_fields,
+    }
+    if TASKS[task].control == "close_loop":
+        optional |= {"in_hand_mode", "in_hand_size"}
+    assert unset <= optional
+    assert unset >= {"floor_color", *CUSTOM_PHYSICS}
 
 
 def test_the_step_limit_grows_with_the_number_of_blocks(make):
