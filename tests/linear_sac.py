@@ -37,10 +37,10 @@ class LinearEncoder(nn.Module):
         return torch.tanh(self.net(torch.cat([pixels, holding.to(pixels.dtype)], dim=-1)))
 
 
-class LinearTwins(nn.Module):
-    def __init__(self):
+class LinearCritics(nn.Module):
+    def __init__(self, critics):
         super().__init__()
-        self.net = nn.Linear(6, 2)
+        self.net = nn.Linear(6, critics)
 
     def forward(self, features, action):
         return self.net(torch.cat([features, action], dim=-1))
@@ -62,7 +62,9 @@ class NoiselessTanhNormal:
         return (action.sum(dim=-1) + self.scale.log().sum(dim=-1)) / 2
 
 
-def make(distribution=NoiselessTanhNormal, seed=0, policy=None, **settings):
+def make(
+    distribution=NoiselessTanhNormal, seed=0, policy=None, kind=SACfDLoss, critics=2, **settings
+):
     torch.manual_seed(seed)
     observation = [keys.PIXELS, keys.HOLDING]
     network = TensorDictModule(policy or LinearPolicy(), observation, ["loc", "scale"])
@@ -71,10 +73,10 @@ def make(distribution=NoiselessTanhNormal, seed=0, policy=None, **settings):
         out_keys=[keys.ACTION],
         distribution_class=distribution,
     )
-    loss = SACfDLoss(
+    loss = kind(
         ProbabilisticTensorDictSequential(network, head),
         TensorDictModule(LinearEncoder(), observation, ["features"]),
-        TensorDictModule(LinearTwins(), ["features", keys.ACTION], ["state_action_value"]),
+        TensorDictModule(LinearCritics(critics), ["features", keys.ACTION], ["state_action_value"]),
         **settings,
     )
     loss.double()

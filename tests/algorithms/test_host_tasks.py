@@ -173,17 +173,16 @@ def test_the_host_reads_no_result_during_an_update(algorithm, network, settings)
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
-@pytest.mark.parametrize("demonstrations", ["none", "adet", "dqfd", "sdqfd"])
 @pytest.mark.parametrize(
-    ("network", "channels"),
+    ("network", "channels", "demonstrations"),
     [
-        ("asr", 1),
-        ("asr", 3),
-        ("equi_asr", 1),
-        ("equi_deictic_asr", 3),
-        ("equi_fcn", 1),
-        ("fcn", 1),
-        ("rot_fcn", 1),
+        *(("asr", 1, demonstrations) for demonstrations in ("none", "adet", "dqfd", "sdqfd")),
+        ("asr", 3, "sdqfd"),
+        ("equi_asr", 1, "sdqfd"),
+        ("equi_deictic_asr", 3, "sdqfd"),
+        ("equi_fcn", 1, "sdqfd"),
+        ("fcn", 1, "sdqfd"),
+        ("rot_fcn", 1, "sdqfd"),
     ],
 )
 def test_losses_of_spatial_networks_read_no_result(network, channels, demonstrations):

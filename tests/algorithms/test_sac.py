@@ -114,17 +114,6 @@ def test_updates_change_priorities_and_counter_and_imitate(demonstrations):
     assert sampler.beta == 1.0
 
 
-def test_the_learning_rate_falls_linearly_over_the_run(demonstrations):
-    sac = build(learning_rate=1e-3, learning_rate_end_factor=0.1)
-    sac.extend(demonstrations)
-    rates = []
-    for _ in range(12):
-        rates.append(sac.optimizer.param_groups[0]["lr"])
-        sac.update()
-    assert rates[:11] == pytest.approx([1e-3 * (1 - 0.09 * k) for k in range(11)])
-    assert rates[11] == pytest.approx(1e-4)
-
-
 def test_plain_sac_needs_no_demonstrations(demonstrations):
     sac = build(demonstration_weight=0.0, replay="uniform", augmentation="none")
     online = demonstrations.clone()

@@ -8,21 +8,16 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
-from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
-from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
-from ba_torchrl.data.transitions import WITH_TARGET
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
-from tests.specs import close_loop_images, open_loop_images
+from tests.algorithms import tiny
 
-BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
 SAC = {
     "learning_rate": 0.003,
     "weight_decay": 0.02,
@@ -78,58 +73,16 @@ OF_PRIORITIES = {
 
 
 def build(name, **changes):
-    torch.manual_seed(0)
-    is_close = name == "sac"
-    problem = Problem(
-        control="close_loop" if is_close else "open_loop",
-        images=close_loop_images(64) if is_close else open_loop_images(32),
-        actions=CloseLoopActions("pxyzr") if is_close else OpenLoopActions("pxyr", BOUNDS),
-        total_updates=10,
-        seed=0,
-        device=torch.device("cpu"),
-    )
-    network = (
-        parse(NETWORKS["cnn"], {"width": 0.25}, "cnn")
-        if is_close
-        else parse(NETWORKS["asr"], {"num_rotations": 4, "width": 0.125}, "asr")
-    )
     values = {**KINDS[name], **changes}
     if values["replay"] != "prioritized":
         values = {key: value for key, value in values.items() if key not in OF_PRIORITIES}
-    settings = parse(ALGORITHMS[name], values, name)
-    return settings.build(network, problem)
+    return tiny.build(name, "cnn" if name == "sac" else "asr", **values)
 
 
-def transitions(algorithm, count=24):
+def transitions(algorithm):
     """Random transitions, every second one a demonstration."""
-    generator = torch.Generator().manual_seed(1)
-
-    def state():
-        images = {
-            key: torch.rand(count, *image.shape, generator=generator) * image.high
-            for key, image in algorithm.images.items()
-        }
-        return {**images, keys.HOLDING: torch.rand(count, 1, generator=generator) < 0.5}
-
-    low, high = (0.26, 0.6) if "in_hand" in algorithm.images else (-0.9, 0.9)
-    size = algorithm.problem.actions.size
-    action = low + (high - low) * torch.rand(count, size, generator=generator)
-    if "in_hand" in algorithm.images:
-        action[:, 2] -= 0.45
-    ended = torch.zeros(count, 1, dtype=torch.bool)
-    following = {
-        **state(),
-        keys.REWARD: torch.rand(count, 1, generator=generator),
-        **{key: ended.clone() for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)},
-    }
-    is_demonstration = torch.arange(count)[:, None] % 2 == 0
-    actions = {keys.ACTION: action}
-    if algorithm.config.imitates in WITH_TARGET:
-        actions[keys.TARGET_ACTION] = -action / 2
-    return TensorDict(
-        {**state(), **actions, keys.IS_DEMONSTRATION: is_demonstration, keys.NEXT: following},
-        [count],
-    )
+    is_spatial = algorithm.problem.control == "open_loop"
+    return (tiny.spatial_transitions if is_spatial else tiny.transitions)(algorithm, 24)
 
 
 @pytest.fixture(params=["sac", "spatial_q"])

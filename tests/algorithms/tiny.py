@@ -49,10 +49,11 @@ def spatial_problem(sequence="pxyr", channels=1):
 
 
 def build(algorithm, network="cnn", **settings):
-    """A learner for `problem`."""
+    """A learner for `problem` or, with a network of the open loop, `spatial_problem`."""
     torch.manual_seed(0)
     config = parse(ALGORITHMS[algorithm], settings, algorithm)
-    return config.build(parse(NETWORKS[network], SIZES[network], network), problem())
+    spec = parse(NETWORKS[network], SIZES[network], network)
+    return config.build(spec, problem() if spec.control == "close_loop" else spatial_problem())
 
 
 def transitions(learner, count=24):
@@ -83,12 +84,12 @@ def transitions(learner, count=24):
     return TensorDict(data, [count])
 
 
-def spatial_transitions(learner):
-    """Eight of `transitions`, with actions of the learner's grid."""
-    data = transitions(learner, 8)
+def spatial_transitions(learner, count=8):
+    """As `transitions`, with actions of the learner's grid."""
+    data = transitions(learner, count)
     generator = torch.Generator().manual_seed(2)
     low, high = torch.tensor(learner.problem.actions.ranges).T
-    action = low + (high - low) * torch.rand(8, len(low), generator=generator)
+    action = low + (high - low) * torch.rand(count, len(low), generator=generator)
     data[keys.ACTION] = learner.nearest_action(action)
     return data
 

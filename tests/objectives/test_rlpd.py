@@ -4,52 +4,20 @@ import math
 
 import pytest
 import torch
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-)
-from torch import nn
-from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.rlpd import RLPDLoss
-from tests.linear_sac import LinearEncoder, LinearPolicy, NoiselessTanhNormal, batch
+from tests import linear_sac
+from tests.linear_sac import batch
 
 CRITICS, ALPHA, GAMMA = 4, 0.2, 0.9
-OBSERVATION = [keys.PIXELS, keys.HOLDING]
 
 
-class LinearValues(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.net = nn.Linear(6, CRITICS)
-
-    def forward(self, features, action):
-        return self.net(torch.cat([features, action], dim=-1))
-
-
-def make(**settings):
-    torch.manual_seed(0)
-    head = ProbabilisticTensorDictModule(
-        in_keys=["loc", "scale"], out_keys=[keys.ACTION], distribution_class=NoiselessTanhNormal
-    )
-    policy = TensorDictModule(LinearPolicy(), OBSERVATION, ["loc", "scale"])
-    loss = RLPDLoss(
-        ProbabilisticTensorDictSequential(policy, head),
-        TensorDictModule(LinearEncoder(), OBSERVATION, ["features"]),
-        TensorDictModule(LinearValues(), ["features", keys.ACTION], ["state_action_value"]),
-        alpha_init=ALPHA,
-        target_entropy=-1.5,
-        **settings,
-    )
-    loss.make_value_estimator(gamma=GAMMA).double()
-    SoftUpdate(loss, tau=0.01)
-    with torch.no_grad():  # targets that differ from the online networks
-        for name in ("target_encoder_network_params", "target_qvalue_network_params"):
-            for value in getattr(loss, name).values(True, True):
-                value.mul_(0.7)
-    return loss
+def make(draws=0, **settings):
+    options = {"kind": RLPDLoss, "critics": CRITICS, "alpha_init": ALPHA, "target_entropy": -1.5}
+    loss = linear_sac.make(**options, **settings)
+    loss._generator.manual_seed(draws)
+    return loss.make_value_estimator(gamma=GAMMA).double()
 
 
 def affine(params, x):
@@ -101,7 +69,7 @@ def test_the_terms_are_those_of_the_formula(entropy_backup):
 
 
 def test_targets_are_from_random_subsets_of_the_given_size():
-    loss, data = make(subset=2, seed=3), batch(weights=None)
+    loss, data = make(subset=2, draws=3), batch(weights=None)
     pairs = [(i, j) for i in range(CRITICS) for j in range(i)]
     # pairs with the same lowest critic have the same target
     candidates = torch.stack([target_of(loss, data, pair, False) for pair in pairs])
@@ -127,7 +95,7 @@ def test_gradients_reach_disjoint_parameters():
 
 
 def test_the_critics_alone_have_the_same_loss():
-    first, second, data = make(seed=1), make(seed=1), batch(weights=None)
+    first, second, data = make(draws=1), make(draws=1), batch(weights=None)
     critic = first.critic_loss(data)
     assert "loss_actor" not in critic
     torch.testing.assert_close(critic["loss_qvalue"], second(data)["loss_qvalue"])
