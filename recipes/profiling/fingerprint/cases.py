@@ -100,7 +100,7 @@ SMALL_NETWORK: dict[str, dict[str, Any]] = {
         "network.width": 0.25,
         "network.num_rotations": 4,
         "network.num_z": 6,
-        "env.actions.sequence": "pxyzrrr",
+        "env.action_sequence": "pxyzrrr",
         "env.in_hand_mode": "proj",
     },
 }
