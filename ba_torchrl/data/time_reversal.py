@@ -22,9 +22,8 @@ from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.deconstruction import Deconstruction
-from ba_torchrl.tasks.structures.open_loop import StructureTask
-from ba_torchrl.tasks.structures.undo import UndoRecorder
+from ba_torchrl.tasks.structures.base import StructureTask
+from ba_torchrl.tasks.structures.deconstruction import Deconstruction, UndoRecorder
 
 _ENDS = (
     keys.REWARD,

@@ -19,7 +19,7 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import Pose
-from ba_torchrl.tasks.structures.undo import UndoRecorder
+from ba_torchrl.tasks.structures.deconstruction import UndoRecorder
 
 TASK = "open_loop/house_building_2"
 STRUCTURES = [

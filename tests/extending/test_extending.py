@@ -70,7 +70,7 @@ def test_new_tasks_keep_the_contract(task):
 def test_a_structure_has_its_fewest_steps_and_its_deconstruction():
     env = ba_torchrl.make("mine/bridge", seed=0, expert=True)
     assert env.reset() is not None
-    assert env.scene.task.planner.blueprint.optimal_steps == 4
+    assert env.scene.task.structure.blueprint.optimal_steps == 4
     assert play(env, 3) == (3, 12)
     env.close()
     apart = make_deconstruction_env("mine/bridge", seed=0, expert=True)

@@ -6,9 +6,9 @@ from typing import Literal
 
 from ba_torchrl.config import TaskParameters
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
-from ba_torchrl.tasks.structures.open_loop import StructureTask
-from ba_torchrl.tasks.structures.parts import cube, cylinder
+from ba_torchrl.tasks.structures.pieces import cube, cylinder
 
 BLOCKS = {"cube": cube, "cylinder": cylinder}
 """Pieces by `object_type`."""

@@ -26,12 +26,12 @@ from ba_torchrl.tasks.manipulation.commands import (
     swaps_fingers,
 )
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest, outline
+from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.packing.tilted_grasps import TiltedGrasp, tilted_grasp
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
-from ba_torchrl.tasks.structures.parts import CUBOID
-from ba_torchrl.tasks.structures.tilted_grasps import is_reachable, release_pose
+from ba_torchrl.tasks.structures.pieces import CUBOID
 
 PALLET_M = (0.232, 0.192, 0.03)
 """Extents of the pallet; all lengths are at the appendix's size."""
@@ -324,7 +324,7 @@ class BoxPalletizing(PackingTask):
         tool, heading = self.robot.tool_frame(), CUBOID.yaw_rad(held)
         turn = wrap_angle(yaw_rad - heading, math.pi)
         for yaw in (heading + turn, heading + turn + math.pi):
-            target = release_pose(CUBOID, held, Pose(position), yaw)
+            target = CUBOID.release_pose(held, Pose(position), yaw)
             pose = carrying_pose(tool, held.pose, target)
             if not swaps_fingers(pose) and is_reachable(
                 self.robot, self.terrain.support_ids, pose, PickPlaceLimits().pre_place_height_m

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, tower
 from ba_torchrl.tasks.structures.improvise import (
     START_GAP_M,
@@ -11,8 +12,7 @@ from ba_torchrl.tasks.structures.improvise import (
     shape_span,
     with_circular_spacing,
 )
-from ba_torchrl.tasks.structures.open_loop import StructureTask
-from ba_torchrl.tasks.structures.parts import cube, cuboid, pair_span, roof, triangle
+from ba_torchrl.tasks.structures.pieces import cube, cuboid, pair_span, roof, triangle
 
 
 @TASKS.register("open_loop/house_building_1")

@@ -20,8 +20,8 @@ from ba_torchrl.sim.geometry import (
 )
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.manipulation.clearance import tool_clearances_m
-from ba_torchrl.tasks.structures.parts import CUBOID
-from ba_torchrl.tasks.structures.tilted_grasps import is_reachable
+from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.structures.pieces import CUBOID
 
 ROLL_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Tilts of the closing axis that are compared: 1 is perpendicular to the sides of the box, so that

@@ -1,4 +1,7 @@
-"""The states of the pieces of a blueprint, and their assignment to its slots."""
+"""The states of the pieces of a blueprint, and their assignment to its slots.
+
+Bodies are matched to slots by their kind, so the assignments depend on the present scene only.
+"""
 
 from __future__ import annotations
 
@@ -77,6 +80,22 @@ def read_piece_states(
     return states
 
 
+def has_tipped(
+    pieces: Mapping[Body, Piece], held: Body | None, tipped_rad: float = UPRIGHT_RAD
+) -> bool:
+    """Whether a piece that must stay upright has tipped over and is not held.
+
+    Args:
+        pieces: the kind of each body.
+        held: the body in the gripper.
+        tipped_rad: tilt of a piece that has tipped over.
+    """
+    return any(
+        piece.stays_upright and body is not held and piece.tilt_rad(body) >= tipped_rad
+        for body, piece in pieces.items()
+    )
+
+
 class SlotAssigner:
     """Finds the assignments of the pieces, in their present states, to the slots of a blueprint.
 
@@ -101,6 +120,15 @@ class SlotAssigner:
         self.states = states
         self.block_m = block_m
         self.held = held
+
+    def evaluate(self) -> dict[str, bool]:
+        """Return whether the structure stands and whether no piece is held."""
+        is_built = any(not self.misplaced(found) for found in self.assignments())
+        return {"is_released": self.held not in self.pieces, "is_built": is_built}
+
+    def placed(self) -> set[Body]:
+        """Return the pieces that are in slots in every largest assignment."""
+        return set.intersection(*map(set, self.largest_assignments()[0]))
 
     def assignments(self) -> Iterator[Assignment]:
         """Yield every assignment that fills all slots."""

@@ -2,7 +2,7 @@
 
 It lists slots from the bottom up. Each slot names the kind of piece that fills it and the slots
 that support it: none for the ground, one, or two for a bridge. `SlotAssigner` matches bodies to
-slots, and `StructurePlanner` tests whether the structure stands and returns the next move.
+slots and tests whether the structure stands, and `next_move` returns the next move.
 """
 
 from __future__ import annotations
@@ -14,7 +14,16 @@ from typing import NamedTuple
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Quaternion, Vector, axes_quaternion, cross, quaternion_matrix
+from ba_torchrl.sim.geometry import (
+    Pose,
+    Quaternion,
+    Vector,
+    axes_quaternion,
+    cross,
+    quaternion_matrix,
+    quaternion_product,
+    surface_quaternion,
+)
 from ba_torchrl.sim.shapes import Shape
 from ba_torchrl.tasks.workspace import Spacing
 
@@ -73,6 +82,23 @@ class Piece:
         if abs(y_axis[2]) <= abs(x_axis[2]):
             x_axis = cross(y_axis, z_axis)
         return axes_quaternion(x_axis, z_axis)
+
+    def in_resting_frame(self, body: Body) -> Quaternion:
+        """Return the orientation of a body relative to the frame of the side on which it lies."""
+        x, y, z, w = self.resting_frame(body)
+        return quaternion_product((-x, -y, -z, w), body.pose.orientation)
+
+    def release_pose(self, body: Body, origin: Pose, yaw_rad: float) -> Pose:
+        """Return the pose at which a body rests on its support.
+
+        Args:
+            body: the body.
+            origin: a frame at its origin whose z axis is the normal of the support.
+            yaw_rad: yaw of the frame of the side on which it lies.
+        """
+        normal = tuple(row[2] for row in quaternion_matrix(origin.orientation))
+        frame = surface_quaternion(normal, yaw_rad)
+        return Pose(origin.position, quaternion_product(frame, self.in_resting_frame(body)))
 
     @property
     def grasped_width_m(self) -> float:

@@ -7,27 +7,37 @@ The commands that undo its actions, in reverse order, build the structure.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ba_torchrl.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import PlanarFrame, Pose, YawPose, downward_pose, quaternion_yaw
-from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import OpenLoopTask, TaskSettings
+from ba_torchrl.sim.geometry import (
+    ORIGIN,
+    Matrix,
+    PlanarFrame,
+    Pose,
+    YawPose,
+    downward_pose,
+    quaternion_yaw,
+    tool_rotation,
+)
+from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.manipulation.commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.manipulation.footprints import extents_m, separation_m
 from ba_torchrl.tasks.structures.assignment import mean_position
+from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Slot
-from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
-from ba_torchrl.tasks.structures.planner import StructurePlanner
-from ba_torchrl.tasks.structures.tilted_grasps import release_pose
-from ba_torchrl.tasks.terrain.flat import Terrain
+from ba_torchrl.tasks.structures.experts import PickPlaceExpert
+from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
 from ba_torchrl.tasks.workspace import Spacing
 
+LowestToolHeight = Callable[[tuple[float, float], Matrix], float]
+"""Function of x and y of the tool and its rotation, which returns its least height."""
+MOVED_M = 5e-3
+"""Largest displacement of a body that counts as unmoved."""
 APART_BLOCKS = 2.4
 """Least distance between the centres of pieces that lie apart, in blocks."""
 GAP_M = 0.02
@@ -43,18 +53,6 @@ SITES = 300
 """Largest number of random sites that are compared for a piece."""
 
 
-class Deconstructible(Protocol):
-    """What deconstruction uses of a structure task, besides `OpenLoopTask`."""
-
-    settings: TaskSettings
-    world: World
-    robot: Robot
-    terrain: Terrain
-    finger_opening: float
-    planner: StructurePlanner
-    expert: PickPlaceExpert
-
-
 class Deconstruction(OpenLoopTask):
     """The reverse of a structure task: the structure stands, and its pieces must be moved apart.
 
@@ -62,7 +60,7 @@ class Deconstruction(OpenLoopTask):
         task: the task that builds the structure, with the same bodies and action limits.
     """
 
-    def __init__(self, task: Deconstructible) -> None:
+    def __init__(self, task: StructureTask) -> None:
         self.task = task
         self._heading_rad: float | None = None
         """Heading with which the structure is aligned on a narrow strip of ground."""
@@ -79,12 +77,12 @@ class Deconstruction(OpenLoopTask):
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Place the structure at random, built from the pieces of an episode of the task."""
         self.task.initialize_episode(rng)
-        planner = self.task.planner
-        slots = planner.blueprint.slots
-        unused = list(planner.pieces)
+        structure = self.task.structure
+        slots = structure.blueprint.slots
+        unused = list(structure.pieces)
         bodies = []
         for slot in slots:
-            candidates = [body for body in unused if planner.pieces[body].kind == slot.piece.kind]
+            candidates = [body for body in unused if structure.pieces[body].kind == slot.piece.kind]
             bodies.append(candidates[rng.integers(len(candidates))])
             unused.remove(bodies[-1])
         # slots on the ground; of two supports of a bridge the first
@@ -92,7 +90,7 @@ class Deconstruction(OpenLoopTask):
             i
             for i, slot in enumerate(slots)
             if not slot.on
-            and (planner.blueprint.partner(i) is None or planner.blueprint.partner(i) > i)
+            and (structure.blueprint.partner(i) is None or structure.blueprint.partner(i) > i)
         ]
         width_m = 2 * max(map(footprint_radius_m, bodies)) + self.block_m
         spacings = [Spacing(width_m, width_m)] * len(on_ground)
@@ -159,10 +157,10 @@ class Deconstruction(OpenLoopTask):
 
     def expert_command(self) -> PickPlaceCommand:
         """Pick the highest piece that does not lie apart, and place it on free ground."""
-        self.task.expert.grasps.on_new_decision()
+        grasps = self.task.grasps()
         held = self.robot.held_body()
         if held is not None:
-            return self._place_apart(held)
+            return self._place_apart(held, grasps)
         pieces = self._pieces_to_move()
         if not pieces:
             return no_op(self.settings.workspace, is_holding=False)
@@ -174,11 +172,11 @@ class Deconstruction(OpenLoopTask):
         top = max(map(level, pieces))
         candidates = [body for body in pieces if level(body) == top]
         if self.action_limits.can_tilt:
-            return self.task.expert.pick(min(candidates, key=self.task.expert.pick_cost_m))
+            return PickPlaceExpert(grasps).pick(min(candidates, key=grasps.pick_cost_m))
         options = [
-            (self.task.expert.grasps.clearance_m(body, yaw), -i, body, yaw)
+            (grasps.clearance_m(body, yaw), -i, body, yaw)
             for i, body in enumerate(candidates)
-            for yaw in self.task.expert.grasps.yaws(body)
+            for yaw in grasps.yaws(body)
         ]
         _, _, body, yaw = max(options, key=lambda option: option[:2])
         x, y, _ = body.position
@@ -205,8 +203,8 @@ class Deconstruction(OpenLoopTask):
                 bridge, the point between them.
             rng: random generator.
         """
-        planner, body = self.task.planner, bodies[number]
-        piece, partner = planner.pieces[body], planner.blueprint.partner(number)
+        structure, body = self.task.structure, bodies[number]
+        piece, partner = structure.pieces[body], structure.blueprint.partner(number)
         supports = [bodies[i] for i in slot.on]
         if partner is not None and partner < number:
             xy = bodies[partner].position[:2]
@@ -221,7 +219,7 @@ class Deconstruction(OpenLoopTask):
             (ax, ay, _), (bx, by, _) = (support.position for support in supports)
             yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
         elif supports and slot.inherits_yaw and self.settings.random_orientation:
-            yaw = planner.pieces[supports[0]].yaw_rad(supports[0])
+            yaw = structure.pieces[supports[0]].yaw_rad(supports[0])
         self.task.stand(body, xy, yaw)
         if supports:
             top = max(vertical_extent(support)[1] for support in supports)
@@ -238,13 +236,13 @@ class Deconstruction(OpenLoopTask):
             bodies: the body in each slot.
             rng: random generator.
         """
-        planner = self.task.planner
-        slots = planner.blueprint.slots
-        bridge = slots[planner.blueprint.bridge_on(number)]
+        structure = self.task.structure
+        slots = structure.blueprint.slots
+        bridge = slots[structure.blueprint.bridge_on(number)]
         pair = [bodies[i] for i in bridge.on]
         if slots[number].on:  # along the y axis of their own support
             support = bodies[slots[number].on[0]]
-            yaw = planner.pieces[support].yaw_rad(support)
+            yaw = structure.pieces[support].yaw_rad(support)
         elif self._heading_rad is not None:
             yaw = self._heading_rad - math.pi / 2
         else:
@@ -254,7 +252,7 @@ class Deconstruction(OpenLoopTask):
         distance = (1 - share) * bridge.span.aim_m + share * bridge.span.most_m
         if bridge.span.gap_m is not None:  # sides on which no finger closes face each other
             for body in pair:
-                grasp_yaw = planner.pieces[body].grasp_yaws_rad[0]
+                grasp_yaw = structure.pieces[body].grasp_yaws_rad[0]
                 body.place(body.position, yaw - grasp_yaw + math.pi * rng.integers(2))
             first, second = (
                 (world_vertices(body)[:, :2] - body.position[:2]) @ line for body in pair
@@ -285,7 +283,7 @@ class Deconstruction(OpenLoopTask):
             or any(is_close(body, other) for other in bodies if other is not body)
         ]
 
-    def _place_apart(self, held: Body) -> PickPlaceCommand:
+    def _place_apart(self, held: Body, grasps: PickPlaceGrasps) -> PickPlaceCommand:
         """Return the place at the first random site with enough free space, or at the best one."""
         tool, pose = self.robot.tool_frame(), held.pose
         others = [other for other in self.objects if other is not held]
@@ -293,14 +291,13 @@ class Deconstruction(OpenLoopTask):
         outline = world_vertices(held)[:, :2] - held.position[:2]
         border = footprint_radius_m(held) + self.block_m / 4
         area = self.terrain.aside_area.shrunk(border)
-        rise_m = self.task.expert.rise_m(held)
+        rise_m = grasps.rise_m(held)
         radius_m = footprint_radius_m(held)
         rng = self._generator()
         best, place = -math.inf, None
         for _ in range(SITES):
             x, y = area.random_point(rng)
-            surface = self.terrain.contact_pose((x, y), radius_m)
-            origin = surface.compose(Pose((0.0, 0.0, rise_m)))
+            origin = self.terrain.origin_pose((x, y), rise_m, radius_m)
             yaw = self._tool_yaw(held, tool.yaw_rad, rng)
             margin = min(
                 math.dist((x, y), other.position[:2]) - APART_BLOCKS * self.block_m - GAP_M
@@ -312,15 +309,15 @@ class Deconstruction(OpenLoopTask):
             frame = PlanarFrame(x, y, yaw - tool.yaw_rad)
             own = extents_m(np.stack(frame.to_world(*outline.T), axis=1))
             gap = min(separation_m(own, other) for other in extents)
-            clearance = self.task.expert.grasps.clearance_m(held, yaw, origin.position)
+            clearance = grasps.clearance_m(held, yaw, origin.position)
             margin = min(margin, gap - GAP_M - SITE_GAP_M, clearance - RELEASE_CLEARANCE_M)
             if margin > best:
                 best = margin
                 target = pose.moved_to(origin.position, yaw - tool.yaw_rad)
                 if self.action_limits.can_tilt:
-                    piece = self.task.planner.pieces[held]
+                    piece = self.task.structure.pieces[held]
                     frame_yaw = quaternion_yaw(piece.resting_frame(held)) + yaw - tool.yaw_rad
-                    target = release_pose(piece, held, origin, frame_yaw)
+                    target = piece.release_pose(held, origin, frame_yaw)
                 place = place_command(tool, pose, target)
             if margin >= 0:
                 break
@@ -333,7 +330,7 @@ class Deconstruction(OpenLoopTask):
             return 0.0
         if self.settings.random_orientation:
             return float(rng.uniform(0.0, math.pi))
-        piece = self.task.planner.pieces[held]
+        piece = self.task.structure.pieces[held]
         turn = -piece.grasp_yaws_rad[0] - piece.yaw_rad(held)
         return tool_yaw_rad + wrap_angle(turn, piece.yaw_period_rad)
 
@@ -341,3 +338,56 @@ class Deconstruction(OpenLoopTask):
         """Return a random generator seeded with the positions of the pieces."""
         poses = np.array([body.position for body in self.objects])
         return np.random.default_rng(np.frombuffer(poses.tobytes(), np.uint32).tolist())
+
+
+class UndoRecorder(NamedTuple):
+    """The scene before an action, from which the command that undoes the action follows."""
+
+    poses: Mapping[Body, Pose]
+    held: Body | None
+    grasp: Pose | None
+    """Pose of the held body in the frame of the tool."""
+
+    @classmethod
+    def record(cls, bodies: Sequence[Body], held: Body | None, grasp: Pose | None) -> UndoRecorder:
+        """Return a recorder of the present scene.
+
+        Args:
+            bodies: the bodies that an action may move.
+            held: the body in the gripper.
+            grasp: pose of the held body in the frame of the tool.
+        """
+        return cls({body: body.pose for body in bodies}, held, grasp)
+
+    def undo_command(
+        self,
+        held: Body | None,
+        grasp: Pose | None,
+        lowest_tool_m: LowestToolHeight = lambda xy, rotation: -math.inf,
+    ) -> PickPlaceCommand | None:
+        """Return the command that undoes the action since the recording.
+
+        A pick is undone by a place at the pose from which the body was picked, a place by a pick at
+        the pose where the body came to rest. Both use the grasp of the body, so the tool pose
+        differs from that of the action if the body slipped or settled.
+
+        Args:
+            held: the body in the gripper now.
+            grasp: pose of the held body in the frame of the tool now.
+            lowest_tool_m: returns for x and y and the rotation of the tool its least height for a
+                pick, metres.
+
+        Returns:
+            None if the action neither picked nor placed a body, or moved another body.
+        """
+        if (self.held is None) == (held is None):
+            return None
+        body = held if self.held is None else self.held
+        for other, (before, _) in self.poses.items():
+            if other is not body and math.dist(before, other.position) > MOVED_M:
+                return None
+        if self.held is None:
+            return place_command(Pose(ORIGIN), grasp, self.poses[body])
+        command = pick_command(body.pose.compose(self.grasp.inverse()))
+        lowest_m = lowest_tool_m((command.x_m, command.y_m), tool_rotation(*command.angles_rad))
+        return command._replace(z_m=max(command.z_m, lowest_m))

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
-from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import Region
@@ -32,17 +31,6 @@ class PlacementArea(NamedTuple):
     """Gap wanted between the bounding circles of two pieces."""
     line_yaw_rad: float | None = None
     """Direction of the line between the two supports of a bridge; None if it is free."""
-
-    def origin_pose(self, site: tuple[float, float], rise_m: float, radius_m: float) -> Pose:
-        """Return a frame whose z axis is the surface normal, at the origin of a piece at a site.
-
-        Args:
-            site: point of the ground, metres.
-            rise_m: distance of the origin above the surface, along the normal.
-            radius_m: radius of the piece.
-        """
-        surface = self.terrain.contact_pose(site, radius_m)
-        return surface.compose(Pose((0.0, 0.0, rise_m)))
 
 
 def nearest_free_site(

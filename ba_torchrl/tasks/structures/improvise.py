@@ -19,7 +19,7 @@ from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
 from ba_torchrl.tasks.base import BLUE
 from ba_torchrl.tasks.structures.blueprint import Piece, Span
-from ba_torchrl.tasks.structures.parts import CUBOID
+from ba_torchrl.tasks.structures.pieces import CUBOID
 
 NUMBERS = (2, 5, 27, 32, 66, 75, 83, 116, 118, 131, 137, 142, 143, 149, 154, 176, 187, 199, 200)
 """PyBullet's numbers of the shapes of figure 12."""

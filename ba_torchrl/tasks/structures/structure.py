@@ -1,4 +1,4 @@
-"""The pieces of a blueprint as bodies of a world.
+"""The pieces of a blueprint as bodies of a world, and whether they form the structure.
 
 No bodies can be added to a sealed world. A kind of piece whose shape varies between episodes is
 therefore loaded in all its variants, and every episode activates as many as there are slots.
@@ -14,8 +14,8 @@ import numpy as np
 from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.structures.assignment import SlotAssigner, read_piece_states
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
-from ba_torchrl.tasks.structures.planner import StructurePlanner
 from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import Spacing
 
@@ -92,6 +92,16 @@ class Structure:
                 chosen += (first + drawn).tolist()
         self._activate(chosen)
 
+    def assigner(self, held: Body | None) -> SlotAssigner:
+        """Return the assigner for the present states of the pieces.
+
+        Args:
+            held: the body in the gripper.
+        """
+        ground, base = self.terrain.support_ids, self.terrain.base_ids
+        states = read_piece_states(self.world, self.pieces, ground, base, self.block_m)
+        return SlotAssigner(self.blueprint, self.pieces, states, self.block_m, held)
+
     def spacings(self, gap_m: float) -> list[Spacing]:
         """Return the space that each piece needs at the start of an episode.
 
@@ -129,7 +139,7 @@ class Structure:
     def set_state(self, state: tuple[int, ...]) -> None:
         """Activate variants by their indices; the world restores poses and visibility."""
         self._pool.set_state(state)
-        self._update()
+        self._read_pool()
 
     def _activate(self, indices: Sequence[int]) -> None:
         """Activate these variants and deactivate all others."""
@@ -137,23 +147,15 @@ class Structure:
             self._pool.clear()
         for index in indices:
             self._pool.activate(self._pool.bodies[index])
-        self._update()
+        self._read_pool()
 
-    def _update(self) -> None:
-        """Update the pieces and the planner after a change of the active variants."""
+    def _read_pool(self) -> None:
+        """Set the pieces after a change of the active variants."""
         drawn = {
             body: self._pool_pieces[self._pool.bodies.index(body)] for body in self._pool.active
         }
         self.pieces: dict[Body, Piece] = {**self._fixed, **drawn}
         """The bodies in the scene, in the order in which they are placed."""
-        self.planner = StructurePlanner(
-            self.blueprint,
-            self.world,
-            self.pieces,
-            self.block_m,
-            self.terrain.support_ids,
-            self.terrain.base_ids,
-        )
 
 
 def _needed_distance_m(piece: Piece) -> float:

@@ -80,6 +80,16 @@ class Terrain(ABC):
         """Return `surface_pose` for an object of a radius, which may cover several faces."""
         return self.surface_pose(xy)
 
+    def origin_pose(self, xy: tuple[float, float], rise_m: float, radius_m: float) -> Pose:
+        """Return a frame whose z axis is the surface normal, at the origin of an object.
+
+        Args:
+            xy: point of the ground below the object, metres.
+            rise_m: distance of the origin above the surface, along the normal.
+            radius_m: radius of the object.
+        """
+        return self.contact_pose(xy, radius_m).compose(Pose((0.0, 0.0, rise_m)))
+
     def uneven_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
         """Return how uneven the surface is below objects of a radius at points [N, 2], [N] metres.
 

@@ -3,9 +3,9 @@
 from ba_torchrl.sim.geometry import Pose, yaw_quaternion
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
-from ba_torchrl.tasks.structures.open_loop import StructureTask
-from ba_torchrl.tasks.structures.parts import cube
+from ba_torchrl.tasks.structures.pieces import cube
 from ba_torchrl.tasks.terrain.flat import Terrain
 
 HEIGHT_M = 0.03

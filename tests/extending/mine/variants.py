@@ -7,7 +7,7 @@ from mine.plateau import Plateau, StackOnPlateau
 from ba_torchrl.tasks.base import BLUE, GREEN, ORANGE, RED, TASKS
 from ba_torchrl.tasks.close_loop.block_stacking import BlockStacking
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
-from ba_torchrl.tasks.structures.parts import cube
+from ba_torchrl.tasks.structures.pieces import cube
 
 
 class RandomPlateau(Plateau):

@@ -18,7 +18,7 @@ from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.packing.tilted_grasps import tilted_grasp
-from ba_torchrl.tasks.structures.parts import CUBOID
+from ba_torchrl.tasks.structures.pieces import CUBOID
 
 BUMPS = "bump/box_palletizing"
 NORMAL = (math.sin(0.2), 0.0, math.cos(0.2))

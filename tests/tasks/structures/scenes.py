@@ -6,10 +6,12 @@ import numpy as np
 
 from ba_torchrl.sim.meshes import gable_mesh
 from ba_torchrl.sim.shapes import Box, Solid
+from ba_torchrl.tasks.structures.assignment import SlotAssigner, read_piece_states
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, Span
 from ba_torchrl.tasks.structures.free_space import PlacementArea
-from ba_torchrl.tasks.structures.parts import CUBE, CUBOID, ROOF
-from ba_torchrl.tasks.structures.planner import StructurePlanner
+from ba_torchrl.tasks.structures.grasps import Grasps
+from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF
+from ba_torchrl.tasks.structures.planner import next_move
 from ba_torchrl.tasks.terrain.flat import Flat
 from ba_torchrl.tasks.workspace import Area, Workspace
 
@@ -55,9 +57,19 @@ class Scene:
             self.bodies[kind] = [world.add(SHAPES[kind], f"{kind} {i}") for i in range(count)]
         kinds = {slot.piece.kind: slot.piece for slot in blueprint.slots}
         pieces = {body: kinds[kind] for kind, bodies in self.bodies.items() for body in bodies}
-        self.planner = StructurePlanner(blueprint, world, pieces, B, frozenset((world.floor,)))
+        self.blueprint, self.pieces, self.ground = blueprint, pieces, frozenset((world.floor,))
         self.cubes = self.bodies.get("cube", [])
         self.scatter(np.random.default_rng(0))
+
+    def assigner(self, held=None):
+        states = read_piece_states(self.world, self.pieces, self.ground, self.ground, B)
+        return SlotAssigner(self.blueprint, self.pieces, states, B, held)
+
+    def is_built(self, held=None):
+        return all(self.assigner(held).evaluate().values())
+
+    def next_move(self, held=None, grasps=None):
+        return next_move(self.assigner(held), AREA, grasps or Grasps())
 
     @property
     def all(self):
@@ -83,7 +95,7 @@ class Scene:
     def play(self, held=None, most=20):
         """Carry out moves until none is left; return them."""
         moves = []
-        while (move := self.planner.next_move(AREA, held)) is not None:
+        while (move := self.next_move(held)) is not None:
             moves.append(move)
             assert len(moves) <= most, moves
             move.body.place(

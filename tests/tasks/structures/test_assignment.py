@@ -7,18 +7,10 @@ import pytest
 
 from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.shapes import Box
-from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.structures.assignment import has_tipped
 from ba_torchrl.tasks.structures.blueprint import tower
-from ba_torchrl.tasks.structures.parts import CUBE, TRIANGLE
-from ba_torchrl.tasks.structures.planner import StructurePlanner
-from tests.tasks.structures.scenes import AREA, BRIDGE, SHAPES, B, rotate
-
-
-def test_a_planner_needs_a_body_for_every_slot():
-    with World() as world:
-        cube = world.add(SHAPES["cube"], "cube")
-        with pytest.raises(ValueError, match="needs 2 of 'cube'"):
-            StructurePlanner(tower(CUBE, CUBE), world, {cube: CUBE}, B, frozenset((world.floor,)))
+from ba_torchrl.tasks.structures.pieces import CUBE, TRIANGLE
+from tests.tasks.structures.scenes import BRIDGE, B, rotate
 
 
 def test_only_pieces_that_must_stay_upright_can_tip(scene):
@@ -26,11 +18,11 @@ def test_only_pieces_that_must_stay_upright_can_tip(scene):
     triangle = s.bodies["triangle"][0]
     for angle, tipped in ((math.pi / 9 - 0.02, False), (math.pi / 9 + 0.02, True)):
         rotate(triangle, (0.0, 1.0, 0.0), angle, 0.0)
-        assert s.planner.has_tipped() is tipped
-    assert not s.planner.has_tipped(held=triangle)
+        assert has_tipped(s.pieces, None) is tipped
+    assert not has_tipped(s.pieces, triangle)
     rotate(s.cubes[0], (0.0, 1.0, 0.0), 0.7, 0.0)
     s.put(triangle, 0.4, 0.1, 0)
-    assert not s.planner.has_tipped()  # a cube has no upright side
+    assert not has_tipped(s.pieces, None)  # a cube has no upright side
 
 
 def test_a_stack_tolerates_offsets_below_half_a_block(scene):
@@ -45,7 +37,7 @@ def test_a_stack_tolerates_offsets_below_half_a_block(scene):
         s.put(lower, 0.4, 0.0, 0)
         s.put(upper, 0.4 + dx, dy, 1, yaw=0.4)
         s.world.step()
-        assert s.planner.is_built() is expected, (dx, dy)
+        assert s.is_built() is expected, (dx, dy)
 
 
 def test_a_stack_needs_contact_and_an_empty_gripper(scene):
@@ -54,15 +46,15 @@ def test_a_stack_needs_contact_and_an_empty_gripper(scene):
         for level, cube in enumerate(order):
             s.put(cube, 0.4, 0.0, level)
         s.world.step()
-        assert s.planner.is_built()
-        assert not any(s.planner.is_built(held=cube) for cube in s.cubes)
+        assert s.is_built()
+        assert not any(s.is_built(held=cube) for cube in s.cubes)
     top = order[2]
     top.place((0.4, 0.0, 2.5 * B + 0.003))
     s.world.step()
-    assert not s.planner.is_built()
+    assert not s.is_built()
     s.put(top, 0.4 + B, 0.0, 1)  # beside the second, without a support
     s.world.step()
-    assert not s.planner.is_built()
+    assert not s.is_built()
 
 
 def test_cubes_side_by_side_are_not_a_stack(scene):
@@ -70,7 +62,7 @@ def test_cubes_side_by_side_are_not_a_stack(scene):
     s.put(s.cubes[0], 0.4, 0.0, 0)
     s.put(s.cubes[1], 0.4 + B, 0.0, 0)
     s.settle()
-    assert not s.planner.is_built()
+    assert not s.is_built()
 
 
 def test_the_triangle_must_be_upright_on_top(scene):
@@ -80,11 +72,11 @@ def test_the_triangle_must_be_upright_on_top(scene):
     s.put(first, 0.4, 0.0, 0)
     s.put(second, 0.4, 0.0, 1)
     s.settle()
-    assert not s.planner.is_built()  # the triangle is on the floor
+    assert not s.is_built()  # the triangle is on the floor
     s.put(triangle, 0.4, 0.0, 2, yaw=1.0)
     s.settle()
-    assert s.planner.is_built()
-    assert s.planner.next_move(AREA) is None
+    assert s.is_built()
+    assert s.next_move() is None
     # on its slope, with the centre unchanged
     slope = math.pi - math.atan2(B, B / 2)
     rotate(triangle, (0.0, 1.0, 0.0), slope, 0.0)
@@ -92,11 +84,11 @@ def test_the_triangle_must_be_upright_on_top(scene):
     triangle.set_pose((0.4, 0.0, 2 * B + depth), triangle.pose[1])
     s.settle()
     assert triangle.touches(second)
-    assert not s.planner.is_built()
+    assert not s.is_built()
     s.put(triangle, 0.4, 0.0, 1)
     s.put(second, 0.5, 0.1, 0)
     s.settle()
-    assert not s.planner.is_built()  # the triangle is one level too low
+    assert not s.is_built()  # the triangle is one level too low
 
 
 def bridge_scene(scene, roof_offset=0.0, spacing=1.75 * B, bearing=0.6):
@@ -113,19 +105,19 @@ def bridge_scene(scene, roof_offset=0.0, spacing=1.75 * B, bearing=0.6):
 def test_a_roof_on_both_cubes_is_a_bridge(scene):
     s, roof = bridge_scene(scene)
     s.settle()
-    assert s.planner.is_built()
-    assert not s.planner.is_built(held=roof)
+    assert s.is_built()
+    assert not s.is_built(held=roof)
 
 
 @pytest.mark.parametrize(("offset", "expected"), [(0.029, True), (0.031, False), (2.6 * B, False)])
 def test_a_bridge_tolerates_offsets_below_one_block(scene, offset, expected):
     s, _ = bridge_scene(scene, roof_offset=offset)
-    assert s.planner.is_built() is expected
+    assert s.is_built() is expected
 
 
 def test_cubes_too_far_apart_are_not_a_bridge(scene):
     s, _ = bridge_scene(scene, spacing=5.2 * B)
-    assert not s.planner.is_built()
+    assert not s.is_built()
 
 
 def test_a_top_slot_must_stay_free(scene):
@@ -133,25 +125,20 @@ def test_a_top_slot_must_stay_free(scene):
     for level, cube in enumerate(s.cubes):
         s.put(cube, 0.4, 0.0, level)
     s.settle()
-    assert not s.planner.is_built()
+    assert not s.is_built()
     (move,) = s.play()
     assert move.body is s.cubes[2]
     assert move.onto == ()
-    assert s.planner.is_built()
+    assert s.is_built()
 
 
-def test_the_support_can_be_another_body_than_the_floor():
-    with World() as world:
-        platform = world.add(Box(size_m=(0.2, 0.2, 0.02), mass_kg=0.0), "platform")
-        platform.place((0.45, 0.0, 0.01))
-        cubes = [world.add(SHAPES["cube"], f"cube {i}") for i in range(2)]
-        pieces = dict.fromkeys(cubes, CUBE)
-        planner = StructurePlanner(
-            tower(CUBE, CUBE), world, pieces, B, support_ids=frozenset({platform.id})
-        )
-        for base, expected in ((0.0, False), (0.02, True)):
-            x = 0.45 if base else 0.7
-            for level, cube in enumerate(cubes):
-                cube.place((x, 0.0, base + (level + 0.5) * B))
-            world.step()
-            assert planner.is_built() is expected
+def test_the_support_can_be_another_body_than_the_floor(scene):
+    s = scene(tower(CUBE, CUBE))
+    platform = s.world.add(Box(size_m=(0.2, 0.2, 0.02), mass_kg=0.0), "platform")
+    platform.place((0.45, 0.0, 0.01))
+    s.ground = frozenset({platform.id})
+    for x, base, expected in ((0.7, 0.0, False), (0.45, 0.02, True)):
+        for level, cube in enumerate(s.cubes):
+            cube.place((x, 0.0, base + (level + 0.5) * B))
+        s.world.step()
+        assert s.is_built() is expected

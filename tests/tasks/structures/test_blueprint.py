@@ -5,7 +5,7 @@ import math
 import pytest
 
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece, Slot, tower
-from ba_torchrl.tasks.structures.parts import CUBE, CUBOID, ROOF, TRIANGLE
+from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF, TRIANGLE
 from tests.tasks.structures.scenes import BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, rotate
 
 

@@ -10,7 +10,7 @@ import ba_torchrl
 from ba_torchrl.data.time_reversal import replay_scores
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import vertical_extent, world_vertices
-from ba_torchrl.tasks.structures.parts import CYLINDER
+from ba_torchrl.tasks.structures.pieces import CYLINDER
 
 STACKING, HOUSE = "close_loop/block_stacking", "close_loop/house_building"
 OPEN_STACKING = "open_loop/block_stacking"

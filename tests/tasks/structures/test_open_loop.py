@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ba_torchrl
+from ba_torchrl.tasks.structures.experts import PickPlaceExpert
 from ba_torchrl.tasks.structures.improvise import (
     CUBOID_M,
     NUMBERS,
@@ -14,6 +15,7 @@ from ba_torchrl.tasks.structures.improvise import (
     random_shapes,
     shape_piece,
 )
+from ba_torchrl.tasks.structures.planner import next_move
 
 B = 0.03
 X, Y = 0.45, 0.0
@@ -219,7 +221,7 @@ def test_a_state_restores_the_shapes():
     assert list(scene.task.objects) == first
     assert [body.pose for body in first] == poses
     assert all(not body.is_hidden for body in first)
-    assert set(scene.task.planner.pieces) == set(first)
+    assert set(scene.task.structure.pieces) == set(first)
     env.close()
 
 
@@ -273,8 +275,9 @@ def test_the_structure_starts_at_a_site_where_other_picks_have_clearance():
     named["cuboid 1"].place((0.56, -0.08, B / 2))
     world.step(2)
     pick = task.expert_command()
-    area = task.expert._placement_area()
-    move = task.planner.next_move(area, None, task.expert)
+    grasps = task.grasps()
+    area = PickPlaceExpert(grasps).placement_area()
+    move = next_move(task.structure.assigner(None), area, grasps)
     assert math.dist(move.position[:2], (0.47, -0.08)) > 0.1
     assert (pick.x_m, pick.y_m) == pytest.approx(move.body.position[:2])
     env.close()

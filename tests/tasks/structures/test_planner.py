@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.tasks.structures.blocking import GraspQueries
 from ba_torchrl.tasks.structures.blueprint import tower
-from ba_torchrl.tasks.structures.parts import CUBE, TRIANGLE
+from ba_torchrl.tasks.structures.grasps import Grasps
+from ba_torchrl.tasks.structures.pieces import CUBE, TRIANGLE
 from tests.tasks.structures.scenes import AREA, BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, B
 
 
@@ -28,9 +28,9 @@ def test_the_moves_build_the_structure_in_the_optimal_steps(scene, blueprint):
     s = scene(blueprint)
     for seed in range(5):
         s.scatter(np.random.default_rng(seed))
-        assert not s.planner.is_built()
+        assert not s.is_built()
         moves = s.play()
-        assert s.planner.is_built()
+        assert s.is_built()
         assert 2 * len(moves) == blueprint.optimal_steps
 
 
@@ -41,7 +41,7 @@ def test_a_move_has_body_supports_position_and_yaw(scene):
     s.put(triangle, 0.5, -0.1, 0, yaw=-1.0)
     s.settle()
     before = [body.pose for body in s.all]
-    move = s.planner.next_move(AREA)
+    move = s.next_move()
     assert [body.pose for body in s.all] == before
     assert move.body is triangle
     assert move.onto == (cube,)
@@ -59,12 +59,12 @@ def test_the_next_cube_balances_a_leaning_tower(scene):
     s.put(leaning, 0.434, 0.05, 1)
     s.put(loose, 0.5, -0.1, 0)
     s.settle()
-    move = s.planner.next_move(AREA)
+    move = s.next_move()
     assert (move.body, move.onto) == (loose, (leaning,))
     assert move.position[:2] == pytest.approx((0.427, 0.05), abs=1e-3)
     loose.place(move.position)
     s.settle()
-    assert s.planner.is_built()
+    assert s.is_built()
 
 
 def test_two_towers_are_joined_from_the_top_down(scene):
@@ -76,7 +76,7 @@ def test_two_towers_are_joined_from_the_top_down(scene):
     assert len(moves) == 2
     tops = (s.cubes[1], s.cubes[3])
     assert moves[0].body in tops
-    assert s.planner.is_built()
+    assert s.is_built()
 
 
 def test_a_triangle_in_a_low_slot_is_removed_first(scene):
@@ -89,7 +89,7 @@ def test_a_triangle_in_a_low_slot_is_removed_first(scene):
     moves = s.play()
     assert [move.piece.kind for move in moves] == ["triangle", "cube", "triangle"]
     assert moves[0].onto == ()
-    assert s.planner.is_built()
+    assert s.is_built()
 
 
 def test_a_roof_on_one_cube_is_removed_before_the_cubes_move(scene):
@@ -102,7 +102,7 @@ def test_a_roof_on_one_cube_is_removed_before_the_cubes_move(scene):
     moves = s.play()
     assert [move.piece.kind for move in moves] == ["roof", "cube", "roof"]
     assert moves[0].onto == ()
-    assert s.planner.is_built()
+    assert s.is_built()
 
 
 def test_cubes_move_to_the_span_of_the_bridge_once(scene):
@@ -112,7 +112,7 @@ def test_cubes_move_to_the_span_of_the_bridge_once(scene):
         s.put(s.cubes[1], 0.45 + spacing / 2, 0.0, 0)
         s.put(s.bodies["roof"][0], 0.45, 0.12, 0, yaw=math.pi / 2)
         s.settle()
-        move = s.planner.next_move(AREA)
+        move = s.next_move()
         assert (move.piece is CUBE) is moved
         if moved:
             (partner,) = (cube for cube in s.cubes if cube is not move.body)
@@ -125,11 +125,11 @@ def test_the_held_piece_is_placed_first(scene):
     first, second = s.cubes
     triangle = s.bodies["triangle"][0]
     first.place((0.4, 0.0, 0.2))
-    assert s.planner.next_move(AREA, held=first)[0] is first
-    assert s.planner.next_move(AREA, held=first).onto == (second,)
+    assert s.next_move(held=first)[0] is first
+    assert s.next_move(held=first).onto == (second,)
     s.scatter(np.random.default_rng(1))
     triangle.place((0.45, 0.0, 0.2))
-    move = s.planner.next_move(AREA, held=triangle)
+    move = s.next_move(held=triangle)
     assert move.body is triangle
     assert move.onto == ()  # its slot has no supports yet
 
@@ -140,7 +140,7 @@ def test_pieces_are_put_down_in_the_area_with_clearance(scene):
     for seed in range(10):
         s.scatter(np.random.default_rng(seed))
         triangle.place((0.6, 0.15, 0.2))
-        x, y, z = s.planner.next_move(AREA, held=triangle).position
+        x, y, z = s.next_move(held=triangle).position
         assert AREA.aside.x[0] <= x <= AREA.aside.x[1]
         assert AREA.aside.y[0] <= y <= AREA.aside.y[1]
         assert z == pytest.approx(B / 2, abs=1e-6)
@@ -151,10 +151,10 @@ def test_pieces_are_put_down_in_the_area_with_clearance(scene):
 
 def test_the_pick_cost_decides_between_equal_moves(scene):
     s = scene(tower(CUBE, CUBE, CUBE))
-    queries = GraspQueries()
+    grasps = Grasps()
     for favourite in s.cubes:
-        queries.pick_cost_m = lambda body, f=favourite: float(body is not f)
-        move = s.planner.next_move(AREA, queries=queries)
+        grasps.pick_cost_m = lambda body, f=favourite: float(body is not f)
+        move = s.next_move(grasps=grasps)
         assert move.body is favourite
 
 
@@ -167,7 +167,7 @@ def test_pieces_that_block_a_grasp_are_moved_to_the_ground(scene):
     s.put(loose, 0.45, 1.1 * B, 0)
     s.world.settle()
 
-    class Queries(GraspQueries):
+    class Blocked(Grasps):
         clears_blocked_pieces = True
 
         def blocks_grasp(self, body, other, position):
@@ -175,15 +175,15 @@ def test_pieces_that_block_a_grasp_are_moved_to_the_ground(scene):
             near = math.dist((x, y), body.position[:2]) < 2 * B
             return [near and z - body.position[2] > B / 2]
 
-    assert s.planner.next_move(AREA).body is loose
+    assert s.next_move().body is loose
     for top in (s.cubes[2], s.cubes[1]):
-        move = s.planner.next_move(AREA, queries=Queries())
+        move = s.next_move(grasps=Blocked())
         assert move.body is top
         assert move.onto == ()
         top.place(move.position)
         s.world.settle()
-    assert s.planner.next_move(AREA, queries=Queries()).onto != ()
+    assert s.next_move(grasps=Blocked()).onto != ()
     # no piece is placed where it would block a grasp
-    move = s.planner.next_move(AREA, held=s.cubes[2], queries=Queries())
+    move = s.next_move(s.cubes[2], Blocked())
     assert move.body is s.cubes[2]
     assert move.onto == (s.cubes[1],)

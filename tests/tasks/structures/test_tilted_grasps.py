@@ -16,13 +16,9 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.structures.parts import CUBE, CUBOID, ROOF
-from ba_torchrl.tasks.structures.tilted_grasps import (
-    in_resting_frame,
-    is_reachable,
-    release_pose,
-    tilted_tools,
-)
+from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.structures.grasps import tilted_tools
+from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF
 
 NORMAL = (math.sin(0.4), 0.0, math.cos(0.4))
 SIDES = [  # rotations that turn a cube onto each of its sides
@@ -83,14 +79,14 @@ def test_the_tools_close_across_the_piece_and_approach_between_normal_and_vertic
 @pytest.mark.parametrize("side", SIDES)
 def test_a_release_lays_the_side_on_the_support_at_the_yaw(body, side):
     on_slope(body, 0.9, side)
-    inner = in_resting_frame(CUBE, body)
-    level = release_pose(CUBE, body, Pose((0.4, 0.1, 0.2)), 0.25)
+    inner = CUBE.in_resting_frame(body)
+    level = CUBE.release_pose(body, Pose((0.4, 0.1, 0.2)), 0.25)
     assert level.position == (0.4, 0.1, 0.2)
     assert columns(level.orientation) == pytest.approx(
         columns(quaternion_product(surface_quaternion((0.0, 0.0, 1.0), 0.25), inner)), abs=1e-9
     )
     assert np.abs(columns(level.orientation)[:, 2]).max() == pytest.approx(1.0, abs=1e-6)
-    slope = release_pose(CUBE, body, Pose((0.4, 0.1, 0.2), surface_quaternion(NORMAL)), 0.25)
+    slope = CUBE.release_pose(body, Pose((0.4, 0.1, 0.2), surface_quaternion(NORMAL)), 0.25)
     along = columns(slope.orientation) @ np.array(NORMAL)
     assert np.abs(along).max() == pytest.approx(1.0, abs=1e-6)
 

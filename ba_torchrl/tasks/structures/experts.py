@@ -1,0 +1,225 @@
+"""Experts of structures: the commands for the planner's next move, from any state of the scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ba_torchrl.actions import GripperCommand, PickPlaceCommand, wrap_angle
+from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.control.pick_place import PickPlaceLimits
+from ba_torchrl.sim.geometry import Pose, quaternion_matrix, quaternion_yaw
+from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.tasks.manipulation.commands import (
+    carrying_pose,
+    no_op,
+    perturbed_pick,
+    pick_command,
+    place_command,
+    swaps_fingers,
+)
+from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.manipulation.primitives import (
+    OPEN,
+    grasped_body,
+    lift,
+    nearest_equivalent_yaw,
+)
+from ba_torchrl.tasks.manipulation.transport import carry_to, pick_up
+from ba_torchrl.tasks.structures.free_space import PlacementArea
+from ba_torchrl.tasks.structures.grasps import (
+    SUFFICIENT_CLEARANCE_M,
+    CloseLoopGrasps,
+    GraspCandidate,
+    Move,
+    PickPlaceGrasps,
+)
+from ba_torchrl.tasks.structures.planner import next_move
+from ba_torchrl.tasks.structures.structure import Structure
+from ba_torchrl.tasks.workspace import ActionLimits
+
+RELEASE_YAWS = 8
+"""Yaws per half turn that are compared for a place with any yaw."""
+BORDER_BLOCKS = 1.5
+"""Distance of placements from the border of their area, in blocks."""
+CLOSE_LOOP_BORDER_BLOCKS = 1.2
+"""The same in close loop."""
+
+
+class PickPlaceExpert:
+    """Returns the pick or place of the planner's next move; made for one decision.
+
+    Args:
+        grasps: the grasps of the pieces.
+    """
+
+    def __init__(self, grasps: PickPlaceGrasps) -> None:
+        self.grasps = grasps
+        self.structure = grasps.structure
+        self.robot = grasps.robot
+        self.terrain = grasps.terrain
+        self.limits = grasps.limits
+
+    def command(self) -> PickPlaceCommand:
+        """Return the pick or place of the planner's next move; a no-op if the structure stands."""
+        held = self.robot.held_body()
+        move = next_move(self.structure.assigner(held), self.placement_area(), self.grasps)
+        if move is None:
+            return no_op(self.terrain.workspace, held is not None)
+        if move.body is held:
+            return self._place(move)
+        body = self._unblocking(move.body)
+        if self.limits.turn_rad and not self.grasps.is_free(body):
+            # straight down, so that the arm reaches it with any deviation
+            upright = self.grasps.best(body)._replace(tool=None)
+            grasp = self.grasps.tool_pose(body, upright)
+            return perturbed_pick(self.structure.world, body, grasp, can_turn=True)
+        return self.pick(body)
+
+    def pick(self, body: Body) -> PickPlaceCommand:
+        """Return the pick of a body at its best grasp."""
+        return pick_command(self.grasps.tool_pose(body, self.grasps.best(body)))
+
+    def placement_area(self) -> PlacementArea:
+        """Return where pieces may be placed on the ground."""
+        border_m = BORDER_BLOCKS * self.structure.block_m
+        return PlacementArea(
+            self.terrain,
+            self.terrain.build_area.shrunk(border_m),
+            self.terrain.aside_area.shrunk(border_m),
+            gap_m=2.0 * self.structure.block_m,
+            # fingers at yaw 0 close along x, on pieces that lie along y
+            line_yaw_rad=None if self.limits.turn_rad else math.pi / 2,
+        )
+
+    def _unblocking(self, body: Body) -> Body:
+        """Return the piece to pick so that a body can be picked.
+
+        This is the body itself if it has a grasp with clearance, else a piece outside of the
+        structure that blocks its grasps and has one. A gripper that cannot turn pushes them.
+        """
+        if not self.limits.turn_rad or self.grasps.is_free(body):
+            return body
+        placed = self.structure.assigner(None).placed()
+        return next(
+            (
+                other
+                for other in self.grasps.others(body)
+                if other not in placed
+                and all(self.grasps.blocks_grasp(body, other, None))
+                and self.grasps.is_free(other)
+            ),
+            body,
+        )
+
+    def _place(self, move: Move) -> PickPlaceCommand:
+        """Return the place that brings the held body to the pose of a move."""
+        tool, held = self.robot.tool_frame(), move.body.pose
+        if self.limits.can_tilt:
+            return place_command(tool, held, self._best_release(move))
+        yaw = tool.yaw_rad
+        if not self.limits.turn_rad:
+            yaw = 0.0
+        elif move.yaw_rad is None:
+            yaws = [math.pi * i / RELEASE_YAWS for i in range(RELEASE_YAWS)]
+            yaw = self._release_yaw(move, yaws)
+        else:
+            aligned = tool.yaw_rad + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
+            count = max(1, round(math.pi / move.yaw_period_rad))  # a half turn swaps the fingers
+            yaws = [aligned + move.yaw_period_rad * i for i in range(count)]
+            yaw = self._release_yaw(move, yaws)
+        return place_command(tool, held, held.moved_to(move.position, yaw - tool.yaw_rad))
+
+    def _release_poses(self, move: Move) -> list[Pose]:
+        """Return the poses at which the held body can be released parallel to its support."""
+        heading = quaternion_yaw(move.piece.resting_frame(move.body))
+        if move.yaw_rad is None:
+            first = heading - self.robot.tool_frame().yaw_rad  # the tool at yaws from zero
+            yaws = [first + math.pi * i / RELEASE_YAWS for i in range(2 * RELEASE_YAWS)]
+        else:
+            count = max(1, round(2 * math.pi / move.yaw_period_rad))
+            yaws = [move.yaw_rad + move.yaw_period_rad * i for i in range(count)]
+            yaws.sort(key=lambda yaw: abs(wrap_angle(yaw - heading)))
+        origin = Pose(move.position, move.surface)
+        return [move.piece.release_pose(move.body, origin, yaw) for yaw in yaws]
+
+    def _best_release(self, move: Move) -> Pose:
+        """Return the pose of the held body at its release, the best of those within reach.
+
+        Poses that the tool reaches without a half turn come first: the held body may be tilted or
+        off the centre of the fingers.
+        """
+        tool, held = self.robot.tool_frame(), move.body.pose
+
+        def quality(pose: Pose) -> tuple[bool, float]:
+            is_exact = not swaps_fingers(carrying_pose(tool, held, pose))
+            return is_exact, self._release_clearance_m(move, pose)
+
+        ranked = sorted(self._release_poses(move), key=quality, reverse=True)
+        supports, clearance_m = self.terrain.support_ids, PickPlaceLimits().pre_place_height_m
+        reachable = (
+            pose
+            for pose in ranked
+            if is_reachable(self.robot, supports, carrying_pose(tool, held, pose), clearance_m)
+        )
+        return next(reachable, ranked[0])
+
+    def _release_clearance_m(self, move: Move, target: Pose) -> float:
+        """Return the clearance of the opening fingers, less what they lack above the ground."""
+        tool = carrying_pose(self.robot.tool_frame(), move.body.pose, target)
+        gripper, (x, y, z) = self.robot.gripper, tool.position
+        rotation = quaternion_matrix(tool.orientation)
+        lowest = self.terrain.lowest_tool_m(gripper, (x, y), rotation, self.robot.opening())
+        candidate = GraspCandidate(tool.yaw_rad, tool=tool.orientation)
+        (clearance_m,) = self.grasps.clearances_m(
+            move.body, [candidate], self.grasps.others(move.body), tool.position
+        )
+        return min(clearance_m, SUFFICIENT_CLEARANCE_M) - max(lowest - z, 0.0)
+
+    def _release_yaw(self, move: Move, yaws_rad: Sequence[float]) -> float:
+        """Return the first of the yaws at which the opening fingers have the largest clearance."""
+        clearances = [
+            min(self.grasps.clearance_m(move.body, yaw, move.position), SUFFICIENT_CLEARANCE_M)
+            for yaw in yaws_rad
+        ]
+        return yaws_rad[clearances.index(max(clearances))]
+
+
+def gripper_command(structure: Structure, robot: Robot, limits: ActionLimits) -> GripperCommand:
+    """Return the close-loop command of the planner's next move.
+
+    Args:
+        structure: the pieces.
+        robot: the robot.
+        limits: limits of an action.
+    """
+    held, grasps = grasped_body(robot), CloseLoopGrasps(structure, robot, limits)
+    region = structure.terrain.build_area.shrunk(CLOSE_LOOP_BORDER_BLOCKS * structure.block_m)
+    area = PlacementArea(structure.terrain, region, region, gap_m=structure.block_m)
+    move = next_move(structure.assigner(held), area, grasps)
+    if move is None:
+        return lift(limits.step_m, OPEN)
+    pieces, ceiling_m = list(structure.pieces), structure.terrain.workspace.z[1]
+    if move.body is not held:
+        return pick_up(
+            robot,
+            move.body,
+            limits,
+            yaws_rad=grasps.yaws(move.body),
+            obstacles=pieces,
+            ceiling_m=ceiling_m,
+        )
+    target_yaw = None
+    if move.yaw_rad is not None:
+        yaw = robot.tool_pose()[1]
+        turn = move.yaw_rad - move.piece.yaw_rad(held)
+        target_yaw = nearest_equivalent_yaw(yaw, yaw + turn, limits, move.yaw_period_rad)
+    return carry_to(
+        robot,
+        held,
+        move.position,
+        limits,
+        yaw_rad=target_yaw,
+        obstacles=pieces,
+        ceiling_m=ceiling_m,
+    )
