@@ -360,19 +360,6 @@ def test_a_state_restores_the_travel_of_the_drawer(make):
     assert env.scene.task.handle_pose == handle
 
 
-@pytest.mark.parametrize("config", [{}, FIXED], ids=["random", "fixed"])
-def test_the_expert_is_as_fast_as_the_published_planner(make, config):
-    env = make(expert=True, **config)
-    lengths = []
-    for _ in range(40):
-        state = env.reset()
-        while not state["done"]:
-            state = env.step(state.set("action", state["expert_action"]))["next"]
-        assert state["success"]
-        lengths.append(int(state["step_count"]))
-    assert np.mean(lengths) <= 1.1 * 8.6
-
-
 @pytest.mark.parametrize("scale", [0.85, 1.0, 1.4])
 def test_the_collision_surface_is_that_of_the_image(make, scale):
     """Rays hit floor, front and handle of the drawer, and the cabinet, at the rendered heights."""
