@@ -1,6 +1,7 @@
 """Drawer Opening: geometry of the cabinet, conditions of success, contacts, expert."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pybullet
@@ -18,18 +19,8 @@ FIXED = {"random_orientation": False, "action_sequence": "pxyz"}
 
 
 @pytest.fixture
-def make():
-    envs = []
-
-    def build(**config):
-        env = ba_torchrl.make(TASK, **{"obs_size": 16, "seed": 0, **config})
-        env.reset()
-        envs.append(env)
-        return env
-
-    yield build
-    for env in envs:
-        env.close()
+def make(make_started):
+    return partial(make_started, TASK)
 
 
 def local_heights(travel, pose, center, side, pixels):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-import ba_torchrl
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
 
 TASK = "close_loop/object_grasping"
@@ -14,17 +13,8 @@ NO_OP = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture
-def make():
-    envs = []
-
-    def build(**config):
-        env = ba_torchrl.make(TASK, **{"obs_size": 32, "seed": 0, **config})
-        envs.append(env)
-        return env
-
-    yield build
-    for env in envs:
-        env.close()
+def make(make_env):
+    return lambda **config: make_env(TASK, **{"expert": False, **config})
 
 
 def finish(env, state, action=None):
