@@ -73,7 +73,8 @@ class DeconstructionEnv(OpenLoopEnv):
 
     def _act(self, scene: Scene, action: np.ndarray) -> None:
         controller = scene.controller
-        before = UndoRecorder.record(scene.task.objects, controller.held, controller.grasp)
+        poses = {body: body.pose for body in scene.task.objects}
+        before = UndoRecorder(poses, controller.held, controller.grasp)
         heights = self._heightmap(scene)
         super()._act(scene, action)
         self._memory = {name: value for name, value in self._memory.items() if name != "undo"}

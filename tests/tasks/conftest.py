@@ -18,3 +18,15 @@ def make_env():
     yield build
     for env in envs:
         env.close()
+
+
+@pytest.fixture
+def make_started(make_env):
+    """Return a function that makes an environment without an expert and starts an episode."""
+
+    def build(task, **config):
+        env = make_env(task, **{"obs_size": 16, "expert": False, **config})
+        env.reset()
+        return env
+
+    return build

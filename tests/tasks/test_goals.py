@@ -5,22 +5,10 @@ import math
 import numpy as np
 import pytest
 
-import ba_torchrl
-
 
 @pytest.fixture
-def make():
-    envs = []
-
-    def build(task, **config):
-        env = ba_torchrl.make(f"close_loop/{task}", obs_size=16, seed=0, **config)
-        env.reset()
-        envs.append(env)
-        return env
-
-    yield build
-    for env in envs:
-        env.close()
+def make(make_started):
+    return lambda task, **config: make_started(f"close_loop/{task}", **config)
 
 
 def test_reaching_succeeds_within_three_centimetres(make):

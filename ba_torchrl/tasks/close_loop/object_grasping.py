@@ -69,11 +69,9 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         # above all objects; the upper parts of the walls are never crossed
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
-        grasp = planner.plan(self.clutter.pool.active, tool, limits, heights, self._slip_cost)
+        grasp = planner.plan(self.pool.active, tool, limits, heights, self._slip_cost)
         if grasp is None or grasp.risk > self.risk_allowed:
-            push = PushPlanner(planner, self.terrain).plan(
-                self.clutter.pool.active, tool, limits, heights
-            )
+            push = PushPlanner(planner, self.terrain).plan(self.pool.active, tool, limits, heights)
             if push is not None:
                 return self._push(push, over_z)
         if grasp is None or robot.opening() < IS_OPEN:

@@ -13,10 +13,8 @@ from ba_torchrl.config import TaskParameters
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Quaternion, YawPose, downward
-from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.base import Task, TaskSettings
+from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clutter.grasp_planner import GraspPlanner
 from ba_torchrl.tasks.terrain.tray import Tray
@@ -34,109 +32,6 @@ DROP_ATTEMPTS = 3
 
 RETREAT_Z_M = (0.55, 0.5, 0.45, 0.4, 0.35)
 """Heights of the tool during the drop; the first with a solution of the inverse kinematics."""
-
-
-class Clutter:
-    """All objects of an object set, and the heap that some of them form in a tray.
-
-    A heap persists until it is empty or `max_attempts` episodes have taken place in it.
-
-    Args:
-        world: not sealed yet.
-        robot: the robot; its arm retreats during a drop.
-        tray: the tray.
-        settings: settings of the task; `parameters` names the object set.
-        max_attempts: number of episodes with a heap after which new objects are dropped.
-    """
-
-    def __init__(
-        self,
-        world: World,
-        robot: Robot,
-        tray: Tray,
-        settings: TaskSettings,
-        *,
-        max_attempts: int,
-    ) -> None:
-        self.world = world
-        self.robot = robot
-        self.settings = settings
-        self.max_attempts = max_attempts
-        self.attempts = 0
-        """Episodes with the present heap that have ended."""
-        self.failures = 0
-        """The last of them in a row without a grasped object."""
-        self.tray = tray
-        parameters = settings.parameters
-        shapes = load_object_set(parameters.object_set, parameters.asset_root)
-        copies = -(-settings.num_objects // len(shapes))
-        numbers = [f" {copy + 1}" if copies > 1 else "" for copy in range(copies)]
-        self.pool = BodyPool(
-            world,
-            [shape for _ in numbers for shape in shapes],
-            [f"{name}{number}" for number in numbers for name in shapes.names],
-        )
-
-    def should_continue(self, grasped_object: Body | None) -> bool:
-        """Whether the next episode continues with the present heap.
-
-        Args:
-            grasped_object: the object that the last episode grasped, if any.
-        """
-        remaining = len(self.pool.active) - (grasped_object is not None)
-        return remaining > 0 and self.attempts + 1 < self.max_attempts
-
-    def advance(self, grasped_object: Body | None) -> None:
-        """Count an attempt, and remove the grasped object from the scene.
-
-        Args:
-            grasped_object: the object that the last episode grasped, if any.
-        """
-        self.attempts += 1
-        if grasped_object is None:
-            self.failures += 1
-        else:
-            self.pool.deactivate(grasped_object)
-            self.failures = 0
-
-    def drop(self, rng: np.random.Generator) -> None:
-        """Drop new objects one by one until they are at rest.
-
-        They start with random orientations, or with the identity if orientations are fixed, and
-        tumble as they hit the tray and each other.
-
-        Args:
-            rng: random generator.
-        """
-        self.attempts = self.failures = 0
-        settings, world, pool = self.settings, self.world, self.pool
-        center = np.array(settings.workspace.center)
-        half_m = self.tray.half_m
-        count = settings.num_objects
-        joints = self.robot.joints
-        self._retreat()
-        pause = round(DROP_INTERVAL_S / world.physics.time_step_s)
-        for _ in range(DROP_ATTEMPTS):
-            pool.clear()
-            chosen = rng.choice(len(pool.bodies), size=count, replace=False)
-            bodies = [pool.bodies[i] for i in chosen]
-            for body in bodies:
-                x, y = center + rng.uniform(DROP_MARGIN_M - half_m, half_m - DROP_MARGIN_M, 2)
-                is_random = settings.random_orientation
-                orientation = _random_orientation(rng) if is_random else (0.0, 0.0, 0.0, 1.0)
-                pool.activate(body)
-                body.set_pose((x, y, DROP_Z_M), orientation)
-                world.step(pause)
-            if world.settle(round(SETTLE_S / world.physics.time_step_s)):
-                break
-        self.robot.teleport(joints)
-
-    def _retreat(self) -> None:
-        """Move the arm to the highest pose above the heap that it can reach."""
-        robot, center_xy = self.robot, self.settings.workspace.center
-        solutions = (robot.inverse_kinematics((*center_xy, z), downward(0.0)) for z in RETREAT_Z_M)
-        joints = next((found for found in solutions if found is not None), robot.joints)
-        robot.teleport(joints)
 
 
 class ClutterTask(Task):
@@ -171,13 +66,21 @@ class ClutterTask(Task):
 
     def load_scene(self) -> None:
         """Load all objects of the object set."""
-        limit = self.settings.parameters.max_attempts
-        self.clutter = Clutter(
+        parameters = self.settings.parameters
+        self.attempts = 0
+        """Episodes with the present heap that have ended."""
+        self.failures = 0
+        """The last of them in a row without a grasped object."""
+        self.max_attempts = parameters.max_attempts
+        if self.max_attempts is None:
+            self.max_attempts = self.default_max_attempts()
+        shapes = load_object_set(parameters.object_set, parameters.asset_root)
+        copies = -(-self.settings.num_objects // len(shapes))
+        numbers = [f" {copy + 1}" if copies > 1 else "" for copy in range(copies)]
+        self.pool = BodyPool(
             self.world,
-            self.robot,
-            self.terrain,
-            self.settings,
-            max_attempts=self.default_max_attempts() if limit is None else limit,
+            [shape for _ in numbers for shape in shapes],
+            [f"{name}{number}" for number in numbers for name in shapes.names],
         )
 
     def make_terrain(self) -> Tray:
@@ -185,29 +88,70 @@ class ClutterTask(Task):
         return Tray(self.world, self.settings.workspace)
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Drop new objects into the tray."""
-        self.clutter.drop(rng)
+        """Drop new objects into the tray one by one until they are at rest.
+
+        They start with random orientations, or with the identity if orientations are fixed, and
+        tumble as they hit the tray and each other.
+
+        Args:
+            rng: random generator.
+        """
+        self.attempts = self.failures = 0
+        settings, world, pool = self.settings, self.world, self.pool
+        center = np.array(settings.workspace.center)
+        half_m = self.terrain.half_m
+        count = settings.num_objects
+        joints = self.robot.joints
+        self._retreat()
+        pause = round(DROP_INTERVAL_S / world.physics.time_step_s)
+        for _ in range(DROP_ATTEMPTS):
+            pool.clear()
+            chosen = rng.choice(len(pool.bodies), size=count, replace=False)
+            bodies = [pool.bodies[i] for i in chosen]
+            for body in bodies:
+                x, y = center + rng.uniform(DROP_MARGIN_M - half_m, half_m - DROP_MARGIN_M, 2)
+                is_random = settings.random_orientation
+                orientation = _random_orientation(rng) if is_random else (0.0, 0.0, 0.0, 1.0)
+                pool.activate(body)
+                body.set_pose((x, y, DROP_Z_M), orientation)
+                world.step(pause)
+            if world.settle(round(SETTLE_S / world.physics.time_step_s)):
+                break
+        self.robot.teleport(joints)
+
+    def _retreat(self) -> None:
+        """Move the arm to the highest pose above the heap that it can reach."""
+        robot, center_xy = self.robot, self.settings.workspace.center
+        solutions = (robot.inverse_kinematics((*center_xy, z), downward(0.0)) for z in RETREAT_Z_M)
+        joints = next((found for found in solutions if found is not None), robot.joints)
+        robot.teleport(joints)
 
     @property
     def continues(self) -> bool:
         """Whether the next episode continues with the present heap."""
-        return self.clutter.should_continue(self.grasped_object())
+        remaining = len(self.pool.active) - (self.grasped_object() is not None)
+        return remaining > 0 and self.attempts + 1 < self.max_attempts
 
     def resume(self) -> None:
         """Count an attempt, and remove the grasped object from the scene."""
-        self.clutter.advance(self.grasped_object())
+        grasped_object = self.grasped_object()
+        self.attempts += 1
+        if grasped_object is None:
+            self.failures += 1
+        else:
+            self.pool.deactivate(grasped_object)
+            self.failures = 0
 
     @cached_property
     def planner(self) -> GraspPlanner:
         """The grasp planner of the expert, made at its first use."""
         camera = HeightCamera(self.world.bodies)
-        bodies = self.clutter.pool.bodies
-        return GraspPlanner(bodies, camera, self.settings.workspace, self.robot.gripper)
+        return GraspPlanner(self.pool.bodies, camera, self.settings.workspace, self.robot.gripper)
 
     @property
     def objects(self) -> Sequence[Body]:
         """The objects in the tray, and the grasped one."""
-        return self.clutter.pool.active
+        return self.pool.active
 
     @property
     def landmarks(self) -> list[YawPose]:
@@ -219,13 +163,12 @@ class ClutterTask(Task):
 
     def get_state(self) -> tuple[tuple[int, ...], int, int]:
         """Return the indices of the active objects and the numbers of attempts and failures."""
-        clutter = self.clutter
-        return clutter.pool.get_state(), clutter.attempts, clutter.failures
+        return self.pool.get_state(), self.attempts, self.failures
 
     def set_state(self, state: tuple[tuple[int, ...], int, int]) -> None:
         """Restore the active objects and the numbers of attempts and failures."""
-        active, self.clutter.attempts, self.clutter.failures = state
-        self.clutter.pool.set_state(active)
+        active, self.attempts, self.failures = state
+        self.pool.set_state(active)
 
 
 def _random_orientation(rng: np.random.Generator) -> Quaternion:

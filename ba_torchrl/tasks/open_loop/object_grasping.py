@@ -79,7 +79,7 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         x, y = workspace.center
         if self.grasped_object() is not None:  # the episode is over; the object is placed back
             return PickPlaceCommand(PLACE, x, y, workspace.z[1] / 2)
-        planner, objects = self.planner, self.clutter.pool.active
+        planner, objects = self.planner, self.pool.active
         heights, tool = planner.heights(), ((x, y, workspace.z[1]), 0.0)
         penalty = partial(self._penalty, _highest(heights))
         grasps = [planner.plan([b], tool, self.action_limits, heights, penalty) for b in objects]
@@ -87,7 +87,7 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         if not found:
             return self._fallback_pick()
         best = [grasp for grasp in found if grasp.cost < found[0].cost + COST_TOLERANCE]
-        grasp = best[self.clutter.failures % len(best)]
+        grasp = best[self.failures % len(best)]
         return pick_command(grasp.tool)
 
     def _penalty(self, highest: np.ndarray, grasps: np.ndarray) -> np.ndarray:
@@ -113,9 +113,9 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
 
         Even if the grasp fails, the object moves, and may be graspable afterwards.
         """
-        samples = [self.planner.placed_samples(body)[:, :3] for body in self.clutter.pool.active]
+        samples = [self.planner.placed_samples(body)[:, :3] for body in self.pool.active]
         samples.sort(key=lambda points: points[:, 2].max(), reverse=True)
-        points = samples[self.clutter.failures % len(samples)]
+        points = samples[self.failures % len(samples)]
         yaws = np.arange(YAWS) * np.pi / YAWS if self.action_limits.turn_rad else np.zeros(1)
         across = points[:, :2] @ np.array([np.cos(yaws), np.sin(yaws)])
         x, y = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
@@ -126,7 +126,7 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
     def grasped_object(self) -> Body | None:
         """Return the object that the last pick lifted; it is hidden from the cameras."""
         # not by its contacts, which are known only after a physics step
-        return next((body for body in self.clutter.pool.active if body.is_hidden), None)
+        return next((body for body in self.pool.active if body.is_hidden), None)
 
 
 def _highest(heights: np.ndarray) -> np.ndarray:

@@ -348,17 +348,6 @@ class UndoRecorder(NamedTuple):
     grasp: Pose | None
     """Pose of the held body in the frame of the tool."""
 
-    @classmethod
-    def record(cls, bodies: Sequence[Body], held: Body | None, grasp: Pose | None) -> UndoRecorder:
-        """Return a recorder of the present scene.
-
-        Args:
-            bodies: the bodies that an action may move.
-            held: the body in the gripper.
-            grasp: pose of the held body in the frame of the tool.
-        """
-        return cls({body: body.pose for body in bodies}, held, grasp)
-
     def undo_command(
         self,
         held: Body | None,

@@ -17,21 +17,6 @@ OPEN_STACKING = "open_loop/block_stacking"
 FIXED = {"random_orientation": False, "action_sequence": "pxyz"}
 
 
-@pytest.fixture
-def make():
-    envs = []
-
-    def build(task, **config):
-        env = ba_torchrl.make(task, **{"obs_size": 16, "seed": 0, **config})
-        env.reset()
-        envs.append(env)
-        return env
-
-    yield build
-    for env in envs:
-        env.close()
-
-
 def of_kind(task, kind):
     return [body for body, piece in task.structure.pieces.items() if piece.kind == kind]
 
@@ -64,10 +49,10 @@ def follow_expert(env):
 # -- pieces ------------------------------------------------------------------------------------
 
 
-def test_sizes_are_the_papers(make):
-    blocks = cubes_of(make(STACKING).scene.task)
+def test_sizes_are_the_papers(make_started):
+    blocks = cubes_of(make_started(STACKING).scene.task)
     assert [block.shape.size_m for block in blocks] == [(0.05, 0.05, 0.05)] * 2
-    task = make(HOUSE).scene.task
+    task = make_started(HOUSE).scene.task
     low, high = np.array(triangle_of(task).shape.bounds_m)
     np.testing.assert_allclose(high - low, 0.05)
     vertices = triangle_of(task).shape.mesh().vertices
@@ -76,9 +61,9 @@ def test_sizes_are_the_papers(make):
 
 
 @pytest.mark.parametrize("task", [STACKING, HOUSE])
-def test_the_number_of_pieces_is_configurable(make, task):
+def test_the_number_of_pieces_is_configurable(make_started, task):
     for count in (2, 3, 4):
-        env = make(task, num_objects=count)
+        env = make_started(task, num_objects=count)
         for _ in range(3):
             env.reset()
             points = [body.position[:2] for body in env.scene.task.objects]
@@ -90,8 +75,8 @@ def test_the_number_of_pieces_is_configurable(make, task):
             ba_torchrl.make(task, num_objects=count)
 
 
-def test_with_fixed_orientations_the_fingers_face_the_ends_of_the_triangle(make):
-    env = make(HOUSE, **FIXED)
+def test_with_fixed_orientations_the_fingers_face_the_ends_of_the_triangle(make_started):
+    env = make_started(HOUSE, **FIXED)
     for _ in range(3):
         env.reset()
         task = env.scene.task
@@ -99,8 +84,8 @@ def test_with_fixed_orientations_the_fingers_face_the_ends_of_the_triangle(make)
         assert triangle_of(task).yaw_rad == pytest.approx(math.pi / 2, abs=1e-3)
 
 
-def test_a_triangle_held_by_its_ends_stays_level(make):
-    scene = make(HOUSE).scene
+def test_a_triangle_held_by_its_ends_stays_level(make_started):
+    scene = make_started(HOUSE).scene
     task = scene.task
     task.stand(cubes_of(task)[0], (0.35, 0.1), 0.0)
     task.stand(triangle_of(task), (0.45, 0.0), math.pi / 2)
@@ -118,8 +103,8 @@ def test_a_triangle_held_by_its_ends_stays_level(make):
 # -- success -----------------------------------------------------------------------------------
 
 
-def test_stacking_succeeds_only_after_the_release(make):
-    env = make(STACKING)
+def test_stacking_succeeds_only_after_the_release(make_started):
+    env = make_started(STACKING)
     scene = env.scene
     lower, upper = cubes_of(scene.task)
     lower.place((0.45, 0.0, 0.025))
@@ -147,8 +132,8 @@ def test_stacking_succeeds_only_after_the_release(make):
         ((0.45, 0.05, 0.025), False),
     ],
 )
-def test_stacking_is_evaluated_at_rest(make, position, expected):
-    env = make(STACKING)
+def test_stacking_is_evaluated_at_rest(make_started, position, expected):
+    env = make_started(STACKING)
     lower, upper = cubes_of(env.scene.task)
     env.scene.controller.reset(((0.35, -0.1, 0.2), 0.0))
     lower.place((0.45, 0.0, 0.025))
@@ -160,8 +145,8 @@ def test_stacking_is_evaluated_at_rest(make, position, expected):
     assert outcome["reward"] == float(expected)
 
 
-def test_a_house_requires_the_triangle_on_top(make):
-    env = make(HOUSE, num_objects=3)
+def test_a_house_requires_the_triangle_on_top(make_started):
+    env = make_started(HOUSE, num_objects=3)
     task = env.scene.task
     env.scene.controller.reset(((0.35, -0.1, 0.25), 0.0))
     first, second = cubes_of(task)
@@ -185,8 +170,8 @@ def test_a_house_requires_the_triangle_on_top(make):
     assert not task.is_success()
 
 
-def test_a_tipped_triangle_ends_the_episode_without_reward(make):
-    env = make(HOUSE)
+def test_a_tipped_triangle_ends_the_episode_without_reward(make_started):
+    env = make_started(HOUSE)
     triangle = triangle_of(env.scene.task)
     slope = math.pi - math.atan2(0.05, 0.025)
     triangle.set_pose((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
@@ -198,8 +183,8 @@ def test_a_tipped_triangle_ends_the_episode_without_reward(make):
     assert outcome["reward"] == 0
 
 
-def test_a_cube_may_lie_on_any_side(make):
-    env = make(HOUSE, expert=True)
+def test_a_cube_may_lie_on_any_side(make_started):
+    env = make_started(HOUSE, expert=True)
     task = env.scene.task
     cubes_of(task)[0].set_pose(
         (*cubes_of(task)[0].position[:2], 0.025),
@@ -214,8 +199,8 @@ def test_a_cube_may_lie_on_any_side(make):
 @pytest.mark.parametrize("task", [STACKING, HOUSE])
 @pytest.mark.parametrize("variant", [{}, FIXED], ids=["random orientations", "fixed"])
 @pytest.mark.parametrize(("count", "most"), [(2, 12.0), (3, 24.0), (4, 40.0)])
-def test_expert_builds_structures_of_two_to_four_pieces(make, task, variant, count, most):
-    env = make(task, num_objects=count, **variant)
+def test_expert_builds_structures_of_two_to_four_pieces(make_started, task, variant, count, most):
+    env = make_started(task, num_objects=count, **variant)
     lengths = []
     for _ in range(5):
         env.reset()
@@ -224,8 +209,8 @@ def test_expert_builds_structures_of_two_to_four_pieces(make, task, variant, cou
     assert np.mean(lengths) <= most
 
 
-def test_expert_separates_blocks_that_touch(make):
-    env = make(STACKING)
+def test_expert_separates_blocks_that_touch(make_started):
+    env = make_started(STACKING)
     for yaw in (-0.6, 0.0, 0.4, 0.8):
         env.reset()
         first, second = cubes_of(env.scene.task)
@@ -234,8 +219,8 @@ def test_expert_separates_blocks_that_touch(make):
         assert follow_expert(env)["success"]
 
 
-def test_expert_removes_a_triangle_in_a_low_slot(make):
-    env = make(HOUSE, num_objects=3)
+def test_expert_removes_a_triangle_in_a_low_slot(make_started):
+    env = make_started(HOUSE, num_objects=3)
     task = env.scene.task
     cubes_of(task)[0].place((0.4, -0.05, 0.025), 0.3)
     cubes_of(task)[1].place((0.52, 0.05, 0.025), 0.0)
@@ -244,8 +229,8 @@ def test_expert_removes_a_triangle_in_a_low_slot(make):
     assert follow_expert(env)["success"]
 
 
-def test_expert_releases_a_piece_that_supports_others(make):
-    env = make(HOUSE)
+def test_expert_releases_a_piece_that_supports_others(make_started):
+    env = make_started(HOUSE)
     scene = env.scene
     task = scene.task
     block = cubes_of(task)[0]
@@ -267,9 +252,9 @@ def test_expert_releases_a_piece_that_supports_others(make):
 
 
 @pytest.fixture
-def cylinders(make):
+def cylinders(make_started):
     """Return a task whose cylinders stand in a stack."""
-    task = make(OPEN_STACKING, object_type="cylinder").scene.task
+    task = make_started(OPEN_STACKING, object_type="cylinder").scene.task
     for level, body in enumerate(task.objects):
         body.place((0.45, 0.0, (level + 0.5) * 0.03), 0.7 * level)
     task.world.settle()
@@ -372,8 +357,8 @@ def play_from_present_scene(env):
     return outcome, steps
 
 
-def test_expert_removes_a_tower_that_blocks_the_grasp_of_the_last_cube(make):
-    env = make(OPEN_STACKING, expert=True, max_steps=20)
+def test_expert_removes_a_tower_that_blocks_the_grasp_of_the_last_cube(make_started):
+    env = make_started(OPEN_STACKING, expert=True, max_steps=20)
     cubes = env.scene.task.objects
     for level, cube in enumerate(cubes[:3]):
         cube.place((0.394, 0.046, (level + 0.5) * 0.03), 1.2)
@@ -387,10 +372,12 @@ def test_expert_removes_a_tower_that_blocks_the_grasp_of_the_last_cube(make):
     ("robot", "gap_m"),
     [("kuka", 0.01), ("kuka", 0.025), ("panda", 0.001), ("panda", 0.01), ("panda", 0.025)],
 )
-def test_expert_without_yaw_stacks_cubes_that_stand_side_by_side(make, robot, gap_m):
+def test_expert_without_yaw_stacks_cubes_that_stand_side_by_side(make_started, robot, gap_m):
     """In a row along the closing direction, cubes block the centred grasps of their neighbours."""
     fixed = {"action_sequence": "pxy", "random_orientation": False}
-    env = make(OPEN_STACKING, expert=True, max_steps=30, robot=robot, num_objects=3, **fixed)
+    env = make_started(
+        OPEN_STACKING, expert=True, max_steps=30, robot=robot, num_objects=3, **fixed
+    )
     for i, cube in enumerate(env.scene.task.objects):
         cube.place((0.42 + i * (0.03 + gap_m), 0.02, 0.015))
     outcome, steps = play_from_present_scene(env)

@@ -243,25 +243,6 @@ def test_a_roof_on_one_shape_is_not_a_success():
 # -- experts -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [*HOUSES, *IMPROVISED])
-def test_the_expert_succeeds_without_yaw(name):
-    env = ba_torchrl.make(
-        f"open_loop/{name}",
-        seed=4,
-        expert=True,
-        action_sequence="pxy",
-        random_orientation=False,
-    )
-    built = 0
-    for _ in range(3):
-        td = env.reset()
-        while not td["done"]:
-            td = env.step(td.set("action", td["expert_action"]))["next"]
-        built += bool(td["success"])
-    assert built == 3
-    env.close()
-
-
 def test_the_structure_starts_at_a_site_where_other_picks_have_clearance():
     """A roof lies close to one pair of blocks; the structure starts at the other pair."""
     env = ba_torchrl.make("open_loop/house_building_4", seed=0, expert=True)

@@ -1,7 +1,5 @@
 """Heaps of objects, and episodes on them."""
 
-import hashlib
-
 import torch
 
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
@@ -10,15 +8,6 @@ TASK = "open_loop/object_grasping"
 CENTER = (0.45, 0.0)
 NO_OP = torch.tensor([1.0, *CENTER, 0.0])
 """A place with an empty gripper: a failed episode that moves no object."""
-
-
-def names(env):
-    return [body.name for body in env.scene.task.objects]
-
-
-def poses_digest(env):
-    poses = [(body.name, body.pose) for body in env.scene.task.objects]
-    return hashlib.sha256(repr(poses).encode()).hexdigest()
 
 
 def play(env, state, action=None):
@@ -32,7 +21,7 @@ def play(env, state, action=None):
 def with_brick(make, **config):
     """Return an environment with a brick in the middle of the tray, 4 cm wide along x."""
     env = make(object_set="household", num_objects=1, action_sequence="pxyzr", **config)
-    state, pool = env.reset(), env.scene.task.clutter.pool
+    state, pool = env.reset(), env.scene.task.pool
     brick = next(body for body in pool.bodies if body.name == "brick")
     pool.clear()
     pool.activate(brick)
