@@ -43,12 +43,10 @@ class Strip(NamedTuple):
 
 
 def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool = False) -> Strip:
-    """Play an episode with the expert and render it.
+    """Play an episode with the expert and render at most a number of images.
 
-    Args:
-        pictures: largest number of images. They are evenly spaced from the initial to the final
-            state; those between show grasps and releases if the task is open-loop.
-        deconstruct: whether the episode takes the structure apart.
+    They are evenly spaced from the initial to the final state; those between show grasps and
+    releases if the task is open-loop. ``deconstruct`` takes the structure apart.
     """
     make_env = make_deconstruction_env if deconstruct else make
     env = make_env(task, expert=True, seed=seed)
@@ -80,11 +78,7 @@ def strip_figure(name: str, strip: Strip, path: str | Path) -> Path:
 
 
 def overview_figure(strips: Mapping[str, Strip], path: str | Path, columns: int = 4) -> Path:
-    """Write the initial and the final state of tasks, under the headings of their groups.
-
-    Args:
-        strips: the episode from `expert_strip`, by task.
-    """
+    """Write the initial and the final state of tasks, by id, under the headings of their groups."""
     groups = tasks_by_heading(strips)
     row_in, pair_in = _TITLE_IN + _CELL_IN, 2 * _CELL_IN + _SPACE_IN
     rows = sum(math.ceil(len(tasks) / columns) for tasks in groups.values())
@@ -126,10 +120,7 @@ class _Sheet:
     ) -> None:
         """Add a title of the height `_TITLE_IN` and square images of the width `_CELL_IN`.
 
-        Args:
-            images: [H, W] or [H, W, 3] each.
-            left_in: left edge of the row.
-            top_in: upper edge of the title.
+        The images are [H, W] or [H, W, 3]; the upper left corner is that of the title.
         """
         self._add_text(title, left_in + _BORDER_IN, top_in + _TITLE_IN - 0.02, size=9)
         size = (_CELL_IN - 2 * _BORDER_IN) / self.size_in

@@ -16,6 +16,7 @@ from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.record.results import flat
 
 Backend = Literal["csv", "tensorboard", "wandb"]
 
@@ -38,10 +39,7 @@ def make_logger(
 ) -> Logger | None:
     """Return TorchRL's logger for ``backend``; None for "csv", which `ScalarLog` writes.
 
-    Args:
-        backend: "csv", "tensorboard" or "wandb".
-        run_dir: folder of the run, for the logger's files.
-        config: of the run, logged as hyper-parameters; may be nested.
+    The configuration of the run, which may be nested, is logged as hyper-parameters.
 
     Raises:
         ValueError: the backend is unknown.
@@ -58,7 +56,9 @@ def make_logger(
         )
     options = {"wandb_kwargs": {"project": "ba-torchrl"}} if backend == "wandb" else {}
     logger = get_logger(backend, logger_name=str(run_dir), experiment_name=name, **options)
-    logger.log_hparams(_flat(config))
+    known = (int, float, str)  # types that every backend supports
+    settings = {k: v if isinstance(v, known) else str(v) for k, v in flat(config).items()}
+    logger.log_hparams(settings)
     return logger
 
 
@@ -85,19 +85,12 @@ class ScalarLog:
     `write`. A resumed run appends to the same file. TorchRL's CSV logger is not used, because it
     writes one file without a header per scalar and keeps all values in memory.
 
-    Args:
-        run_dir: folder of the run, which is created if needed.
-        backend: "csv" for the file only; "tensorboard" or "wandb" for an additional logger.
-
     Raises:
         ImportError: the package of the backend is missing.
     """
 
     def __init__(
-        self,
-        run_dir: str | Path,
-        backend: Backend = "csv",
-        config: Mapping[str, Any] | None = None,
+        self, run_dir: str | Path, backend: Backend = "csv", config: Mapping[str, Any] | None = None
     ) -> None:
         run_dir = Path(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -110,12 +103,7 @@ class ScalarLog:
             self._writer.writerow(_COLUMNS)
 
     def write(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Write scalars by name.
-
-        Args:
-            step: gradient updates so far.
-            scalars: numbers, or tensors of one element.
-        """
+        """Write scalars, numbers or tensors of one element, after ``step`` gradient updates."""
         values = {name: float(value) for name, value in scalars.items()}
         self._writer.writerows((step, name, repr(value)) for name, value in values.items())
         self._file.flush()
@@ -132,13 +120,10 @@ class ScalarLog:
 
 
 def read_scalars(path: str | Path) -> dict[str, Series]:
-    """Read the scalars of a run.
+    """Read the scalars of a run from its folder or ``scalars.csv``.
 
     If a resumed run wrote a step twice, the later value is returned. An incomplete last row of a
     killed run is ignored.
-
-    Args:
-        path: ``scalars.csv`` or the run folder.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -170,14 +155,3 @@ def _drop_incomplete_row(path: Path) -> None:
         content = path.read_bytes()
         if not content.endswith(b"\n"):
             os.truncate(path, content.rfind(b"\n") + 1)
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested settings to types that every backend supports: numbers, flags and text."""
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value if isinstance(value, int | float | str) else str(value)
-    return flat

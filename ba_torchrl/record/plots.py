@@ -39,17 +39,13 @@ def plot_learning_curve(
     ylabel: str = "success rate",
     ylim: tuple[float, float] | None = (0.0, 1.0),
 ) -> Path:
-    """Plot curves into a PNG, with optional error bands.
+    """Plot curves into a PNG, with optional error bands, and return its path.
 
     Args:
         curves: by name, (x, y) or (x, y, low, high), each [n]; low and high bound the band, for
             example mean minus and plus standard error. Or the ``scalars.csv`` of a run, of which
             the success rates are plotted.
-        path: of the PNG; its folder is created if needed.
         ylim: limits of the y axis; None for automatic limits.
-
-    Returns:
-        The path.
 
     Raises:
         ImportError: matplotlib is missing.
@@ -80,21 +76,14 @@ def plot_panels(
     ylim: tuple[float, float] | None = (0.0, 1.0),
     columns: int | None = None,
 ) -> Path:
-    """Plot curves into a grid of panels, as in the paper's figures 18 to 22.
+    """Plot curves into a grid of panels, as in the paper's figures 18 to 22, and return the PNG.
 
     Args:
         panels: curves as for `plot_learning_curve`, by title.
-        path: of the PNG; its folder is made if it does not exist.
         names: names of all curves, in the order of colours; a name has the same colour in all
             panels.
-        xlabel: below the panels.
-        ylabel: at their left.
-        ylim: least and greatest y; None fits the curves.
         columns: largest number of panels in a row; None for three to five, with the fewest empty
             cells.
-
-    Returns:
-        The path.
 
     Raises:
         ImportError: matplotlib is missing.

@@ -43,15 +43,9 @@ _HEADER = (
 
 
 def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
-    """Write the report of all runs below some folders.
+    """Write the report of all runs below some folders, and return the path of the page.
 
     The page contains the curves and tables, and links to the videos.
-
-    Args:
-        folder: of the report, which is created if needed.
-
-    Returns:
-        Path of the page.
 
     Raises:
         FileNotFoundError: there is no finished run.

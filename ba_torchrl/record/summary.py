@@ -131,9 +131,8 @@ class Section:
 def load_sections(roots: Iterable[str | Path]) -> tuple[list[Section], list[Path]]:
     """Read every finished run below some folders.
 
-    Returns:
-        Sections in the order of the benchmarks' names, runs without a benchmark last; and the
-        folders of unfinished runs, those with a damaged result included.
+    Return sections in the order of the benchmarks' names, runs without a benchmark last; and the
+    folders of unfinished runs, those with a damaged result included.
 
     Raises:
         FileNotFoundError: a folder is missing, or none holds a finished run.
@@ -173,8 +172,7 @@ def standard_error(values: np.ndarray) -> np.ndarray | float:
 def interval(values: np.ndarray) -> tuple[float, float]:
     """Return a bootstrap interval of the mean at `CONFIDENCE`; nan for a single value.
 
-    Args:
-        values: one per seed. With few seeds the interval tends to be too narrow.
+    With few seeds the interval tends to be too narrow.
     """
     if len(values) < 2:
         return float("nan"), float("nan")
@@ -232,22 +230,13 @@ def _row(title: str, group: Group) -> dict[str, Any]:
     low, high = interval(group.final)
     updates, steps = group.reaches(GOOD_RATE)
     results = [run.result for run in group.runs]
-    values = (
-        title,
-        group.task,
-        group.method,
-        len(group.runs),
-        float(group.final.mean()),
-        float(standard_error(group.final)),
-        low,
-        high,
-        float(group.rates.mean()) if group.rates.size else float("nan"),
-        updates,
-        steps,
-        float(np.mean([result.final.mean_length for result in results])),
-        float(np.mean([result.seconds for result in results])) / 3600,
-    )
-    return dict(zip(COLUMNS, values, strict=True))
+    final, rates = group.final, group.rates
+    values = [float(final.mean()), float(standard_error(final)), low, high]
+    values += [float(rates.mean()) if rates.size else float("nan"), updates, steps]
+    values.append(float(np.mean([result.final.mean_length for result in results])))
+    values.append(float(np.mean([result.seconds for result in results])) / 3600)
+    names = (title, group.task, group.method, len(group.runs))
+    return dict(zip(COLUMNS, (*names, *values), strict=True))
 
 
 def _grouped(runs: Sequence[Run]) -> list[Group]:

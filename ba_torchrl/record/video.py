@@ -47,10 +47,7 @@ class FrameRecorder:
 
 
 def check_video(path: str | Path, fps: float) -> None:
-    """Check the name and the speed of a video.
-
-    Args:
-        path: ends in ``.mp4`` or ``.gif``.
+    """Check the name of a video, which ends in ``.mp4`` or ``.gif``, and its frames per second.
 
     Raises:
         ConfigError: the suffix is unknown, or ``fps`` is not a number from `MIN_FPS` to `MAX_FPS`.
@@ -64,15 +61,10 @@ def check_video(path: str | Path, fps: float) -> None:
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> Path:
-    """Write images as a video.
+    """Write images as a video, ``.mp4`` (H.264) or ``.gif``, and return its path.
 
-    Args:
-        path: ends in ``.mp4`` (H.264) or ``.gif``; its folder is created if needed.
-        frames: [T, H, W, 3] uint8, or a sequence of T images of equal size. For ``.mp4``, an odd
-            height or width is padded with a copy of the last row or column.
-
-    Returns:
-        The path.
+    The frames [T, H, W, 3] are uint8 of equal size. For ``.mp4``, an odd height or width is padded
+    with a copy of the last row or column.
 
     Raises:
         ImportError: imageio or its ffmpeg is missing.

@@ -9,7 +9,6 @@ import numpy as np
 import pybullet
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.geometry import IDENTITY, ORIGIN, Pose, Quaternion, Vector, yaw_quaternion
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Shape, Solid
@@ -102,11 +101,6 @@ class ArticulatedLink(Body):
         state = pybullet.getJointState(self.id, self.links[0], physicsClientId=self.client)
         return abs(state[1]) <= speed_m_s
 
-    def touches(self, other: Body) -> bool:
-        """Whether this link was in contact with a body in the last physics step."""
-        points = contacts(self.client, self.id, other.id)
-        return is_any_within(point for point in points if point.link in self.links)
-
 
 class ArticulatedBody:
     """A fixed link and a sliding link: one PyBullet body with one prismatic joint.
@@ -150,10 +144,7 @@ class ArticulatedBody:
             linkInertialFramePositions=[ORIGIN] * len(parts),
             linkInertialFrameOrientations=[IDENTITY] * len(parts),
             linkParentIndices=parents,
-            linkJointTypes=[
-                pybullet.JOINT_PRISMATIC,
-                *[pybullet.JOINT_FIXED] * (len(parts) - 1),
-            ],
+            linkJointTypes=[pybullet.JOINT_PRISMATIC, *[pybullet.JOINT_FIXED] * (len(parts) - 1)],
             linkJointAxis=[joint.axis] * len(parts),
             physicsClientId=client,
         )
@@ -167,11 +158,7 @@ class ArticulatedBody:
         low, high = joint.limits_m
         # a separate call: PyBullet ignores joint limits in a call with other settings
         pybullet.changeDynamics(
-            self.id,
-            0,
-            jointLowerLimit=low,
-            jointUpperLimit=high,
-            physicsClientId=client,
+            self.id, 0, jointLowerLimit=low, jointUpperLimit=high, physicsClientId=client
         )
         # a velocity motor with target zero and limited force acts as dry friction
         pybullet.setJointMotorControl2(

@@ -181,7 +181,8 @@ class Body:
 
     def touches(self, other: Body) -> bool:
         """Whether the two bodies were in contact in the last physics step."""
-        return is_any_within(contacts(self.client, self.id, other.id))
+        points = contacts(self.client, self.id, other.id)
+        return is_any_within(point for point in points if point.link in self.links)
 
     def bounding_box(self) -> tuple[Vector, Vector]:
         """Return the lower and upper corner of the axis-aligned bounding box, metres.

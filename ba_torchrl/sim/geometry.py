@@ -85,12 +85,7 @@ def matrix_quaternion(rows: Matrix) -> Quaternion:
     """Return the unit quaternion of a rotation matrix, given by its rows."""
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = rows
     # four times the squares of the components; the largest one is a safe divisor
-    squares = (
-        1 + m00 - m11 - m22,
-        1 - m00 + m11 - m22,
-        1 - m00 - m11 + m22,
-        1 + m00 + m11 + m22,
-    )
+    squares = (1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22)
     largest = squares.index(max(squares))
     products = (
         (squares[0], m01 + m10, m02 + m20, m21 - m12),

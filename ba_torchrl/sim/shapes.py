@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -135,9 +133,11 @@ class Solid(Shape):
                 physicsClientId=client,
             )
         # PyBullet creates several hulls only from a file
-        with _obj_file(self.parts) as path:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "mesh.obj"
+            write_obj(path, self.parts)
             return pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, fileName=path, physicsClientId=client
+                pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client
             )
 
     def create_visual(self, client: int) -> int:
@@ -151,15 +151,6 @@ class Solid(Shape):
             rgbaColor=self.color,
             physicsClientId=client,
         )
-
-
-@contextmanager
-def _obj_file(parts: Sequence[Mesh]) -> Iterator[str]:
-    """Write a temporary OBJ file and yield its path."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mesh.obj"
-        write_obj(path, parts)
-        yield str(path)
 
 
 class MeshLists(NamedTuple):

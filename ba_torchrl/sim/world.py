@@ -177,10 +177,7 @@ class World:
         with loading(model):
             self.floor = pybullet.loadURDF(model, physicsClientId=self.client)
         pybullet.changeDynamics(
-            self.floor,
-            -1,
-            lateralFriction=self.physics.floor_friction,
-            physicsClientId=self.client,
+            self.floor, -1, lateralFriction=self.physics.floor_friction, physicsClientId=self.client
         )
         if floor_color is not None:
             pybullet.changeVisualShape(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,15 +114,11 @@ def check_progress(
     action `MAX_REPETITIONS` times, or send that many actions out of reach in succession. The scenes
     are disturbed by random actions, by fingers that close around an object (close loop), and by an
     object that is dropped, often flush with another body (open loop). Tasks of one step are exempt.
-
-    Args:
-        episodes: number of episodes for each disturbance, with those that it ends.
-        max_unsolved_rate: largest share of the episodes that reach the step limit.
+    At most ``max_unsolved_rate`` of the episodes may reach the step limit.
     """
     if TASKS[task].terminates_at_limit:
         return
-    env = make_small(task, expert=True, max_steps=MAX_STEPS, **config)
-    try:
+    with closing(make_small(task, expert=True, max_steps=MAX_STEPS, **config)) as env:
         for disturb in DISTURBANCES[TASKS[task].control]:
             unsolved = []
             for seed in range(episodes):
@@ -135,16 +132,12 @@ def check_progress(
                 f"{task}: after {disturb.__name__} the expert does not end the episodes of seeds "
                 f"{unsolved} in {MAX_STEPS} steps"
             )
-    finally:
-        env.close()
 
 
 def play_disturbed(env: ManipulationEnv, seed: int, disturb: Disturb) -> Disturbed | None:
     """Return the expert's steps from a disturbed scene; None if the disturbance ends the episode.
 
-    Args:
-        env: the environment, with an expert.
-        seed: of the episode and of the disturbance.
+    The seed is that of the episode and of the disturbance.
     """
     state = disturb(env, env.reset(seed=seed), np.random.default_rng(seed))
     if state[keys.DONE]:

@@ -10,6 +10,7 @@ import functools
 import math
 import pickle
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -48,10 +49,11 @@ def check_task(
 
     Args:
         task: id of a registered task.
+        robot: name of the robot.
         episodes: number of episodes that the expert plays, both from the start and after random
             actions.
-        min_success_rate: least success rate of the expert from the start.
-        min_recovery_rate: least success rate of the expert after random actions.
+        min_success_rate: of the expert from the start.
+        min_recovery_rate: of the expert after random actions.
         max_typical_steps: largest mean (close loop) or median (open loop) number of the expert's
             steps; None for no limit.
 
@@ -59,18 +61,8 @@ def check_task(
         AssertionError: a check fails; the message states the reason.
         ConfigError: the task is unknown.
     """
-    check_specs(task, robot=robot)
-    check_vector_specs(task, robot=robot)
-    check_resets(task, robot=robot)
-    check_seeds(task, robot=robot)
-    check_successive_episodes(task, robot=robot)
-    check_observations_are_copies(task, robot=robot)
-    check_random_actions(task, robot=robot)
-    check_extreme_actions(task, robot=robot)
-    check_pickling(task, robot=robot)
-    check_step_limit(task, robot=robot)
-    check_expert_is_passive(task, robot=robot)
-    check_partial_resets(task, robot=robot)
+    for check in CHECKS:
+        check(task, robot=robot)
     check_expert(
         task,
         episodes=episodes,
@@ -84,32 +76,21 @@ def check_task(
 
 def check_specs(task: str, **config: Any) -> None:
     """Check that observations, actions and done flags match the environment's specs."""
-    env = make_small(task, expert=True, max_steps=2, **config)
-    try:
+    with closing(make_small(task, expert=True, max_steps=2, **config)) as env:
         check_env_specs(env, break_when_any_done="both", seed=0)
-    finally:
-        env.close()
 
 
 def check_vector_specs(task: str, *, parallel: bool = False, **config: Any) -> None:
     """Check the specs of two environments that step together."""
-    env = make_vector_env(
-        task,
-        2,
-        parallel=parallel,
-        start_method="fork",
-        **{"obs_size": 32, "seed": 0, "expert": True, "max_steps": 2, **config},
-    )
-    try:
+    config = {"obs_size": 32, "seed": 0, "expert": True, "max_steps": 2, **config}
+    vector = make_vector_env(task, 2, parallel=parallel, start_method="fork", **config)
+    with closing(vector) as env:
         check_env_specs(env, break_when_any_done="both", seed=0)
-    finally:
-        env.close()
 
 
 def check_resets(task: str, *, episodes: int = 10, **config: Any) -> None:
     """Check that an episode starts in a valid scene whose goal does not hold."""
-    env = make_small(task, **config)
-    try:
+    with closing(make_small(task, **config)) as env:
         for episode in range(episodes):
             state = env.reset()
             where = f"{task}, episode {episode}"
@@ -118,15 +99,13 @@ def check_resets(task: str, *, episodes: int = 10, **config: Any) -> None:
             assert not state[keys.DONE], f"{where}: done at the start"
             assert not state[keys.SUCCESS], f"{where}: success at the start"
             assert state[keys.STEP_COUNT] == 0, f"{where}: the step count does not start at 0"
-    finally:
-        env.close()
 
 
 def check_seeds(task: str, **config: Any) -> None:
     """Check that a seed determines the images bit for bit, and that another seed changes them."""
-    first, second = make_small(task, **config), make_small(task, **config)
-    policy = _constant_policy(first, 0.65, 0.25, 0.85, 0.0, 0.6)
-    try:
+    make_env = functools.partial(make_small, task, **config)
+    with closing(make_env()) as first, closing(make_env()) as second:
+        policy = _constant_policy(first, 0.65, 0.25, 0.85, 0.0, 0.6)
         a, b = (env.rollout(4, policy)[keys.NEXT, keys.PIXELS] for env in (first, second))
         assert torch.equal(a, b), f"{task}: two environments with the same seed differ"
         first.set_seed(0)
@@ -136,27 +115,20 @@ def check_seeds(task: str, **config: Any) -> None:
         )
         other = first.reset(seed=1)[keys.PIXELS]
         assert not torch.equal(other, again[keys.PIXELS][0]), f"{task}: the seed changes nothing"
-    finally:
-        first.close()
-        second.close()
 
 
 def check_successive_episodes(task: str, **config: Any) -> None:
     """Check that the next episode starts from another scene, unless the task continues it."""
     if continues(task):
         return
-    env = make_small(task, **config)
-    try:
+    with closing(make_small(task, **config)) as env:
         a, b = (env.reset()[keys.PIXELS] for _ in range(2))
         assert not torch.equal(a, b), f"{task}: two episodes start from the same scene"
-    finally:
-        env.close()
 
 
 def check_observations_are_copies(task: str, **config: Any) -> None:
     """Check that a step does not modify images that were returned earlier."""
-    env = make_small(task, expert=True, **config)
-    try:
+    with closing(make_small(task, expert=True, **config)) as env:
         state = env.reset()
         while True:
             kept, copy = state[keys.PIXELS], state[keys.PIXELS].clone()
@@ -166,62 +138,48 @@ def check_observations_are_copies(task: str, **config: Any) -> None:
                 break
             state = following
         assert not torch.equal(copy, following[keys.PIXELS]), f"{task}: the image never changes"
-    finally:
-        env.close()
 
 
 def check_random_actions(task: str, **config: Any) -> None:
     """Check that random actions cause no fault and no observation outside its spec."""
-    env = make_small(task, **config)
-    torch.manual_seed(0)
-    try:
+    with closing(make_small(task, **config)) as env:
+        torch.manual_seed(0)
         for _ in range(2):
             last = env.rollout(50)[keys.NEXT].select(*env.observation_spec.keys())[-1]
             assert env.observation_spec.is_in(last), f"{task}: an observation is out of its spec"
         assert env.faults == 0, f"{task}: {env.faults} simulator faults under random actions"
-    finally:
-        env.close()
 
 
 def check_extreme_actions(task: str, **config: Any) -> None:
     """Check that actions at the bounds of their ranges cause no fault."""
-    env = make_small(task, **config)
-    rng = np.random.default_rng(0)
+    with closing(make_small(task, **config)) as env:
+        rng = np.random.default_rng(0)
 
-    def policy(tensordict: TensorDictBase) -> TensorDictBase:
-        fractions = rng.integers(0, 2, 7).astype(np.float32).tolist()
-        return tensordict.set(keys.ACTION, action_at(env, fractions))
+        def policy(tensordict: TensorDictBase) -> TensorDictBase:
+            fractions = rng.integers(0, 2, 7).astype(np.float32).tolist()
+            return tensordict.set(keys.ACTION, action_at(env, fractions))
 
-    try:
         for _ in range(3):
             env.rollout(50, policy)
         assert env.faults == 0, f"{task}: {env.faults} simulator faults under extreme actions"
-    finally:
-        env.close()
 
 
 def check_pickling(task: str, **config: Any) -> None:
     """Check that a function that makes the environment can be sent to another process."""
     factory = functools.partial(make, task, obs_size=16, **config)
-    env = pickle.loads(pickle.dumps(factory))()
-    try:
+    with closing(pickle.loads(pickle.dumps(factory))()) as env:
         env.reset()
-    finally:
-        env.close()
 
 
 def check_step_limit(task: str, **config: Any) -> None:
     """Check that the step limit truncates, unless the task terminates there."""
     if TASKS[task].terminates_at_limit:
         return
-    env = make_small(task, max_steps=3, **config)
-    # close loop: no motion, gripper open; open loop: a place without an object
-    action = action_at(env, [0.5])
-    action[0] = 1.0
-    try:
+    with closing(make_small(task, max_steps=3, **config)) as env:
+        # close loop: no motion, gripper open; open loop: a place without an object
+        action = action_at(env, [0.5])
+        action[0] = 1.0
         rollout = env.rollout(10, lambda td: td.set(keys.ACTION, action.clone()))
-    finally:
-        env.close()
     assert len(rollout) == 3, f"{task}: {len(rollout)} steps with max_steps=3"
     last = rollout[keys.NEXT][-1]
     assert last[keys.TRUNCATED], f"{task}: the step limit does not truncate"
@@ -241,15 +199,11 @@ def check_expert(
 ) -> None:
     """Check the expert's success rate and steps, and the rewards and ends of its episodes.
 
-    Args:
-        max_typical_steps: largest mean (close loop) or median (open loop) number of steps of solved
-            episodes; None for no limit.
+    ``max_typical_steps`` is the largest mean (close loop) or median (open loop) number of steps of
+    solved episodes; None for no limit.
     """
-    env = make_small(task, expert=True, **config)
-    try:
+    with closing(make_small(task, expert=True, **config)) as env:
         played = play_expert(env, episodes)
-    finally:
-        env.close()
     lengths = [len(episode) for episode in played if episode[keys.NEXT, keys.SUCCESS][-1]]
     assert len(lengths) >= min_success_rate * episodes, (
         f"{task}: the expert solves {len(lengths)} of {episodes} episodes, "
@@ -276,22 +230,18 @@ def check_expert(
 def check_recovery(task: str, *, episodes: int, min_success_rate: float, **config: Any) -> None:
     """Check the expert's success rate after random actions; one-step tasks are exempt.
 
-    Args:
-        episodes: number of episodes, without those that end during the random actions.
+    Episodes that end during the random actions do not count.
     """
     if TASKS[task].terminates_at_limit:
         return
-    env = make_small(task, expert=True, **config)
-    outcomes: list[bool] = []
-    try:
+    with closing(make_small(task, expert=True, **config)) as env:
+        outcomes: list[bool] = []
         for seed in range(2 * episodes):
             success = _recover(env, seed)
             if success is not None:
                 outcomes.append(success)
             if len(outcomes) == episodes:
                 break
-    finally:
-        env.close()
     assert len(outcomes) >= episodes / 2, f"{task}: random actions end most episodes"
     assert np.mean(outcomes) >= min_success_rate, (
         f"{task}: after random actions the expert solves {sum(outcomes)} of "
@@ -301,32 +251,27 @@ def check_recovery(task: str, *, episodes: int, min_success_rate: float, **confi
 
 def check_expert_is_passive(task: str, **config: Any) -> None:
     """Check that computing the expert's action does not change the episode."""
-    computed, plain = make_small(task, expert=True, **config), make_small(task, **config)
-    policy = _constant_policy(plain, 0.0, 0.7, 0.7, 0.05, 0.55)
-    try:
+    make_env = functools.partial(make_small, task, **config)
+    with closing(make_env(expert=True)) as computed, closing(make_env()) as plain:
+        policy = _constant_policy(plain, 0.0, 0.7, 0.7, 0.05, 0.55)
         a, b = (env.rollout(6, policy)[keys.NEXT, keys.PIXELS] for env in (computed, plain))
         assert torch.equal(a, b), f"{task}: computing the expert's action changes the episode"
         for _ in range(5):
             computed.scene.task.expert_command()
         position = computed.scene.robot.tool_pose()[0]
         assert all(map(math.isfinite, position)), f"{task}: the expert moved the robot"
-    finally:
-        computed.close()
-        plain.close()
 
 
 def check_partial_resets(task: str, **config: Any) -> None:
     """Check that a reset of one environment of a vector does not affect the other."""
-    env = make_vector_env(task, 2, parallel=False, **{"obs_size": 32, "seed": 0, **config})
-    try:
+    config = {"obs_size": 32, "seed": 0, **config}
+    with closing(make_vector_env(task, 2, parallel=False, **config)) as env:
         state = env.reset()
         space = env.action_spec.space
         state = env.step(state.set(keys.ACTION, (space.low + space.high) / 2))[keys.NEXT]
         before = state[keys.PIXELS].clone()
         state["_reset"] = torch.tensor([[True], [False]])
         after = env.reset(state)
-    finally:
-        env.close()
     counts = after[keys.STEP_COUNT].flatten().tolist()
     assert counts == [0, 1], f"{task}: step counts {counts} after a reset of the first environment"
     assert torch.equal(after[keys.PIXELS][1], before[1]), (
@@ -337,6 +282,22 @@ def check_partial_resets(task: str, **config: Any) -> None:
             f"{task}: the environment that was reset shows the same scene"
         )
 
+
+CHECKS = (
+    check_specs,
+    check_vector_specs,
+    check_resets,
+    check_seeds,
+    check_successive_episodes,
+    check_observations_are_copies,
+    check_random_actions,
+    check_extreme_actions,
+    check_pickling,
+    check_step_limit,
+    check_expert_is_passive,
+    check_partial_resets,
+)
+"""The checks of `check_task` that count no successes."""
 
 # -- parts -----------------------------------------------------------------------------------
 

@@ -73,12 +73,7 @@ def test_images_equal_those_of_the_mesh_in_a_file(name, tmp_path):
             view = pybullet.computeViewMatrix((0.1, -0.15, 0.1), (0, 0, 0), (0, 0, 1))
             projection = pybullet.computeProjectionMatrixFOV(50, 1, 0.01, 1)
             _, _, rgb, depth, _ = pybullet.getCameraImage(
-                64,
-                64,
-                view,
-                projection,
-                renderer=pybullet.ER_TINY_RENDERER,
-                physicsClientId=client,
+                64, 64, view, projection, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=client
             )
             return np.array(rgb), np.array(depth)
         finally:

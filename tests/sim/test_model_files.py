@@ -24,5 +24,6 @@ def test_a_model_that_cannot_be_loaded_is_named(tmp_path, client):
     path.write_text("no model", encoding="utf-8")
     with pytest.raises(SimulationError, match=r"PyBullet cannot load .*robot\.urdf"):
         load(path, client)
+    path = tmp_path / "other.urdf"  # PyBullet keeps the content of a file
     path.write_text("<robot name='cube'><link name='body'/></robot>", encoding="utf-8")
     assert load(path, client) == 0

@@ -30,12 +30,7 @@ from ba_torchrl.sim.control.close_loop import (
     pose_in_tool_frame,
     quintic_time_scaling,
 )
-from ba_torchrl.sim.geometry import (
-    Matrix,
-    Pose,
-    Vector,
-    quaternion_matrix,
-)
+from ba_torchrl.sim.geometry import Matrix, Pose, Vector, quaternion_matrix
 from ba_torchrl.sim.robots.base import Robot, RobotSleep
 from ba_torchrl.sim.robots.gripper import Gripper
 
@@ -333,12 +328,7 @@ class PickPlace:
         """
         end = self._approach_point(position, rotation, clearance_m)
         path = plan_approach(
-            self.robot,
-            self.surface.support_ids,
-            self.limits,
-            end,
-            rotation,
-            top_down=self.top_down,
+            self.robot, self.surface.support_ids, self.limits, end, rotation, top_down=self.top_down
         )
         self.is_out_of_reach = path is None
         if path is None:
@@ -423,11 +413,7 @@ class PickPlace:
         self.update_grasp()
 
     def _move_straight(
-        self,
-        start: Vector,
-        end: Vector,
-        rotation: Matrix,
-        count: int | None = None,
+        self, start: Vector, end: Vector, rotation: Matrix, count: int | None = None
     ) -> None:
         """Simulate a straight motion of the tool.
 

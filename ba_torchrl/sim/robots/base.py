@@ -147,11 +147,7 @@ class Robot(ABC):
         """
         for joint in self.arm_joints:
             pybullet.changeDynamics(
-                robot,
-                joint,
-                jointLowerLimit=-10,
-                jointUpperLimit=10,
-                physicsClientId=self.client,
+                robot, joint, jointLowerLimit=-10, jointUpperLimit=10, physicsClientId=self.client
             )
 
     def _add_gear(

@@ -242,25 +242,21 @@ class HeightCamera:
         return below.copy()
 
 
-def depth_image(meshes: Sequence[SceneMesh], lens: Lens, pixels: int) -> np.ndarray:
-    """Render depths along the optical axis, [pixels, pixels] float64 metres, at most `FAR_M`."""
-    return _depth(meshes, lens, pixels, _recesses(meshes))
-
-
-def _recesses(meshes: Sequence[SceneMesh]) -> np.ndarray:
-    return np.concatenate([np.empty((0, 6)), *(mesh.recesses() for mesh in meshes)])
-
-
-def _depth(
-    meshes: Sequence[SceneMesh], lens: Lens, pixels: int, recesses: np.ndarray
+def depth_image(
+    meshes: Sequence[SceneMesh], lens: Lens, pixels: int, *, recesses: bool = True
 ) -> np.ndarray:
+    """Render depths along the optical axis, [pixels, pixels] float64 metres, at most `FAR_M`."""
     image = np.empty((pixels, pixels))
     eye, focal = np.array(lens.eye_m, dtype=float), lens.focal_px(pixels)
-    rasterize_floor(eye, lens.axes, focal, FAR_M, recesses, image)
+    rasterize_floor(eye, lens.axes, focal, FAR_M, _recesses(meshes if recesses else ()), image)
     for mesh in meshes:
         vertices, faces = mesh.triangles()
         rasterize_depth(vertices, faces, eye, lens.axes, focal, NEAR_M, image)
     return image
+
+
+def _recesses(meshes: Sequence[SceneMesh]) -> np.ndarray:
+    return np.concatenate([np.empty((0, 6)), *(mesh.recesses() for mesh in meshes)])
 
 
 def visible_points(
@@ -279,7 +275,7 @@ def visible_points(
     points = np.empty((len(lenses) * pixels * pixels, 3))
     count = 0
     for lens in lenses:
-        depth = _depth(meshes, lens, pixels, np.empty((0, 6)))
+        depth = depth_image(meshes, lens, pixels, recesses=False)
         eye = np.array(lens.eye_m, dtype=float)
         count = unproject(
             depth, eye, lens.axes, lens.focal_px(pixels), recesses, low, high, points, count

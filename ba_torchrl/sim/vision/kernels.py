@@ -82,11 +82,7 @@ def rasterize_heights(vertices, faces, x0, y0, pixel, image):
 
 @njit()
 def paint_square(
-    image: np.ndarray,
-    center_px: tuple[float, float],
-    half_px: float,
-    yaw_rad: float,
-    value: float,
+    image: np.ndarray, center_px: tuple[float, float], half_px: float, yaw_rad: float, value: float
 ) -> None:
     """Set the pixels whose centres lie in a rotated square.
 

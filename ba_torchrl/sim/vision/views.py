@@ -148,11 +148,8 @@ class View(ABC):
     """A method to render the scene."""
 
     channels: ClassVar[int] = 1
-
-    @property
-    def rotates_with_scene(self) -> bool:
-        """Whether the image of a scene that is rotated about z, with the tool, is rotated."""
-        return True
+    rotates_with_scene: ClassVar[bool] = True
+    """Whether the image of a scene that is rotated about z, with the tool, is rotated."""
 
     @abstractmethod
     def range_m(self, setup: ViewSetup) -> Range:
@@ -320,19 +317,15 @@ class Oblique(View):
 
     shows_height: bool
 
-    @property
-    def rotates_with_scene(self) -> bool:
-        """False: the camera stays at its side."""
-        return False
+    rotates_with_scene: ClassVar[bool] = False
 
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the bounds of the depth in the workspace, or of the height."""
         if self.shows_height:
             return -MAX_RECESS_M, setup.fixed_camera_z_m
         lens = oblique_lens(setup.center_m)
-        return lens.plane_depth_range_m(setup.fixed_camera_z_m)[0], lens.plane_depth_range_m(
-            -MAX_RECESS_M
-        )[1]
+        nearest, _ = lens.plane_depth_range_m(setup.fixed_camera_z_m)
+        return nearest, lens.plane_depth_range_m(-MAX_RECESS_M)[1]
 
     def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
@@ -350,11 +343,7 @@ class ObliqueRgbd(View):
     """Colour and depth of the oblique view, with the robot."""
 
     channels: ClassVar[int] = 4
-
-    @property
-    def rotates_with_scene(self) -> bool:
-        """False: the camera stays at its side."""
-        return False
+    rotates_with_scene: ClassVar[bool] = False
 
     def range_m(self, setup: ViewSetup) -> Range:
         """Return the bounds of colours (0 to 1) and depths together."""

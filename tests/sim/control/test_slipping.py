@@ -20,12 +20,9 @@ def holds(*, teleport, tilt_rad=(0.0, 0.0, 0.0), off_center_m=0.0, **options):
 
 
 @pytest.mark.parametrize("teleport", [True, False])
+@pytest.mark.parametrize(("friction", "is_held"), [(0.05, False), (0.4, True)])
 @pytest.mark.parametrize(
-    ("friction", "is_held"), [(0.0, False), (0.05, False), (0.4, True), (1.0, True)]
-)
-@pytest.mark.parametrize(
-    ("size_m", "tilt_rad", "off_center_m"),
-    [(CUBE_M, 0.0, 0.0), (CUBE_M, TILT_RAD, 0.0), (LONG_M, 0.0, 0.04), (LONG_M, TILT_RAD, 0.04)],
+    ("size_m", "tilt_rad", "off_center_m"), [(CUBE_M, 0.0, 0.0), (LONG_M, TILT_RAD, 0.04)]
 )
 def test_a_grasp_needs_friction(teleport, friction, is_held, size_m, tilt_rad, off_center_m):
     assert is_held == holds(

@@ -47,8 +47,9 @@ def test_a_block_released_above_a_slope_falls(slope_rad, tilt_rad, gap_m, stays)
     assert math.dist(*positions) < (8e-3 if stays else 0.04)
 
 
-@pytest.mark.parametrize("yaw_rad", [0.0, 0.6, math.pi / 2])
-@pytest.mark.parametrize("slope_rad", [GENTLE_RAD, STEEP_RAD])
+@pytest.mark.parametrize(
+    ("slope_rad", "yaw_rad"), [(GENTLE_RAD, 0.6), (STEEP_RAD, 0.0), (STEEP_RAD, math.pi / 2)]
+)
 def test_a_vertical_tool_picks_a_block_that_lies_on_a_slope(slope_rad, yaw_rad):
     """A finger that touches the slope stops the closing until the tool is lifted."""
     poses = []

@@ -9,12 +9,7 @@ import pytest
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision import depth
-from ba_torchrl.sim.vision.depth import (
-    HeightCamera,
-    PosedShape,
-    SceneMesh,
-    depth_image,
-)
+from ba_torchrl.sim.vision.depth import HeightCamera, PosedShape, SceneMesh, depth_image
 from ba_torchrl.sim.vision.lens import Lens, oblique_lens, side_lenses
 from ba_torchrl.sim.world import World
 from tests.sim.vision.boxes import CENTER, placed, random_boxes, ray_depths, rays_of
@@ -64,6 +59,16 @@ def test_a_tilted_box_shows_its_slope():
         expected = np.clip(0.2 + 0.05 * math.sqrt(2) - np.abs(xs), 0, None)
         expected[np.abs(xs) > 0.05 * math.sqrt(2)] = 0
         np.testing.assert_allclose(image[:, 50], expected, atol=1e-9)
+
+
+def test_recesses_appear_only_where_the_floor_is_visible():
+    with World() as world:
+        box = world.add(Box(size_m=(0.05, 0.05, 0.05)), "box")
+        goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), "goal")
+        box.place((0.02, 0.0, 0.025))
+        goal.place((0.0, 0.0, 0.0))
+        image = HeightCamera([box, goal]).heightmap((0.0, 0.0), 0.2, 100)
+    assert image[[60, 30, 10], 50].tolist() == pytest.approx([0.05, -0.02, 0.0])
 
 
 def test_a_rotated_camera_equals_a_world_rotated_the_other_way():
