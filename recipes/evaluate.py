@@ -65,11 +65,12 @@ def main(settings: Settings) -> None:
         chosen = ", none of which training used"
         seed = config.derived_seed(SeedUse.TEST)
     env = make_vector_env(
-        config.task,
+        config.resolved_env,
         settings.num_envs,
         parallel=settings.parallel,
-        register_modules=[*settings.plugins, *config.plugins],
-        **{**config.env, "seed": seed, "expert": settings.expert},
+        register_modules=settings.plugins,
+        seed=seed,
+        expert=settings.expert,
     )
     episodes: list[TensorDict] = []
 
@@ -92,7 +93,7 @@ def main(settings: Settings) -> None:
     if settings.expert:
         print(f"\n{agreement_table(episodes, config.resolved_env.actions.sequence)}")
     if settings.video is not None:
-        frames = record_episodes(config.task, config.env, policy, settings.video_episodes, seed)
+        frames = record_episodes(config.resolved_env, policy, settings.video_episodes, seed)
         print(f"  video     {write_video(settings.video, frames, fps=FPS)}")
 
 

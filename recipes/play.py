@@ -13,6 +13,7 @@ from pydantic import Field, field_validator
 
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.demos import expert_policy
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
 from ba_torchrl.training.command_line import (
     Count,
@@ -52,14 +53,10 @@ class Settings(StrictModel):
 def main(settings: Settings) -> None:
     """Play episodes and write a video of them."""
     is_expert = settings.policy == "expert"
+    resolved = resolve_env(settings.task, {**settings.env, "expert": is_expert})
     torch.manual_seed(settings.seed)
-    frames = record_episodes(
-        settings.task,
-        {**settings.env, "expert": is_expert},
-        expert_policy if is_expert else None,
-        settings.episodes,
-        settings.seed,
-    )
+    policy = expert_policy if is_expert else None
+    frames = record_episodes(resolved, policy, settings.episodes, settings.seed)
     print(f"{settings.episodes} episodes of {settings.task}, {len(frames)} pictures")
     if settings.video is not None:
         print(f"  video  {write_video(settings.video, frames, fps=settings.fps)}")

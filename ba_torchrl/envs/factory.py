@@ -13,21 +13,21 @@ from ba_torchrl.config import WorkerOptions, parse
 from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
 from ba_torchrl.envs.vector.make import make_vector, processes_save_time
-from ba_torchrl.plugins import module_names
+from ba_torchrl.plugins import import_modules, module_names
 
 
-def make(task: str, **config: Any) -> ManipulationEnv:
+def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv:
     """Make a TorchRL environment.
 
     Args:
-        task: one of `ba_torchrl.list_tasks`.
+        task: one of `ba_torchrl.list_tasks`, or what `resolve_env` returned.
         config: fields of `ba_torchrl.config.EnvConfig`, such as ``robot="kuka"``, ``seed=0`` or
             ``expert=True``.
 
     Raises:
         ConfigError: the task or a parameter is unknown, or its value cannot be used.
     """
-    return make_resolved(resolve_env(task, config))
+    return make_resolved(_resolved(task, config))
 
 
 def make_resolved(resolved: ResolvedEnv) -> ManipulationEnv:
@@ -40,7 +40,7 @@ def make_resolved(resolved: ResolvedEnv) -> ManipulationEnv:
 
 
 def make_vector_env(
-    task: str,
+    task: str | ResolvedEnv,
     num_envs: int,
     *,
     workers: WorkerOptions | None = None,
@@ -54,7 +54,7 @@ def make_vector_env(
     ``SerialEnv``. The same seed gives the same episodes in both.
 
     Args:
-        task: one of `ba_torchrl.list_tasks`.
+        task: as for `make`.
         num_envs: how many; environment i has the seed ``seed + i``.
         workers: how they are started, and replaced when they fail.
         register_modules: modules outside the package that each process imports before it makes its
@@ -70,7 +70,7 @@ def make_vector_env(
     of_workers = {name: options.pop(name) for name in WorkerOptions.model_fields if name in options}
     given = {} if workers is None else workers.model_dump()
     workers = parse(WorkerOptions, {**given, **of_workers}, "workers")
-    resolved = resolve_env(task, options, modules=module_names(register_modules))
+    resolved = _resolved(task, options, module_names(register_modules))
     if workers.parallel is None:
         workers = workers.model_copy(update={"parallel": processes_save_time(num_envs)})
     if workers.parallel and workers.start_method == "spawn":
@@ -78,3 +78,12 @@ def make_vector_env(
     return make_vector(
         partial(make, resolved), num_envs, seed=resolved.config.seed, workers=workers
     )
+
+
+def _resolved(
+    task: str | ResolvedEnv, config: dict[str, Any], modules: Sequence[str] = ()
+) -> ResolvedEnv:
+    if not isinstance(task, ResolvedEnv):
+        return resolve_env(task, config, modules=modules)
+    import_modules(modules)
+    return task.changed(**config)

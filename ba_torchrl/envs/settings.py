@@ -90,6 +90,20 @@ class ResolvedEnv:
             parameters=model(**{name: getattr(config, name) for name in model.model_fields}),
         )
 
+    def changed(self, **changes: Any) -> ResolvedEnv:
+        """Return these parameters with changes; defaults that were filled in stay.
+
+        Args:
+            changes: fields of `EnvConfig`.
+
+        Raises:
+            ConfigError: as `resolve_env`.
+        """
+        if not changes:
+            return self
+        values = {**self.config.model_dump(), **changes}
+        return resolve_env(self.task_id, values, modules=self.modules)
+
     def check_spawned_process_knows(self) -> None:
         """Check that a spawned process can import what registers the parts of the environment.
 

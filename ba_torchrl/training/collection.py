@@ -35,14 +35,8 @@ def make_env(config: ExperimentConfig, seed: int, **changes: Any) -> EnvBase:
         changes: keywords of `make_vector_env` that differ from the run's; by default, failed
             processes are waited for.
     """
-    options = {**config.env, "seed": seed, "wait_for_restarts": True, **changes}
-    return make_vector_env(
-        config.task,
-        config.num_envs,
-        workers=config.workers,
-        register_modules=config.plugins,
-        **options,
-    )
+    options = {"seed": seed, "wait_for_restarts": True, **changes}
+    return make_vector_env(config.resolved_env, config.num_envs, workers=config.workers, **options)
 
 
 def start_collection(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from ba_torchrl import make
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.data.episodes import Policy, collect_episodes, mean_length, success_rate
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.record.video import FrameRecorder
 
 
@@ -86,8 +86,7 @@ def evaluate(
 
 @torch.no_grad()
 def record_episodes(
-    task: str,
-    env_settings: dict[str, Any],
+    resolved: ResolvedEnv,
     policy: Policy | None,
     episodes: int,
     seed: int,
@@ -96,8 +95,7 @@ def record_episodes(
     """Play greedy episodes and render every step, as a `FrameRecorder` does.
 
     Args:
-        task: id of the task.
-        env_settings: fields of `EnvConfig`.
+        resolved: the environment.
         policy: acts on an unbatched root TensorDict; None for random actions.
         episodes: their number.
         seed: of the first.
@@ -106,7 +104,7 @@ def record_episodes(
     Returns:
         Images [H, W, 3] uint8 in the order of time.
     """
-    env = make(task, **{**env_settings, "seed": seed})
+    env = make(resolved, seed=seed)
     recorder = FrameRecorder(env)
     act = env.rand_action if policy is None else policy
     try:

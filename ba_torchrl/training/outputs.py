@@ -62,13 +62,8 @@ def record_video(config: ExperimentConfig, policy: Policy) -> Path | None:
     """Record greedy episodes; return the file, None if the run wants no video."""
     if not config.video_episodes:
         return None
-    frames = record_episodes(
-        config.task,
-        config.env,
-        policy,
-        config.video_episodes,
-        config.derived_seed(SeedUse.REPORT),
-    )
+    seed = config.derived_seed(SeedUse.REPORT)
+    frames = record_episodes(config.resolved_env, policy, config.video_episodes, seed)
     return write_video(config.folder / "evaluation.mp4", frames, fps=VIDEO_FPS)
 
 
