@@ -122,9 +122,8 @@ def test_imports_go_one_way(module):
 
 
 SIM = (
-    {"geometry", "display", "model_files", "snapshots"},
-    {"activation", "contacts", "meshes"},
-    {"mesh_lists"},
+    {"geometry"},
+    {"contacts", "meshes"},
     {"shapes"},
     {"assets", "bodies"},
     {"articulated"},

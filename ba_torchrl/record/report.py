@@ -28,17 +28,21 @@ from ba_torchrl.record.summary import (
     summarize,
 )
 
+_NUMBERS = {
+    "mean of the curve": ("curve_mean", ".3f"),
+    f"updates to {GOOD_RATE:.0%}": ("updates_to_80", ".0f"),
+    f"steps to {GOOD_RATE:.0%}": ("env_steps_to_80", ".0f"),
+    "episode length": ("mean_length", ".1f"),
+    "hours per run": ("hours", ".2f"),
+}
+"""Column of the table and format of each number, by its heading."""
 _HEADER = (
     "task",
     "method",
     "seeds",
     "success ± standard error",
     f"{CONFIDENCE:.0%} interval",
-    "mean of the curve",
-    f"updates to {GOOD_RATE:.0%}",
-    f"steps to {GOOD_RATE:.0%}",
-    "episode length",
-    "hours per run",
+    *_NUMBERS,
 )
 
 
@@ -136,16 +140,11 @@ def _cells(row: dict[str, Any]) -> list[str]:
         str(row["seeds"]),
         f"{row['success']:.3f}{error}",
         "–" if math.isnan(row["low"]) else f"{row['low']:.3f} to {row['high']:.3f}",
-        _number(row["curve_mean"], ".3f"),
-        _number(row["updates_to_80"], ".0f"),
-        _number(row["env_steps_to_80"], ".0f"),
-        _number(row["mean_length"], ".1f"),
-        _number(row["hours"], ".2f"),
+        *(
+            "–" if math.isnan(row[column]) else format(row[column], form)
+            for column, form in _NUMBERS.values()
+        ),
     ]
-
-
-def _number(value: float, form: str) -> str:
-    return "–" if math.isnan(value) else format(value, form)
 
 
 def _markdown(section: Section, table: Sequence[dict[str, Any]]) -> str:

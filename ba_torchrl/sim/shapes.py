@@ -23,6 +23,8 @@ class Shape(ABC):
     """Geometry, mass and material of a body.
 
     Args:
+        mass_kg: 0 for a static body.
+        friction: coefficient of lateral friction.
         color: red, green, blue, alpha in [0, 1].
         center_of_mass_m: in the frame of the geometry, metres.
     """

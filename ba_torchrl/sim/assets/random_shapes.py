@@ -62,7 +62,7 @@ class RandomShapes(ObjectSet):
 
 
 def shape_path(number: int) -> Path:
-    """Return the mesh file of a random shape."""
+    """Return the mesh file of a random shape, 0 to 999."""
     return Path(pybullet_data.getDataPath(), "random_urdfs", f"{number:03d}", f"{number:03d}.obj")
 
 

@@ -150,9 +150,7 @@ class Robot(ABC):
                 robot, joint, jointLowerLimit=-10, jointUpperLimit=10, physicsClientId=self.client
             )
 
-    def _add_gear(
-        self, robot: int, first: int, second: int, ratio: float, max_force: float = 50
-    ) -> None:
+    def _add_gear(self, robot: int, first: int, second: int, ratio: float) -> None:
         """Couple two joints by a gear constraint.
 
         The velocity of the first joint is minus ``ratio`` times that of the second.
@@ -169,7 +167,7 @@ class Robot(ABC):
             physicsClientId=self.client,
         )
         pybullet.changeConstraint(
-            gear, gearRatio=ratio, maxForce=max_force, erp=0.5, physicsClientId=self.client
+            gear, gearRatio=ratio, maxForce=50, erp=0.5, physicsClientId=self.client
         )
 
     def _couple_fingers(self, robot: int, ratio: float) -> None:

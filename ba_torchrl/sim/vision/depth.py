@@ -228,7 +228,7 @@ class HeightCamera:
     ) -> np.ndarray:
         """Render a height image, [pixels, pixels] float64 metres above the floor.
 
-        ``yaw_rad`` is the heading of the image rows; 0 is +x.
+        It shows a square with the edge ``side_m``; ``yaw_rad`` is the heading of its rows, 0 is +x.
         """
         view = _TopView(tuple(center_m), side_m, pixels, yaw_rad)
         if view != self._view or not self._layers:

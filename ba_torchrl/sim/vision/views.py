@@ -105,6 +105,7 @@ class ViewSetup:
     Args:
         center_m: x and y of the workspace centre.
         z_m: lower and upper bound of z in the workspace.
+        workspace_m: width of the workspace.
         width_m: width of the square that an orthographic image shows.
         camera_height_m: height above the tool of cameras that follow the tool.
         finger_span_m: distance between the squares of the fully open fingers.

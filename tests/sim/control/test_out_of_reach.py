@@ -70,15 +70,6 @@ class SlabSurface:
         return 0.0
 
 
-def test_a_pose_without_inverse_kinematics_is_out_of_reach():
-    scene = RampScene()
-    with scene.world:
-        scene.hand.pick((1.4, 0.0, 0.1), ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)))
-        assert scene.hand.is_out_of_reach
-        scene.pick()
-        assert not scene.hand.is_out_of_reach
-
-
 @pytest.mark.parametrize("teleport", [True, False])
 def test_a_check_for_penetration_does_not_move_the_arm(teleport):
     scene = RampScene(teleport=teleport)
