@@ -23,7 +23,7 @@ def transitions(count=20):
 
     expert = torch.arange(count)[:, None] % 3 == 0
     action = torch.rand(count, 4, generator=generator)
-    data = {**state(), keys.ACTION: action, keys.IS_EXPERT: expert, keys.NEXT: state()}
+    data = {**state(), keys.ACTION: action, keys.IS_DEMONSTRATION: expert, keys.NEXT: state()}
     return TensorDict(data, [count])
 
 
