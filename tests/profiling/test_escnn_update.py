@@ -41,7 +41,7 @@ def batch(count=6):
     data = {
         **state(),
         keys.ACTION: 1.8 * rand(5) - 0.9,
-        keys.IS_EXPERT: torch.arange(count)[:, None] % 2 == 0,
+        keys.IS_DEMONSTRATION: torch.arange(count)[:, None] % 2 == 0,
         keys.NEXT: {**state(), **ends},
     }
     return TensorDict(data, [count])
