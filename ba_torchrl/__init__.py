@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from ba_torchrl.envs.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
+    from ba_torchrl.config import EnvConfig, WorkerOptions
     from ba_torchrl.envs.factory import make, make_vector_env
+    from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 
 __version__ = "0.1.0"
 
-__all__ = ["__version__", "list_tasks", "make", "make_vector_env"]
+_MODULES = {
+    "EnvConfig": "config",
+    "ResolvedEnv": "envs.settings",
+    "WorkerOptions": "config",
+    "make": "envs.factory",
+    "make_vector_env": "envs.factory",
+    "resolve_env": "envs.settings",
+}
+"""Modules of the public names, imported at their first use: that of TorchRL takes seconds."""
+
+__all__ = [
+    "EnvConfig",
+    "ResolvedEnv",
+    "WorkerOptions",
+    "__version__",
+    "list_tasks",
+    "make",
+    "make_vector_env",
+    "resolve_env",
+]
 
 register_with_gymnasium()
 
@@ -24,8 +46,10 @@ def list_tasks() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("make", "make_vector_env"):
-        from ba_torchrl.envs import factory  # imports TorchRL, which takes seconds
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
 
-        return getattr(factory, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return __all__

@@ -106,16 +106,19 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
         raise ConfigError(f"{path} does not hold episodes: {error}") from error
 
 
-def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> None:
+def check_demonstrations(
+    path: str | Path, *, task: str, env: dict[str, Any], least: int = 1
+) -> None:
     """Check that there are demonstrations of the same task and parameters at ``path``.
 
     Args:
         path: folder that `save_demonstrations` wrote.
         task: id of the task.
         env: fields of `EnvConfig` of the environments.
+        least: number of episodes that are needed.
 
     Raises:
-        ConfigError: there are none at ``path``, their files are damaged, or task or parameters
+        ConfigError: there are too few at ``path``, their files are damaged, or task or parameters
             differ; the message names every difference.
     """
     path = Path(path)
@@ -124,11 +127,13 @@ def check_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) ->
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     check(path)
-    kinds = {"task": str, "env": dict}
+    kinds = {"task": str, "env": dict, "episodes": int}
     if not isinstance(metadata, dict) or any(
         not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
     ):
         raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
+    if metadata["episodes"] < least:
+        raise ConfigError(f"{path} holds {metadata['episodes']} episodes, {least} are needed")
     # A field that is missing in the file was added later and has its default value.
     found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
     wanted = {"task": task, **_env_values(task, env)}

@@ -88,7 +88,7 @@ def check(folder: str | Path) -> None:
     folder = Path(folder)
     try:
         listed = json.loads((folder / CHECKSUMS_FILE).read_text(encoding="utf-8"))["crc32"]
-        listed = {name: tuple(fingerprint) for name, fingerprint in listed.items()}
+        listed = {name: (int(size), int(checksum)) for name, (size, checksum) in listed.items()}
     except FileNotFoundError:
         raise DamagedFilesError(
             f"{folder} has no {CHECKSUMS_FILE}: it is incomplete, or of an earlier version"
@@ -205,7 +205,6 @@ class StateFolder:
         """Read a folder that ``dumps`` wrote.
 
         Raises:
-            ConfigError: a file is neither safetensors nor JSON.
             DamagedFilesError: the files are not a state.
         """
         self.load_state_dict(read_state(path))
@@ -221,7 +220,7 @@ def _files(folder: Path) -> Iterator[Path]:
         if path.is_symlink() or not (path.is_dir() or path.suffix in _DATA_SUFFIXES):
             raise ConfigError(
                 f"{path} is not opened: only {' and '.join(sorted(_DATA_SUFFIXES))} files are "
-                "data, others could run code"
+                "data, others could run code. Folders of earlier versions are not read"
             )
         if path.is_file():
             yield path

@@ -53,8 +53,7 @@ class CopiesWithState:
             for cls in type(self).__mro__
             for name in vars(cls).get("copied_attributes", ())
         }
-        config = self.config.model_copy(update={"render": False})
-        resolved = dataclasses.replace(self.resolved, config=config)
+        resolved = self.resolved.changed(render=False)
         return _make_copy, (type(self), resolved, scene, attributes, self.device)
 
 

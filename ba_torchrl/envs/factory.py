@@ -13,7 +13,8 @@ from ba_torchrl.config import WorkerOptions, parse
 from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
 from ba_torchrl.envs.vector.make import make_vector, processes_save_time
-from ba_torchrl.plugins import import_modules, module_names
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import module_names
 
 
 def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv:
@@ -60,7 +61,7 @@ def make_vector_env(
         register_modules: modules outside the package that each process imports before it makes its
             environment, such as ``["my_tasks"]``. Those that register the task and the robot are
             found without being named.
-        make: makes one environment.
+        make: makes one environment; a function or class that the processes can import.
         options: as for `make`, and single fields of `ba_torchrl.config.WorkerOptions`, such as
             ``parallel=False`` or ``timeout_s=120``.
 
@@ -68,6 +69,8 @@ def make_vector_env(
         ConfigError: as for `make`.
     """
     of_workers = {name: options.pop(name) for name in WorkerOptions.model_fields if name in options}
+    if not isinstance(workers, WorkerOptions | None):
+        raise ConfigError(f"workers: must be WorkerOptions, got {workers!r}")
     given = {} if workers is None else workers.model_dump()
     workers = parse(WorkerOptions, {**given, **of_workers}, "workers")
     resolved = _resolved(task, options, module_names(register_modules))
@@ -85,5 +88,4 @@ def _resolved(
 ) -> ResolvedEnv:
     if not isinstance(task, ResolvedEnv):
         return resolve_env(task, config, modules=modules)
-    import_modules(modules)
-    return task.changed(**config)
+    return resolve_env(task.task_id, {**task.given, **config}, modules=[*task.modules, *modules])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
@@ -54,8 +54,10 @@ class ResolvedEnv:
     the parameters of open loop can be None."""
     actions: CloseLoopActions | OpenLoopActions
     """The action space."""
-    modules: tuple[str, ...] = ()
+    modules: tuple[str, ...]
     """Modules outside the package to import before the environment can be made."""
+    given: Mapping[str, Any] = field(compare=False)
+    """The values from which the parameters were resolved."""
 
     @property
     def task_class(self) -> type[Task]:
@@ -91,7 +93,7 @@ class ResolvedEnv:
         )
 
     def changed(self, **changes: Any) -> ResolvedEnv:
-        """Return these parameters with changes; defaults that were filled in stay.
+        """Return the parameters with changes, resolved anew.
 
         Args:
             changes: fields of `EnvConfig`.
@@ -99,10 +101,7 @@ class ResolvedEnv:
         Raises:
             ConfigError: as `resolve_env`.
         """
-        if not changes:
-            return self
-        values = {**self.config.model_dump(), **changes}
-        return resolve_env(self.task_id, values, modules=self.modules)
+        return resolve_env(self.task_id, {**self.given, **changes}, modules=self.modules)
 
     def check_spawned_process_knows(self) -> None:
         """Check that a spawned process can import what registers the parts of the environment.
@@ -115,7 +114,7 @@ class ResolvedEnv:
                 check_spawned_process_knows(registry.kind, name)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return resolve_env, (self.task_id, self.config.model_dump(), None, self.modules)
+        return resolve_env, (self.task_id, dict(self.given), None, self.modules)
 
 
 def resolve_env(
@@ -140,6 +139,7 @@ def resolve_env(
         ConfigError: a name is unknown, a type wrong or a value out of range, the task does not
             support a value, or a module does not exist.
     """
+    modules = tuple(modules)
     import_modules(modules)
     task_class = TASKS[task_id]
     model = env_config_model(task_class.Parameters)
@@ -157,7 +157,8 @@ def resolve_env(
             f"{', '.join(missing)}; the sequence has {', '.join(actions.components)}"
         )
     registering = (module for *_, module in _plugins(task_id, config) if module not in MAIN)
-    return ResolvedEnv(task_id, config, actions, tuple(dict.fromkeys([*modules, *registering])))
+    modules = tuple(dict.fromkeys([*modules, *registering]))
+    return ResolvedEnv(task_id, config, actions, modules, given)
 
 
 def _plugins(task_id: str, config: EnvConfig) -> Iterator[tuple[Registry[Any], str, str]]:

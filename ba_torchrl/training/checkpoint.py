@@ -106,8 +106,10 @@ def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
     plugins = saved.get("plugins")
     if isinstance(plugins, list) and "plugins" not in changes:
         check_known(map(str, plugins), file)
-    values = {**saved, **changes}
-    return ExperimentConfig.parse(values, what=str(file))
+    try:
+        return ExperimentConfig.parse({**saved, **changes}, what=str(file))
+    except ConfigError as error:
+        raise ConfigError(f"this version cannot use {file}: {error}") from None
 
 
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:

@@ -96,16 +96,11 @@ def gather_demonstrations(
         on_episode: called with each episode that is played.
 
     Raises:
-        ConfigError: the folder holds fewer than the run asks for, or none that can be used.
+        ConfigError: the folder holds none that can be used.
         RuntimeError: no episode can be used.
     """
     if config.demonstrations_path is not None:
         episodes = load_demonstrations(config.demonstrations_path, task=config.task, env=config.env)
-        if len(episodes) < config.demonstrations:
-            raise ConfigError(
-                f"{config.demonstrations_path} holds {len(episodes)} episodes, fewer than "
-                f"demonstrations={config.demonstrations}"
-            )
         for name in ("demonstrations_noise", "demonstrations_turn_noise", "demonstrations_source"):
             if getattr(config, name) != type(config).model_fields[name].default:
                 logger.warning("%s has no effect on episodes of demonstrations_path", name)

@@ -289,7 +289,9 @@ class ExperimentConfig(WorkerOptions):
         if self.demonstrations_path is not None:
             if not self.demonstrations:
                 raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")
-            check_demonstrations(self.demonstrations_path, task=self.task, env=self.env)
+            check_demonstrations(
+                self.demonstrations_path, task=self.task, env=self.env, least=self.demonstrations
+            )
 
 
 def usable_device(name: str) -> torch.device:

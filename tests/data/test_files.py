@@ -100,6 +100,11 @@ def empty_the_checksums(folder):
     return "is damaged"
 
 
+def alter_the_form_of_the_checksums(folder):
+    (folder / CHECKSUMS_FILE).write_text('{"crc32": {"values.json": []}}')
+    return "is damaged"
+
+
 def delete_the_checksums(folder):
     (folder / CHECKSUMS_FILE).unlink()
     return f"has no {CHECKSUMS_FILE}"
@@ -114,6 +119,7 @@ def delete_the_checksums(folder):
         add_one,
         tear_the_checksums,
         empty_the_checksums,
+        alter_the_form_of_the_checksums,
         delete_the_checksums,
     ],
 )

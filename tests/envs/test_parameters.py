@@ -223,6 +223,18 @@ def test_a_resolved_configuration_is_valid_and_complete(task):
     assert unset >= {"floor_color", *CUSTOM_PHYSICS}
 
 
+def test_environments_are_made_from_resolved_parameters(make):
+    resolved = resolve_env("open_loop/block_stacking", {"obs_size": 32})
+    env = ba_torchrl.make(resolved, num_objects=8)
+    assert (env.config.obs_size, env.max_steps) == (32, 14)  # the default of eight blocks
+    env.close()
+    vector = ba_torchrl.make_vector_env(resolved, 2, parallel=False, max_steps=3)
+    assert vector.reset()["pixels"].shape == (2, 1, 32, 32)
+    vector.close()
+    named = resolve_env(PICKING, {}, modules=["json"])
+    assert pickle.loads(pickle.dumps(named)).modules == named.changed(seed=1).modules == ("json",)
+
+
 def test_the_step_limit_grows_with_the_number_of_blocks(make):
     for count, limit in ((4, 10), (6, 10), (7, 12), (8, 14)):
         assert make("open_loop/block_stacking", num_objects=count).max_steps == limit
