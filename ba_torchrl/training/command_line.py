@@ -130,6 +130,10 @@ def _name_presets(message: str, settings: DictConfig) -> str:
         chosen = settings.get(group)
         if preset and isinstance(chosen, DictConfig) and "name" in chosen:
             message = message.replace(f"{group} {chosen.name!r}", f"{group} {preset!r}")
+        start, listed, names = message.partition(f"tasks take {group}: ")
+        if listed:
+            presets = hydra_schema.presets_of(group, names.split(", "))
+            message = f"{start}{listed}{', '.join(presets)}"
     return message
 
 

@@ -139,6 +139,16 @@ def preset(group: str, name: str) -> dict[str, Any]:
     return OmegaConf.to_container(settings[group], resolve=True)
 
 
+def presets_of(group: str, names: Iterable[str]) -> list[str]:
+    """Return the names of the presets whose registered name is one of some names.
+
+    Args:
+        group: folder in ``configs``, such as "algorithm".
+        names: in the group's registry.
+    """
+    return [each for each in _presets(group) if preset(group, each)["name"] in names]
+
+
 def _presets(group: str) -> list[str]:
     """Return the names of a group's presets."""
     files = GlobalHydra.instance().config_loader().get_group_options(group)
