@@ -1,5 +1,7 @@
 """Episodes that the tests play."""
 
+import torch
+
 
 def follow(env, state, steps=1000, action=None):
     """Take expert actions, or the given one, until the episode ends; return every state."""
@@ -32,3 +34,14 @@ def check_lift(env, position, low_m=0.145, high_m=0.155):
     scene.controller.grip(1.0)
     scene.world.settle()
     assert not scene.task.is_success()
+
+
+def play_scene(env):
+    """Take expert actions from the present scene, at rest; return the last step."""
+    env.scene.world.settle()
+    env.scene.world.step(2)
+    while True:
+        action = torch.from_numpy(env._expert_action(env.scene))
+        state = env._step(env.full_action_spec.zero().set("action", action))
+        if state["done"]:
+            return state
