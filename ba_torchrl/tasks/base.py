@@ -23,7 +23,7 @@ from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain.flat import Flat, Terrain
-from ba_torchrl.tasks.workspace import ActionLimits, Spacing, Workspace
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks")
 
@@ -123,11 +123,7 @@ class Task(ABC):
 
     @classmethod
     def step_limit(cls, num_objects: int) -> int:
-        """Return the default number of steps after which an episode is truncated.
-
-        Args:
-            num_objects: number of objects.
-        """
+        """Return the default number of steps after which an episode is truncated."""
         return cls.max_steps
 
     @abstractmethod
@@ -138,17 +134,11 @@ class Task(ABC):
         """Choose the objects of an episode, before the terrain and their poses are drawn.
 
         By default all objects are part of every episode.
-
-        Args:
-            rng: random generator of the episode.
         """
 
     @abstractmethod
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Set new random poses of the bodies.
-
-        Args:
-            rng: random generator of the episode.
 
         Raises:
             PlacementError: the workspace is too small for them.
@@ -262,20 +252,6 @@ class Task(ABC):
         """
         return self.terrain.random_point(rng, padding_m)
 
-    def random_points(
-        self, rng: np.random.Generator, spacings: Sequence[Spacing]
-    ) -> list[tuple[float, float]]:
-        """Return random points of the ground, one for each object, that keep their distances.
-
-        Args:
-            rng: random generator.
-            spacings: space that each object needs.
-
-        Raises:
-            PlacementError: the workspace is too small for them.
-        """
-        return self.terrain.random_points(rng, spacings)
-
     def random_yaw(self, rng: np.random.Generator, span_rad: float) -> float:
         """Return a random yaw from a range of ``span_rad`` about 0; 0 with fixed orientations."""
         if not self.settings.random_orientation:
@@ -305,7 +281,6 @@ class OpenLoopTask(Task):
         """Return the least height of a pick, at which the fingers close above the ground, metres.
 
         Args:
-            xy: position of the tool, metres.
             rotation: rotation of the tool; None if it points down.
         """
         return self.terrain.lowest_tool_m(self.robot.gripper, xy, rotation)
@@ -315,7 +290,6 @@ class OpenLoopTask(Task):
 
         Args:
             top_m: height of the highest point in the window around the target.
-            xy: position of the target.
         """
         return max(top_m - self.block_m / 2, self.lowest_tool_m(xy))
 
@@ -324,16 +298,11 @@ class OpenLoopTask(Task):
 
         Args:
             top_m: height of the highest point in the window around the target.
-            xy: position of the target.
         """
         return top_m + self.block_m / 2
 
     def window_m(self, held: Body | None) -> float:
-        """Return half the width of the square window around the target, metres.
-
-        Args:
-            held: the body in the gripper.
-        """
+        """Return half the width of the square window around the target, metres."""
         return self.block_m / 2
 
 
@@ -359,7 +328,6 @@ class CloseLoopTask(Task):
         object from one to the other.
 
         Args:
-            rng: random generator.
             paddings_m: twice the least distance of each point from the border.
             distance_m: least distance between the points.
 
@@ -380,10 +348,6 @@ class CloseLoopTask(Task):
 
 def check_scales(task_id: str, scales: tuple[float, float]) -> None:
     """Check that scales are within the limits of a task.
-
-    Args:
-        task_id: id of the task.
-        scales: the smallest and the largest scale.
 
     Raises:
         ConfigError: a scale is outside the limits.

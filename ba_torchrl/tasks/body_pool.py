@@ -27,8 +27,6 @@ class BodyPool:
 
     Args:
         world: not sealed yet.
-        shapes: shapes of the bodies.
-        names: names of the bodies.
     """
 
     def __init__(self, world: World, shapes: Sequence[Shape], names: Sequence[str]) -> None:
@@ -67,7 +65,6 @@ def deactivate_body(body: Body, index: int) -> None:
     """Take a body out of the scene; see `BodyPool`.
 
     Args:
-        body: the body.
         index: number of its position, different for every inactive body.
     """
     row, column = divmod(index, COLUMNS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from ba_torchrl.sim.geometry import PlanarFrame, Vector
 
 LAYOUT_ATTEMPTS = 2000
 """Random layouts before a `PlacementError`; bowl and block fit in about one of ten."""
+SITE_STEP_M = 0.02
+"""Grid spacing of the sites of an area."""
 
 
 @dataclass(frozen=True)
@@ -72,30 +74,6 @@ class Spacing(NamedTuple):
     """Least distance between its centre and those of the objects placed before it."""
 
 
-class Region(Protocol):
-    """A convex part of the horizontal plane, metres."""
-
-    def shrunk(self, border_m: float) -> Self:
-        """Return the region less a border of this width."""
-
-    def outside_m(self, points: np.ndarray) -> np.ndarray:
-        """Return how far points [N, 2] are outside of the region, [N]; 0 inside."""
-
-    def sites(self, step_m: float) -> np.ndarray:
-        """Return a grid of points [S, 2] of the region."""
-
-    def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
-        """Return a random point at least half of ``padding_m`` from the border.
-
-        Raises:
-            PlacementError: the region is too small.
-        """
-
-    @property
-    def heading_rad(self) -> float | None:
-        """Heading of a region so narrow that pieces must be aligned with it; None otherwise."""
-
-
 class Area(NamedTuple):
     """An axis-aligned rectangle of the horizontal plane, metres."""
 
@@ -112,9 +90,9 @@ class Area(NamedTuple):
         low, high = np.array([self.x, self.y]).T
         return np.maximum(np.maximum(low - points, points - high), 0.0).max(axis=1)
 
-    def sites(self, step_m: float) -> np.ndarray:
+    def sites(self) -> np.ndarray:
         """Return a grid of points [S, 2]."""
-        return np.array([(a, b) for a in _grid(*self.x, step_m) for b in _grid(*self.y, step_m)])
+        return np.array([(a, b) for a in _grid(*self.x) for b in _grid(*self.y)])
 
     def shrunk(self, border_m: float) -> Area:
         """Return the area less a border of this width."""
@@ -141,10 +119,6 @@ class Area(NamedTuple):
         self, rng: np.random.Generator, spacings: Sequence[Spacing]
     ) -> list[tuple[float, float]]:
         """Return uniformly random points, one for each object, that keep their distances.
-
-        Args:
-            rng: random generator.
-            spacings: space that each object needs.
 
         Raises:
             PlacementError: no layout was found.
@@ -196,13 +170,13 @@ class OrientedArea(NamedTuple):
         outside = np.maximum(np.abs(along) - self.half_x, np.abs(across) - self.half_y)
         return np.maximum(np.maximum(outside, 0.0), self.within.outside_m(points))
 
-    def sites(self, step_m: float) -> np.ndarray:
+    def sites(self) -> np.ndarray:
         """Return a grid of points [S, 2], parallel to the rectangle."""
         grid = np.array(
             [
                 self.frame.to_world(a, b)
-                for a in _grid(-self.half_x, self.half_x, step_m)
-                for b in _grid(-self.half_y, self.half_y, step_m)
+                for a in _grid(-self.half_x, self.half_x)
+                for b in _grid(-self.half_y, self.half_y)
             ]
         )
         inside = self.within.outside_m(grid) == 0
@@ -226,6 +200,10 @@ class OrientedArea(NamedTuple):
         )
 
 
-def _grid(low: float, high: float, step_m: float) -> list[float]:
-    count = max(1, round((high - low) / step_m))
+Region = Area | OrientedArea
+"""A convex part of the horizontal plane."""
+
+
+def _grid(low: float, high: float) -> list[float]:
+    count = max(1, round((high - low) / SITE_STEP_M))
     return [low + (high - low) * i / count for i in range(count + 1)]

@@ -16,7 +16,7 @@ STEPS = {
     "close_loop/block_in_bowl": 11.2,
     "close_loop/block_stacking": 12.0,
     "close_loop/house_building": 11.9,
-    "close_loop/corner_picking": 17.0 / 1.1,
+    "close_loop/corner_picking": 13.9,
     "close_loop/drawer_opening": 8.6,
     "close_loop/object_grasping": 14.2,
     "open_loop/block_stacking": 6,
@@ -41,8 +41,8 @@ STEPS = {
     "bump/house_building_4": 12,  # no piece starts on the platform
     "bump/box_palletizing": 36,
 }
-"""Mean steps of the published planners in close loop, optimal steps in open loop (appendix A). The
-tests allow 1.1 times as many."""
+"""Mean steps of the published planners in close loop, of which the tests allow 1.1 times as many;
+optimal steps in open loop (appendix A)."""
 
 SUCCESS = {
     "close_loop/object_grasping": 0.95,
@@ -110,7 +110,7 @@ def without_yaw(task):
 
 def check_expert(task, episodes, margin, **config):
     """Check the expert against the published lengths and the success rates of `SUCCESS`."""
-    limit = 1.1 * STEPS[task] if task in STEPS else None  # None for tasks that are not in the paper
+    limit = STEPS[task] * (1.1 if REGISTRY[task].control == "close_loop" else 1)
     success = SUCCESS.get(task, 0.99)
     if "r" not in config.get("action_sequence", "r"):
         success = SUCCESS_WITHOUT_YAW.get(task, success)
@@ -123,24 +123,17 @@ def check_expert(task, episodes, margin, **config):
     )
 
 
-def test_specs(task):
-    checks.check_specs(task)
+@pytest.mark.parametrize("check", checks.CHECKS, ids=lambda check: check.__name__)
+def test_contract(task, check):
+    check(task)
 
 
 @pytest.mark.parametrize(
-    ("task", "parallel"),
-    [
-        *((task, False) for task in TASKS),
-        *((task, True) for task in TASKS[::8]),
-        *(pytest.param(task, True, marks=pytest.mark.slow) for task in TASKS[4::8]),
-    ],
+    "task",
+    [*TASKS[::8], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[4::8])],
 )
-def test_vector_specs(task, parallel):
-    checks.check_vector_specs(task, parallel=parallel)
-
-
-def test_an_episode_starts_valid_and_unsolved(task):
-    checks.check_resets(task, episodes=10)
+def test_vector_specs_of_worker_processes(task):
+    checks.check_vector_specs(task, parallel=True)
 
 
 @pytest.mark.parametrize(("task", "robot"), SAMPLE)
@@ -152,38 +145,6 @@ def test_an_episode_of_another_robot_starts_valid_and_unsolved(task, robot):
 @pytest.mark.parametrize("robot", OTHER_ROBOTS)
 def test_an_episode_of_every_robot_starts_valid_and_unsolved(task, robot):
     checks.check_resets(task, robot=robot, episodes=20)
-
-
-def test_seeds_reproduce_the_images(task):
-    checks.check_seeds(task)
-
-
-def test_successive_episodes_differ(task):
-    if checks.continues(task):
-        pytest.skip("the next episode starts from the scene in which the last one ended")
-    checks.check_successive_episodes(task)
-
-
-def test_observations_are_copies(task):
-    checks.check_observations_are_copies(task)
-
-
-def test_random_actions_stay_in_the_specs(task):
-    checks.check_random_actions(task)
-
-
-def test_extreme_actions_do_not_fail(task):
-    checks.check_extreme_actions(task)
-
-
-def test_the_constructor_can_be_pickled(task):
-    checks.check_pickling(task)
-
-
-def test_the_step_limit_truncates(task):
-    if REGISTRY[task].terminates_at_limit:
-        pytest.skip("the step limit terminates the episode")
-    checks.check_step_limit(task)
 
 
 def test_the_expert_succeeds(task):
@@ -285,11 +246,3 @@ def test_the_expert_repeats_no_action_in_an_unchanged_scene_over_60_episodes(tas
 def check_progress(task, episodes, **config):
     rate = UNSOLVED[task][0] if task in UNSOLVED else 0.0
     checks.check_progress(task, episodes=episodes, max_unsolved_rate=rate, **config)
-
-
-def test_the_expert_changes_nothing(task):
-    checks.check_expert_is_passive(task)
-
-
-def test_partial_resets_in_a_vector(task):
-    checks.check_partial_resets(task)

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from tests.tasks.episodes import check_lift
+
 
 @pytest.fixture
 def make(make_started):
@@ -22,19 +24,8 @@ def test_reaching_succeeds_within_three_centimetres(make):
 
 def test_picking_requires_a_grasp_and_a_height(make):
     env = make("block_picking")
-    scene = env.scene
-    scene.task.block.place((0.45, 0.0, 0.025))
-    scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
-    assert not scene.task.is_success()  # high, without the block
-    scene.controller.move_to((0.45, 0.0, 0.025), 0.0)
-    scene.controller.grip(0.0)
-    scene.controller.move_to((0.45, 0.0, 0.14), 0.0)
-    assert not scene.task.is_success()  # held, at a low height
-    scene.controller.move_to((0.45, 0.0, 0.16), 0.0)
-    assert scene.task.is_success()
-    scene.controller.grip(1.0)
-    scene.world.settle()
-    assert not scene.task.is_success()
+    env.scene.task.block.place((0.45, 0.0, 0.025))
+    check_lift(env, (0.45, 0.0, 0.025), low_m=0.14, high_m=0.16)
 
 
 def test_pushing_succeeds_within_five_centimetres(make):

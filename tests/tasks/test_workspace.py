@@ -30,7 +30,7 @@ def test_random_points_and_sites_are_inside(heading):
     assert abs(across).max() <= 0.02 + 1e-9
     assert np.ptp(across) > 0.035
     assert np.ptp(along) > 0.3
-    for found in (points, area.sites(0.02)):
+    for found in (points, area.sites()):
         assert area.outside_m(found) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -39,7 +39,7 @@ def test_an_area_narrower_than_the_border_is_the_line_along_its_centre():
     assert area.heading_rad is None
     line = area.shrunk(0.04)
     assert line.heading_rad == 0.5
-    _, across = line.frame.to_local(*line.sites(0.02).T)
+    _, across = line.frame.to_local(*line.sites().T)
     assert abs(across).max() < 1e-12
     side = np.array([area.frame.to_world(0.0, 0.05)])
     assert line.outside_m(side) == pytest.approx(0.05)

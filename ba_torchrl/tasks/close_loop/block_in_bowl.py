@@ -71,7 +71,7 @@ class BlockInBowl(CloseLoopTask):
         """Place block and bowl at random poses, at least 17 cm apart."""
         block = 2.4 * self.block_m
         bowl = 0.17 * self.settings.scale
-        points = self.random_points(rng, (Spacing(block, block), Spacing(bowl, bowl)))
+        points = self.terrain.random_points(rng, (Spacing(block, block), Spacing(bowl, bowl)))
         for body, xy in zip((self.block, self.bowl), points, strict=True):
             self.stand(body, xy, self.random_yaw(rng, math.pi))
 

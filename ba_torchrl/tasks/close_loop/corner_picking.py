@@ -152,11 +152,7 @@ class CornerPicking(CloseLoopTask):
         return pick_up(robot, block, limits, yaws_rad=yaws, ceiling_m=ceiling)
 
     def clearance_m(self, yaw_rad: float) -> float:
-        """Return the clearance between the walls and open fingers around the block, metres.
-
-        Args:
-            yaw_rad: yaw of the gripper.
-        """
+        """Return the clearance between the walls and open fingers around the block, metres."""
         turn = yaw_rad - self.corner.yaw_rad
         along = finger_extent_m(self.robot.gripper)
         across = self.robot.gripper.half_width_m

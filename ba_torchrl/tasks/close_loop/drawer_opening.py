@@ -188,7 +188,6 @@ class DrawerOpening(CloseLoopTask):
         Args:
             behind: target of the descent along the handle's direction of motion.
             tool: position of the tool along and across that direction from the rod, and height.
-            turn: yaw error.
         """
         robot, limits, scale = self.robot, self.action_limits, self.settings.scale
         ahead, across, z = tool

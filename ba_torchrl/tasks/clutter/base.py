@@ -92,9 +92,6 @@ class ClutterTask(Task):
 
         They start with random orientations, or with the identity if orientations are fixed, and
         tumble as they hit the tray and each other.
-
-        Args:
-            rng: random generator.
         """
         self.attempts = self.failures = 0
         settings, world, pool = self.settings, self.world, self.pool

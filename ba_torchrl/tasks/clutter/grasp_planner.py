@@ -62,7 +62,6 @@ class GraspPlanner:
         pool: all bodies that may be grasped.
         camera: camera of the height image, in which all obstacles are visible.
         workspace: bounds of the tool.
-        gripper: the gripper.
     """
 
     def __init__(
@@ -111,9 +110,6 @@ class GraspPlanner:
         """Return the grasp of any of the bodies with the lowest cost; None without a grasp.
 
         Args:
-            bodies: the bodies.
-            tool: position and yaw of the tool.
-            limits: limits of an action.
             heights: height image of `heights`.
             penalty: returns the additional costs [N] of grasps [N, 6]: x, y, z, yaw, risk, slip.
         """
@@ -161,7 +157,6 @@ class GraspPlanner:
 
         Args:
             samples: [N, 6] surface points and normals of the body.
-            tool: position and yaw of the tool.
         """
         low, high = self.workspace.z
         found = _search(

@@ -61,7 +61,6 @@ class PushPlanner:
 
     Args:
         grasps: the grasp planner of the objects.
-        tray: the tray.
     """
 
     def __init__(self, grasps: GraspPlanner, tray: Tray) -> None:
@@ -84,9 +83,6 @@ class PushPlanner:
         """Return the push or pull of any of the bodies with the lowest cost; None without any.
 
         Args:
-            bodies: the bodies.
-            tool: position and yaw of the tool.
-            limits: limits of an action.
             heights: height image of `GraspPlanner.heights`.
         """
         pushes = [push for body in bodies for push in self._pushes(body, tool, limits, heights)]

@@ -40,7 +40,6 @@ def half_gap_m(gripper: Gripper, opening: float = 1.0) -> float:
     """Return half the width of the gap between the fingers, less a margin.
 
     Args:
-        gripper: the gripper.
         opening: opening of the gripper, 0 to 1.
     """
     return opening * (gripper.half_gap_m - INNER_MARGIN_M)
@@ -50,7 +49,6 @@ def finger_extent_m(gripper: Gripper, opening: float = 1.0) -> float:
     """Return the distance of the fingers' outer sides from the tool point, plus a margin.
 
     Args:
-        gripper: the gripper.
         opening: opening of the gripper, 0 to 1.
     """
     return gripper.finger_reach_m - (1 - opening) * gripper.half_gap_m + OUTER_MARGIN_M
@@ -60,7 +58,6 @@ def finger_ranges_m(gripper: Gripper, opening: float = 1.0) -> tuple[Range, Rang
     """Return the ranges that the two fingers occupy, relative to the tool point.
 
     Args:
-        gripper: the gripper.
         opening: opening of the gripper, 0 to 1.
     """
     inner, outer = half_gap_m(gripper, opening), finger_extent_m(gripper, opening)
@@ -73,8 +70,6 @@ def finger_rectangles(
     """Return the footprints of the two fingers.
 
     Args:
-        gripper: the gripper.
-        tool: frame of the tool.
         half_opening_m: distance between the tool point and the inner side of a finger.
     """
     along = gripper.finger_reach_m - gripper.half_gap_m
@@ -121,11 +116,7 @@ def path_clearance_m(
     """Return the clearance between the fingertips on their path to a body, and other bodies.
 
     Args:
-        gripper: the gripper.
-        body: the body to grasp.
-        yaw_rad: yaw of the gripper.
         ranges_m: ranges that the fingers occupy, relative to the origin of the body.
-        others: the other bodies.
         at: assumed position of the body; its present one if None.
     """
     bx, by, bz = body.position if at is None else at
@@ -152,10 +143,6 @@ def grasp_clearance_m(
     """Return the clearance between the fingers, opened around a body's origin, and other bodies.
 
     Args:
-        gripper: the gripper.
-        body: the body to grasp.
-        yaw_rad: yaw of the gripper.
-        others: the other bodies.
         opening: opening of the gripper, 0 to 1.
         at: assumed position of the body; its present one if None.
     """
@@ -172,9 +159,6 @@ def hand_clearance_m(
     """Return the clearance between the hand above the palm and other bodies.
 
     Args:
-        robot: the robot.
-        tool: frame of the tool.
-        tool_z_m: height of the tool.
         others: the other bodies; only those higher than the palm count.
     """
     gap = math.inf
@@ -190,19 +174,14 @@ def tool_clearances_m(
     tools: Sequence[Pose],
     others: Iterable[Body],
     opening: float = 1.0,
-    *,
-    with_knuckles: bool = False,
 ) -> np.ndarray:
     """Return the clearances between the hand with open fingers at some poses, and other bodies.
 
     Each is a lower bound, the largest gap between parallel lines that separate the two.
 
     Args:
-        robot: the robot.
         tools: K poses of the tool, which may be tilted.
-        others: the other bodies.
         opening: opening of the gripper, 0 to 1.
-        with_knuckles: include the parts of the fingers that are wider than those beside an object.
 
     Returns:
         [K] metres.
@@ -211,7 +190,7 @@ def tool_clearances_m(
     upright = np.array(downward(0.0)).T
     to_views = np.stack([rotation_array(tool.orientation) @ upright for tool in tools])
     origins = np.array([tool.position for tool in tools])[:, None]
-    parts, heights = _hand_extents(robot.gripper, robot.hand_half_extents_m, opening, with_knuckles)
+    parts, heights = _hand_extents(robot.gripper, robot.hand_half_extents_m, opening)
     gaps = np.full(len(tools), math.inf)
     for other in others:
         corners = (world_vertices(other) - origins) @ to_views
@@ -223,15 +202,13 @@ def tool_clearances_m(
 
 @lru_cache(maxsize=64)
 def _hand_extents(
-    gripper: Gripper, hand_half_extents_m: tuple[float, float], opening: float, with_knuckles: bool
+    gripper: Gripper, hand_half_extents_m: tuple[float, float], opening: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return outlines and heights of the parts of an open hand at the origin.
 
     Args:
-        gripper: the gripper.
         hand_half_extents_m: half the extents of the hand above the palm.
         opening: opening of the gripper, 0 to 1.
-        with_knuckles: include the parts of the fingers that are wider than those beside an object.
 
     Returns:
         Extremes [parts, 2, BEARINGS] of each part's outline, and its height [parts] above the tool
@@ -241,11 +218,9 @@ def _hand_extents(
     fingers = finger_rectangles(gripper, origin, half_gap_m(gripper, opening))
     parts = [(finger, gripper.lowest_tip_m) for finger in fingers]
     parts.append((Rectangle(*origin, *hand_half_extents_m), gripper.palm_height_m))
-    if with_knuckles:
-        reach_m, height = knuckles_m(gripper)
-        reach_m -= (1 - opening) * gripper.half_gap_m
-        half_width_m = gripper.half_width_m + SIDE_MARGIN_M
-        parts.append((Rectangle(*origin, reach_m, half_width_m), height))
+    reach_m, height = knuckles_m(gripper)
+    reach_m -= (1 - opening) * gripper.half_gap_m
+    parts.append((Rectangle(*origin, reach_m, gripper.half_width_m + SIDE_MARGIN_M), height))
     outlines, heights = zip(*parts, strict=True)
     return np.stack([extents_m(part.corners) for part in outlines]), np.array(heights)
 
@@ -259,7 +234,6 @@ def outline_clearances_m(
     """Return the clearances between the fingers and outlines.
 
     Args:
-        gripper: the gripper.
         tools: K frames of the tool.
         half_opening_m: distance between the tool point and the inner side of a finger.
         others: outlines of bodies that are higher than the fingertips.

@@ -31,21 +31,13 @@ def place_command(tool: Pose, held: Pose, target: Pose) -> PickPlaceCommand:
     """Return the place that brings the held body to a pose.
 
     Args:
-        tool: present pose of the tool.
-        held: present pose of the held body.
         target: pose of the held body at its release.
     """
     return _command(PLACE, carrying_pose(tool, held, target))
 
 
 def carrying_pose(tool: Pose, held: Pose, target: Pose) -> Pose:
-    """Return the pose of the tool that brings the held body to a pose.
-
-    Args:
-        tool: present pose of the tool.
-        held: present pose of the held body.
-        target: target pose of the held body.
-    """
+    """Return the pose of the tool that brings the held body to a pose."""
     return target.compose(held.inverse().compose(tool))
 
 
@@ -54,9 +46,6 @@ def swaps_fingers(tool: Pose) -> bool:
 
     Such an action brings the fingers to the pose, but reverses a held body in it: the error of the
     place is twice the body's tilt and distance from the centre of the tool.
-
-    Args:
-        tool: pose of the tool.
     """
     rz, _, _ = tool_angles(tool.orientation)
     return abs(rz) >= ROUNDING_RAD and rz % (2 * math.pi) > math.pi
@@ -86,9 +75,6 @@ def scene_generator(world: World) -> np.random.Generator:
 
     A failed grasp moves the objects that it touches at least in the last bits, so the next draw
     differs, while an expert with this generator remains a function of the scene.
-
-    Args:
-        world: the world of the bodies.
     """
     poses = [(*body.position, *body.pose.orientation) for body in world.bodies]
     return np.random.default_rng(np.array(poses).view(np.uint64).ravel())
@@ -101,9 +87,6 @@ def perturbed_pick(world: World, body: Body, grasp: Pose, *, can_turn: bool) -> 
     deviations are more likely than large ones.
 
     Args:
-        world: the world of the body.
-        body: the body.
-        grasp: pose of the tool.
         can_turn: whether the yaw of the tool may deviate.
     """
     rng = scene_generator(world)

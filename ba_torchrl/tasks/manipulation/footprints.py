@@ -110,7 +110,6 @@ def outline(body: Body, yaw_rad: float | None = None) -> Rectangle:
     """Return the bounding rectangle of a body's footprint.
 
     Args:
-        body: the body.
         yaw_rad: yaw of the rectangle; that of the body if None.
     """
     yaw = body.yaw_rad if yaw_rad is None else yaw_rad
@@ -122,7 +121,6 @@ def narrowest(body: Body, yaw_rad: float | None = None) -> list[Rectangle]:
     """Return the bounding rectangles of a body's footprint with the least extent along x.
 
     Args:
-        body: the body.
         yaw_rad: the only yaw to consider; `WIDTH_YAWS` yaws if None.
 
     Returns:

@@ -46,9 +46,7 @@ def is_reachable(
     Both are also reached after half a turn of the tool, which the action space may add.
 
     Args:
-        robot: the robot.
         support_ids: PyBullet ids of the bodies that form the ground.
-        tool: pose of the tool.
         clearance_m: distance before the pose at which the approach ends.
     """
     if any(abs(tilt) > MAX_TILT_RAD for tilt in tool_angles(tool.orientation)[1:]):

@@ -54,9 +54,6 @@ def move_toward(
     """Return the command towards a pose; the environment limits it.
 
     Args:
-        robot: the robot.
-        target: target position of the tool, metres.
-        yaw_rad: target yaw of the gripper.
         opening: opening of the gripper, 0 to 1.
     """
     position, yaw = robot.tool_pose()
@@ -70,8 +67,6 @@ def nearest_equivalent_yaw(
     """Return the yaw nearest to the present one that is equivalent to a target yaw.
 
     Args:
-        yaw_rad: present yaw of the gripper.
-        target_rad: target yaw.
         limits: limits of an action; a gripper that cannot turn keeps its yaw.
         period_rad: yaws that differ by a multiple of this are equivalent.
     """
@@ -91,9 +86,6 @@ def grasped_body(robot: Robot) -> Body | None:
     """Return the body between fingers that press on it, None without one.
 
     Open fingers can touch a wide body on both sides, too, but do not press on it.
-
-    Args:
-        robot: the robot.
     """
     is_pressing = robot.commanded_opening < robot.opening() - LEAST_SQUEEZE
     return robot.held_body() if is_pressing else None
@@ -103,9 +95,6 @@ def closing(robot: Robot) -> float:
     """Return the opening to command for an empty gripper to close.
 
     Fingers that something stopped open first: they close no further by the same command.
-
-    Args:
-        robot: the robot.
     """
     is_stopped = robot.commanded_opening < IS_CLOSED <= robot.opening()
     return OPEN if is_stopped else CLOSED
@@ -115,9 +104,7 @@ def release(body: Body, floor_m: float, limits: ActionLimits) -> GripperCommand:
     """Return the next command to lower the held body to the floor and open the fingers.
 
     Args:
-        body: the held body.
         floor_m: height of the floor, metres.
-        limits: limits of an action.
     """
     gap = max(vertical_extent(body)[0] - floor_m, 0.0)
     return lift(-gap, OPEN if gap <= limits.step_m else CLOSED)
@@ -127,7 +114,6 @@ def lift(height_m: float, opening: float = CLOSED) -> GripperCommand:
     """Return the command of a vertical displacement.
 
     Args:
-        height_m: displacement.
         opening: opening of the gripper, 0 to 1.
     """
     return GripperCommand(opening, 0.0, 0.0, height_m, 0.0)
@@ -147,10 +133,6 @@ def can_descend(
     aligns the body, and not to another ascent.
 
     Args:
-        robot: the robot.
-        body: the body.
-        target_yaw_rad: yaw of the grasp.
-        limits: limits of an action.
         others: bodies to avoid besides it.
     """
     (x, y, z), yaw = robot.tool_pose()
@@ -172,11 +154,6 @@ def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
 
     The gripper moves above the block, descends once its fingers have free ways, and closes them
     with the action that reaches the grasp height.
-
-    Args:
-        robot: the robot.
-        body: the block.
-        limits: limits of an action.
     """
     (x, y, z), yaw = robot.tool_pose()
     bx, by, bz = body.position
@@ -216,11 +193,7 @@ def push(
     is grasped and dragged away from there.
 
     Args:
-        robot: the robot.
-        body: the body.
         goal: goal of the tool, metres.
-        workspace: the workspace.
-        limits: limits of an action.
         opening: opening of the gripper, 0 to 1.
         stop_short_m: distance before the goal at which the tool stops.
     """
@@ -282,27 +255,24 @@ def behind_point(
     body: Body,
     direction: tuple[float, float],
     workspace: Workspace,
-    standoff_m: float = STANDOFF_M,
 ) -> tuple[float, float]:
     """Return the point of the workspace from which to push a body.
 
+    It is `STANDOFF_M` from the body's origin; closer near the border, but never so close that the
+    gripper touches the body.
+
     Args:
-        robot: the robot.
-        body: the body.
         direction: unit vector of the push.
-        workspace: the workspace.
-        standoff_m: distance from the origin of the body; less near the border, but never so little
-            that the gripper touches the body.
     """
     bx, by, _ = body.position
     inner = body.shape.mesh().vertices[:, :2]
     nearest = float((inner**2).sum(axis=1).max() ** 0.5)
     nearest += robot.gripper.half_width_m
-    limit = standoff_m
+    limit = STANDOFF_M
     for b, u, (low, high) in zip((bx, by), direction, (workspace.x, workspace.y), strict=True):
         if abs(u) > 1e-9:
             limit = min(limit, (b - (low if u > 0 else high)) / u)
-    back = max(limit, min(nearest, standoff_m))
+    back = max(limit, min(nearest, STANDOFF_M))
     x, y, _ = workspace.clip((bx - back * direction[0], by - back * direction[1], 0.0))
     return x, y
 
@@ -311,8 +281,6 @@ def has_room_behind(robot: Robot, body: Body, behind: tuple[float, float]) -> bo
     """Whether a gripper at the point from which to push a body does not touch the body.
 
     Args:
-        robot: the robot.
-        body: the body.
         behind: point of `behind_point`.
     """
     offset = np.subtract(behind, body.position[:2])

@@ -50,7 +50,6 @@ def carry_to(
     yaw_rad: float | None = None,
     obstacles: Sequence[Body] = (),
     ceiling_m: float = math.inf,
-    clearance_m: float = TRAVEL_CLEARANCE_M,
 ) -> GripperCommand:
     """Return the next command to carry the held body to a position and release it there.
 
@@ -58,15 +57,10 @@ def carry_to(
     reaches the target opens the fingers.
 
     Args:
-        robot: the robot.
-        body: the held body.
         position: target position of the origin of the body.
-        limits: limits of an action.
         yaw_rad: final yaw of the gripper; None for its present yaw.
         obstacles: bodies to pass over, including the support at the target.
         ceiling_m: largest height of the tool.
-        clearance_m: gap between the body and the obstacles, and above the target before it
-            descends.
     """
     tool_pose, pose = robot.tool_frame(), body.pose
     tool, yaw = tool_pose.position, tool_pose.yaw_rad
@@ -78,7 +72,7 @@ def carry_to(
     if offset <= DESCENT_OFFSET_M and abs(turn) <= max(limits.turn_rad, ALIGNED_RAD):
         arrives = tool[2] - target[2] <= limits.step_m
         return move_toward(robot, target, yaw + turn, OPEN if arrives else CLOSED)
-    above = (*target[:2], min(target[2] + clearance_m, ceiling_m))
+    above = (*target[:2], min(target[2] + TRAVEL_CLEARANCE_M, ceiling_m))
     return travel(
         robot,
         above,
@@ -87,7 +81,6 @@ def carry_to(
         below_m=max(tool[2] - vertical_extent(body)[0], tips_below_tool_m(robot)),
         obstacles=[other for other in obstacles if other is not body],
         ceiling_m=ceiling_m,
-        clearance_m=clearance_m,
     )
 
 
@@ -104,11 +97,8 @@ def pick_up(
 
     Args:
         robot: the robot, with an empty gripper.
-        body: the body.
-        limits: limits of an action.
         yaws_rad: yaws of the gripper at which the fingers close on the body, up to half turns. The
             grasp uses the nearest one at which the fingers have clearance.
-        obstacles: bodies to avoid.
         ceiling_m: largest height of the tool.
     """
     (x, y, z), yaw = robot.tool_pose()
@@ -158,9 +148,6 @@ def travel(
     small errors lead to no other displacement: what a learner can imitate.
 
     Args:
-        robot: the robot.
-        target: target position of the tool.
-        yaw_rad: target yaw of the gripper.
         opening: opening of the gripper, 0 to 1.
         below_m: distance from the tool down to the lowest point of gripper and held body.
         obstacles: bodies to pass over.
@@ -191,8 +178,6 @@ def _height_needed(
     """Return the height that a straight motion of the tool needs; None if it is high enough.
 
     Args:
-        start: present position of the tool.
-        end: position of the tool at its end.
         zones: centre and radius of the zone around each obstacle, and height of the tool there.
     """
     needed = None

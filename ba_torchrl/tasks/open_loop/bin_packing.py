@@ -99,6 +99,7 @@ class BinPacking(PackingTask):
     max_steps = 20
     num_objects = 8
     num_objects_range = (1, 10)
+    container_m = BIN_M
 
     def load_scene(self) -> None:
         """Load the bin, and as many objects of each shape as an episode may draw."""
@@ -204,10 +205,8 @@ class BinPacking(PackingTask):
 
     def _inside(self, margin_m: float = 0.0) -> Rectangle:
         """Return the inner outline of the bin, less a margin."""
-        x, y, _ = self.container.position
-        length, width, _ = (size * self.unit / 2 for size in BIN_M)
-        margin = WALL_M * self.unit + margin_m
-        return Rectangle(x, y, self.container.yaw_rad, length - margin, width - margin)
+        outer, margin = self.container_outline(), WALL_M * self.unit + margin_m
+        return outer.resized(outer.half_x - margin, outer.half_y - margin)
 
     def _walls(self) -> list[Rectangle]:
         """Return the outlines of the bin's walls."""

@@ -90,6 +90,7 @@ class BottleArrangement(PackingTask):
     num_objects = 6
     num_objects_range = (6, 6)
     finger_opening = 0.8
+    container_m = TRAY_M
 
     def load_scene(self) -> None:
         """Load the tray, and as many bottles of each kind as an episode may draw."""
@@ -221,24 +222,18 @@ class BottleArrangement(PackingTask):
         first = self.container.yaw_rad + math.pi / 4
         return [first + math.pi * i / GRASP_YAWS for i in range(GRASP_YAWS)]
 
-    def _tray(self) -> Rectangle:
-        """Return the outline of the tray."""
-        x, y, _ = self.container.position
-        length, width, _ = (size * self.unit for size in TRAY_M)
-        return Rectangle(x, y, self.container.yaw_rad, length / 2, width / 2)
-
     def _floor_z_m(self) -> float:
         """Return the height of the floor of the tray."""
         return self.container.position[2] + (FLOOR_M - TRAY_M[2] / 2) * self.unit
 
     def _inside(self) -> Rectangle:
         """Return the inner outline of the tray."""
-        tray, wall = self._tray(), WALL_M * self.unit
+        tray, wall = self.container_outline(), WALL_M * self.unit
         return tray.resized(tray.half_x - wall, tray.half_y - wall)
 
     def _slot_offset_m(self, body: Body) -> float:
         """Return the distance between a bottle and the nearest slot."""
-        tray = self._tray()
+        tray = self.container_outline()
         return min(
             math.dist(body.position[:2], tray.frame.to_world(x * self.unit, y * self.unit))
             for x, y in slots()
@@ -257,7 +252,7 @@ class BottleArrangement(PackingTask):
 
     def _free_site(self, held: Body | None) -> tuple[float, float]:
         """Return the first free slot, or the site in the tray with the largest gap."""
-        tray = self._tray()
+        tray = self.container_outline()
         sites = [tray.frame.to_world(x * self.unit, y * self.unit) for x, y in slots()]
         for site in sites:
             if self._neighbor_gap_m(site, held) >= NEIGHBOR_GAP_M:

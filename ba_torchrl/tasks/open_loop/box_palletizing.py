@@ -29,7 +29,7 @@ from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
-from ba_torchrl.tasks.packing.tilted_grasps import TiltedGrasp, tilted_grasp
+from ba_torchrl.tasks.packing.tilted_grasps import tilted_grasp
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 from ba_torchrl.tasks.structures.pieces import CUBOID
 
@@ -100,6 +100,7 @@ class BoxPalletizing(PackingTask):
     num_objects = 18
     num_objects_range = (6, 18)
     num_objects_step = PER_LAYER
+    container_m = PALLET_M
 
     def load_scene(self) -> None:
         """Load the pallet and all boxes."""
@@ -149,7 +150,7 @@ class BoxPalletizing(PackingTask):
 
     def stacked(self) -> dict[tuple[int, int], Body]:
         """Return the stacked, released boxes by layer and number of their slots."""
-        held, pallet = self.robot.held_body(), self._pallet()
+        held, pallet = self.robot.held_body(), self.container_outline()
         found: dict[tuple[int, int], Body] = {}
         for body in self.pool.active:
             slot = None if body is held else self._slot_of(body, pallet)
@@ -191,7 +192,15 @@ class BoxPalletizing(PackingTask):
         body = max(unstacked, key=priority)
         tool, clearance_m = grasps[body].tool, grasps[body].clearance_m
         if self.action_limits.can_tilt and CUBOID.tilt_rad(body) > LEVEL_RAD:
-            tilted = self._tilted_grasp(body)
+            tilted = tilted_grasp(
+                self.robot,
+                self.terrain.support_ids,
+                body,
+                [other for other in (*self.pool.active, self.container) if other is not body],
+                above_centre_m=(BOX_M[2] / 2 - GRASP_DEPTH_M) * self.unit,
+                offsets_m=[offset * self.unit for offset in self.grasp_offsets_m],
+                opening=self.finger_opening,
+            )
             if tilted is not None:
                 tool, clearance_m = tilted
         if clearance_m < BLOCKED_M:
@@ -201,31 +210,12 @@ class BoxPalletizing(PackingTask):
 
     # ----------------------------------------------------------------------------------------
 
-    def _tilted_grasp(self, body: Body) -> TiltedGrasp | None:
-        """Return the grasp of a box on a slope; None if the arm reaches none."""
-        return tilted_grasp(
-            self.robot,
-            self.terrain.support_ids,
-            body,
-            [other for other in (*self.pool.active, self.container) if other is not body],
-            above_centre_m=(BOX_M[2] / 2 - GRASP_DEPTH_M) * self.unit,
-            offsets_m=[offset * self.unit for offset in self.grasp_offsets_m],
-            opening=self.finger_opening,
-            sufficient_m=SUFFICIENT_CLEARANCE_M,
-        )
-
     def _activate_next_box(self) -> None:
         """Place the next box where it arrives."""
         number = len(self.pool.active)
         box = self.pool.bodies[number]
         self.pool.activate(box)
         self.stand(box, *self._arrivals[number])
-
-    def _pallet(self) -> Rectangle:
-        """Return the outline of the pallet."""
-        x, y, _ = self.container.position
-        half_x, half_y, _ = (size * self.unit / 2 for size in PALLET_M)
-        return Rectangle(x, y, self.container.yaw_rad, half_x, half_y)
 
     def _level_z_m(self, layer: int) -> float:
         """Return the height of the centres of a layer's boxes."""
@@ -258,7 +248,7 @@ class BoxPalletizing(PackingTask):
         if CUBOID.tilt_rad(held) > math.pi / 4:
             return self._tip_over(held)
         layer = min(len(stacked) // PER_LAYER, self.settings.num_objects // PER_LAYER - 1)
-        pallet, heading = self._pallet(), CUBOID.yaw_rad(held)
+        pallet, heading = self.container_outline(), CUBOID.yaw_rad(held)
         width, length, height = (size * self.unit / 2 for size in BOX_M)
         z = self._level_z_m(layer) + RELEASE_GAP_M
         obstacles = [
@@ -292,7 +282,6 @@ class BoxPalletizing(PackingTask):
         The outer boxes of a column are moved apart by what the gap between the slots lacks.
 
         Args:
-            slot: the slot.
             row: -1, 0 or 1: the position of the slot along its x axis.
             neighbors: outlines of the other boxes in the layer.
         """
@@ -315,7 +304,6 @@ class BoxPalletizing(PackingTask):
         """Return the place at which a box that is tilted in the gripper is level, if there is one.
 
         Args:
-            held: the box.
             position: final position of its centre.
             yaw_rad: its final yaw, up to half turns.
         """
@@ -342,7 +330,7 @@ class BoxPalletizing(PackingTask):
 
     def _tip_over(self, held: Body) -> PickPlaceCommand:
         """Return the place at the pallet's edge from which an upended box tips over."""
-        pallet, own = self._pallet(), narrowest(held, self.robot.tool_pose()[1])[0]
+        pallet, own = self.container_outline(), narrowest(held, self.robot.tool_pose()[1])[0]
         width, length, _ = (size * self.unit / 2 for size in BOX_M)
         others = [outline(body) for body in self.pool.active if body is not held]
         workspace = self.settings.workspace

@@ -90,7 +90,6 @@ class CovidLayout:
 
     Args:
         world: not sealed yet.
-        terrain: the ground.
     """
 
     def __init__(self, world: World, terrain: Terrain) -> None:
@@ -110,8 +109,6 @@ class CovidLayout:
         """Place the layout.
 
         Args:
-            center: its centre, metres.
-            yaw_rad: its yaw.
             mirror: -1 to mirror it along its x axis, else 1.
         """
         for area, xy, body in self._slabs:
@@ -154,10 +151,6 @@ class CovidLayout:
 
 def new_rows(tube_m: float, swab_m: float) -> tuple[float, float]:
     """Return y of the centres of new tubes and of new swabs, in the frame of their box.
-
-    Args:
-        tube_m: length of a tube.
-        swab_m: length of a swab.
 
     Raises:
         PlacementError: they do not fit into the box.
@@ -445,8 +438,6 @@ class CovidTest(OpenLoopTask):
         """Return the place of the held body at the site of an area farthest from other objects.
 
         Args:
-            held: the held body.
-            area: the area.
             sites: positions in the frame of the area.
             yaw_rad: yaw of the body in that frame, for a gripper that can turn.
             rim_m: least height of the fingertips.

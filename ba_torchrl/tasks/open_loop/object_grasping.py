@@ -62,7 +62,6 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
 
         Args:
             top_m: height of the highest point in the window around the target.
-            xy: position of the target.
         """
         gripper = self.robot.gripper
         tips_m = gripper.tip_height_m(OBJECT_WIDTH_M / 2)

@@ -60,7 +60,6 @@ def open_box(size_m: Vector, wall_m: float, floor_m: float, color: Color) -> Blo
         size_m: outer extents.
         wall_m: thickness of the walls.
         floor_m: thickness of the floor above the ground.
-        color: red, green, blue, alpha.
     """
     x, y, z = size_m
     walls = frame_parts(size_m, wall_m)
@@ -81,6 +80,9 @@ class PackingTask(OpenLoopTask):
 
     grasp_offsets_m: ClassVar[tuple[float, ...]] = (0.0, 0.008, -0.008, 0.022, -0.022)
     """Distances of the grasps of a long object from its centre at scale `SCALE`, metres."""
+
+    container_m: ClassVar[Vector]
+    """Outer extents of the container at scale `SCALE`, metres."""
 
     container: Body
     pool: BodyPool
@@ -125,6 +127,12 @@ class PackingTask(OpenLoopTask):
 
     # -- parts of the experts ----------------------------------------------------------------
 
+    def container_outline(self) -> Rectangle:
+        """Return the outline of the container."""
+        x, y, _ = self.container.position
+        half_x, half_y, _ = (size * self.unit / 2 for size in self.container_m)
+        return Rectangle(x, y, self.container.yaw_rad, half_x, half_y)
+
     def obstacles(self, body: Body | None, above_m: float) -> list[Rectangle]:
         """Return the outlines of the obstacles of the fingers.
 
@@ -165,7 +173,6 @@ class PackingTask(OpenLoopTask):
         """Return the place of the held body at a position and a yaw up to half turns.
 
         Args:
-            held: the held body.
             position: final position of its origin.
             turn_rad: rotation about the vertical from its present yaw.
         """

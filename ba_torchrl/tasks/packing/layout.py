@@ -44,7 +44,6 @@ def scatter(
 
     Args:
         task: gives the workspace, the robot, and whether orientations are random.
-        rng: random generator.
         footprints: footprint of each object.
         fixed: outlines of bodies that are in the scene already.
         clear_of: outline of a tall body, which the hand that grasps an object must not overlap.
@@ -95,7 +94,6 @@ def random_rectangle(
 
     Args:
         task: gives the workspace, and whether orientations are random.
-        rng: random generator.
         half_x: half its extent along its x axis.
         half_y: half its extent along its y axis.
         fixed_yaw_rad: its yaw with fixed orientations.

@@ -21,6 +21,7 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.manipulation.clearance import tool_clearances_m
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.packing.base import SUFFICIENT_CLEARANCE_M
 from ba_torchrl.tasks.structures.pieces import CUBOID
 
 ROLL_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
@@ -55,19 +56,15 @@ def tilted_grasp(
     above_centre_m: float,
     offsets_m: Iterable[float],
     opening: float,
-    sufficient_m: float,
 ) -> TiltedGrasp | None:
     """Return the best reachable grasp of a box: most parallel to it, central and with clearance.
 
     Args:
-        robot: the robot.
         support_ids: PyBullet ids of the bodies that form the ground.
         body: the box, longest along y.
-        others: the bodies around it.
         above_centre_m: height of the tool above the centre of the box, along the normal of its top.
         offsets_m: distances of the grasps from the centre along the box.
         opening: opening of the gripper, 0 to 1.
-        sufficient_m: clearances above this are equally good.
 
     Returns:
         The grasp; None if none is within reach.
@@ -88,17 +85,15 @@ def tilted_grasp(
     )
     best, best_score = None, -math.inf
     for cost, roll, pitch, offset in candidates:
-        if sufficient_m - cost <= best_score:
+        if SUFFICIENT_CLEARANCE_M - cost <= best_score:
             break
         axis = _unit((closing[0], closing[1], -roll * closing[2]))
         up = (-pitch * normal[0], -pitch * normal[1], 1 + pitch - pitch * normal[2])
         down = perpendicular(tuple(-u for u in up), axis)
         position = tuple(frame.apply(np.array([0.0, offset, above_centre_m])).tolist())
         tool = Pose(position, axes_quaternion(axis, down))
-        (clearance_m,) = tool_clearances_m(
-            robot, [tool], others, opening, with_knuckles=True
-        ).tolist()
-        score = min(clearance_m, sufficient_m) - cost
+        (clearance_m,) = tool_clearances_m(robot, [tool], others, opening).tolist()
+        score = min(clearance_m, SUFFICIENT_CLEARANCE_M) - cost
         if score > best_score and is_reachable(robot, support_ids, tool):
             best, best_score = TiltedGrasp(tool, clearance_m), score
     return best

@@ -49,8 +49,6 @@ def read_piece_states(
     """Return the state of every piece, with the contacts of the last physics step.
 
     Args:
-        world: the world of the bodies.
-        pieces: the kind of each body.
         ground: PyBullet ids of the bodies that form the ground.
         base: those of them on which a structure may stand.
         block_m: edge of a block. A support is at least half of it lower than the piece.
@@ -86,8 +84,6 @@ def has_tipped(
     """Whether a piece that must stay upright has tipped over and is not held.
 
     Args:
-        pieces: the kind of each body.
-        held: the body in the gripper.
         tipped_rad: tilt of a piece that has tipped over.
     """
     return any(
@@ -100,9 +96,6 @@ class SlotAssigner:
     """Finds the assignments of the pieces, in their present states, to the slots of a blueprint.
 
     Args:
-        blueprint: the structure.
-        pieces: the kind of each body.
-        states: the state of each body.
         block_m: edge of a block, which bounds how far a piece may be off the centre of its slot.
         held: the body in the gripper; it fills no slot.
     """
@@ -168,7 +161,6 @@ class SlotAssigner:
         """Return the pieces that rest on bodies in slots where the blueprint places none of them.
 
         Args:
-            assignment: the body in each slot.
             numbers: numbers of the slots to check; by default those that must stay clear.
         """
         slots = self.blueprint.slots

@@ -172,7 +172,7 @@ class CloseLoopStructureTask(StructureGoal, CloseLoopTask):
         spacings = self.spacing_blocks
         padding, distance = spacings.get(len(pieces), spacings[max(spacings)])
         spacing = Spacing(padding * self.block_m, distance * self.block_m)
-        points = self.random_points(rng, [spacing] * len(pieces))
+        points = self.terrain.random_points(rng, [spacing] * len(pieces))
         for (body, piece), xy in zip(pieces.items(), points, strict=True):
             fixed_yaw = -piece.grasp_yaws_rad[0] % math.pi
             self.stand(body, xy, fixed_yaw + self.random_yaw(rng, piece.yaw_period_rad))

@@ -92,7 +92,6 @@ class Piece:
         """Return the pose at which a body rests on its support.
 
         Args:
-            body: the body.
             origin: a frame at its origin whose z axis is the normal of the support.
             yaw_rad: yaw of the frame of the side on which it lies.
         """

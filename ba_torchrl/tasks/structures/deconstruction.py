@@ -196,12 +196,8 @@ class Deconstruction(OpenLoopTask):
         """Place a body in its slot, after those of all earlier slots.
 
         Args:
-            number: number of the slot.
-            slot: the slot.
-            bodies: the body in each slot.
             center: point of the ground for a slot without supports; for one of two supports of a
                 bridge, the point between them.
-            rng: random generator.
         """
         structure, body = self.task.structure, bodies[number]
         piece, partner = structure.pieces[body], structure.blueprint.partner(number)
@@ -229,13 +225,7 @@ class Deconstruction(OpenLoopTask):
             self._separate_pair(number, bodies, rng)
 
     def _separate_pair(self, number: int, bodies: Sequence[Body], rng: np.random.Generator) -> None:
-        """Move the two supports of a bridge from their common centre to a random distance.
-
-        Args:
-            number: number of the slot of either support.
-            bodies: the body in each slot.
-            rng: random generator.
-        """
+        """Move the two supports of a bridge from their common centre to a random distance."""
         structure = self.task.structure
         slots = structure.blueprint.slots
         bridge = slots[structure.blueprint.bridge_on(number)]

@@ -47,11 +47,7 @@ CLOSE_LOOP_BORDER_BLOCKS = 1.2
 
 
 class PickPlaceExpert:
-    """Returns the pick or place of the planner's next move; made for one decision.
-
-    Args:
-        grasps: the grasps of the pieces.
-    """
+    """Returns the pick or place of the planner's next move; made for one decision."""
 
     def __init__(self, grasps: PickPlaceGrasps) -> None:
         self.grasps = grasps
@@ -186,13 +182,7 @@ class PickPlaceExpert:
 
 
 def gripper_command(structure: Structure, robot: Robot, limits: ActionLimits) -> GripperCommand:
-    """Return the close-loop command of the planner's next move.
-
-    Args:
-        structure: the pieces.
-        robot: the robot.
-        limits: limits of an action.
-    """
+    """Return the close-loop command of the planner's next move."""
     held, grasps = grasped_body(robot), CloseLoopGrasps(structure, robot, limits)
     region = structure.terrain.build_area.shrunk(CLOSE_LOOP_BORDER_BLOCKS * structure.block_m)
     area = PlacementArea(structure.terrain, region, region, gap_m=structure.block_m)

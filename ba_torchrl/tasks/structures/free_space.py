@@ -15,8 +15,6 @@ from ba_torchrl.tasks.workspace import Region
 
 LEVEL_M = 1e-3
 """Tolerance of the height at which a bridge rests on a piece beside its supports."""
-SITE_STEP_M = 0.02
-"""Grid spacing of the sites that are compared."""
 
 
 class PlacementArea(NamedTuple):
@@ -39,14 +37,12 @@ def nearest_free_site(
     """Return where to place a body: the nearest site with the least deficit.
 
     Args:
-        body: the body to place.
         others: the bodies to keep a gap to.
-        area: where to place it.
         in_structure: whether the body is the base of a structure, instead of placed aside.
     """
     x, y, _ = body.position
     region = area.building if in_structure else area.aside
-    sites = region.sites(SITE_STEP_M)
+    sites = region.sites()
     distances = np.hypot(sites[:, 0] - x, sites[:, 1] - y)
     deficits = placement_deficit_m(sites, body, others, area, in_structure=in_structure)
     return tuple(sites[np.lexsort((distances, deficits))[0]].tolist())
@@ -64,9 +60,7 @@ def placement_deficit_m(
 
     Args:
         sites: [S, 2] points of the ground, metres.
-        body: the body to place.
         others: the bodies to keep a gap to.
-        area: where to place it.
         in_structure: whether the body is part of a structure, instead of placed aside.
 
     Returns:
@@ -94,7 +88,6 @@ def beside_supports(bridge: Body, supports: Sequence[Body], others: Sequence[Bod
     """Return the bodies beside two supports on which a bridge would rest, too.
 
     Args:
-        bridge: the bridge.
         supports: its supports; a piece with fewer than two is no bridge.
         others: bodies that are not part of the structure.
     """

@@ -133,8 +133,6 @@ class Grasps:
         """Return for each grasp candidate of a piece whether another piece blocks it.
 
         Args:
-            body: the piece to grasp.
-            other: the other piece.
             position: assumed position of the other piece; its present one if None.
         """
         return (False,)
@@ -144,8 +142,6 @@ class PickPlaceGrasps(Grasps):
     """The grasps of the open-loop expert, for one decision: it remembers them by their body.
 
     Args:
-        structure: the pieces.
-        robot: the robot.
         limits: limits of an action; a gripper that cannot turn grasps at yaw 0.
         finger_opening: opening of the fingers before a pick, 0 to 1.
         clears_blocked_pieces: whether to remove pieces that block the grasp of another piece.
@@ -199,12 +195,7 @@ class PickPlaceGrasps(Grasps):
         return cost_m
 
     def site_deficit_m(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:
-        """Return the clearance [S] that hand and load lack when they pick the remaining pieces.
-
-        Args:
-            sites: [S, P, 2] points of the ground that a structure at each site occupies, metres.
-            rest: the pieces that remain to be picked.
-        """
+        """Return the clearance [S] that hand and load lack when they pick the remaining pieces."""
         if not rest:
             return np.zeros(len(sites))
         # rectangles around each piece: the hand at its first and last yaw, and the piece itself
@@ -226,13 +217,7 @@ class PickPlaceGrasps(Grasps):
         return np.maximum(SITE_GAP_M + self.structure.block_m / 2 - gaps, 0.0).sum(axis=1)
 
     def blocks_grasp(self, body: Body, other: Body, position: Vector | None) -> list[bool]:
-        """Return for each grasp candidate of a body whether another piece blocks it.
-
-        Args:
-            body: the body to grasp.
-            other: the other piece.
-            position: assumed position of the other piece; its present one if None.
-        """
+        """Return for each grasp candidate of a body whether another piece blocks it."""
         at = body.position
         if position is not None:  # the body is displaced instead of the other piece
             coordinates = zip(at, other.position, position, strict=True)
@@ -250,8 +235,6 @@ class PickPlaceGrasps(Grasps):
         """Return the clearance between the hand, opened around a body, and the other pieces.
 
         Args:
-            body: the body.
-            yaw_rad: yaw of the gripper.
             position: assumed position of the body; its present one if None.
 
         Returns:
@@ -402,8 +385,6 @@ class PickPlaceGrasps(Grasps):
         Of an edge grasp only the far finger counts.
 
         Args:
-            body: the body.
-            candidates: the grasps.
             others: the other bodies; those beyond the reach of the hand do not count.
             position: assumed position of the body; its present one if None.
         """
@@ -422,9 +403,7 @@ class PickPlaceGrasps(Grasps):
             }
             if tilted:
                 tools = [Pose(grasps[i], candidates[i].tool) for i in tilted]
-                gaps_m = tool_clearances_m(
-                    self.robot, tools, [other], self.finger_opening, with_knuckles=True
-                )
+                gaps_m = tool_clearances_m(self.robot, tools, [other], self.finger_opening)
                 found |= zip(tilted, gaps_m.tolist(), strict=True)
             for i, gap_m in found.items():
                 clearances_m[i] = min(clearances_m[i], gap_m)
@@ -436,10 +415,6 @@ class PickPlaceGrasps(Grasps):
         """Return the clearance of a tool that points straight down from another body.
 
         Args:
-            body: the body.
-            candidate: the grasp.
-            grasp: position of the tool.
-            other: the other body.
             at: position of the body.
         """
         gripper, yaw = self.robot.gripper, candidate.yaw_rad
@@ -461,8 +436,6 @@ class CloseLoopGrasps(Grasps):
     all others.
 
     Args:
-        structure: the pieces.
-        robot: the robot.
         limits: limits of an action; a gripper that cannot turn keeps its yaw.
     """
 
@@ -491,10 +464,8 @@ class GraspBlocking:
     """Which pieces block the grasps of which others.
 
     Args:
-        pieces: the kind of each body.
         bodies_above: for each body all that it supports, directly or through others.
         held: the body in the gripper; it blocks no grasp.
-        grasps: the grasps of the pieces.
     """
 
     def __init__(
@@ -551,7 +522,6 @@ class GraspBlocking:
         """Return the number of moves that a move adds, as its piece blocks others.
 
         Args:
-            move: the move.
             assignment: the body in each slot; these pieces are not picked.
         """
         if not self.grasps.clears_blocked_pieces:
@@ -610,7 +580,6 @@ def edge_grasps(
     succeed, as the body can slide into the gap between the fingers.
 
     Args:
-        gripper: the gripper.
         body: a body on the ground, on which it can slide.
         yaw_rad: yaw of the gripper, up to half a turn.
         opening: opening of the gripper, 0 to 1.

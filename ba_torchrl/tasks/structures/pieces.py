@@ -98,7 +98,6 @@ def pair_span(block_m: float, most: float) -> Span:
     """Return the distance between the two supports of a bridge.
 
     Args:
-        block_m: edge of a block.
         most: largest distance of their centres, in blocks.
     """
     return Span(0.0, 1.75 * block_m, most * block_m)

@@ -36,9 +36,7 @@ def next_move(assigner: SlotAssigner, area: PlacementArea, grasps: Grasps) -> Mo
     placed before another is picked. Of the assignments, that with the fewest moves is followed.
 
     Args:
-        assigner: the present states of the pieces.
         area: where pieces may be placed on the ground.
-        grasps: the grasps of the pieces.
     """
     return _Planner(assigner, area, grasps).next_move()
 
@@ -131,13 +129,7 @@ class _Planner:
                         yield len(removed), top, None
 
     def _to_slot(self, body: Body, number: int, assignment: Assignment) -> tuple[Move, float]:
-        """Return the move of a body to a slot, and the clearance that its position lacks, metres.
-
-        Args:
-            body: the body to move.
-            number: number of the slot.
-            assignment: the body in each slot.
-        """
+        """Return the move of a body to a slot, and the clearance in metres that it lacks there."""
         blueprint, slot, piece = self.assigner.blueprint, self.slots[number], self.pieces[body]
         supports = [assignment[i] for i in slot.on]
         partner = blueprint.partner(number)
@@ -183,8 +175,6 @@ class _Planner:
         """Return where on a long support one of the two pieces under a bridge is placed.
 
         Args:
-            body: the piece.
-            support: the long support.
             neighbor: the other piece, if it is on the support already.
             distance_m: distance between the two pieces.
         """
@@ -205,8 +195,6 @@ class _Planner:
         """Return the move of a body to the ground beside another, and the clearance it lacks there.
 
         Args:
-            body: the body to move.
-            neighbor: the other body.
             bridge: the slot that both will support.
             rest: the pieces that remain to be picked.
         """
@@ -253,7 +241,6 @@ class _Planner:
         """Return the move of a body to the nearest free site on the ground.
 
         Args:
-            body: the body to move.
             in_structure: whether the body is the base of the structure, instead of placed aside.
         """
         others = [other for other in self.pieces if other is not body]

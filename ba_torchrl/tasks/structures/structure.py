@@ -36,8 +36,6 @@ class Structure:
     Args:
         blueprint: the structure; its pieces have shapes or variants.
         world: not sealed yet.
-        block_m: edge of a block, metres.
-        terrain: the ground.
         largest_first: whether pieces are placed at random in order of the space that they need, the
             largest first; otherwise from the bottom slot up.
     """
@@ -58,7 +56,7 @@ class Structure:
         pieces = [slot.piece for slot in blueprint.slots]
         if largest_first:
             pieces.reverse()
-            pieces.sort(key=_needed_distance_m, reverse=True)
+            pieces.sort(key=lambda p: p.spacing.distance_m if p.spacing else 0.0, reverse=True)
         self._fixed: dict[Body, Piece] = {}
         numbers: dict[str, int] = {}
         for piece in pieces:
@@ -93,11 +91,7 @@ class Structure:
         self._activate(chosen)
 
     def assigner(self, held: Body | None) -> SlotAssigner:
-        """Return the assigner for the present states of the pieces.
-
-        Args:
-            held: the body in the gripper.
-        """
+        """Return the assigner for the present states of the pieces."""
         ground, base = self.terrain.support_ids, self.terrain.base_ids
         states = read_piece_states(self.world, self.pieces, ground, base, self.block_m)
         return SlotAssigner(self.blueprint, self.pieces, states, self.block_m, held)
@@ -156,7 +150,3 @@ class Structure:
         }
         self.pieces: dict[Body, Piece] = {**self._fixed, **drawn}
         """The bodies in the scene, in the order in which they are placed."""
-
-
-def _needed_distance_m(piece: Piece) -> float:
-    return 0.0 if piece.spacing is None else piece.spacing.distance_m

@@ -24,7 +24,6 @@ class Terrain(ABC):
 
     Args:
         world: not sealed yet; the terrain loads its own bodies.
-        workspace: bounds of the task.
     """
 
     def __init__(self, world: World, workspace: Workspace) -> None:
@@ -136,10 +135,6 @@ class Terrain(ABC):
     ) -> list[tuple[float, float]]:
         """Return random points of the spawn area that keep their distances.
 
-        Args:
-            rng: random generator.
-            spacings: space that each object needs.
-
         Raises:
             PlacementError: no layout was found.
         """
@@ -163,9 +158,6 @@ class Terrain(ABC):
         """Place bodies at random poses on the ground, apart from each other.
 
         Args:
-            rng: random generator.
-            bodies: the bodies.
-            spacings: space that each body needs.
             draw_yaw: returns a random yaw of a body.
             base: one of the bodies, on which a structure can stand. It starts in the build area if
                 structures can only stand in a part of the ground.
@@ -201,8 +193,6 @@ class Terrain(ABC):
         """Return the least height of the tool at which the fingers close above the surface.
 
         Args:
-            gripper: the gripper.
-            xy: position of the tool, metres.
             rotation: rotation of the tool; None if it points down.
             opening: opening of the gripper before it closes, 0 to 1.
         """

@@ -56,7 +56,6 @@ class Ramps(SlopedTerrain):
 
     Args:
         world: not sealed yet.
-        workspace: bounds of the task.
     """
 
     def __init__(self, world: World, workspace: Workspace) -> None:

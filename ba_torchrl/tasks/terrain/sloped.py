@@ -95,8 +95,6 @@ class SlopedTerrain(Terrain):
         """Return position and yaw of a body in the build area; None if no body starts there.
 
         Args:
-            rng: random generator.
-            body: the body.
             draw_yaw: returns a random yaw of a body.
 
         Raises:
@@ -133,9 +131,6 @@ class SlopedTerrain(Terrain):
         """Place bodies at random poses where they may start, apart from each other.
 
         Args:
-            rng: random generator.
-            bodies: the bodies.
-            spacings: space that each body needs.
             draw_yaw: returns a random yaw of a body.
             base: one of the bodies, which starts in the build area if any does.
 
@@ -232,7 +227,6 @@ class SlopedTerrain(Terrain):
         """Return the least-squares planes of the surface on circles about points.
 
         Args:
-            points: [N, 2].
             radius_m: radius of the circles.
 
         Returns:

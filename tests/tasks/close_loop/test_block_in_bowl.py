@@ -17,6 +17,7 @@ from ba_torchrl.sim.meshes import (
 )
 from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
+from tests.tasks.episodes import follow
 
 TASK = "close_loop/block_in_bowl"
 FLOOR_M = 0.016
@@ -114,34 +115,22 @@ def lay(env, offset, z, yaw=0.3):
     assert world.settle(400)
 
 
-def test_a_block_inside_the_bowl_is_a_success(env):
-    task = env.scene.task
+def test_success_requires_the_block_inside_the_upright_bowl(env):
+    task, world = env.scene.task, env.scene.world
     lay(env, 0.0, FLOOR_M + 0.03)
     assert task.is_success()
+    for x, z in ((0.0, 0.2), (0.075, 0.095 + 2e-4)):  # above the bowl, on its rim
+        task.block.place((0.45 + x, -0.05, z))
+        world.step(2)
+        assert not task.is_success()
     lay(env, 0.12, 0.025)
     assert not task.is_success()  # beside the bowl
-    task.block.place((0.45, -0.05, 0.2))
-    env.scene.world.step(2)
-    assert not task.is_success()  # above the bowl
-
-
-def test_a_block_under_the_bowl_is_not_a_success(env):
-    task = env.scene.task
     task.block.place((0.45, -0.05, 0.025))
     task.bowl.place((0.45, -0.05, 0.05 + 0.0355))
-    env.scene.world.step(20)
+    world.step(20)
     assert task.bowl.touches(task.block)
     assert task.bowl.tilt_rad < task.upright_rad
-    assert not task.is_success()
-
-
-def test_a_block_on_the_rim_is_not_a_success(env):
-    lay(env, 0.0, FLOOR_M + 0.03)
-    task = env.scene.task
-    assert task.is_success()
-    task.block.place((0.45 + 0.075, -0.05, 0.095 + 2e-4))
-    env.scene.world.step()
-    assert not task.is_success()
+    assert not task.is_success()  # under the bowl
 
 
 def test_a_held_block_is_not_a_success(env):
@@ -157,36 +146,17 @@ def test_a_held_block_is_not_a_success(env):
     assert not task.is_success()
 
 
-def test_a_tipped_bowl_ends_the_episode(env):
+@pytest.mark.parametrize(("tilt", "returns"), [(0.6, True), (2.5, False)])
+def test_a_tilted_bowl_returns_upright_and_a_tipped_one_ends_the_episode(env, tilt, returns):
     task = env.scene.task
     env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
-    task.bowl.set_pose((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((2.5, 0.0, 0.0)))
+    task.bowl.set_pose((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((tilt, 0.0, 0.0)))
     env.scene.world.settle(400)
-    assert task.bowl.tilt_rad > task.tipped_rad
+    assert (task.bowl.tilt_rad < 0.02) is returns
+    assert (task.bowl.tilt_rad > task.tipped_rad) is not returns
     outcome = env._step(env.full_action_spec.zero())
-    assert outcome["terminated"]
+    assert outcome["terminated"] != returns
     assert not outcome["success"]
-
-
-def test_a_tilted_bowl_returns_upright(env):
-    task = env.scene.task
-    env.scene.controller.reset(((0.45, 0.1, 0.24), 0.0))
-    task.bowl.set_pose((0.45, -0.05, 0.06), pybullet.getQuaternionFromEuler((0.6, 0.0, 0.0)))
-    env.scene.world.settle(400)
-    assert task.bowl.tilt_rad < 0.02
-
-
-def play(env, state):
-    steps = 0
-    while not state["done"]:
-        state = env.step(state.set("action", state["expert_action"]))["next"]
-        steps += 1
-    return bool(state["success"]), steps
-
-
-def restart(env):
-    """Return the state after a no-op."""
-    return env._step(env.full_action_spec.zero())
 
 
 @pytest.mark.parametrize("bearing", np.arange(8) * math.pi / 4)
@@ -199,9 +169,9 @@ def test_the_expert_grasps_a_block_beside_the_bowl(env, bearing):
     block_x, block_y = x + distance * math.cos(bearing), y + distance * math.sin(bearing)
     task.block.place((block_x, block_y, 0.025), bearing)
     env.scene.world.settle()
-    success, steps = play(env, restart(env))
-    assert success
-    assert steps < 25
+    seen = follow(env, env._step(env.full_action_spec.zero()))
+    assert seen[-1]["success"]
+    assert len(seen) < 25
 
 
 def test_the_grasp_does_not_move_the_bowl(env):

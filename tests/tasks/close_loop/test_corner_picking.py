@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ba_torchrl
+from tests.tasks.episodes import check_lift, play
 
 TASK = "close_loop/corner_picking"
 
@@ -99,18 +100,11 @@ def test_the_block_cannot_be_grasped_in_the_corner(env, turn):
 
 
 def test_success_requires_a_grasp_and_fifteen_centimetres(env):
-    scene, task = env.scene, env.scene.task
+    task = env.scene.task
     task.put_corner((0.45, 0.0), 0.0)
     task.block.place((0.45, 0.0, 0.027))
     assert task.clearance_m(0.0) > 0
-    scene.controller.reset(((0.45, 0.0, 0.16), 0.0))
-    assert not task.is_success()  # high, without the block
-    scene.controller.move_to((0.45, 0.0, 0.027), 0.0)
-    scene.controller.grip(0.0)
-    scene.controller.move_to((0.45, 0.0, 0.145), 0.0)
-    assert not task.is_success()  # held, at a low height
-    scene.controller.move_to((0.45, 0.0, 0.155), 0.0)
-    assert task.is_success()
+    check_lift(env, (0.45, 0.0, 0.027))
 
 
 def test_the_clearance_is_the_gap_between_fingers_and_walls(env):
@@ -139,33 +133,6 @@ def test_the_block_is_dragged_by_friction_alone(env):
             assert task.block.tilt_rad < 0.6  # its edge may catch at a wall
 
 
-def test_the_expert_command_depends_on_the_scene_only(env):
-    state = env.reset()
-    while not state["done"]:
-        commands = [env.scene.task.expert_command() for _ in range(2)]
-        assert commands[0] == commands[1]
-        state = env.step(state.set("action", state["expert_action"]))["next"]
-    assert state["success"]
-
-
-@pytest.mark.parametrize(
-    "variant",
-    [{}, {"random_orientation": False, "action_sequence": "pxyz"}],
-    ids=["random orientations", "fixed, without yaw"],
-)
-def test_the_expert_needs_at_most_seventeen_steps(variant):
-    env = ba_torchrl.make(TASK, obs_size=16, seed=3, expert=True, **variant)
-    lengths = []
-    for _ in range(30):
-        state = env.reset()
-        while not state["done"]:
-            state = env.step(state.set("action", state["expert_action"]))["next"]
-        assert state["success"]
-        lengths.append(int(state["step_count"]))
-    env.close()
-    assert np.mean(lengths) <= 15.3  # 1.1 times the published one
-
-
 def test_the_expert_drags_a_rotated_block_out_of_the_corner(env):
     solved = 0
     for turn in np.linspace(0.1, 1.4, 10):
@@ -176,7 +143,5 @@ def test_the_expert_drags_a_rotated_block_out_of_the_corner(env):
         task.block.place((*task.corner.to_world(-0.09 + half, -0.09 + half), 0.027), yaw + turn)
         env.scene.world.settle()
         state = env._step(env.full_action_spec.zero())
-        while not state["done"]:
-            state = env.step(state.set("action", state["expert_action"]))["next"]
-        solved += bool(state["success"])
+        solved += bool(play(env, state)["success"])
     assert solved >= 9

@@ -13,6 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.meshes import box_mesh, write_obj
 from ba_torchrl.tasks.clutter.base import DROP_Z_M
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
+from tests.tasks.episodes import play
 
 NO_OPS = {
     "close_loop": torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0]),
@@ -50,14 +51,6 @@ def names(env):
 def digest(env):
     poses = [(body.name, body.pose) for body in env.scene.task.objects]
     return hashlib.sha256(repr(poses).encode()).hexdigest()
-
-
-def play(env, state, action=None):
-    """Act until the episode ends, with expert actions or with the given one."""
-    while not state["done"]:
-        chosen = state["expert_action"] if action is None else action
-        state = env.step(state.set("action", chosen))["next"]
-    return state
 
 
 @pytest.mark.parametrize("count", [1, 5, 15])

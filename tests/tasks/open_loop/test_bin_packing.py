@@ -7,7 +7,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
 from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, _window_maxima, object_shapes
-from tests.tasks.packing.scenes import BIN, QUARTER_TURN, follow
+from tests.tasks.episodes import follow
+from tests.tasks.packing.scenes import BIN, QUARTER_TURN
 
 
 def filled_bin(make_env, count=4):

@@ -6,12 +6,11 @@ import math
 import pytest
 import torch
 
-import ba_torchrl
 from ba_torchrl.actions import PLACE
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 from ba_torchrl.tasks.open_loop.box_palletizing import BOX_M, PALLET_M, SLOT_M, slots
-from tests.tasks.packing.scenes import BOXES, QUARTER_TURN, follow
+from tests.tasks.episodes import follow
+from tests.tasks.packing.scenes import BOXES, QUARTER_TURN
 
 
 class Pallet:
@@ -199,8 +198,3 @@ def test_the_expert_tips_over_a_box_that_stands_on_its_end(make_env):
     seen = follow(env, state)
     assert seen[-1]["success"]
     assert len(seen) <= 12 + 4
-
-
-def test_the_message_lists_the_supported_numbers_of_boxes():
-    with pytest.raises(ConfigError, match="6, 12 or 18 objects, not 7"):
-        ba_torchrl.make(BOXES, num_objects=7)

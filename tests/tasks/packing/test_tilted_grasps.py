@@ -34,7 +34,6 @@ def grasp(robot, body, others):
         above_centre_m=ABOVE_M,
         offsets_m=(0.0, 0.008, -0.008),
         opening=0.7,
-        sufficient_m=4e-3,
     )
 
 

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-import ba_torchrl
 from ba_torchrl.tasks.structures.experts import PickPlaceExpert
 from ba_torchrl.tasks.structures.improvise import (
     CUBOID_M,
@@ -16,23 +15,20 @@ from ba_torchrl.tasks.structures.improvise import (
     shape_piece,
 )
 from ba_torchrl.tasks.structures.planner import next_move
+from tests.tasks.episodes import follow
 
 B = 0.03
 X, Y = 0.45, 0.0
 APART = 1.75 * B / 2
-CUBES = {"block_stacking": 4, "house_building_1": 3, "house_building_2": 2, "house_building_3": 2}
-CUBES["house_building_4"] = 4
-HOUSES = sorted(CUBES)
+HOUSES = ["block_stacking", *(f"house_building_{i}" for i in (1, 2, 3, 4))]
 IMPROVISED = ["improvise_house_building_2", "improvise_house_building_3"]
 
 
 class House:
     """A task with its structure standing, in which tests move pieces."""
 
-    def __init__(self, name):
-        self.env = ba_torchrl.make(f"open_loop/{name}", seed=0)
-        self.env.reset()
-        self.task, self.world = self.env.scene.task, self.env.scene.world
+    def __init__(self, env, name):
+        self.task, self.world = env.scene.task, env.scene.world
         self.named = {body.name: body for body in self.task.objects}
         self.cubes = [body for name, body in self.named.items() if name.startswith("cube")]
         self.build(name)
@@ -57,12 +53,8 @@ class House:
             self.put(self.named["roof 1"], 0.0, level)
         self.world.settle()
 
-    def put(self, body, along, level, across=0.0, turn=None):
-        position = (X + across, Y + along, (level + 0.5) * B)
-        if turn is None:
-            body.place(position)
-        else:
-            body.set_pose(position, turn)
+    def put(self, body, along, level, across=0.0):
+        body.place((X + across, Y + along, (level + 0.5) * B))
 
     @property
     def top(self):
@@ -75,32 +67,23 @@ class House:
 
 
 @pytest.fixture
-def house():
-    made = []
-
-    def make(name):
-        made.append(House(name))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.env.close()
+def house(make_started):
+    return lambda name: House(make_started(f"open_loop/{name}"), name)
 
 
 @pytest.mark.parametrize("name", HOUSES)
-def test_the_finished_structure_is_the_goal(house, name):
+def test_the_finished_structure_is_the_goal_and_a_tipped_roof_ends_the_episode(house, name):
     h = house(name)
     assert h.is_success()
     assert h.task.is_valid()
-
-
-@pytest.mark.parametrize("name", HOUSES)
-def test_a_top_piece_on_the_floor_is_not_a_success(house, name):
-    h = house(name)
-    low = h.top.shape.bounds_m[0][2]
-    h.top.place((X + 0.12, Y, -low))
+    top = h.top
+    top.place((X + 0.12, Y, -top.shape.bounds_m[0][2]))
     assert not h.is_success()
     assert h.task.is_valid()
+    turn = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
+    top.set_pose((X + 0.13, Y, 0.02), turn)
+    assert not h.is_success()
+    assert h.task.is_valid() == (name == "block_stacking")
 
 
 @pytest.mark.parametrize("name", ["block_stacking", "house_building_1"])
@@ -115,18 +98,6 @@ def test_a_block_beside_the_stack_is_not_a_success(house, name):
     h.world.settle()
     assert not h.is_success()
     assert lowest.position[2] == pytest.approx(B / 2, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("house_building_1", "triangle 1"), *((f"house_building_{i}", "roof 1") for i in (2, 3, 4))],
-)
-def test_a_tipped_roof_ends_the_episode_without_success(house, name, kind):
-    h = house(name)
-    turn = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
-    h.named[kind].set_pose((X + 0.13, Y, 0.02), turn)
-    assert not h.is_success()
-    assert not h.task.is_valid()
 
 
 @pytest.mark.parametrize("name", ["house_building_2", "house_building_3", "house_building_4"])
@@ -158,17 +129,13 @@ def test_a_house_without_a_storey_is_not_a_success(house, name):
 
 
 @pytest.mark.parametrize("name", [*HOUSES, *IMPROVISED])
-def test_only_the_last_place_is_a_success(name):
-    env = ba_torchrl.make(f"open_loop/{name}", seed=1, expert=True)
-    td, holding = env.reset(), False
-    while not td["done"]:
-        holding = bool(td["holding"])
-        assert not td["success"]
-        td = env.step(td.set("action", td["expert_action"]))["next"]
-    assert td["success"]
-    assert holding
-    assert not td["holding"]
-    env.close()
+def test_only_the_last_place_is_a_success(make_env, name):
+    env = make_env(f"open_loop/{name}", obs_size=128, seed=1)
+    *before, previous, last = follow(env, env.reset())
+    assert not any(state["success"] for state in (*before, previous))
+    assert previous["holding"]
+    assert last["success"]
+    assert not last["holding"]
 
 
 # -- improvised houses -------------------------------------------------------------------------
@@ -193,8 +160,8 @@ def test_shapes_and_cuboids_have_the_sizes_of_the_specification():
 
 
 @pytest.mark.parametrize("name", IMPROVISED)
-def test_every_episode_draws_its_shapes(name):
-    env = ba_torchrl.make(f"open_loop/{name}", seed=0)
+def test_every_episode_draws_its_shapes(make_started, name):
+    env = make_started(f"open_loop/{name}")
     drawn = set()
     for _ in range(12):
         env.reset()
@@ -204,13 +171,10 @@ def test_every_episode_draws_its_shapes(name):
         assert len(task.objects) == task.num_objects
         drawn.add(tuple(body.name for body in task.objects[1:3]))
     assert len(drawn) > 8
-    env.close()
 
 
-def test_a_state_restores_the_shapes():
-    env = ba_torchrl.make("open_loop/improvise_house_building_3", seed=0, expert=True)
-    env.reset()
-    scene = env.scene
+def test_a_state_restores_the_shapes(make_started):
+    scene = make_started("open_loop/improvise_house_building_3").scene
     first, state = list(scene.task.objects), scene.get_state()
     poses = [body.pose for body in first]
     rng = np.random.default_rng(5)
@@ -222,13 +186,11 @@ def test_a_state_restores_the_shapes():
     assert [body.pose for body in first] == poses
     assert all(not body.is_hidden for body in first)
     assert set(scene.task.structure.pieces) == set(first)
-    env.close()
 
 
-def test_a_roof_on_one_shape_is_not_a_success():
-    env = ba_torchrl.make("open_loop/improvise_house_building_2", seed=0)
-    env.reset()
-    task, world = env.scene.task, env.scene.world
+def test_a_roof_on_one_shape_is_not_a_success(make_started):
+    scene = make_started("open_loop/improvise_house_building_2").scene
+    task, world = scene.task, scene.world
     roof, first, second = task.objects
     first.place((X, Y - 0.1, first.shape.height_m / 2))
     second.place((X, Y + 0.1, second.shape.height_m / 2))
@@ -237,16 +199,14 @@ def test_a_roof_on_one_shape_is_not_a_success():
     world.settle()
     assert roof.touches(first)
     assert not task.is_success()
-    env.close()
 
 
 # -- experts -----------------------------------------------------------------------------------
 
 
-def test_the_structure_starts_at_a_site_where_other_picks_have_clearance():
+def test_the_structure_starts_at_a_site_where_other_picks_have_clearance(make_started):
     """A roof lies close to one pair of blocks; the structure starts at the other pair."""
-    env = ba_torchrl.make("open_loop/house_building_4", seed=0, expert=True)
-    env.reset()
+    env = make_started("open_loop/house_building_4")
     task, world = env.scene.task, env.scene.world
     named = {body.name: body for body in task.objects}
     points = [(0.40, -0.12), (0.40, -0.04), (0.36, 0.15), (0.55, 0.15)]
@@ -261,4 +221,3 @@ def test_the_structure_starts_at_a_site_where_other_picks_have_clearance():
     move = next_move(task.structure.assigner(None), area, grasps)
     assert math.dist(move.position[:2], (0.47, -0.08)) > 0.1
     assert (pick.x_m, pick.y_m) == pytest.approx(move.body.position[:2])
-    env.close()

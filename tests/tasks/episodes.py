@@ -1,0 +1,47 @@
+"""Episodes that the tests play."""
+
+import torch
+
+
+def follow(env, state, steps=1000, action=None):
+    """Take expert actions, or the given one, until the episode ends; return every state."""
+    seen = []
+    for _ in range(steps):
+        chosen = state["expert_action"] if action is None else action
+        state = env.step(state.clone().set("action", chosen))["next"]
+        seen.append(state)
+        if state["done"]:
+            break
+    return seen
+
+
+def play(env, state, action=None):
+    """Act until the episode ends; return the last state."""
+    return follow(env, state, action=action)[-1]
+
+
+def check_lift(env, position, low_m=0.145, high_m=0.155):
+    """Check that success requires a grasp of the body at a position and a height of 15 cm."""
+    scene = env.scene
+    scene.controller.reset(((*position[:2], high_m), 0.0))
+    assert not scene.task.is_success()  # high, without the body
+    scene.controller.move_to(position, 0.0)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((*position[:2], low_m), 0.0)
+    assert not scene.task.is_success()  # held, at a low height
+    scene.controller.move_to((*position[:2], high_m), 0.0)
+    assert scene.task.is_success()
+    scene.controller.grip(1.0)
+    scene.world.settle()
+    assert not scene.task.is_success()
+
+
+def play_scene(env):
+    """Take expert actions from the present scene, at rest; return the last step."""
+    env.scene.world.settle()
+    env.scene.world.step(2)
+    while True:
+        action = torch.from_numpy(env._expert_action(env.scene))
+        state = env._step(env.full_action_spec.zero().set("action", action))
+        if state["done"]:
+            return state
