@@ -172,10 +172,9 @@ def test_the_executed_action_is_the_target_where_the_expert_is_not_asked():
     assert torch.equal(stored[keys.TARGET_ACTION], data[keys.ACTION])
 
 
-def test_a_replay_with_other_entries_is_refused(tmp_path):
+def test_a_replay_with_other_entries_is_refused():
     learner = tiny.build("rlpd", batch_size=6)
     learner.extend(tiny.transitions(learner))
-    learner.save_replay(tmp_path / "replay")
-    tiny.build("rlpd", batch_size=6).load_replay(tmp_path / "replay")
+    tiny.build("rlpd", batch_size=6).load_replay_state(learner.replay_state())
     with pytest.raises(ConfigError, match=r"lack the entry 'target_action'.*another run_dir"):
-        tiny.build("rlpd", batch_size=6, init="bc").load_replay(tmp_path / "replay")
+        tiny.build("rlpd", batch_size=6, init="bc").load_replay_state(learner.replay_state())
