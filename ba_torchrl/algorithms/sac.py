@@ -25,15 +25,14 @@ from ba_torchrl.algorithms.base import (
     SeedUse,
 )
 from ba_torchrl.config import changed
-from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.data.augmentation.stored import StoredCopies
+from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
 from ba_torchrl.data.augmentation.views import (
     CenterCrop,
     RandomViews,
     ViewTransform,
     cropped_images,
 )
-from ba_torchrl.data.episode_assembler import EpisodeAssembler
+from ba_torchrl.data.episodes import EpisodeAssembler
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
