@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -630,28 +629,22 @@ class Learner(ABC):
         self.optimizers.load_state_dict(state)
         self.updates = state["updates"]
 
-    def save_replay(self, folder: Path) -> None:
-        """Write the replay into a folder: transitions, priorities and the state of its draws.
-
-        Args:
-            folder: an empty folder.
+    def replay_state(self) -> dict[str, Any]:
+        """Return transitions, priorities and the state of the draws, as views: do not modify them.
 
         Raises:
             FloatingPointError: a loss of the last update was not finite.
         """
         self.host_tasks.run()
-        self.replay.dumps(folder)
+        return self.replay.state_dict()
 
-    def load_replay(self, folder: Path) -> None:
-        """Restore the replay from a folder that `save_replay` wrote.
-
-        Args:
-            folder: the folder; it may be deleted after the call.
+    def load_replay_state(self, state: dict[str, Any]) -> None:
+        """Restore the replay from a `replay_state`.
 
         Raises:
             ConfigError: its transitions have other entries than those of this learner.
         """
-        self.replay.loads(folder)
+        self.replay.load_state_dict(state)
         has_target = self.config.imitates in WITH_TARGET
         expected = {keys.IS_DEMONSTRATION: True, keys.TARGET_ACTION: has_target}
         for key, is_expected in expected.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import torch
@@ -26,16 +25,14 @@ from ba_torchrl.algorithms.base import (
     SeedUse,
 )
 from ba_torchrl.config import changed
-from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.data.augmentation.stored import StoredCopies
+from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
 from ba_torchrl.data.augmentation.views import (
     CenterCrop,
     RandomViews,
     ViewTransform,
     cropped_images,
 )
-from ba_torchrl.data.episode_assembler import EpisodeAssembler
-from ba_torchrl.data.files import read_state, write_state
+from ba_torchrl.data.episodes import EpisodeAssembler
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
@@ -45,9 +42,6 @@ from ba_torchrl.objectives.imitation import ActionDistance
 from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SACfDLoss, SoftUpdateByNetwork
 
 Loss = TypeVar("Loss", bound=SACfDLoss)
-
-_REPLAY, _EPISODES = "replay", "episodes"
-"""Folders of a saved replay, if successes are imitated."""
 
 
 @ALGORITHMS.register("sac")
@@ -359,22 +353,18 @@ class SAC(Learner):
             data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
         return super().to_transitions(data, is_demonstration=True)
 
-    def save_replay(self, folder: Path) -> None:
-        """Write the replay, and the transitions of unfinished episodes if there are any, into a
-        folder."""
+    def replay_state(self) -> dict[str, Any]:
+        """Return the state of the replay and, if successes are imitated, the transitions of
+        unfinished episodes."""
         if self.episodes is None:
-            super().save_replay(folder)
-            return
-        super().save_replay(folder / _REPLAY)
-        write_state(folder / _EPISODES, self.episodes.state_dict())
+            return super().replay_state()
+        return {**super().replay_state(), "episodes": self.episodes.state_dict()}
 
-    def load_replay(self, folder: Path) -> None:
-        """Restore what `save_replay` wrote."""
-        if self.episodes is None:
-            super().load_replay(folder)
-            return
-        super().load_replay(folder / _REPLAY)
-        self.episodes.load_state_dict(read_state(folder / _EPISODES))
+    def load_replay_state(self, state: dict[str, Any]) -> None:
+        """Restore the replay, and the unfinished episodes, from a `replay_state`."""
+        super().load_replay_state(state)
+        if self.episodes is not None:
+            self.episodes.load_state_dict(state["episodes"])
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return all parameters but the entropy temperature."""

@@ -38,14 +38,13 @@ class DurableCheckpoint(Checkpoint):
     """TorchRL's checkpoint as a folder of data that appears when it is complete on the disk.
 
     Args:
-        components: what is saved, by name.
+        components: what is saved, by name: each has ``state_dict`` and ``load_state_dict``.
     """
 
     def __init__(self, **components: Any) -> None:
         super().__init__()
         for name, component in components.items():
-            has_own_format = hasattr(component, "dump")
-            self.register(name, component, adapter=None if has_own_format else _StateAdapter())
+            self.register(name, component, adapter=_StateAdapter())
 
     def save(self, path: str | Path, **options: Any) -> Path:
         """Write a checkpoint; see TorchRL.

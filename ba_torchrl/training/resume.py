@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
@@ -87,7 +88,9 @@ class ResumeState:
         self._folder = folder / _FOLDER
         self._checkpoint = DurableCheckpoint(
             algorithm=algorithm,
-            replay=_Replay(algorithm),
+            replay=SimpleNamespace(
+                state_dict=algorithm.replay_state, load_state_dict=algorithm.load_replay_state
+            ),
             progress=progress,
             generators=_Generators(),
         )
@@ -188,16 +191,3 @@ class _Generators(GlobalRNGState):
         if len(found) < len(state_dict):
             logger.warning("another device: %s not restored", ", ".join(state_dict.keys() - found))
         super().load_state_dict(found)
-
-
-class _Replay:
-    """An algorithm's replay with the methods ``dump`` and ``load`` of TorchRL's checkpoints."""
-
-    def __init__(self, algorithm: Learner) -> None:
-        self._algorithm = algorithm
-
-    def dump(self, path: Path) -> None:
-        self._algorithm.save_replay(path)
-
-    def load(self, path: Path) -> None:
-        self._algorithm.load_replay(path)

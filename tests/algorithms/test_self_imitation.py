@@ -32,6 +32,9 @@ def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
     learner.extend(learner.to_transitions(data, is_demonstration=False))
     assert learner.replay_size == 3
     assert len(learner.episodes) == 1
+    other = build("sac", imitate_successes=True, batch_size=4, replay=replay)
+    other.load_replay_state(learner.replay_state())
+    assert (other.replay_size, len(other.episodes)) == (3, 1)
 
 
 def test_successes_are_imitated_where_the_expert_would_act_otherwise():

@@ -123,11 +123,6 @@ def test_two_updates_change_every_network(preset, network):
         assert algorithm.policy(state)[keys.ACTION].isfinite().all()
 
 
-def test_the_network_of_ferm_is_refused_by_an_ensemble_of_critics():
-    with pytest.raises(ConfigError, match="builds no ensemble of critics"):
-        build("rlpd", "ferm")
-
-
 @pytest.mark.parametrize("preset", ["rad", "drq", "ferm"])
 def test_a_restored_learner_continues_the_same_views(preset):
     first, second = build(preset, "cnn"), build(preset, "cnn")

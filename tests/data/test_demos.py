@@ -76,6 +76,10 @@ def test_another_configuration_is_refused_by_name(collected, tmp_path):
         load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "in_hand_mode": "proj"})
     with pytest.raises(ConfigError, match="num_objects: collected with 2, needed 3"):
         load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, "num_objects": 3})
+    with pytest.raises(ConfigError, match="task: collected with 'open_loop/block_stacking'"):
+        load_demonstrations(tmp_path / "demos", task="close_loop/block_picking", env={})
+    with pytest.raises(ConfigError, match="no demonstrations"):
+        load_demonstrations(tmp_path / "nowhere", task=TASK, env=ENV)
 
 
 def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):

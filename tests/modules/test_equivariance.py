@@ -197,29 +197,6 @@ def test_the_vector_field_has_the_indices_of_x_and_y(sequence):
     assert loc[others].abs().min() > 1e-4
 
 
-def eighth_turn_values(networks):
-    """Twin values of a smooth scene and an action that are turned together, [8, 2]."""
-    turns = [k * math.pi / 4 for k in range(8)]
-    images = torch.stack([blob(64, angle + 0.2) for angle in turns])
-    actions = torch.tensor(
-        [[0.5, 0.4 * math.cos(a + 0.9), 0.4 * math.sin(a + 0.9), -0.3, 0.2] for a in turns]
-    )
-    with torch.no_grad():
-        return networks.critic(
-            networks.encoder(images, torch.zeros(8, 1, dtype=torch.bool)), actions
-        )
-
-
-def test_values_are_approximately_invariant_under_eighth_turns():
-    """Within 10 % of their size, median of five networks; pixels break 45 degrees."""
-    deviations = []
-    for seed in range(5):
-        values = eighth_turn_values(build(64, n_hidden=16, seed=seed))
-        mean = values.mean(dim=0)
-        deviations.append(float(((values - mean).abs() / mean.abs()).max()))
-    assert sorted(deviations)[2] < 0.1
-
-
 def test_the_head_of_the_critic_is_exactly_invariant_under_c8():
     """One pixel needs no interpolation: a rotation shifts the regular fields by one channel."""
     critic = build(64).critic

@@ -58,22 +58,6 @@ def test_equal_values_give_the_gradient_to_the_first(layout):
     check(x)
 
 
-def test_by_hand():
-    x = torch.tensor([[1.0, 4.0, -1.0, -2.0], [3.0, 4.0, -3.0, 0.0]])[None, None].requires_grad_()
-    y = relu_of_max_pool(x)
-    assert y.flatten().tolist() == [4.0, 0.0]
-    y.sum().backward()
-    assert x.grad.flatten().tolist() == [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-
-
-def test_a_slope_below_zero_by_hand():
-    x = torch.tensor([[1.0, 4.0, -1.0, -2.0], [3.0, 4.0, -3.0, -5.0]])[None, None].requires_grad_()
-    y = relu_of_max_pool(x, 0.25)
-    assert y.flatten().tolist() == [4.0, -0.25]
-    y.sum().backward()
-    assert x.grad.flatten().tolist() == [0.0, 1.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0]
-
-
 @pytest.mark.parametrize("place", range(4))
 def test_nan_is_not_lost(place):
     x = torch.randn(1, 2, 2, 2)

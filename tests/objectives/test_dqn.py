@@ -8,7 +8,6 @@ from torchrl.modules import QValueActor
 
 from ba_torchrl.objectives.dqn import (
     LevelDQNLoss,
-    cross_entropy,
     large_margin,
     strict_large_margin,
 )
@@ -200,23 +199,6 @@ def test_the_margin_of_dqfd_has_gradients_for_the_worst_violation():
     assert q.grad[0].tolist() == pytest.approx([-1.0, 0.0, 1.0])
 
 
-def test_cross_entropy_of_even_values_is_the_logarithm_of_their_number():
-    losses = cross_entropy(torch.zeros(2, 5), torch.tensor([0, 3]), beta=100.0)
-    assert losses.tolist() == pytest.approx([math.log(5)] * 2)
-
-
-def test_a_truncated_step_bootstraps_and_a_terminated_one_does_not():
-    data = batch(size=2)
-    data["next", "reward"] = torch.ones(2, 1)
-    data["next", "terminated"] = torch.tensor([[True], [False]])
-    data["next", "truncated"] = torch.tensor([[False], [True]])
-    data["next", "done"] = torch.ones(2, 1, dtype=torch.bool)
-    loss = make_loss()
-    target = loss._target(data)
-    assert target[0].item() == 1
-    assert target[1].item() != 1
-
-
 def test_the_target_network_gets_no_gradient_and_the_network_does():
     loss = make_loss()
     out = loss(batch())
@@ -280,29 +262,6 @@ def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstr
     assert (losses[is_demonstration] > 0).all()
     share = len(data) if demonstrations == "sdqfd" else is_demonstration.sum()
     torch.testing.assert_close(of("mean"), losses.sum() / share)
-
-
-def test_an_unknown_reduction_is_refused():
-    with pytest.raises(ValueError, match="reduction must be none, mean or sum, got 'max'"):
-        make_loss(reduction="max")
-
-
-def test_in_keys_can_be_set_and_follow_renamed_keys():
-    loss = make_loss(demonstrations="none")
-    data = batch()
-    order = [
-        "holding",
-        "pixels",
-        *[key for key in loss.in_keys if key not in ("holding", "pixels")],
-    ]
-    loss.in_keys = order
-    assert loss.in_keys == order
-    by_name = loss(data.clone())["loss_qvalue"]
-    by_position = loss(*(data[key] for key in order))
-    assert torch.equal(by_position[loss.out_keys.index("loss_qvalue")], by_name)
-    loss.set_keys(action="chosen")
-    assert "chosen" in loss.in_keys
-    assert "action" not in loss.in_keys
 
 
 @pytest.mark.parametrize("action_space", ["one_hot", "categorical"])

@@ -79,21 +79,6 @@ def test_targets_are_from_random_subsets_of_the_given_size():
     assert len(expected) >= 3
 
 
-def test_gradients_reach_disjoint_parameters():
-    loss, data = make(), batch(weights=None)
-    found = loss(data)
-    groups = {
-        "loss_actor": ["actor_network_params"],
-        "loss_qvalue": ["encoder_network_params", "qvalue_network_params"],
-    }
-    for name, owned in groups.items():
-        loss.zero_grad()
-        found[name].backward(retain_graph=True)
-        for group in ("actor_network_params", "encoder_network_params", "qvalue_network_params"):
-            grads = [p.grad for p in getattr(loss, group).values(True, True)]
-            assert any(g is not None and g.abs().sum() > 0 for g in grads) == (group in owned)
-
-
 def test_the_critics_alone_have_the_same_loss():
     first, second, data = make(draws=1), make(draws=1), batch(weights=None)
     critic = first.critic_loss(data)

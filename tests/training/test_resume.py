@@ -181,14 +181,14 @@ def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_pa
 def test_a_crash_while_saving_keeps_the_last_state(tmp_path):
     config = config_for(tmp_path)
     experiment = Experiment(config, progress=False)
-    save = experiment.algorithm.save_replay
+    replay_state = experiment.algorithm.replay.state_dict
 
-    def save_and_fail_at_the_second(folder):
-        save(folder)
+    def fail_at_the_second():
         if experiment.algorithm.updates == 6:
             raise Interrupted
+        return replay_state()
 
-    experiment.algorithm.save_replay = save_and_fail_at_the_second
+    experiment.algorithm.replay.state_dict = fail_at_the_second
     with pytest.raises(Interrupted):
         experiment.run()
     # a kill leaves the unfinished state lying about, which an exception does not

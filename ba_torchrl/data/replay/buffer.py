@@ -10,7 +10,6 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 
 from ba_torchrl.data.files import StateFolder
-from ba_torchrl.data.replay.schema import Schema, differences
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 from ba_torchrl.envs import keys
@@ -18,6 +17,9 @@ from ba_torchrl.errors import ReplaySchemaError
 
 _INDEX = "index"  # TorchRL's writer adds it
 _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))
+
+Schema = dict[NestedKey, tuple[torch.dtype, torch.Size]]
+"""Type and shape of each entry by key, without the batch dimension."""
 
 
 class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
@@ -117,7 +119,7 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
             if missing:
                 raise ReplaySchemaError(f"transitions lack {missing}")
             return
-        problems = differences(found, expected)
+        problems = _differences(found, expected)
         if problems:
             raise ReplaySchemaError(
                 "transitions differ from those in the replay: " + "; ".join(problems)
@@ -136,3 +138,19 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
         for key, image_type in storage.image_types.items():
             schema |= dict.fromkeys((key, (keys.NEXT, key)), image_type)
         return schema
+
+
+def _differences(found: Schema, expected: Schema) -> list[str]:
+    """Return a description of each entry that differs, sorted."""
+    problems = [f"missing {key!r}" for key in expected if key not in found]
+    problems += [f"unexpected {key!r}" for key in found if key not in expected]
+    problems += [
+        f"{key!r} is {_text(*found[key])}, stored as {_text(*expected[key])}"
+        for key in expected
+        if key in found and found[key] != expected[key]
+    ]
+    return sorted(problems)
+
+
+def _text(dtype: torch.dtype, shape: torch.Size) -> str:
+    return f"{str(dtype).removeprefix('torch.')}{list(shape)}"

@@ -7,7 +7,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ba_torchrl.data.augmentation.so2 import SO2Augmentation, rotate_displacement, rotate_images
+from ba_torchrl.data.augmentation.so2 import (
+    SO2Augmentation,
+    StoredCopies,
+    rotate_displacement,
+    rotate_images,
+)
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 
@@ -179,3 +184,24 @@ def test_invalid_arguments_are_refused():
         SO2Augmentation(IMAGES, "pxyz", seed=0, probability=1.5)
     with pytest.raises(ValueError, match="no x and y"):
         SO2Augmentation(IMAGES, "pz", seed=0)
+
+
+def test_each_transition_is_followed_by_its_rotated_copies():
+    rotation = SO2Augmentation(IMAGES, "pxyzr", seed=0, probability=1.0)
+    data = batch(n=3)
+    data["number"] = torch.arange(3)
+    data[keys.ACTION] *= 0.5  # short enough never to leave the box
+    out = StoredCopies(rotation, 4)(data)
+    assert out["number"].tolist() == [0] * 5 + [1] * 5 + [2] * 5
+    assert len(out[keys.ACTION].unique(dim=0)) == 15  # each copy has an angle of its own
+    for i in range(15):
+        original, copy = data[i // 5], out[i]
+        assert torch.equal(copy[keys.NEXT, keys.REWARD], original[keys.NEXT, keys.REWARD])
+        if i % 5 == 0:
+            assert (copy == original).all()
+            continue
+        old, new = original[keys.ACTION], copy[keys.ACTION]
+        assert torch.equal(old[[0, 3, 4]], new[[0, 3, 4]])
+        angle = (torch.atan2(new[2], new[1]) - torch.atan2(old[2], old[1]))[None].double()
+        turned = rotate_images(original[keys.PIXELS][None], angle)[0]
+        torch.testing.assert_close(copy[keys.PIXELS], turned, atol=2e-4, rtol=0)

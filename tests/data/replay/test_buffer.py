@@ -14,8 +14,8 @@ from torchrl.checkpoint import Checkpoint
 import ba_torchrl
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.replay.codecs import DepthQuantizer
-from ba_torchrl.data.replay.frames import FrameTable
 from ba_torchrl.data.replay.make import make_replay
+from ba_torchrl.data.replay.storage import FrameTable
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ReplaySchemaError

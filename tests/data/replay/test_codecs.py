@@ -22,12 +22,6 @@ def test_every_code_survives_a_round_trip():
     assert torch.equal(quantizer.encode(quantizer.decode(codes)), codes)
 
 
-def test_quantisation_is_idempotent():
-    quantizer = DepthQuantizer(0.32)
-    once = quantizer(torch.rand(2, 1, 16, 16) * 0.32)
-    assert torch.equal(quantizer(once), once)
-
-
 def test_ends_and_clipping():
     quantizer = DepthQuantizer(0.32)
     depth = torch.tensor([-1.0, 0.0, 0.32, 5.0])
@@ -45,15 +39,10 @@ def test_any_shape_and_floating_type(shape, dtype):
     codes, restored = quantizer.encode(depth), quantizer(depth)
     assert codes.dtype == torch.uint8
     assert codes.shape == restored.shape == shape
+    assert torch.equal(restored, quantizer.decode(codes).to(dtype))
     assert restored.dtype == dtype
     assert quantizer.decode(codes).dtype == torch.float32
     assert torch.equal(depth, original)
-
-
-def test_the_codec_as_a_module_returns_the_decoded_image():
-    quantizer = DepthQuantizer(0.32)
-    depth = torch.rand(1, 8, 8) * 0.32
-    assert torch.equal(quantizer(depth), quantizer.decode(quantizer.encode(depth)))
 
 
 def test_invalid_arguments_are_refused():

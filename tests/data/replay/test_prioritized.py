@@ -234,12 +234,12 @@ def test_draws_and_weights_follow_the_formula(bonus):
     assert weights == pytest.approx(textbook / textbook.max(), rel=1e-9)
 
 
-@pytest.mark.parametrize(("beta", "expected"), [(0.0, [0, 0, 0]), (0.4, [0.4, 0.7, 1.0])])
+@pytest.mark.parametrize(("beta", "expected"), [(0.0, [0] * 5), (0.4, [0.4, 0.7, 1.0, 1.0, 0.4])])
 def test_the_exponent_of_the_weights_increases_to_one_except_from_zero(beta, expected):
     buffer, sampler = make(FLAGS, beta=beta)
     buffer.update_priority(torch.arange(8), torch.tensor(ERRORS))
     found = []
-    for fraction in (0.0, 0.5, 1.0):
+    for fraction in (0.0, 0.5, 1.0, 3.0, -1.0):
         sampler.anneal(fraction)
         found.append(sampler.beta)
         is_one = bool((buffer.sample()["priority_weight"] == 1).all())
@@ -338,14 +338,6 @@ def test_a_large_checkpoint_is_saved_and_loaded_fast():
     other.load_state_dict(sampler.state_dict())
     assert time.perf_counter() - start < 2
     assert other._sum_tree.query(0, 100_000) == pytest.approx(sampler._sum_tree.query(0, 100_000))
-
-
-def test_anneal_covers_the_run():
-    _, sampler = make(FLAGS)
-    assert sampler.beta == 0.4
-    for fraction, beta in [(0, 0.4), (0.5, 0.7), (1, 1.0), (3, 1.0), (-1, 0.4)]:
-        sampler.anneal(fraction)
-        assert sampler.beta == pytest.approx(beta)
 
 
 def test_invalid_arguments_are_refused():

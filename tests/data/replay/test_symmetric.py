@@ -5,7 +5,6 @@ from torchrl.data import ReplayBuffer
 
 from ba_torchrl.data.replay.codecs import HalfPrecision
 from ba_torchrl.data.replay.make import make_replay
-from ba_torchrl.errors import ConfigError
 
 CODEC = HalfPrecision(0.25)
 
@@ -51,21 +50,6 @@ def filled(**settings):
     made.extend(transitions(range(10), True))
     made.extend(transitions(range(50, 90), False))
     return made
-
-
-def test_half_of_every_batch_are_demonstrations():
-    made = filled()
-    assert len(made) == 50
-    seen = set()
-    for _ in range(100):
-        batch = made.sample()
-        assert batch.batch_size == (8,)
-        assert batch["is_demonstration"].flatten().tolist() == [True] * 4 + [False] * 4
-        numbers = batch["action"].flatten().tolist()
-        assert all(number < 10 for number in numbers[:4])
-        assert all(number >= 50 for number in numbers[4:])
-        seen |= set(numbers)
-    assert seen == {*range(10), *range(50, 90)}  # uniform over both sides
 
 
 def test_it_is_a_torchrl_replay_buffer():
@@ -119,14 +103,6 @@ def test_each_side_is_drawn_uniformly_by_its_own_generator():
         assert made.sample()["action"].flatten().tolist() == expected
 
 
-def test_mixed_transitions_are_told_apart_by_their_flags():
-    made = replay()
-    mixed = torch.cat([transitions([1], True), transitions([2, 3], False), transitions([4], True)])
-    made.extend(mixed)
-    assert (len(made), made.num_demonstrations) == (4, 2)
-    assert set(made.sample(200)["action"][:100].flatten().tolist()) == {1, 4}
-
-
 def test_images_are_restored_within_the_error_of_the_codec():
     made = filled()
     batch = made.sample()
@@ -156,16 +132,6 @@ def test_the_seed_determines_the_draws_and_a_saved_replay_continues_them(tmp_pat
     assert numbers == {*range(10), *range(50, 90)}
 
 
-def test_an_empty_or_a_full_replay_raises():
+def test_an_empty_replay_raises():
     with pytest.raises(RuntimeError, match="empty"):
         replay().sample()
-    made = replay(capacity=6)
-    made.extend(transitions(range(5), True))
-    with pytest.raises(ConfigError, match=r"fill the replay of 6 .*2 more do not fit"):
-        made.extend(transitions(range(2), True))
-
-
-def test_shared_frames_are_kept_once():
-    made = replay()
-    made.extend(transitions([7] * 6, False))
-    assert made.storage.frame_count == 4  # one per kind and moment
