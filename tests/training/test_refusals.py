@@ -66,7 +66,10 @@ def test_refused_networks_and_algorithms_have_the_names_of_the_registry(tmp_path
     ("overrides", "message"),
     [
         (("algorithm=dqn", "network=equi"), "algorithm 'dqn' learns open_loop tasks"),
-        (("algorithm=dqn", "network=equi"), "take algorithm: bc, dagger, drq, ferm, iql, rad, rlpd"),
+        (
+            ("algorithm=dqn", "network=equi"),
+            "take algorithm: bc, dagger, drq, ferm, iql, rad, rlpd",
+        ),
         (("algorithm=sac", "network=rot_fcn"), "network 'rot_fcn' is for open_loop tasks"),
         (("task=open_loop/block_stacking", *OPEN[1:], "network=equi_d4"), "network 'equi_d4' is"),
     ],
