@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LRScheduler
-
-logger = logging.getLogger(__name__)
 
 
 class Optimizers:
@@ -110,26 +107,10 @@ class Optimizers:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the states from those of a `state_dict` of any device.
-
-        Moments that do not fit the parameters are left out, and so is an optimiser that the state
-        of another version lacks; a warning says so.
-        """
+        """Restore the states from those of a `state_dict` of any device."""
         for name, optimizer in self._named.items():
-            saved = state.get(f"{name}optimizer")
-            if saved is not None and fits(optimizer, saved):
-                optimizer.load_state_dict(saved)
-            else:
-                logger.warning(
-                    "%soptimizer: moments of another version; they are not restored", name
-                )
-            if saved is None:
-                continue
-            scheduler = self.schedulers[name]
-            scheduler.load_state_dict(state[f"{name}scheduler"])
-            # the optimiser's rates, unless its state was left out
-            for group, rate in zip(optimizer.param_groups, scheduler.get_last_lr(), strict=False):
-                group["lr"] = rate
+            optimizer.load_state_dict(state[f"{name}optimizer"])
+            self.schedulers[name].load_state_dict(state[f"{name}scheduler"])
 
 
 def make_adam(
@@ -158,18 +139,3 @@ def make_adam(
 def parameters_of(optimizer: Optimizer) -> list[nn.Parameter]:
     """Return the parameters of an optimiser."""
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
-
-
-def fits(optimizer: Optimizer, state: Mapping[str, Any]) -> bool:
-    """Return whether the moments in a ``state_dict`` have the shapes of the parameters."""
-    groups = state["param_groups"]
-    if len(groups) != len(optimizer.param_groups):
-        return False
-    for group, saved in zip(optimizer.param_groups, groups, strict=True):
-        if len(group["params"]) != len(saved["params"]):
-            return False
-        for parameter, index in zip(group["params"], saved["params"], strict=True):
-            moments = state["state"].get(index, {}).get("exp_avg")
-            if moments is not None and moments.shape != parameter.shape:
-                return False
-    return True

@@ -127,24 +127,6 @@ def test_terms_with_different_optimisers_are_not_minimised_together():
         )
 
 
-def test_a_state_without_the_optimisers_of_a_term_is_loaded(caplog):
-    learner, other = ferm(), ferm()
-    for _ in range(2):
-        learner.update()
-    state = learner.state_dict()
-    older = {
-        name: part
-        for name, part in state.items()
-        if not name.startswith(("encoder_", "contrastive_"))
-    }
-    with caplog.at_level("WARNING"):
-        other.load_state_dict(older)
-    assert "encoder_optimizer: moments of another version" in caplog.text
-    for name, value in learner.loss.state_dict().items():
-        assert torch.equal(other.loss.state_dict()[name], value)
-    other.update()
-
-
 def test_only_gradients_of_the_step_are_clamped():
     first, second = (torch.nn.Parameter(torch.zeros(1)) for _ in range(2))
     main, own = (torch.optim.SGD([p], 1.0) for p in (first, second))
