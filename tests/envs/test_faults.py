@@ -103,7 +103,7 @@ def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt
     env.close()
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", [give_nan, disconnect, break_joint])
 def test_the_episodes_after_a_fault_are_those_of_the_seed(fault):
     undisturbed, env = make(), make()
     expected = [undisturbed.reset(), undisturbed.reset(), undisturbed.reset()]
