@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
-import numpy as np
-
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
@@ -69,7 +67,9 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         # above all objects; the upper parts of the walls are never crossed
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
-        grasp = planner.plan(self.pool.active, tool, limits, heights, self._slip_cost)
+        grasp = planner.plan(  # the slip score is an additional cost
+            self.pool.active, tool, limits, heights, penalty=lambda grasps: grasps[:, 5]
+        )
         if grasp is None or grasp.risk > self.risk_allowed:
             push = PushPlanner(planner, self.terrain).plan(self.pool.active, tool, limits, heights)
             if push is not None:
@@ -77,10 +77,6 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         if grasp is None or robot.opening() < IS_OPEN:
             return lift(limits.step_m, OPEN)
         return self._grasp(grasp, over_z)
-
-    def _slip_cost(self, grasps: np.ndarray) -> np.ndarray:
-        """Return the slip scores [N] of grasps as additional costs."""
-        return grasps[:, 5]
 
     def _grasp(self, grasp: TopDownGrasp, over_z: float) -> GripperCommand:
         """Move above the object with open fingers, descend, and close the fingers at the end."""

@@ -12,7 +12,7 @@ from pydantic import Field
 from ba_torchrl.config import TaskParameters
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Quaternion, YawPose, downward
+from ba_torchrl.sim.geometry import YawPose, downward
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
@@ -107,8 +107,10 @@ class ClutterTask(Task):
             bodies = [pool.bodies[i] for i in chosen]
             for body in bodies:
                 x, y = center + rng.uniform(DROP_MARGIN_M - half_m, half_m - DROP_MARGIN_M, 2)
-                is_random = settings.random_orientation
-                orientation = _random_orientation(rng) if is_random else (0.0, 0.0, 0.0, 1.0)
+                orientation = (0.0, 0.0, 0.0, 1.0)
+                if settings.random_orientation:  # uniform over SO(3)
+                    quaternion = rng.normal(size=4)
+                    orientation = tuple((quaternion / np.linalg.norm(quaternion)).tolist())
                 pool.activate(body)
                 body.set_pose((x, y, DROP_Z_M), orientation)
                 world.step(pause)
@@ -166,9 +168,3 @@ class ClutterTask(Task):
         """Restore the active objects and the numbers of attempts and failures."""
         active, self.attempts, self.failures = state
         self.pool.set_state(active)
-
-
-def _random_orientation(rng: np.random.Generator) -> Quaternion:
-    """Return an orientation uniform over SO(3)."""
-    quaternion = rng.normal(size=4)
-    return tuple((quaternion / np.linalg.norm(quaternion)).tolist())

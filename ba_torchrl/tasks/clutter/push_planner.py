@@ -147,7 +147,8 @@ class PushPlanner:
             return
         near = np.linalg.norm(points[:, :2] - center, axis=1) < 0.01
         top = float(points[near, 2].max() if near.any() else points[:, 2].max())
-        if self._height_at(center, heights) > top + 0.005:
+        i, j = ((center - self._grasps.corner) / PIXEL_M).astype(int)
+        if heights[i, j] > top + 0.005:
             return  # another object lies on it
         contact_z = top - self._tip_m
         start = (*center, contact_z - PRESS_M)
@@ -158,10 +159,6 @@ class PushPlanner:
             cost += COLLISION_COST
         end = (*(center + displacement), contact_z - PULL_DEPTH_M)
         yield Push(start, end, 3 * PRESS_M, cost)
-
-    def _height_at(self, point: np.ndarray, heights: np.ndarray) -> float:
-        i, j = ((point - self._grasps.corner) / PIXEL_M).astype(int)
-        return float(heights[i, j])
 
     def _is_free(self, point: np.ndarray, heights: np.ndarray) -> bool:
         """Whether the floor at a point is free for the closed fingers."""

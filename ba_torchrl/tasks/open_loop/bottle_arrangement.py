@@ -207,20 +207,16 @@ class BottleArrangement(PackingTask):
         self, xy: tuple[float, float], half_opening_m: float, obstacles: Sequence[Rectangle]
     ) -> tuple[float, float]:
         """Return the yaw at which fingers at a position have the largest clearance, and this."""
-        yaws = self._yaws()
+        yaws = [0.0]
+        if self.action_limits.turn_rad:
+            first = self.container.yaw_rad + math.pi / 4  # a diagonal of the tray
+            yaws = [first + math.pi * i / GRASP_YAWS for i in range(GRASP_YAWS)]
         tools = [PlanarFrame(*xy, yaw) for yaw in yaws]
         gripper = self.robot.gripper
         clearances_m = outline_clearances_m(gripper, tools, half_opening_m, obstacles).tolist()
         rounded = [round(clearance_m, 4) for clearance_m in clearances_m]
         best = rounded.index(max(rounded))
         return yaws[best], clearances_m[best]
-
-    def _yaws(self) -> list[float]:
-        """Return the yaws to grasp or release a bottle at, a diagonal of the tray first."""
-        if not self.action_limits.turn_rad:
-            return [0.0]
-        first = self.container.yaw_rad + math.pi / 4
-        return [first + math.pi * i / GRASP_YAWS for i in range(GRASP_YAWS)]
 
     def _floor_z_m(self) -> float:
         """Return the height of the floor of the tray."""

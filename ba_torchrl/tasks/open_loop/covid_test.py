@@ -170,11 +170,6 @@ def new_columns(count: int) -> list[float]:
     return [(i - (count - 1) / 2) * COLUMN_M for i in range(count)]
 
 
-def layout_half_m(yaw_rad: float) -> float:
-    """Return half the extent of the layout along the axes of the workspace."""
-    return HALF_LAYOUT_M * (abs(math.cos(yaw_rad)) + abs(math.sin(yaw_rad)))
-
-
 def _slab(area: Area, size_m: tuple[float, float], top_m: float) -> Box:
     return Box(size_m=(*size_m, top_m + UNDERGROUND_M), mass_kg=0, color=area.color)
 
@@ -263,7 +258,8 @@ class CovidTest(OpenLoopTask):
         yaw = math.pi / 2 * float(rng.integers(4) if is_random else 2 * rng.integers(2))
         yaw += self.random_yaw(rng, 2 * self.turn_rad)
         mirror = 1.0 if rng.random() < 0.5 else -1.0
-        center = self.random_point(rng, 2 * layout_half_m(yaw))
+        extent_m = 2 * (HALF_LAYOUT_M * (abs(math.cos(yaw)) + abs(math.sin(yaw))))
+        center = self.random_point(rng, extent_m)
         self.layout.place(center, yaw, mirror)
         new_box = self.layout.new_box
         for bodies, row in zip((self.tubes, self.swabs), self._rows(), strict=True):

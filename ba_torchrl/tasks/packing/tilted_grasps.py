@@ -12,7 +12,6 @@ import numpy as np
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import (
     Pose,
-    Vector,
     axes_quaternion,
     dot,
     perpendicular,
@@ -87,7 +86,9 @@ def tilted_grasp(
     for cost, roll, pitch, offset in candidates:
         if SUFFICIENT_CLEARANCE_M - cost <= best_score:
             break
-        axis = _unit((closing[0], closing[1], -roll * closing[2]))
+        axis = (closing[0], closing[1], -roll * closing[2])
+        norm = math.sqrt(dot(axis, axis))
+        axis = tuple(a / norm for a in axis)
         up = (-pitch * normal[0], -pitch * normal[1], 1 + pitch - pitch * normal[2])
         down = perpendicular(tuple(-u for u in up), axis)
         position = tuple(frame.apply(np.array([0.0, offset, above_centre_m])).tolist())
@@ -97,9 +98,3 @@ def tilted_grasp(
         if score > best_score and is_reachable(robot, support_ids, tool):
             best, best_score = TiltedGrasp(tool, clearance_m), score
     return best
-
-
-def _unit(vector: Vector) -> Vector:
-    """Return a vector normalised."""
-    norm = math.sqrt(dot(vector, vector))
-    return tuple(v / norm for v in vector)

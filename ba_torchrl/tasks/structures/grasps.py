@@ -273,7 +273,8 @@ class PickPlaceGrasps(Grasps):
             ]
         # Edge grasps are for a gripper that cannot turn, and for slopes beside a body. On another
         # body, the grasped one would drag its support along.
-        if (self.limits.can_tilt or not self.limits.turn_rad) and self._is_on_ground(body):
+        has_edge_grasps = self.limits.can_tilt or not self.limits.turn_rad
+        if has_edge_grasps and self.terrain.gap_below_m(body) < self.structure.block_m / 4:
             gripper, opening = self.robot.gripper, self.finger_opening
             for candidate in centered:
                 for side, edge in zip(
@@ -319,9 +320,6 @@ class PickPlaceGrasps(Grasps):
             ),
             ranked[0],
         )
-
-    def _is_on_ground(self, body: Body) -> bool:
-        return self.terrain.gap_below_m(body) < self.structure.block_m / 4
 
     def quality(self, body: Body, candidate: GraspCandidate) -> Quality:
         """Return the quality of a grasp, by which grasps are compared."""
@@ -497,10 +495,6 @@ class GraspBlocking:
                 for column in zip(*rows, strict=True)
             ] or [frozenset()]
         return self._obstacles[body]
-
-    def is_blocked(self, body: Body) -> bool:
-        """Whether every grasp candidate of a body is blocked."""
-        return all(self.obstacles(body))
 
     def removals(self, assignment: Sequence[Body | None]) -> Iterator[tuple[int, Body, None]]:
         """Yield the pieces to place on the ground to free the grasp of another piece.

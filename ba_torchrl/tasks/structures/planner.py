@@ -74,7 +74,7 @@ class _Planner:
                 # another held piece is placed on the ground before this choice
                 places_held = holds_piece and body is not held
                 extra_moves += places_held
-                if body is not held and blocking.is_blocked(body):
+                if body is not held and all(blocking.obstacles(body)):
                     extra_moves += BLOCKED_MOVES
                 if best is not None and extra_moves > best[0][0]:
                     continue

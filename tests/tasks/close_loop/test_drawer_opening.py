@@ -13,6 +13,7 @@ from ba_torchrl.envs.episodes import evaluate_at_rest
 from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.close_loop.drawer_opening import cabinet_parts, drawer_parts
+from tests.tasks.episodes import play
 
 TASK = "close_loop/drawer_opening"
 FIXED = {"random_orientation": False, "action_sequence": "pxyz"}
@@ -64,31 +65,19 @@ def test_the_height_image_shows_cabinet_drawer_and_handle_in_their_sizes(make, t
     np.testing.assert_allclose(image[flat], expected[flat], atol=1e-6)
 
 
-def test_the_observation_shows_the_travel_of_the_drawer(make):
-    env = make(obs_size=64)
-    cabinet = env.scene.task.cabinet
-    state, no_op = env.reset(), torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0])
-    cabinet.place(cabinet.base.position, cabinet.base.yaw_rad, 0.1)
-    after = env.step(state.clone().set("action", no_op))["next"]
-    changed = (after["pixels"] - state["pixels"]).abs() > 0.01
-    assert 0.01 < changed.float().mean() < 0.3
-
-
-def test_the_drawer_is_hollow_and_open_on_top(make):
-    block = Box(size_m=(0.03, 0.03, 0.03))
+@pytest.mark.parametrize(
+    ("x", "y", "height"), [(0.18, 0.03, 0.019), (0.0, 0.0, 0.11)], ids=["its floor", "the cabinet"]
+)
+def test_the_drawer_is_hollow_and_open_on_top(make, x, y, height):
     with World() as world:
-        env = make()
-        shapes = [part.shape for part in env.scene.task.cabinet.parts]
-        cabinet = world.add_articulated(*shapes, env.scene.task.cabinet.joint, "cabinet")
-        dropped = world.add(block, "block")
+        cabinet = make().scene.task.cabinet
+        shapes = [part.shape for part in cabinet.parts]
+        cabinet = world.add_articulated(*shapes, cabinet.joint, "cabinet")
+        dropped = world.add(Box(size_m=(0.03, 0.03, 0.03)), "block")
         cabinet.place((0.0, 0.0, 0.0), travel_m=0.2)
-        dropped.place((0.18, 0.03, 0.13))
+        dropped.place((x, y, 0.14))
         world.step(120)
-        assert dropped.position[2] == pytest.approx(0.019 + 0.015, abs=2e-3)  # on its floor
-        cabinet.place((0.0, 0.0, 0.0), travel_m=0.2)
-        dropped.place((0.0, 0.0, 0.14))
-        world.step(120)
-        assert dropped.position[2] == pytest.approx(0.11 + 0.015, abs=2e-3)  # on the cabinet
+        assert dropped.position[2] == pytest.approx(height + 0.015, abs=2e-3)
 
 
 def test_the_cabinet_is_hollow_in_front_and_between_its_walls():
@@ -181,14 +170,19 @@ def at_handle(env, ahead, height, opening, turn, across=0.0):
     return scene
 
 
+def move(scene, dx=0.0, dy=0.0, dz=0.0, turn=0.0):
+    (x, y, z), yaw = scene.robot.tool_pose()
+    scene.controller.move_to((x + dx, y + dy, z + dz), yaw + turn)
+
+
 def follow(scene, commands):
     """Follow the expert's commands within 5 cm and 45 degrees each."""
     for _ in range(commands):
-        command, ((x, y, z), yaw) = scene.task.expert_command(), scene.robot.tool_pose()
+        command = scene.task.expert_command()
         share = min(1.0, 0.05 / max(abs(d) for d in command[1:4])) if any(command[1:4]) else 1.0
         dx, dy, dz = (share * d for d in command[1:4])
         turn = max(-math.pi / 4, min(math.pi / 4, command.dyaw_rad))
-        scene.controller.move_to((x + dx, y + dy, z + dz), yaw + turn)
+        move(scene, dx, dy, dz, turn)
 
 
 @pytest.mark.parametrize(
@@ -240,16 +234,14 @@ def test_a_pulled_drawer_follows_the_fingers_and_stays(make):
     scene = at_handle(make(), -0.026, 0.07, 0.0, math.pi / 2)
     travels = []
     for _ in range(6):
-        (x, y, z), yaw = scene.robot.tool_pose()
-        scene.controller.move_to((x - 0.05, y, z), yaw)
+        move(scene, dx=-0.05)
         travels.append(scene.task.cabinet.travel_m)
     # a gap of 8.5 mm first, then 5 cm each, up to the limit of the joint
     np.testing.assert_allclose(travels, [0.0415, 0.0915, 0.1415, 0.1915, 0.2, 0.2], atol=4e-3)
     scene.world.settle()
     assert scene.task.cabinet.travel_m == pytest.approx(0.2, abs=2e-3)
     for _ in range(6):
-        (x, y, z), yaw = scene.robot.tool_pose()
-        scene.controller.move_to((x + 0.05, y, z), yaw)
+        move(scene, dx=0.05)
     scene.world.settle()
     assert scene.task.cabinet.travel_m == pytest.approx(0.0, abs=2e-3)
 
@@ -259,22 +251,19 @@ def test_fingers_closed_on_the_rod_pull_it_without_a_held_body(make):
     scene.controller.grip(0.0)
     assert scene.robot.held_body() is None
     for _ in range(3):
-        (x, y, z), yaw = scene.robot.tool_pose()
-        scene.controller.move_to((x - 0.05, y, z), yaw)
+        move(scene, dx=-0.05)
     assert scene.task.cabinet.travel_m == pytest.approx(0.15, abs=3e-3)
 
 
 def test_the_motion_stops_at_a_handle_that_cannot_move(make):
     scene = at_handle(make(), 0.0, 0.14, 0.0, math.pi / 2)
     for _ in range(3):  # onto the rod from above
-        (x, y, z), yaw = scene.robot.tool_pose()
-        scene.controller.move_to((x, y, z - 0.05), yaw)
+        move(scene, dz=-0.05)
     assert scene.robot.tool_pose()[0][2] > 0.08
     assert scene.task.handle_pose[0][2] == pytest.approx(0.08, abs=1e-6)
     scene = at_handle(make(), -0.026, 0.07, 0.0, math.pi / 2)
     for _ in range(3):  # along the rod, into a post
-        (x, y, z), yaw = scene.robot.tool_pose()
-        scene.controller.move_to((x, y + 0.05, z), yaw)
+        move(scene, dy=0.05)
     assert scene.robot.tool_pose()[0][1] < 0.035
     np.testing.assert_allclose(scene.task.cabinet.base.position, (0.57, 0.0, 0.0), atol=1e-9)
 
@@ -299,10 +288,7 @@ def test_scaled_drawers_open_by_scaled_travel(make):
     env = make(object_scale_range=0.9, expert=True)
     assert env.scene.task.cabinet.joint.limits_m == (0.0, pytest.approx(0.18))
     np.testing.assert_allclose(env.scene.task.handle_pose[0][2], 0.072, atol=1e-6)
-    state = env.reset()
-    while not state["done"]:
-        state = env.step(state.set("action", state["expert_action"]))["next"]
-    assert state["success"]
+    assert play(env, env.reset())["success"]
     assert 0.135 < env.scene.task.cabinet.travel_m < 0.17
 
 
