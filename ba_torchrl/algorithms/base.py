@@ -612,15 +612,21 @@ class Learner(ABC):
             names.append("averaged_policy")
         return {name: getattr(self, name) for name in names}
 
+    def generators(self) -> Mapping[str, torch.Generator]:
+        """Return the generators whose states are saved, by name, besides those of the replay and
+        the augmentations; by default none."""
+        return {}
+
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, target, optimiser, schedule, augmentations and number of updates.
+        """Return networks, target, optimiser, schedule, generators and number of updates.
 
         Raises:
             FloatingPointError: a loss of the last update was not finite.
         """
         self.host_tasks.run()
         state = {name: part.state_dict() for name, part in self._stateful_parts().items()}
-        return {**state, **self.optimizers.state_dict(), "updates": self.updates}
+        draws = {name: each.get_state() for name, each in self.generators().items()}
+        return {**state, **self.optimizers.state_dict(), "updates": self.updates, **draws}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
@@ -628,6 +634,8 @@ class Learner(ABC):
             part.load_state_dict(state[name])
         self.optimizers.load_state_dict(state)
         self.updates = state["updates"]
+        for name, generator in self.generators().items():
+            generator.set_state(state[name].cpu())
 
     def replay_state(self) -> dict[str, Any]:
         """Return transitions, priorities and the state of the draws, as views: do not modify them.

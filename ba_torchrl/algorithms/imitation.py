@@ -165,7 +165,7 @@ class MixedPolicy(TensorDictModuleBase):
         self.in_keys = list(policy.in_keys)
         self.out_keys = [keys.ACTION]
         self._actions = actions
-        self._generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of a root TensorDict of any batch shape.
@@ -177,21 +177,13 @@ class MixedPolicy(TensorDictModuleBase):
         if exploration_type() != ExplorationType.RANDOM or self.beta == 0:
             return out
         draws = torch.rand(
-            *out.batch_size, 1, generator=self._generator, device="cpu", dtype=torch.float32
+            *out.batch_size, 1, generator=self.generator, device="cpu", dtype=torch.float32
         )
         expert = out[keys.EXPERT_ACTION]
         if self._actions is not None:
             expert = self._actions.nearest(expert)
         is_expert = draws.to(expert.device) < self.beta
         return out.set(keys.ACTION, torch.where(is_expert, expert, out[keys.ACTION]))
-
-    def get_generator_state(self) -> Tensor:
-        """Return the state of the generator."""
-        return self._generator.get_state()
-
-    def set_generator_state(self, state: Tensor) -> None:
-        """Restore the state of the generator, from any device."""
-        self._generator.set_state(state.cpu())
 
 
 class DAgger(BC):
@@ -227,12 +219,11 @@ class DAgger(BC):
         beta = config.beta_init * max(1 - self.updates / config.beta_updates, 0.0)
         self.policy.beta.fill_(beta)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return networks, optimiser, schedule, generators and number of updates."""
-        return {**super().state_dict(), "mixture": self.policy.get_generator_state()}
+    def generators(self) -> dict[str, torch.Generator]:
+        """Return the generator of the choice between the actions of policy and expert."""
+        return {"mixture": self.policy.generator}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
         super().load_state_dict(state)
-        self.policy.set_generator_state(state["mixture"])
         self._set_beta()

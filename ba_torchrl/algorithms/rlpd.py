@@ -8,8 +8,9 @@ update of the policy. There is no term that imitates the demonstrations.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
+import torch
 from pydantic import Field
 from tensordict import TensorDict
 from torch.optim import Optimizer
@@ -119,11 +120,6 @@ class RLPD(SAC):
             self.step([self.loss.critic_loss(self.sample())])
         return super().update()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return networks, targets, optimiser, schedule, generators and number of updates."""
-        return {**super().state_dict(), "ensemble": self.loss.get_generator_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the learner from a `state_dict` of any device."""
-        super().load_state_dict(state)
-        self.loss.set_generator_state(state["ensemble"])
+    def generators(self) -> dict[str, torch.Generator]:
+        """Return the generator of the subsets of critics."""
+        return {"ensemble": self.loss.generator}

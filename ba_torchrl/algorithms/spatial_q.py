@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 
+import torch
 from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -193,13 +194,12 @@ class SpatialQ(Learner):
         epsilon = config.epsilon_init + share * (config.epsilon_end - config.epsilon_init)
         self.explorer.epsilon.fill_(epsilon)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return network, target, optimiser, schedule, generators and number of updates."""
-        return {**super().state_dict(), "exploration": self.explorer.get_generator_state()}
+    def generators(self) -> dict[str, torch.Generator]:
+        """Return the generator of random actions."""
+        return {"exploration": self.explorer.generator}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
         super().load_state_dict(state)
-        self.explorer.set_generator_state(state["exploration"])
         self.target_updater.counter = self.updates % self.config.target_interval
         self._set_epsilon()

@@ -35,6 +35,21 @@ class TransitionLoss(LossModule):
             one.
     """
 
+    @dataclass
+    class _AcceptedKeys:
+        """Entries that ``set_keys`` can rename; those of the next state are nested in "next"."""
+
+        action: NestedKey = keys.ACTION
+        reward: NestedKey = keys.REWARD
+        done: NestedKey = keys.DONE
+        terminated: NestedKey = keys.TERMINATED
+        is_demonstration: NestedKey = keys.IS_DEMONSTRATION
+        value: NestedKey = "state_value"
+        priority: NestedKey = keys.TD_ERROR
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
     default_value_estimator = ValueEstimators.TD0
 
     def __init__(

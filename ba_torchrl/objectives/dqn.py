@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import torch
@@ -158,22 +157,6 @@ class LevelDQNLoss(TransitionLoss):
             loss_demonstration.
         weight_norm: statistic by which a batch's weights are divided.
     """
-
-    @dataclass
-    class _AcceptedKeys:
-        """Entries that ``set_keys`` can rename; those of the next state are nested in "next"."""
-
-        action: NestedKey = keys.ACTION
-        reward: NestedKey = keys.REWARD
-        done: NestedKey = keys.DONE
-        terminated: NestedKey = keys.TERMINATED
-        is_demonstration: NestedKey = keys.IS_DEMONSTRATION
-        value: NestedKey = "state_value"
-        priority: NestedKey = keys.TD_ERROR
-        priority_weight: NestedKey = "priority_weight"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
 
     value_network: nn.Module
     value_network_params: TensorDictParams

@@ -60,7 +60,7 @@ class RLPDLoss(SACfDLoss):
         )
         self.subset = subset
         # On the CPU, so that the subsets of a seed are the same on all devices.
-        self._generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator().manual_seed(seed)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -88,16 +88,8 @@ class RLPDLoss(SACfDLoss):
         return {"q_value": q.mean(), "q_std": q.std(dim=-1).mean()}
 
     def _target_value(self, q: Tensor) -> Tensor:
-        chosen = torch.randperm(q.shape[-1], generator=self._generator, device="cpu")[: self.subset]
+        chosen = torch.randperm(q.shape[-1], generator=self.generator, device="cpu")[: self.subset]
         return q[..., chosen.to(q.device)].amin(dim=-1)
 
     def _policy_value(self, q: Tensor) -> Tensor:
         return q.mean(dim=-1)
-
-    def get_generator_state(self) -> Tensor:
-        """Return the state of the generator of subsets."""
-        return self._generator.get_state()
-
-    def set_generator_state(self, state: Tensor) -> None:
-        """Restore the state of the generator, from any device."""
-        self._generator.set_state(state.cpu())

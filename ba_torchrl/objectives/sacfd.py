@@ -86,19 +86,11 @@ class SACfDLoss(TransitionLoss):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """Entries that ``set_keys`` can rename; those of the next state are nested in "next"."""
+    class _AcceptedKeys(TransitionLoss._AcceptedKeys):
+        """As for `TransitionLoss`, with the expert's action and the critics' values."""
 
-        action: NestedKey = keys.ACTION
-        reward: NestedKey = keys.REWARD
-        done: NestedKey = keys.DONE
-        terminated: NestedKey = keys.TERMINATED
-        is_demonstration: NestedKey = keys.IS_DEMONSTRATION
         target_action: NestedKey | None = None
         state_action_value: NestedKey = "state_action_value"
-        value: NestedKey = "state_value"
-        priority: NestedKey = keys.TD_ERROR
-        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

@@ -50,7 +50,7 @@ def test_beta_decreases_linearly_to_zero():
     other = build("dagger", beta_init=0.6, beta_updates=6, batch_size=4)
     other.load_state_dict(learner.state_dict())
     assert other.policy.beta.item() == pytest.approx(0.1)
-    states = [each.policy.get_generator_state() for each in (learner, other)]
+    states = [each.policy.generator.get_state() for each in (learner, other)]
     assert torch.equal(*states)
 
 

@@ -84,7 +84,7 @@ def test_a_restored_learner_draws_the_same_subsets():
     first, second = made(), made()
     first.update()
     second.load_state_dict(first.state_dict())
-    states = [learner.loss.get_generator_state() for learner in (first, second)]
+    states = [learner.loss.generator.get_state() for learner in (first, second)]
     assert torch.equal(*states)
 
 

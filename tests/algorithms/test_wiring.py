@@ -317,7 +317,7 @@ def test_no_two_uses_of_randomness_draw_the_same_numbers(replay):
     if replay == "symmetric":
         generators = dict(spatial.replay.sampler.generators)
     generators["augmentation"] = spatial.augmentation._generator
-    generators["exploration"] = spatial.explorer._generator
+    generators["exploration"] = spatial.explorer.generator
     torch.manual_seed(spatial.problem.seed)
     draws = {name: tuple(torch.rand(4, generator=g).tolist()) for name, g in generators.items()}
     draws["weights"] = tuple(torch.rand(4).tolist())

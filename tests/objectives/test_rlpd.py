@@ -16,7 +16,7 @@ CRITICS, ALPHA, GAMMA = 4, 0.2, 0.9
 def make(draws=0, **settings):
     options = {"kind": RLPDLoss, "critics": CRITICS, "alpha_init": ALPHA, "target_entropy": -1.5}
     loss = linear_sac.make(**options, **settings)
-    loss._generator.manual_seed(draws)
+    loss.generator.manual_seed(draws)
     return loss.make_value_estimator(gamma=GAMMA).double()
 
 

@@ -1,12 +1,15 @@
 """The SACfD loss against plain arithmetic, and against TorchRL's contract."""
 
+import itertools
 import math
 
 import pytest
 import torch
+from torch.distributions import Bernoulli, kl_divergence
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
 from ba_torchrl.envs import keys
+from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SoftUpdateByNetwork
 from tests.linear_sac import (
     batch,
     make,
@@ -314,3 +317,233 @@ def test_in_keys_can_be_set_and_follow_renamed_keys():
     loss.set_keys(action="chosen")
     assert "chosen" in loss.in_keys
     assert "action" not in loss.in_keys
+
+
+# -- the behaviour term --------------------------------------------------------------------------
+
+
+EXPERTS = (True, True, False, True)
+WEIGHTS = (0.2, 0.8, 0.4, 0.1)
+
+
+def test_behaviour_term_pulls_the_sample_to_the_expert():
+    loss = make(alpha_init=1e-9, demonstration_weight=1.0)
+    data = batch()
+    with torch.no_grad():  # critics that do not care
+        loss.qvalue_network_params["module", "net", "weight"].zero_()
+    optimizer = torch.optim.SGD(loss.actor_network_params.parameters(), 0.1)
+    errors = []
+    for _ in range(20):
+        out = loss(data.clone())
+        errors.append(float(out["demonstration_error"]))
+        optimizer.zero_grad()
+        out["loss_actor"].backward()
+        optimizer.step()
+    assert all(later < earlier for earlier, later in itertools.pairwise(errors))
+
+
+def test_the_term_with_the_divergence_of_actions():
+    data = batch(EXPERTS, WEIGHTS)
+    data[keys.ACTION][0, 0] = 1.0  # at the end of the range, as the gripper's commands are
+    options = {"demonstration_distance": "kl", "weighted_terms": "all"}
+    loss = make(demonstration_weight=0.3, **options)
+    with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+        action = loss.actor_network.get_dist(data).rsample()
+    expert, policy = (Bernoulli((1 + value) / 2) for value in (data[keys.ACTION], action))
+    distances = 2 * kl_divergence(expert, policy).mean(dim=-1)
+    found = loss(data.clone())
+    flags = torch.tensor(EXPERTS)
+    torch.testing.assert_close(found["demonstration_error"], distances[flags].mean())
+    weights = torch.tensor(WEIGHTS, dtype=distances.dtype) / max(WEIGHTS)
+    without = make(demonstration_weight=0.0, **options)(data.clone())  # with the same parameters
+    difference = found["loss_actor"] - without["loss_actor"]
+    assert difference.item() == pytest.approx(
+        0.3 * (weights * distances)[flags].mean().item(), rel=1e-5
+    )
+
+
+def test_the_term_is_against_the_entry_of_the_expert():
+    data, executed = batch(EXPERTS), batch(EXPERTS)
+    data["label"] = data[keys.ACTION].clone()
+    data[keys.ACTION] = -data[keys.ACTION] / 3  # what was executed in place of the expert's action
+    loss = make(demonstration_weight=0.3)
+    loss.set_keys(target_action="label")
+    assert {"label", keys.ACTION} <= set(loss.in_keys)
+    found, expected = loss(data), make(demonstration_weight=0.3)(executed)
+    for name in ("loss_actor", "demonstration_error", "entropy"):
+        torch.testing.assert_close(found[name], expected[name])
+    assert not torch.allclose(found["loss_qvalue"], expected["loss_qvalue"])
+    with pytest.raises(KeyError, match="label"):
+        loss(data.exclude("label"))
+
+
+# -- several views of each observation (DrQ) -----------------------------------------------------
+
+VIEWS, TARGET_VIEWS = 3, 2
+
+
+def views_of(data, count, path=()):
+    """Return views [count] of an observation: batches with different pixels."""
+    generator = torch.Generator().manual_seed(count)
+    views = []
+    for _ in range(count):
+        view = data.clone()
+        noise = torch.rand(data[(*path, keys.PIXELS)].shape, generator=generator)
+        view[(*path, keys.PIXELS)] += noise.double()
+        views.append(view)
+    return views
+
+
+def with_views(data):
+    """Return a batch with views, and its parts as batches with a single one."""
+    states, followings = views_of(data, VIEWS), views_of(data, TARGET_VIEWS, (keys.NEXT,))
+    out = data.clone()
+    for key in (keys.PIXELS, keys.HOLDING):
+        out[key] = torch.stack([view[key] for view in states], dim=1)
+        nested = (keys.NEXT, key)
+        out[nested] = torch.stack([view[nested] for view in followings], dim=1)
+    return out, states, followings
+
+
+def test_the_target_is_the_mean_over_the_views_of_the_next_observation():
+    data, _, followings = with_views(batch())
+    loss = make(views=VIEWS, target_views=TARGET_VIEWS, alpha_init=0.2)
+    single = make(alpha_init=0.2)
+    targets = torch.stack([single._target(view) for view in followings])
+    assert not torch.allclose(targets[0], targets[1])
+    torch.testing.assert_close(loss._target(data), targets.mean(dim=0))
+
+
+@pytest.mark.parametrize("terms", ["none", "all"])
+def test_losses_and_priorities_are_means_over_the_views_of_the_observation(terms):
+    data, states, _ = with_views(batch())
+    settings = {"alpha_init": 0.2, "weighted_terms": terms}
+    loss = make(views=VIEWS, target_views=TARGET_VIEWS, **settings)
+    out, target = loss(data), loss._target(data)
+    single, found = make(**settings), []
+    for state in states:
+        # a terminated transition, whose target is its reward
+        state[keys.NEXT, keys.REWARD] = target
+        state[keys.NEXT, keys.TERMINATED] |= True
+        found.append(single(state))
+    for name in single.out_keys:
+        expected = torch.stack([values[name] for values in found]).mean()
+        torch.testing.assert_close(out[name], expected)
+    priorities = torch.stack([state[keys.TD_ERROR] for state in states]).mean(dim=0)
+    torch.testing.assert_close(data[keys.TD_ERROR], priorities)
+
+
+def test_one_view_of_either_kind():
+    data, states, followings = with_views(batch())
+    one_state = data.clone()
+    one_state[keys.PIXELS], one_state[keys.HOLDING] = (
+        states[0][keys.PIXELS],
+        data[keys.HOLDING][:, 0],
+    )
+    assert torch.isfinite(make(target_views=TARGET_VIEWS)(one_state)["loss_qvalue"])
+    one_target = data.clone()
+    for key in (keys.PIXELS, keys.HOLDING):
+        one_target[keys.NEXT, key] = followings[0][keys.NEXT, key]
+    assert torch.isfinite(make(views=VIEWS)(one_target)["loss_qvalue"])
+
+
+# -- the contrastive term ------------------------------------------------------------------------
+
+
+def loop(anchors, weight, positives):
+    """InfoNCE with Python floats: the cross-entropy of each anchor with its own positive."""
+    losses = []
+    for i, anchor in enumerate(anchors):
+        similarities = [
+            sum(
+                anchor[m] * weight[m][n] * positive[n]
+                for m in range(len(anchor))
+                for n in range(len(positive))
+            )
+            for positive in positives
+        ]
+        top = max(similarities)
+        log_sum = top + math.log(sum(math.exp(s - top) for s in similarities))
+        losses.append(log_sum - similarities[i])
+    return losses
+
+
+def test_the_loss_equals_a_loop():
+    torch.manual_seed(0)
+    head = BilinearInfoNCE(3).double()
+    assert 0 <= float(head.weight.min()) <= float(head.weight.max()) < 1
+    anchors, positives = torch.randn(5, 3).double(), torch.randn(5, 3).double()
+    expected = loop(anchors.tolist(), head.weight.tolist(), positives.tolist())
+    assert head(anchors, positives).tolist() == pytest.approx(expected, rel=1e-9)
+
+
+def with_positives(data):
+    data = data.clone()
+    generator = torch.Generator().manual_seed(5)
+    shape = data[keys.PIXELS].shape
+    data[keys.POSITIVE, keys.PIXELS] = torch.rand(shape, generator=generator, dtype=torch.float64)
+    data[keys.POSITIVE, keys.HOLDING] = data[keys.HOLDING]
+    return data
+
+
+def features(loss, params, tree, i):
+    weight = getattr(loss, params)["module", "net", "weight"].tolist()
+    bias = getattr(loss, params)["module", "net", "bias"].tolist()
+    x = [*tree[keys.PIXELS][i].tolist(), float(tree[keys.HOLDING][i])]
+    return [
+        math.tanh(sum(w * v for w, v in zip(row, x, strict=True)) + b)
+        for row, b in zip(weight, bias, strict=True)
+    ]
+
+
+def contrastive(**settings):
+    torch.manual_seed(1)
+    return make(contrastive=BilinearInfoNCE(4), **settings)
+
+
+def test_anchors_are_features_and_positives_those_of_the_target_encoder():
+    loss, data = contrastive(), with_positives(batch())
+    anchors = [features(loss, "encoder_network_params", data, i) for i in range(4)]
+    positives = [
+        features(loss, "target_encoder_network_params", data[keys.POSITIVE], i) for i in range(4)
+    ]
+    expected = loop(anchors, loss.contrastive.weight.tolist(), positives)
+    out = loss.contrastive_loss(data)
+    assert list(out.keys()) == ["loss_contrastive"]
+    assert float(out["loss_contrastive"]) == pytest.approx(sum(expected) / 4, rel=1e-9)
+    none = contrastive(reduction="none").contrastive_loss(data)["loss_contrastive"]
+    assert none.tolist() == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_other_losses_are_those_without_it():
+    expected, found = make()(batch()), contrastive()(with_positives(batch()))
+    assert set(found.keys()) == set(expected.keys())
+    for name in expected.keys():  # noqa: SIM118
+        torch.testing.assert_close(found[name], expected[name])
+
+
+def test_its_gradient_reaches_the_encoder_and_the_similarity_only():
+    loss = contrastive()
+    loss.contrastive_loss(with_positives(batch()))["loss_contrastive"].backward()
+    reached = {n for n, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
+    encoder = {n for n, _ in loss.named_parameters() if n.startswith("encoder_network")}
+    assert encoder
+    assert reached == {*encoder, "contrastive.weight"}
+
+
+def test_the_encoders_target_has_a_rate_of_its_own():
+    loss = make()
+    updater = SoftUpdateByNetwork(loss, tau=0.25, taus={"encoder_network": 0.5})
+    assert isinstance(updater, SoftUpdate)
+    rates = {"encoder_network": 0.5, "qvalue_network": 0.25}
+    before = {}
+    with torch.no_grad():
+        for name in rates:
+            for value in getattr(loss, f"{name}_params").values(True, True):
+                value.add_(1.0)
+            before[name] = getattr(loss, f"target_{name}_params").clone()
+    updater.step()
+    for name, tau in rates.items():
+        online, target = getattr(loss, f"{name}_params"), getattr(loss, f"target_{name}_params")
+        for key, old in before[name].items(True, True):
+            torch.testing.assert_close(target[key], old + tau * (online[key].detach() - old))

@@ -9,10 +9,11 @@ from typing import Literal, NamedTuple, Protocol
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.so2 import (
+    SeededModule,
     copy_exact_quarters,
     map_pairs,
     quarters_and_rotation,
@@ -80,7 +81,7 @@ class ActionGrid(Protocol):
         which swaps the fingers, bool [B]."""
 
 
-class RigidAugmentation(nn.Module):
+class RigidAugmentation(SeededModule):
     """Applies a random rigid transform to images, next images and action of each transition.
 
     Images with the gripper's axes do not change, with two exceptions: a reflection reverses the
@@ -115,7 +116,7 @@ class RigidAugmentation(nn.Module):
         order: int = 16,
         grid: ActionGrid | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(seed)
         if not 0 <= probability <= 1 or order < 1:
             raise ValueError(
                 f"probability must be in [0, 1] and order positive, got {probability}, {order}"
@@ -139,9 +140,6 @@ class RigidAugmentation(nn.Module):
         self._gripper_images = {
             key: image for key, image in images.items() if image.frame == "gripper"
         }
-        # On the CPU for any device of the batch, so that the draws of a seed are the same on all
-        # devices.
-        self._generator = torch.Generator().manual_seed(seed)
         self._xy = [actions.components.index(name) for name in "xy"]
         bounds = torch.tensor(actions.bounds_m[:2], dtype=torch.float64, device="cpu")
         self._center, self._side = bounds.mean(dim=1), bounds[:, 1] - bounds[:, 0]
@@ -256,11 +254,3 @@ class RigidAugmentation(nn.Module):
                 index = to_device(rows, image.device)
                 image[index] = spec.reverse_axes(image[index], axes)
                 out.set(nested, image)
-
-    def get_extra_state(self) -> Tensor:
-        """Return the generator's state, so that a checkpoint continues the same draws."""
-        return self._generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator's state, from any device."""
-        self._generator.set_state(state.cpu())

@@ -114,7 +114,30 @@ def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
         )
 
 
-class SO2Augmentation(nn.Module):
+class SeededModule(nn.Module):
+    """A module with draws of its own, whose generator is a part of its state.
+
+    The generator is on the CPU for any device of the batch, so that the draws of a seed are the
+    same on all devices.
+
+    Args:
+        seed: of the draws.
+    """
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def get_extra_state(self) -> Tensor:
+        """Return the generator's state, so that a checkpoint continues the same draws."""
+        return self._generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restore the generator's state, from any device."""
+        self._generator.set_state(state.cpu())
+
+
+class SO2Augmentation(SeededModule):
     """Rotates images, next images and (dx, dy) of each transition by a random angle.
 
     The reference implementation stores four rotated copies with each transition; on sampled
@@ -141,7 +164,7 @@ class SO2Augmentation(nn.Module):
         seed: int,
         probability: float = 0.8,
     ) -> None:
-        super().__init__()
+        super().__init__(seed)
         if not 0 <= probability <= 1:
             raise ValueError(f"probability must be in [0, 1], got {probability}")
         if not {"x", "y"} <= set(action_sequence):
@@ -150,9 +173,6 @@ class SO2Augmentation(nn.Module):
         self.probability = probability
         self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
         self._plane = [action_sequence.index("x"), action_sequence.index("y")]
-        # On the CPU for any device of the batch, so that the angles of a seed are the same on all
-        # devices.
-        self._generator = torch.Generator().manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return a copy of a batch of transitions [B] with some of them rotated.
@@ -178,14 +198,6 @@ class SO2Augmentation(nn.Module):
             action[rows, plane] = rotate_displacement(action[rows, plane], angle)
             out.set(key, action)
         return out
-
-    def get_extra_state(self) -> Tensor:
-        """Return the generator's state, so that a checkpoint continues the same draws."""
-        return self._generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator's state, from any device."""
-        self._generator.set_state(state.cpu())
 
 
 class StoredCopies(nn.Module):

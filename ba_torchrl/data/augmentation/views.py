@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from ba_torchrl.data.augmentation.so2 import SeededModule
 from ba_torchrl.data.transfer import to_device
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
@@ -76,7 +77,7 @@ def cropped_images(images: Mapping[str, ImageSpec], size: int) -> dict[str, Imag
     return {key: replace(image, size=size) for key, image in images.items()}
 
 
-class RandomViews(nn.Module):
+class RandomViews(SeededModule):
     """Replaces the images of transitions by random views of them.
 
     With one view of the image and one of the next image, both have the same offset (RAD: Laskin et
@@ -110,7 +111,7 @@ class RandomViews(nn.Module):
         target_views: int = 1,
         has_positive: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(seed)
         if min(views, target_views) < 1:
             raise ValueError(f"views must be positive, got {views} and {target_views}")
         self.sizes = {key: image.size if size is None else size for key, image in images.items()}
@@ -118,9 +119,6 @@ class RandomViews(nn.Module):
         self.views = views
         self.target_views = target_views
         self.has_positive = has_positive
-        # On the CPU for any device of the batch, so that the offsets of a seed are the same on all
-        # devices.
-        self._generator = torch.Generator().manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return a copy of a batch of transitions [B] with views of the images.
@@ -162,11 +160,3 @@ class RandomViews(nn.Module):
         """Return [B, C, size, size] of a single view, and [B, V, C, size, size] of several."""
         views = take_views(image, offsets, self.sizes[key], self.padding)
         return views.squeeze(1) if offsets.shape[1] == 1 else views
-
-    def get_extra_state(self) -> Tensor:
-        """Return the generator's state, so that a checkpoint continues the same draws."""
-        return self._generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator's state, from any device."""
-        self._generator.set_state(state.cpu())

@@ -221,15 +221,7 @@ class SpatialPolicy(nn.Module):
         super().__init__()
         self.values = values
         self.register_buffer("epsilon", torch.zeros(()))
-        self._generator = torch.Generator().manual_seed(seed)
-
-    def get_generator_state(self) -> Tensor:
-        """Return the state of the generator of random actions."""
-        return self._generator.get_state()
-
-    def set_generator_state(self, state: Tensor) -> None:
-        """Restore the state of the generator, from any device."""
-        self._generator.set_state(state.cpu())
+        self.generator = torch.Generator().manual_seed(seed)
 
     @torch.no_grad()
     def forward(self, *observation: Tensor) -> Tensor:
@@ -246,7 +238,7 @@ class SpatialPolicy(nn.Module):
         indices, _ = self.values.greedy(*images, holding)
         if exploration_type() == ExplorationType.RANDOM and self.epsilon > 0:
             explores = (
-                torch.rand(count, generator=self._generator, device="cpu", dtype=torch.float32)
+                torch.rand(count, generator=self.generator, device="cpu", dtype=torch.float32)
                 < self.epsilon.cpu()
             )
             random = self._random_indices(images[0]).to(indices.device)
@@ -259,12 +251,12 @@ class SpatialPolicy(nn.Module):
         count, width = len(pixels), pixels.shape[-1]
         weights = (pixels[:, 0] > OBJECT_HEIGHT_M).flatten(1).float().cpu()
         weights[weights.sum(dim=1) == 0] = 1.0
-        pixel = torch.multinomial(weights, 1, generator=self._generator)[:, 0]
+        pixel = torch.multinomial(weights, 1, generator=self.generator)[:, 0]
         columns = {"x": pixel // width, "y": pixel % width}
         for name, axis in zip(actions.components, actions.axes, strict=True):
             if name not in columns:
                 columns[name] = torch.randint(
-                    axis.count, (count,), generator=self._generator, device="cpu"
+                    axis.count, (count,), generator=self.generator, device="cpu"
                 )
         return torch.stack([columns[name] for name in actions.components], dim=-1)
 
