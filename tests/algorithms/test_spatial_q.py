@@ -106,6 +106,8 @@ def test_a_restored_learner_continues_identically(transitions):
     second.load_state_dict(copy.deepcopy(first.state_dict()))
     second.load_replay_state(copy.deepcopy(first.replay_state()))
     assert second.updates == 4
+    states = [each.explorer.generator.get_state() for each in (first, second)]
+    assert torch.equal(*states)
     assert second.replay_size == first.replay_size
     for _ in range(3):
         one, other = first.update(), second.update()
