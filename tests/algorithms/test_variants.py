@@ -243,44 +243,6 @@ def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_trai
     assert all(value.grad is None for value in encoder.values(True, True))
 
 
-def test_moments_of_other_parameters_are_not_restored(caplog):
-    saved, restored = build("sacfd", "cnn"), build("sacfd", "cnn")
-    for learner in (saved, restored):
-        learner.extend(transitions(learner))
-    saved.update()
-    state = saved.state_dict()
-    moments = state["optimizer"]["state"]
-    state["optimizer"] = {
-        **state["optimizer"],
-        "state": dict(zip(moments, reversed(moments.values()), strict=True)),
-    }
-    restored.load_state_dict(state)
-    assert "they are not restored" in caplog.text
-    assert not restored.optimizer.state
-    restored.update()
-    assert restored.updates == 2
-
-
-def test_the_learning_rate_is_restored_without_the_moments():
-    """LinearLR changes the optimiser's rate step by step."""
-    settings = {"learning_rate": 1e-3, "learning_rate_end_factor": 0.1}
-    saved, restored = (build("sacfd", "cnn", **settings) for _ in range(2))
-    for learner in (saved, restored):
-        learner.extend(transitions(learner))
-    for _ in range(5):
-        saved.update()
-    state = saved.state_dict()
-    groups = state["optimizer"]["param_groups"]
-    state["optimizer"] = {"state": {}, "param_groups": groups[:1]}
-    restored.load_state_dict(state)
-    assert not restored.optimizer.state
-    for rate in torch.linspace(5.5e-4, 1e-4, 6).tolist():
-        for learner in (saved, restored):
-            rates = [group["lr"] for group in learner.optimizer.param_groups]
-            assert rates == pytest.approx([rate] * len(rates))
-            learner.update()
-
-
 def test_the_acting_policy_sees_the_centre_of_larger_images():
     ferm = build("ferm", "ferm")
     state = transitions(ferm).select(*ferm.observation_keys)
