@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ba_torchrl
 from ba_torchrl.data.demos import expert_scores
 from ba_torchrl.sim.robots import ur5
 from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
@@ -55,9 +54,3 @@ def test_only_the_width_of_the_fingers_differs(robot):
 def test_experts_succeed_with_wide_fingers(robot, task):
     scores = expert_scores(task, EPISODES, seed=0, num_envs=1, parallel=False, robot=robot)
     assert scores.success_rate == 1
-
-
-def test_environments_run_with_wide_fingers(robot):
-    env = ba_torchrl.make("close_loop/block_picking", robot=robot, seed=0)
-    assert env.rollout(3).shape[0] == 3
-    env.close()

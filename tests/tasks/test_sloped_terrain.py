@@ -19,7 +19,7 @@ from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.terrain.bumps import Bumps
 from ba_torchrl.tasks.terrain.flat import Flat
 from ba_torchrl.tasks.terrain.ramps import EDGE_MARGIN_M, GAP_M, RampLayout, Ramps
-from ba_torchrl.tasks.terrain.sloped import footprint, lowest_plane
+from ba_torchrl.tasks.terrain.sloped import lowest_plane
 from ba_torchrl.tasks.workspace import Spacing, Workspace
 
 WORKSPACE = Workspace((0.25, 0.65), (-0.1, 0.3), (0.0, 0.4))  # its centre is off the x axis
@@ -373,12 +373,3 @@ def test_a_gap_narrower_than_the_pieces_is_refused(world):
         assert 0.1 <= sum(ramps.layout.distances_m) <= GAP_M[1]
     with pytest.raises(ValueError, match="wider"):
         Ramps(World(), WORKSPACE).reserve(0.25)
-
-
-def test_footprints_are_rotated_outlines(make_env):
-    env = make_env("ramp/house_building_2")
-    env.reset()
-    roof = max(env.scene.task.objects, key=lambda body: np.ptp(body.shape.vertices[:, 1]))
-    outline = footprint(roof, (0.4, 0.1), math.pi / 2)
-    assert np.ptp(outline[:, 0]) == pytest.approx(np.ptp(roof.shape.vertices[:, 1]))
-    assert outline.mean(axis=0) == pytest.approx((0.4, 0.1), abs=1e-6)

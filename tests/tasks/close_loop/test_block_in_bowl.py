@@ -6,7 +6,6 @@ import numpy as np
 import pybullet
 import pytest
 
-import ba_torchrl
 from ba_torchrl.sim.meshes import (
     bowl_parts,
     box_mesh,
@@ -25,11 +24,8 @@ BOWL = {"foot_radius_m": 0.045, "floor_m": FLOOR_M, "wall_m": 0.006}
 
 
 @pytest.fixture
-def env():
-    env = ba_torchrl.make(TASK, obs_size=64, seed=0, expert=True)
-    env.reset()
-    yield env
-    env.close()
+def env(make_started):
+    return make_started(TASK, obs_size=64, expert=True)
 
 
 def volume(mesh):

@@ -5,18 +5,14 @@ import math
 import numpy as np
 import pytest
 
-import ba_torchrl
 from tests.tasks.episodes import check_lift, play
 
 TASK = "close_loop/corner_picking"
 
 
 @pytest.fixture
-def env():
-    env = ba_torchrl.make(TASK, obs_size=64, seed=0, expert=True)
-    env.reset()
-    yield env
-    env.close()
+def env(make_started):
+    return make_started(TASK, obs_size=64, expert=True)
 
 
 def test_the_block_is_flush_with_both_walls(env):
@@ -71,18 +67,17 @@ def test_the_block_stays_in_the_corner_without_contact(env):
         assert math.dist((x, y), (-0.065, -0.065)) < 1e-3
 
 
-def test_random_yaws_cover_the_circle_and_fixed_ones_are_zero(env):
+def test_random_yaws_cover_the_circle_and_fixed_ones_are_zero(env, make_started):
     yaws = []
     for _ in range(60):
         env.reset()
         yaws.append(env.scene.task.corner[2])
     assert min(yaws) < -2.5
     assert max(yaws) > 2.5
-    fixed = ba_torchrl.make(TASK, obs_size=16, seed=0, random_orientation=False)
+    fixed = make_started(TASK, random_orientation=False)
     for _ in range(5):
         fixed.reset()
         assert fixed.scene.task.corner[2] == 0
-    fixed.close()
 
 
 @pytest.mark.parametrize("turn", [0.0, math.pi / 4, math.pi / 2])

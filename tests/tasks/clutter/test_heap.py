@@ -187,21 +187,6 @@ def test_the_default_number_of_attempts_is_that_of_the_reference(make, control, 
         make(max_attempts=0)
 
 
-def test_a_success_is_an_attempt_and_resets_the_count_of_failures(make, control):
-    env = make(expert=True, max_attempts=4)
-    count = DEFAULT_COUNT[control]
-    for _ in range(2):
-        play(env, env.reset(), NO_OPS[control])
-    assert play(env, env.reset())["success"]
-    state = env.reset()
-    assert len(names(env)) == count - 1
-    assert env.scene.task.get_state()[1:] == (3, 0)
-    play(env, state)
-    env.reset()
-    assert len(names(env)) == count
-    assert env.scene.task.get_state()[1:] == (0, 0)
-
-
 def test_an_object_outside_the_workspace_ends_the_episode_and_replaces_the_heap(make, control):
     env = make()
     state = env.reset()

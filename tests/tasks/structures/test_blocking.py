@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 
 from ba_torchrl.sim.meshes import box_mesh, transform_mesh
@@ -96,12 +95,3 @@ def test_clearance_on_the_path_of_a_finger(world, offset, yaw, gap_m):
     at = (AT[0] + 0.05, *AT[1:])
     room = path_clearance_m(GRIPPER, body, yaw, (way_m,), [other], at)
     assert room == pytest.approx(gap_m, abs=1e-4)
-
-
-def test_bodies_below_the_fingertips_do_not_block_the_path(world):
-    body, low = world.add(CUBE, "cube"), world.add(Box(size_m=(0.03, 0.03, 0.006)), "low")
-    body.place(AT)
-    low.place((AT[0] + 0.05, AT[1], 0.003))
-    assert path_clearance_m(GRIPPER, body, 0.0, ((0.015, 0.077),), [low]) < 0
-    raised = (*AT[:2], AT[2] + 0.01)
-    assert path_clearance_m(GRIPPER, body, 0.0, ((0.015, 0.077),), [low], raised) == np.inf
