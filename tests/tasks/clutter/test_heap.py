@@ -217,13 +217,13 @@ def test_when_a_heap_is_replaced(make, monkeypatch, present, attempts, succeeds,
     env = make(num_objects=present, max_attempts=3)
     env.reset()
     task = env.scene.task
-    task.attempts = attempts
+    task.attempts, task.failures = attempts, 1
     grasped_object = task.pool.active[0] if succeeds else None
     monkeypatch.setattr(task, "grasped_object", lambda: grasped_object)
     assert task.continues is should_continue
     task.resume()
     assert task.attempts == attempts + 1
-    assert task.failures == (0 if succeeds else 1)
+    assert task.failures == (0 if succeeds else 2)
     assert len(task.pool.active) == present - succeeds
 
 

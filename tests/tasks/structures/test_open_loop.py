@@ -106,7 +106,9 @@ def test_a_roof_on_one_support_or_off_the_centre_is_not_a_success(house, name):
     roof = h.named["roof 1"]
     x, y, z = roof.position
     if name == "house_building_3":
-        roof.place((x, y + 1.2 * B, z))  # on the cuboid, off its centre
+        cuboid = h.named["cuboid 1"]
+        cuboid.place((x, y + 0.8 * B, cuboid.position[2]))
+        roof.place((x, y + 1.2 * B, z))  # on the cuboid, off the centre of the cubes
     else:
         other = h.cubes[-1]
         side = math.copysign(1.0, other.position[1] - Y)
