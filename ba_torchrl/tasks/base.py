@@ -267,7 +267,7 @@ class OpenLoopTask(Task):
     """A task whose actions are picks and places (appendix A.1, G.1).
 
     Without a z component in the action, `pick_height_m` and `place_height_m` return the height of
-    the tool from the highest point in a window around the target.
+    the tool from ``top_m``, that of the highest point in a window around the target.
     """
 
     control = "open_loop"
@@ -278,27 +278,15 @@ class OpenLoopTask(Task):
     """Opening of the gripper before a pick, 0 to 1."""
 
     def lowest_tool_m(self, xy: tuple[float, float], rotation: Matrix | None = None) -> float:
-        """Return the least height of a pick, at which the fingers close above the ground, metres.
-
-        Args:
-            rotation: rotation of the tool; None if it points down.
-        """
+        """Return the least height of the tool, metres, at which fingers close above the ground."""
         return self.terrain.lowest_tool_m(self.robot.gripper, xy, rotation)
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a pick without z, metres.
-
-        Args:
-            top_m: height of the highest point in the window around the target.
-        """
+        """Return the height of the tool for a pick without z, metres."""
         return max(top_m - self.block_m / 2, self.lowest_tool_m(xy))
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a place without z, metres.
-
-        Args:
-            top_m: height of the highest point in the window around the target.
-        """
+        """Return the height of the tool for a place without z, metres."""
         return top_m + self.block_m / 2
 
     def window_m(self, held: Body | None) -> float:

@@ -1,7 +1,8 @@
 """Clearance of a gripper, from its measured outline.
 
 Clearances are gaps in metres: negative in collision, infinite if no body is near. The x axis is the
-direction in which the fingers close. Only bodies higher than the fingertips count.
+direction in which the fingers close. Only bodies higher than the fingertips count. Openings of the
+gripper are from 0, closed, to 1.
 """
 
 from __future__ import annotations
@@ -37,29 +38,17 @@ PASSING_GAP_M = 0.012
 
 
 def half_gap_m(gripper: Gripper, opening: float = 1.0) -> float:
-    """Return half the width of the gap between the fingers, less a margin.
-
-    Args:
-        opening: opening of the gripper, 0 to 1.
-    """
+    """Return half the width of the gap between the fingers, less a margin."""
     return opening * (gripper.half_gap_m - INNER_MARGIN_M)
 
 
 def finger_extent_m(gripper: Gripper, opening: float = 1.0) -> float:
-    """Return the distance of the fingers' outer sides from the tool point, plus a margin.
-
-    Args:
-        opening: opening of the gripper, 0 to 1.
-    """
+    """Return the distance of the fingers' outer sides from the tool point, plus a margin."""
     return gripper.finger_reach_m - (1 - opening) * gripper.half_gap_m + OUTER_MARGIN_M
 
 
 def finger_ranges_m(gripper: Gripper, opening: float = 1.0) -> tuple[Range, Range]:
-    """Return the ranges that the two fingers occupy, relative to the tool point.
-
-    Args:
-        opening: opening of the gripper, 0 to 1.
-    """
+    """Return the ranges that the two fingers occupy, relative to the tool point."""
     inner, outer = half_gap_m(gripper, opening), finger_extent_m(gripper, opening)
     return (-outer, -inner), (inner, outer)
 
@@ -143,7 +132,6 @@ def grasp_clearance_m(
     """Return the clearance between the fingers, opened around a body's origin, and other bodies.
 
     Args:
-        opening: opening of the gripper, 0 to 1.
         at: assumed position of the body; its present one if None.
     """
     ranges = finger_ranges_m(gripper, opening)
@@ -181,7 +169,6 @@ def tool_clearances_m(
 
     Args:
         tools: K poses of the tool, which may be tilted.
-        opening: opening of the gripper, 0 to 1.
 
     Returns:
         [K] metres.
@@ -208,7 +195,6 @@ def _hand_extents(
 
     Args:
         hand_half_extents_m: half the extents of the hand above the palm.
-        opening: opening of the gripper, 0 to 1.
 
     Returns:
         Extremes [parts, 2, BEARINGS] of each part's outline, and its height [parts] above the tool

@@ -18,7 +18,7 @@ from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m, half_gap_
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
-"""Openings of the gripper."""
+"""The ends of the range of the gripper's opening."""
 IS_OPEN = 0.9
 """Least opening of an open gripper."""
 IS_CLOSED = 0.1
@@ -51,11 +51,7 @@ STANDOFF_M = 0.08
 def move_toward(
     robot: Robot, target: tuple[float, float, float], yaw_rad: float, opening: float
 ) -> GripperCommand:
-    """Return the command towards a pose; the environment limits it.
-
-    Args:
-        opening: opening of the gripper, 0 to 1.
-    """
+    """Return the command towards a pose; the environment limits it."""
     position, yaw = robot.tool_pose()
     dx, dy, dz = (t - p for t, p in zip(target, position, strict=True))
     return GripperCommand(opening, dx, dy, dz, wrap_angle(yaw_rad - yaw))
@@ -111,11 +107,7 @@ def release(body: Body, floor_m: float, limits: ActionLimits) -> GripperCommand:
 
 
 def lift(height_m: float, opening: float = CLOSED) -> GripperCommand:
-    """Return the command of a vertical displacement.
-
-    Args:
-        opening: opening of the gripper, 0 to 1.
-    """
+    """Return the command of a vertical displacement."""
     return GripperCommand(opening, 0.0, 0.0, height_m, 0.0)
 
 
@@ -194,7 +186,6 @@ def push(
 
     Args:
         goal: goal of the tool, metres.
-        opening: opening of the gripper, 0 to 1.
         stop_short_m: distance before the goal at which the tool stops.
     """
     position, yaw = robot.tool_pose()

@@ -148,7 +148,6 @@ def travel(
     small errors lead to no other displacement: what a learner can imitate.
 
     Args:
-        opening: opening of the gripper, 0 to 1.
         below_m: distance from the tool down to the lowest point of gripper and held body.
         obstacles: bodies to pass over.
         ceiling_m: largest height of the tool.

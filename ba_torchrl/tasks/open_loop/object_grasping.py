@@ -59,9 +59,6 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         `DEEPEST_M` and the palm limit the depth below the highest point. The fingertips, which may
         move down as the fingers close, stay above the floor of the tray around an object of
         `OBJECT_WIDTH_M`.
-
-        Args:
-            top_m: height of the highest point in the window around the target.
         """
         gripper = self.robot.gripper
         tips_m = gripper.tip_height_m(OBJECT_WIDTH_M / 2)

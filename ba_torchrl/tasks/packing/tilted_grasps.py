@@ -63,7 +63,6 @@ def tilted_grasp(
         body: the box, longest along y.
         above_centre_m: height of the tool above the centre of the box, along the normal of its top.
         offsets_m: distances of the grasps from the centre along the box.
-        opening: opening of the gripper, 0 to 1.
 
     Returns:
         The grasp; None if none is within reach.

@@ -576,7 +576,6 @@ def edge_grasps(
     Args:
         body: a body on the ground, on which it can slide.
         yaw_rad: yaw of the gripper, up to half a turn.
-        opening: opening of the gripper, 0 to 1.
 
     Returns:
         One grasp for each finger; none if the body nearly fills the gap between the fingers.
