@@ -32,7 +32,7 @@ def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv:
 
 
 def make_resolved(resolved: ResolvedEnv) -> ManipulationEnv:
-    """Make the environment that `resolve_env` described.
+    """Make an environment from what `resolve_env` returned.
 
     Raises:
         ConfigError: the workspace does not suit the objects or the robot.
