@@ -56,7 +56,13 @@ def parse(model: type[Model], values: dict[str, Any], what: str) -> Model:
 class StrictModel(BaseModel):
     """Immutable settings that refuse unknown names, wrong types and infinite numbers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,  # the docstring below a field is its description
+    )
 
 
 def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str]:
@@ -115,12 +121,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 class TaskParameters(StrictModel):
-    """The parameters that one task adds to `EnvConfig`; a task without any uses this class.
-
-    The docstring below a field is its description in the page of the tasks.
-    """
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
+    """The parameters that one task adds to `EnvConfig`; a task without any uses this class."""
 
     @model_validator(mode="before")
     @classmethod
