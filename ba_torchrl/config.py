@@ -6,10 +6,11 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator
 from functools import cache
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from typing_extensions import Self
 
 from ba_torchrl.errors import ConfigError
 

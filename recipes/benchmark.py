@@ -1,4 +1,4 @@
-"""Run a benchmark: tasks x algorithms x networks x seeds. The same command continues a grid: ``ba-torchrl benchmark`` in a clone; see ba_torchrl/commands/benchmark.py."""
+"""``ba-torchrl benchmark`` in a clone; the code is in ba_torchrl/commands/benchmark.py."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Collect demonstrations from a task's expert or by deconstruction of structures, and save them: ``ba-torchrl collect`` in a clone; see ba_torchrl/commands/collect.py."""
+"""``ba-torchrl collect`` in a clone; the code is in ba_torchrl/commands/collect.py."""
 
 import sys
 

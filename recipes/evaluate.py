@@ -1,4 +1,4 @@
-"""Evaluate a trained policy: ``ba-torchrl evaluate`` in a clone; see ba_torchrl/commands/evaluate.py."""
+"""``ba-torchrl evaluate`` in a clone; the code is in ba_torchrl/commands/evaluate.py."""
 
 import sys
 

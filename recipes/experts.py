@@ -1,4 +1,4 @@
-"""Measure the experts: success rate and length of random episodes, as a table in Markdown: ``ba-torchrl experts`` in a clone; see ba_torchrl/commands/experts.py."""
+"""``ba-torchrl experts`` in a clone; the code is in ba_torchrl/commands/experts.py."""
 
 import sys
 

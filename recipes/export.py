@@ -1,4 +1,4 @@
-"""Write the policy of a run into one file, with a card of its success: ``ba-torchrl export`` in a clone; see ba_torchrl/commands/export.py."""
+"""``ba-torchrl export`` in a clone; the code is in ba_torchrl/commands/export.py."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Show a task: the expert, random actions or a trained policy, in a video or in a window: ``ba-torchrl play`` in a clone; see ba_torchrl/commands/play.py."""
+"""``ba-torchrl play`` in a clone; the code is in ba_torchrl/commands/play.py."""
 
 import sys
 

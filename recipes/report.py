@@ -1,4 +1,4 @@
-"""Report the results of runs: curves with standard errors, tables, and a page with videos: ``ba-torchrl report`` in a clone; see ba_torchrl/commands/report.py."""
+"""``ba-torchrl report`` in a clone; the code is in ba_torchrl/commands/report.py."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""List the tasks, describe some of them, or write the page of all: ``ba-torchrl tasks`` in a clone; see ba_torchrl/commands/tasks.py."""
+"""``ba-torchrl tasks`` in a clone; the code is in ba_torchrl/commands/tasks.py."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Train a policy: ``ba-torchrl train`` in a clone; see ba_torchrl/commands/train.py."""
+"""``ba-torchrl train`` in a clone; the code is in ba_torchrl/commands/train.py."""
 
 import sys
 

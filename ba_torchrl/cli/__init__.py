@@ -12,13 +12,26 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 from ba_torchrl import __version__
 from ba_torchrl._malloc import tune_malloc
+from ba_torchrl.errors import install_command
 
 PROGRAM = "ba-torchrl"
 EXIT_CODE = 2
 """Exit code of a command line that cannot be used."""
+OF_TRAINING = (
+    "hydra-core",
+    "omegaconf",
+    "matplotlib",
+    "jinja2",
+    "imageio",
+    "imageio-ffmpeg",
+    "pillow",
+    "joblib",
+)
+"""Packages of the extra [train]."""
 _FOLDER = Path(__file__).parents[1] / "commands"
 
 
@@ -42,12 +55,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
         if os.getcwd() not in sys.path:  # where `plugins` are, as with `python -m`
             sys.path.insert(0, os.getcwd())
-        importlib.import_module(f"ba_torchrl.commands.{first}").COMMAND.run(rest)
+        _import(first).COMMAND.run(rest)
     else:
         close = difflib.get_close_matches(first, command_names(), n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         known = ", ".join(command_names())
         sys.stderr.write(f"error: unknown command {first!r}.{hint} Known: {known}\n")
+        sys.exit(EXIT_CODE)
+
+
+def config_dir() -> Path:
+    """Return the folder of the configurations: in the installed package, or in a clone."""
+    package = _FOLDER.parent
+    installed = package / "configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def _import(command: str) -> ModuleType:
+    """Return the module of a command; end the process if a package of an extra is missing."""
+    try:
+        return importlib.import_module(f"ba_torchrl.commands.{command}")
+    except ModuleNotFoundError as error:
+        package = {"hydra": "hydra-core", "PIL": "pillow"}.get(error.name or "", error.name or "")
+        if package not in OF_TRAINING:
+            raise
+        sys.stderr.write(
+            f"error: {PROGRAM} {command} needs the extra [train] of the package, of which "
+            f"{package!r} is missing: {install_command(*OF_TRAINING)}\n"
+        )
         sys.exit(EXIT_CODE)
 
 

@@ -23,7 +23,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf, open_dict
 from pydantic import BaseModel
 
-from ba_torchrl.cli import PROGRAM
+from ba_torchrl.cli import PROGRAM, config_dir
 from ba_torchrl.cli.errors import name_presets, plain_errors
 from ba_torchrl.cli.help import describe
 from ba_torchrl.config import parse
@@ -34,13 +34,6 @@ from ba_torchrl.training import hydra_schema
 _OF_HYDRA = ("--multirun", "-m", "--cfg", "-c", "--info", "-i", "--package", "-p", "--resolve")
 """Options of Hydra that a command with a configuration has too."""
 LOG_FORMAT = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
-
-
-def config_dir() -> Path:
-    """Return the folder of the configurations: in the installed package, or in a clone."""
-    package = Path(__file__).parents[1]
-    installed = package / "configs"
-    return installed if installed.is_dir() else package.parent / "configs"
 
 
 @dataclass
@@ -99,9 +92,15 @@ class Command:
         logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
         with self.composed(arguments) as settings:
             if arguments.asks_for_help:
-                print(describe(self, OmegaConf.to_container(settings)))  # noqa: T201
+                print(self._help(OmegaConf.to_container(settings)))  # noqa: T201
             else:
                 self._run_composed(settings, arguments)
+
+    def _help(self, values: dict[str, Any]) -> str:
+        word = f" [{self.positional.upper()}]" if self.positional else ""
+        usage = f"{self.name}{word} [FIELD=VALUE ...]"
+        text = sys.modules[self.main.__module__].__doc__ or ""
+        return describe(usage, text, self.settings, values, self.config_names())
 
     def config_names(self, further: str | None = None) -> list[str]:
         """Return the names that ``--config-name`` takes.

@@ -37,8 +37,6 @@ _OUT_OF_MEMORY = ("can't allocate memory", "Cannot allocate memory")
 """Parts of the messages of torch's RuntimeError when the CPU's memory is exhausted."""
 
 
-
-
 def plain_errors(function: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a function: errors of configuration and of resources are printed without traceback.
 

@@ -6,8 +6,8 @@ import re
 import shutil
 import textwrap
 import types
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -23,9 +23,6 @@ from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.collectors.base import COLLECTORS
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS
 
-if TYPE_CHECKING:
-    from ba_torchrl.cli.command import Command
-
 CHOICES = {"robot": ROBOTS, "robots": ROBOTS, "view_type": VIEWS, "observations": OBSERVATIONS}
 """Registries that fields of these names choose from."""
 _PRESETS = ("algorithm", "replay", "rotation", "network", "collector", "launcher", "benchmark")
@@ -38,22 +35,20 @@ _REGISTRIES = {
 _INDENT = 6
 
 
-def describe(command: Command, values: Mapping[str, Any]) -> str:
+def describe(
+    usage: str, text: str, model: type[BaseModel], values: Mapping[str, Any], names: Sequence[str]
+) -> str:
     """Return the help of a command.
 
     Args:
-        command: the command.
+        usage: what follows the program's name.
+        text: description of the command.
+        model: of its settings.
         values: its composed settings, unresolved; the presets among them decide which fields the
             parts of the settings have.
+        names: of its configuration files.
     """
-    module = __import__(command.main.__module__, fromlist=["__doc__"])
-    word = f" [{command.positional.upper()}]" if command.positional else ""
-    lines = [
-        f"usage: {PROGRAM} {command.name}{word} [FIELD=VALUE ...]",
-        "",
-        *(module.__doc__ or "").strip().splitlines(),
-    ]
-    names = command.config_names()
+    lines = [f"usage: {PROGRAM} {usage}", "", *text.strip().splitlines()]
     if names:
         lines += ["", f"--config-name: {' | '.join(names)}"]
         lines += ["--config-dir: a further folder of configurations"]
@@ -63,7 +58,7 @@ def describe(command: Command, values: Mapping[str, Any]) -> str:
                 known = hydra_schema.preset_names(group)
                 if known:
                     lines += _wrapped(f"  {group}=", " | ".join(known))
-    parts = list(_parts(command, values))
+    parts = list(_parts(model, values))
     expanded = {prefix for _, _, _, prefix in parts}
     for title, model, own, prefix in parts:
         lines += ["", f"{title}:"]
@@ -74,10 +69,10 @@ def describe(command: Command, values: Mapping[str, Any]) -> str:
 
 
 def _parts(
-    command: Command, values: Mapping[str, Any]
+    settings: type[BaseModel], values: Mapping[str, Any]
 ) -> Iterator[tuple[str, type[BaseModel], Mapping[str, Any], str]]:
     """Yield title, model, values and prefix of each part of the settings."""
-    yield "settings", command.settings, values, ""
+    yield "settings", settings, values, ""
     if "env" in values:
         task = values.get("task")
         known = isinstance(task, str) and task in TASKS

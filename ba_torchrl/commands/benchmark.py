@@ -28,6 +28,7 @@ from ba_torchrl.training.config import ExperimentConfig, choose
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
 
+
 class Settings(BenchmarkConfig):
     """The grid, and what to do with it."""
 

@@ -31,9 +31,7 @@ def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
     """
     is_resumed = values["resume"] is True and (Path(values["run_dir"]) / CONFIG_FILE).exists()
     if is_resumed and arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
-        return read_config(
-            values["run_dir"], **{name: values[name] for name in arguments.names}
-        )
+        return read_config(values["run_dir"], **{name: values[name] for name in arguments.names})
     return ExperimentConfig.parse(values)
 
 

@@ -81,7 +81,8 @@ class TaskDescription:
             ),
         }
         if len(self.numbers_of_objects) > 1:
-            rows["num_objects"] = f"{self.num_objects} ({', '.join(map(str, self.numbers_of_objects))})"
+            allowed = ", ".join(map(str, self.numbers_of_objects))
+            rows["num_objects"] = f"{self.num_objects} ({allowed})"
         for name, (default, meaning) in self.parameters.items():
             rows[name] = f"{default!r}" + (f". {meaning}" if meaning else "")
         if self.expert is not None:

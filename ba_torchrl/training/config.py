@@ -28,7 +28,7 @@ from ba_torchrl.data.demos import (
 )
 from ba_torchrl.data.time_reversal import check_has_structure
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, install_command
 from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectorConfig
@@ -250,7 +250,7 @@ class ExperimentConfig(WorkerOptions):
         if not is_available(config.logger):
             raise ConfigError(
                 f"logger: {config.logger!r} needs a package that is not installed: "
-                f"pip install 'ba-torchrl[{config.logger}]'"
+                + install_command(config.logger)
             )
         usable_device(config.device)
         return config.model_copy(update={"plugins": config._all_plugins()})

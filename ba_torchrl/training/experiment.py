@@ -6,11 +6,11 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Self
 
 import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
+from typing_extensions import Self
 
 from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.episodes import mean_length, success_rate

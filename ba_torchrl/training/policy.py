@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDictBase
@@ -61,9 +61,9 @@ class PolicyCard(StrictModel):
     """Environment steps of the run, demonstrations not counted."""
     minutes: float | None = None
     """Duration of the run."""
-    hardware: dict[str, Any] = {}
+    hardware: dict[str, Any] = Field(default_factory=dict)
     """Machine of the run."""
-    versions: dict[str, str] = {}
+    versions: dict[str, str] = Field(default_factory=dict)
     """Versions of Python and the packages in the run."""
 
 
@@ -243,4 +243,3 @@ def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
 
     found = binomtest(successes, episodes).proportion_ci(method="wilson")
     return float(found.low), float(found.high)
-

@@ -206,12 +206,12 @@ def test_soft_update_moves_the_targets():
     pairs = [("encoder_network_params", "net", "weight"), ("qvalue_network_params", "net", "bias")]
     with torch.no_grad():
         for name, *path in pairs:
-            getattr(loss, name)["module", *path].add_(1.0)
-    before = [getattr(loss, f"target_{name}")["module", *path].clone() for name, *path in pairs]
+            getattr(loss, name)[("module", *path)].add_(1.0)
+    before = [getattr(loss, f"target_{name}")[("module", *path)].clone() for name, *path in pairs]
     updater.step()
     for (name, *path), old in zip(pairs, before, strict=True):
-        source = getattr(loss, name)["module", *path]
-        target = getattr(loss, f"target_{name}")["module", *path]
+        source = getattr(loss, name)[("module", *path)]
+        target = getattr(loss, f"target_{name}")[("module", *path)]
         torch.testing.assert_close(target, old + 0.25 * (source - old))
         assert not torch.equal(target, old)
     assert not any(n.startswith("target") for n, _ in loss.named_parameters())

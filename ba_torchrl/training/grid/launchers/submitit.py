@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import Field
 from tqdm import tqdm
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, install_command
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.jobs import unfinished
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid, LauncherConfig
@@ -54,7 +54,7 @@ class SubmititConfig(LauncherConfig):
         if find_spec("submitit") is None:
             raise ConfigError(
                 "launcher: 'submitit' needs a package that is not installed: "
-                "pip install 'ba-torchrl[submitit]'"
+                f"{install_command('hydra-submitit-launcher')}"
             )
 
     def run_all(self, grid: Grid) -> dict[Path, str]:
