@@ -6,7 +6,7 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator
 from functools import cache
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -301,6 +301,43 @@ class EnvConfig(StrictModel):
 
 
 _GENERAL_FIELDS.update(EnvConfig.model_fields)
+
+
+class EnvKeywords(TypedDict, total=False):
+    """The keywords of `ba_torchrl.make`, for type checkers; `EnvConfig` describes them."""
+
+    robot: str
+    action_sequence: str | None
+    workspace: tuple[Interval, Interval, Interval] | None
+    object_scale_range: Interval | None
+    max_steps: int | None
+    num_objects: int | None
+    obs_size: int
+    in_hand_size: int | None
+    in_hand_mode: str | None
+    top_down_approach: bool
+    fast_mode: bool
+    render: bool
+    random_orientation: bool
+    half_rotation: bool | None
+    workspace_check: Literal["point", "bounding_box"]
+    close_loop_tray: bool
+    view_type: str
+    view_scale: float
+    dpos: float
+    drot: float
+    obs_type: Literal["pixel", "vec"]
+    rgb: bool
+    point_cloud: int
+    observations: tuple[str, ...]
+    floor_color: Rgb | None
+    workspace_color: Rgb | None
+    physics_mode: Literal["fast", "slow", "custom"]
+    time_step_s: float | None
+    solver_iterations: int | None
+    solver_residual: float | None
+    expert: bool
+    seed: int | None
 
 
 @cache

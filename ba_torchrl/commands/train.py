@@ -54,6 +54,10 @@ def main(config: ExperimentConfig) -> None:
         print(f"  video       {result.video}")
     print(f"  checkpoint  {result.checkpoint}")
     print(f"  result      {result.record}")
+    print("  to use it in Python:")
+    print(f'    policy = ba_torchrl.load_policy("{config.run_dir}")')
+    print("    env = ba_torchrl.make(policy.task, **policy.env_config)")
+    print("    env.rollout(env.max_steps, policy)")
 
 
 COMMAND = Command(main, ExperimentConfig, config="train", parse=parse)

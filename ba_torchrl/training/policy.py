@@ -22,6 +22,7 @@ from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.files import write_text
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import RESULT_FILE, read_result
 from ba_torchrl.tasks.base import TASKS
@@ -100,8 +101,12 @@ class TrainedPolicy(TensorDictModuleBase):
     @property
     def env_config(self) -> dict[str, Any]:
         """Keywords for `ba_torchrl.make` and `ba_torchrl.make_vector_env`, besides the task."""
-        given = self.config.resolved_env.given.items()
-        return {name: value for name, value in given if name not in SET_BY_THE_EXPERIMENT}
+        usual = resolve_env(self.task, {}).config
+        return {
+            name: value
+            for name, value in self.config.resolved_env.config
+            if value != getattr(usual, name) and name not in SET_BY_THE_EXPERIMENT
+        }
 
     @property
     def test_seed(self) -> int:
