@@ -15,13 +15,14 @@ REQUIREMENTS := requirements.txt requirements-no-deps.txt pyproject.toml
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup train test test-slow lint
+.PHONY: help setup train test test-slow test-versions lint
 
 help:
 	@echo "make setup      create $(VENV) with everything this project uses"
 	@echo "make train      the quick start: train, evaluate, write curves and a video"
 	@echo "make test       the tests (minutes)"
 	@echo "make test-slow  the tests that take longer"
+	@echo "make test-versions  the lowest and newest versions, in fresh environments (gigabytes)"
 	@echo "make lint       check style; list long files, deep classes and lines to read"
 	@echo
 	@echo "ARGS='...' is passed on: make train ARGS='seed=1', make test ARGS='-k vector'."
@@ -31,7 +32,7 @@ help:
 setup: $(STAMP)
 
 train: $(STAMP)
-	$(BIN)/python recipes/train.py --config-name quickstart $(ARGS)
+	$(BIN)/ba-torchrl train --config-name quickstart $(ARGS)
 
 # One process per core, each with one thread: numeric libraries would fight over the cores.
 test: $(STAMP)
@@ -39,6 +40,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow $(ARGS)
+
+test-versions: $(STAMP)
+	$(BIN)/python tests/versions.py $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -68,6 +68,7 @@ class Experiment:
         self._state = ResumeState(config.folder, self.algorithm, self._progress)
         self._timer = UpdateTimer()
         self._seconds_per_update: float | None = None
+        self._phase_name = ""
         self._signals = StopSignals()
         self._is_between_updates = False
         """Whether the state can be saved: there is one, and no update is under way."""
@@ -225,13 +226,14 @@ class Experiment:
     @contextmanager
     def _phase(self, name: str) -> Iterator[None]:
         """Context in which the progress bar names what the run does."""
-        before = self._bar.desc
+        before, self._phase_name = self._phase_name, name
         shows = sys.stderr.isatty()  # in a file, each refresh is a line
         self._bar.set_description(name, refresh=shows)
         try:
             yield
         finally:
-            self._bar.set_description_str(before, refresh=shows)
+            self._phase_name = before
+            self._bar.set_description(before, refresh=shows)
 
     def _store(self, data: TensorDict) -> int:
         """Add collected transitions to the replay and count steps, faults and successes.

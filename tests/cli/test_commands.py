@@ -38,6 +38,7 @@ COMMANDS = (
     "plot",
     "report",
     "soak",
+    "measure",
     "speed",
     "tasks",
 )
@@ -71,7 +72,7 @@ REFUSED = [
     ("soak", "tasks=[mine/none]", "unknown task 'mine/none'"),
     ("soak", "steps=1", "steps"),
     ("speed", "foo=1", "unknown"),
-    ("speed", "output=folder.json", "cannot write to "),
+    ("measure", "output=folder.json", "cannot write to "),
 ]
 REQUIRED = {
     "train": ("run_dir=new",),

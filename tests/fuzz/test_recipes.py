@@ -15,7 +15,8 @@ WORK = {
     "experts": "expert_scores",
     "play": "record_episodes",
     "soak": "run_soak",
-    "speed": "measure",
+    "measure": "measure",
+    "speed": "steps_per_second",
     "evaluate": None,  # there is no checkpoint
     "train": "Experiment",
     "benchmark": "plan",

@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[2]
 def printed_table(folder, which):
     """Run the recipe; return the header, the rows and the column of work."""
     done = subprocess.run(
-        [sys.executable, ROOT / "recipes" / "speed.py", f"which={which}", "repeats=1"],
+        [sys.executable, ROOT / "recipes" / "measure.py", f"which={which}", "repeats=1"],
         cwd=folder,
         capture_output=True,
         text=True,

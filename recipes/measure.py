@@ -1,10 +1,10 @@
 """Print times of steps, images and updates, frames per second, and the replay's memory, as a table.
 
-python recipes/speed.py
-python recipes/speed.py which=simulation repeats=50 output=before.json
-python recipes/speed.py which=simulation repeats=50 compare=before.json
-python recipes/speed.py which=learning/equi_sdqfd_update profile=true
-python recipes/speed.py which=learning device=cuda
+python recipes/measure.py
+python recipes/measure.py which=simulation repeats=50 output=before.json
+python recipes/measure.py which=simulation repeats=50 compare=before.json
+python recipes/measure.py which=learning/equi_sdqfd_update profile=true
+python recipes/measure.py which=learning device=cuda
 """
 
 from ba_torchrl._malloc import tune_malloc
