@@ -1,13 +1,14 @@
-# `make train` and `make test` need Python 3.11 and make, nothing else: they set up .venv first.
+# `make train` and `make test` need Python 3.10 to 3.13 and make, nothing else: they set up .venv first.
 
 VENV ?= .venv
 ARGS ?=
 # Another place to take torch from, as a URL for pip's --index-url. Empty: as pip is configured.
 TORCH_INDEX_URL ?=
 
-IS_311 := import sys; sys.exit(sys.version_info[:2] != (3, 11))
-PYTHON ?= $(shell for python in python3.11 python3 python; do \
-	if $$python -c "$(IS_311)" >/dev/null 2>&1; then echo $$python; break; fi; done)
+IS_SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
+# 3.11 first: the last version for which PyBullet has a wheel.
+PYTHON ?= $(shell for python in python3.11 python3 python3.12 python3.13 python3.10 python; do \
+	if $$python -c "$(IS_SUPPORTED)" >/dev/null 2>&1; then echo $$python; break; fi; done)
 
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -53,9 +54,9 @@ lint: $(STAMP)
 # cannot reorder it: torch goes first, or a requirement would pull in another build of it.
 $(STAMP): $(REQUIREMENTS)
 	@rm -f $(STAMP)
-	@if ! $(BIN)/python -c "import pip; $(IS_311)" >/dev/null 2>&1; then \
-		if ! "$(PYTHON)" -c "$(IS_311)" >/dev/null 2>&1; then \
-			echo "Python 3.11 is needed (PyBullet has no ready-made build for later ones)." >&2; \
+	@if ! $(BIN)/python -c "import pip; $(IS_SUPPORTED)" >/dev/null 2>&1; then \
+		if ! "$(PYTHON)" -c "$(IS_SUPPORTED)" >/dev/null 2>&1; then \
+			echo "Python 3.10 to 3.13 is needed." >&2; \
 			echo "$(if $(PYTHON),'$(PYTHON)' is not one,None was found): make PYTHON=/path/to/python3.11 ..." >&2; \
 			exit 1; \
 		fi; \

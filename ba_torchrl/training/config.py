@@ -101,7 +101,7 @@ class ExperimentConfig(WorkerOptions):
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
     policy that has not learnt to turn arrives. None in the appendix."""
     demonstrations_path: str | None = None
-    """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones, and
+    """Folder that `ba-torchrl collect` wrote; its episodes replace newly collected ones, and
     source and noise are those of the folder."""
     pretrain_updates: int = Field(default=0, ge=0)
     """Updates on the demonstrations before the first environment step."""

@@ -215,6 +215,7 @@ def save_policy(
     tensors = policy.policy.state_dict()
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file({name: value.detach().cpu().clone() for name, value in tensors.items()}, path)
+    path.chmod(0o644)  # safetensors makes it readable for its owner alone
     write_text(path.with_suffix(CARD), card.model_dump_json(indent=2) + "\n")
     return card
 
