@@ -136,6 +136,8 @@ class Command:
             raise ConfigError(f"unknown option {options[0]!r}.{_known(options[0], known)}")
         if self.config is None and (found.config_name or found.config_dir):
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
+        if found.config_dir is not None and not Path(found.config_dir).is_dir():
+            raise ConfigError(f"there is no folder {found.config_dir}")
         return Arguments(
             rest if is_for_hydra else list(self._overrides(rest)),
             found.config_name,
@@ -171,17 +173,17 @@ class Command:
         Raises:
             ConfigError: a name is unknown, or the grammar of a word is wrong.
         """
-        overrides = list(arguments.overrides)
-        if arguments.config_dir is not None:
-            folder = Path(arguments.config_dir).resolve()
-            if not folder.is_dir():
-                raise ConfigError(f"there is no folder {arguments.config_dir}")
-            overrides.append(f"hydra.searchpath=['file://{folder}']")
+        overrides, main_folder = list(arguments.overrides), config_dir()
         name = arguments.config_name or self.config or self._store_defaults()
         known = self.config_names(arguments.config_dir)
         if self.config is not None and name not in known:
             raise ConfigError(f"unknown configuration {name!r}.{_known(name, known)}")
-        with initialize_config_dir(str(config_dir()), version_base="1.3", job_name=self.name):
+        if arguments.config_dir is not None:
+            other = Path(arguments.config_dir).resolve()
+            if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
+                main_folder, other = other, main_folder
+            overrides.append(f"hydra.searchpath=['file://{other}']")
+        with initialize_config_dir(str(main_folder), version_base="1.3", job_name=self.name):
             try:
                 settings = compose(name, overrides=overrides, return_hydra_config=True)
             except HydraException as error:

@@ -2,21 +2,20 @@
 
 ba-torchrl speed
 ba-torchrl speed open_loop/bin_packing num_envs=8 updates=0
-ba-torchrl speed close_loop/block_picking env.obs_size=128 network=equi device=cuda
+ba-torchrl speed close_loop/block_picking env.obs_size=128 networks=[equi] device=cuda
 """
 
 from __future__ import annotations
 
 import time
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from pydantic import Field, field_validator
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, NumEnvs, Plugins, Seed, TaskId, Text, checked, without
+from ba_torchrl.cli.types import Count, NumEnvs, Plugins, Seed, TaskId, Text, without
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data import collect_demonstrations, expert_policy
 from ba_torchrl.tasks.base import TASKS
@@ -24,6 +23,9 @@ from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.duration import WARM_UP_UPDATES, compute_path
+
+LEARNERS = {"close_loop": ("sac", "equi_small"), "open_loop": ("spatial_q", "fcn")}
+"""Algorithm and usual network by control."""
 
 
 class Settings(StrictModel):
@@ -41,10 +43,9 @@ class Settings(StrictModel):
     """Environments of the vectors."""
     steps: Count = 200
     """Steps of each measurement."""
-    algorithm: Annotated[str, checked(ALGORITHMS.__getitem__)] | None = None
-    """Of the learner; null for sac in close loop and spatial_q in open loop."""
-    network: Text | None = None
-    """Preset of the learner's network; null for equi_small in close loop, fcn in open loop."""
+    networks: list[Text] | None = Field(default=None, min_length=1)
+    """Presets of networks, each measured with SAC in close loop and spatial Q-learning in open
+    loop; null for equi_small and fcn."""
     updates: int = Field(default=20, ge=0)
     """Updates of each learner; 0 for none."""
     device: Text = "auto"
@@ -69,10 +70,11 @@ def main(settings: Settings) -> None:
         ):
             rate = steps_per_second(task, settings, **{"num_envs": settings.num_envs, **workers})
             print(f"{task:34} {name:17} {rate:10.1f} steps")
-        if settings.updates:
-            config = learner(task, settings)
+        algorithm, usual = LEARNERS[TASKS[task].control]
+        for network in (settings.networks or [usual]) if settings.updates else ():
+            config = learner(task, algorithm, network, settings)
             rate = updates_per_second(config, settings)
-            name = f"{config.algorithm['name']} {settings.network or config.network['name']}"
+            name = f"{algorithm} {network}"
             print(f"{task:34} {name:17} {rate:10.2f} updates, {compute_path(config)}")
 
 
@@ -107,11 +109,15 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
         env.close()
 
 
-def learner(task: str, settings: Settings) -> ExperimentConfig:
-    """Return the configuration of the learner that is measured on a task."""
-    is_close_loop = TASKS[task].control == "close_loop"
-    algorithm = settings.algorithm or ("sac" if is_close_loop else "spatial_q")
-    network = settings.network or ("equi_small" if is_close_loop else "fcn")
+def learner(task: str, algorithm: str, network: str, settings: Settings) -> ExperimentConfig:
+    """Return the configuration of the learner that is measured on a task.
+
+    Args:
+        task: id of the task.
+        algorithm: registered name.
+        network: preset.
+        settings: of the measurement.
+    """
     return ExperimentConfig.parse(
         {
             "plugins": settings.plugins,

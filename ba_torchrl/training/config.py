@@ -79,6 +79,8 @@ class ExperimentConfig(WorkerOptions):
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool | None = None
+    """One process per environment, or all in this process, with the same episodes; None for
+    processes where at least three can run at a time."""
     wait_for_restarts: bool = False
     """In collection; evaluations wait. See `WorkerOptions` for the fields of processes."""
     collector: dict[str, Any] = Field(default_factory=lambda: {"name": "single"})

@@ -175,7 +175,7 @@ def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
 def test_speed_prints_rates(capsys, monkeypatch):
     words = ["close_loop/block_reaching", "env.obs_size=64", "steps=4", "num_envs=2", "updates=1"]
     monkeypatch.setattr("ba_torchrl.commands.speed.WARM_UP_UPDATES", 0)
-    cli.main(["speed", *words, "network=cnn"])
+    cli.main(["speed", *words, "networks=[cnn]"])
     rows = [line for line in capsys.readouterr().out.splitlines() if "block_reaching" in line]
     assert len(rows) == 4
     assert all(float(row.split(" steps")[0].split()[-1]) > 0 for row in rows[:3])
