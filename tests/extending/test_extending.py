@@ -31,8 +31,8 @@ NEW_TASKS = (
 )
 MOST_LINES = {
     "behaviour_cloning": 90,
-    "bridge": 35,
-    "plateau": 60,
+    "bridge": 30,
+    "plateau": 50,
     "tall_block": 70,
     "two_views": 90,
     "wrist_camera": 40,

@@ -16,6 +16,8 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
+from ba_torchrl.tasks.open_loop.houses import HouseBuilding2
+from ba_torchrl.tasks.six_dof import task_on
 from ba_torchrl.tasks.terrain.bumps import Bumps
 from ba_torchrl.tasks.terrain.flat import Flat
 from ba_torchrl.tasks.terrain.ramps import EDGE_MARGIN_M, GAP_M, RampLayout, Ramps
@@ -222,7 +224,7 @@ def test_objects_lie_flush_on_one_side_of_each_edge(make_env, task):
         terrain = task_.terrain
         on_base = []
         for body, piece in task_.structure.pieces.items():
-            _, across = terrain._frame.to_local(*bottom(body)[:, :2].T)
+            _, across = terrain.frame.to_local(*bottom(body)[:, :2].T)
             first, second = terrain.layout.distances_m
             inside = (across < first).all() and (across > -second).all()
             assert inside or (across > first).all() or (across < -second).all()
@@ -373,3 +375,12 @@ def test_a_gap_narrower_than_the_pieces_is_refused(world):
         assert 0.1 <= sum(ramps.layout.distances_m) <= GAP_M[1]
     with pytest.raises(ValueError, match="wider"):
         Ramps(World(), WORKSPACE).reserve(0.25)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "size"), [({}, "13 x 13 cm"), ({"platform_m": (0.2, 0.15)}, "20 x 15 cm")]
+)
+def test_a_row_on_bumps_has_a_platform_of_its_own_or_the_default_size(attributes, size):
+    task = task_on("bump/house_building_2", HouseBuilding2, attributes)
+    assert task.platform_m == attributes.get("platform_m", (0.13, 0.13))
+    assert task.__doc__.startswith(f"House Building 2 on a platform of {size};")

@@ -395,8 +395,7 @@ class CovidTest(OpenLoopTask):
         z = vertical_extent(body)[0] + self._grasp_m
         grasp = downward_pose((x, y, z), self._grasp_yaw(body))
         if not self._can_grasp(body):
-            can_turn = self.action_limits.turn_rad > 0
-            return perturbed_pick(self.world, body, grasp, can_turn=can_turn)
+            return perturbed_pick(self.world, body, grasp, self.action_limits)
         return pick_command(grasp)
 
     def _pick_candidates(self) -> list[Body]:

@@ -23,7 +23,6 @@ class HouseBuilding1(StructureTask):
     triangle tips over or a piece leaves the workspace. Appendix A.1.
     """
 
-    max_steps = 10
     num_objects = 4
     num_objects_range = (2, 6)
 
@@ -41,7 +40,6 @@ class HouseBuilding2(StructureTask):
     piece leaves the workspace. Appendix A.1.
     """
 
-    max_steps = 10
     num_objects = 3
     num_objects_range = (3, 3)
 
@@ -62,7 +60,6 @@ class HouseBuilding3(StructureTask):
     """
 
     scale_limits = (0.55, 0.9)
-    max_steps = 10
     num_objects = 4
     num_objects_range = (4, 4)
 
@@ -116,7 +113,6 @@ class ImproviseHouseBuilding2(StructureTask):
     tips over or leaves the workspace. Appendix A.1.
     """
 
-    max_steps = 10
     num_objects = 3
     num_objects_range = (3, 3)
     start_gap_m = START_GAP_M
@@ -139,7 +135,6 @@ class ImproviseHouseBuilding3(StructureTask):
     """
 
     scale_limits = (0.55, 0.9)
-    max_steps = 10
     num_objects = 4
     num_objects_range = (4, 4)
     start_gap_m = START_GAP_M

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Matrix, Pose, yaw_quaternion
+from ba_torchrl.sim.geometry import Matrix
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Color, Solid
@@ -105,10 +105,6 @@ class Tray(Terrain):
         objects fail: of 200 picks without yaw 167 succeed instead of 175.
         """
         return gripper.lowest_tool_m(rotation, opening)
-
-    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
-        """Return the pose of an upright frame on the base."""
-        return Pose((*xy, FLOOR_Z_M), yaw_quaternion(yaw_rad))
 
 
 _SIGNS = ((-1, -1), (1, -1), (1, 1), (-1, 1))

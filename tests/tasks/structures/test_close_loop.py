@@ -131,11 +131,16 @@ def test_stacking_is_evaluated_at_rest(make_started, position, expected):
     assert outcome["reward"] == float(expected)
 
 
-def test_a_tipped_triangle_ends_the_episode_without_reward(make_started):
+def test_a_tipped_triangle_ends_the_episode_without_reward(make_started, monkeypatch):
     env = make_started(HOUSE)
-    triangle = triangle_of(env.scene.task)
+    task, triangle = env.scene.task, triangle_of(env.scene.task)
     slope = math.pi - math.atan2(0.05, 0.025)
-    triangle.set_pose((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
+    for tilt, valid in ((math.pi / 9 - 0.02, True), (math.pi / 9 + 0.02, False), (slope, False)):
+        triangle.set_pose((0.45, 0.0, 0.04), (0.0, math.sin(tilt / 2), 0.0, math.cos(tilt / 2)))
+        assert task.is_valid() is valid
+    with monkeypatch.context() as patch:
+        patch.setattr(task.robot, "held_body", lambda: triangle)
+        assert task.is_valid()
     env.scene.world.settle()
     assert triangle.tilt_rad > 1.0
     outcome = no_op(env)
