@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import world_vertices
-from ba_torchrl.sim.geometry import PlanarFrame, quaternion_matrix, tool_rotation
+from ba_torchrl.sim.geometry import quaternion_matrix, tool_rotation
 from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
@@ -145,27 +145,6 @@ def test_the_pyramids_have_slopes_up_to_15_degrees_and_the_platform_their_height
     assert max(headings) - min(headings) > 2.5
     assert bumps.top_m == pytest.approx(0.1 * math.tan(math.pi / 12))
     assert bumps.height_m(bumps.layout.platform[:2]) == bumps.top_m
-
-
-def test_bumps_are_pyramids_side_by_side_with_the_platform_above_them(world):
-    bumps = make_bumps(world)
-    rows = PlanarFrame(*WORKSPACE.center, bumps.layout.heading_rad)
-    points = np.random.default_rng(2).uniform((0.0, -0.35), (0.9, 0.55), (500, 2))
-    heights = bumps.heights_m(points)
-    for xy, height in zip(points, heights, strict=True):
-        local = np.array(rows.to_local(*xy))
-        expected = 0.0
-        for cell, number in enumerate(bumps.layout.pyramids):
-            offset = np.abs(local - bumps.base_m * (np.array(divmod(cell, 3)) - 1)).max()
-            slope = math.tan(bumps.slopes_rad[number])
-            expected = max(expected, slope * (bumps.base_m / 2 - offset))
-        along, across = bumps.layout.platform.to_local(*xy)
-        is_inside = 0.25 <= xy[0] <= 0.65 and -0.1 <= xy[1] <= 0.3
-        if is_inside and abs(along) <= 0.065 and abs(across) <= 0.05:
-            expected = bumps.top_m
-        assert height == pytest.approx(expected, abs=1e-12)
-    assert (heights == bumps.top_m).any()
-    assert (heights == 0.0).any()
 
 
 def test_on_level_ground_the_least_height_of_the_tool_is_that_of_a_flat_floor(world):

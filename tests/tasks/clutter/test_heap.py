@@ -187,11 +187,11 @@ def test_the_heap_is_replaced_after_the_configured_number_of_attempts(make, cont
 
 
 @both_controls
-@pytest.mark.parametrize("count", [1, 4, 5])
+@pytest.mark.parametrize("count", [1, 5])
 def test_the_default_number_of_attempts_is_that_of_the_reference(make, control, count):
     env = make(num_objects=count)
     env.reset()
-    expected = {"close_loop": {1: 2, 4: 6, 5: 8}[count], "open_loop": 30}[control]
+    expected = {"close_loop": {1: 2, 5: 8}[count], "open_loop": 30}[control]
     assert env.scene.task.max_attempts == expected
     with pytest.raises(ConfigError, match="max_attempts"):
         make(max_attempts=0)
