@@ -36,6 +36,11 @@ class Workspace:
         """Extent along x."""
         return self.x[1] - self.x[0]
 
+    @property
+    def upper_corner(self) -> Vector:
+        """The corner with the largest coordinates."""
+        return (self.x[1], self.y[1], self.z[1])
+
     def contains(self, point: Vector) -> bool:
         """Whether a point lies strictly inside."""
         return all(

@@ -22,8 +22,8 @@ TOP_M = SIDE + BELOW_M + TRAVEL_CLEARANCE_M
 class Table:
     """Kuka and cubes on the floor."""
 
-    def __init__(self):
-        self.world = World()
+    def __init__(self, world):
+        self.world = world
         self.robot = ROBOTS["kuka"](self.world)
         self.robot.set_opening(1.0)
 
@@ -41,9 +41,8 @@ class Table:
 
 @pytest.fixture
 def table():
-    found = Table()
-    yield found
-    found.world.close()
+    with World() as world:
+        yield Table(world)
 
 
 def over(table, obstacle, z=TOP_M):

@@ -306,8 +306,7 @@ class CovidTest(OpenLoopTask):
     @property
     def landmarks(self) -> Sequence[YawPose]:
         """Poses of areas, tubes and swabs; the upper corner of the workspace for used swabs."""
-        workspace, layout = self.settings.workspace, self.layout
-        corner = ((workspace.x[1], workspace.y[1], workspace.z[1]), 0.0)
+        layout, corner = self.layout, (self.settings.workspace.upper_corner, 0.0)
         areas = (layout.new_box, layout.used_box, layout.test_area)
         return [
             corner if body in self._used_swabs else (body.position, body.yaw_rad)

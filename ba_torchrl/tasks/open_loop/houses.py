@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, tower
-from ba_torchrl.tasks.structures.improvise import (
-    START_GAP_M,
-    any_cuboid,
-    any_shape,
-    shape_span,
-    with_circular_spacing,
-)
+from ba_torchrl.tasks.structures.improvise import START_GAP_M, any_cuboid, any_shape, shape_span
 from ba_torchrl.tasks.structures.pieces import cube, cuboid, pair_span, roof, triangle
 
 
@@ -121,7 +117,7 @@ class ImproviseHouseBuilding2(StructureTask):
     def blueprint(self) -> Blueprint:
         """Return two shapes that support the roof."""
         shape = any_shape()
-        across = Slot(with_circular_spacing(roof(self.block_m)), on=(0, 1), span=shape_span())
+        across = Slot(replace(roof(self.block_m), spacing=None), on=(0, 1), span=shape_span())
         return Blueprint((Slot(shape), Slot(shape), across))
 
 
@@ -148,6 +144,6 @@ class ImproviseHouseBuilding3(StructureTask):
                 Slot(shape),
                 Slot(shape),
                 Slot(any_cuboid(), on=(0, 1), span=shape_span()),
-                Slot(with_circular_spacing(roof(self.block_m)), on=(2,), centered_over=(0, 1)),
+                Slot(replace(roof(self.block_m), spacing=None), on=(2,), centered_over=(0, 1)),
             )
         )

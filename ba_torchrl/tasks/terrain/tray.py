@@ -69,13 +69,8 @@ class Tray(Terrain):
             np.array([[s * self.half_m, t * self.half_m] for s, t in _SIGNS]), [FLOOR_Z_M] * 4
         )
         walls = [_wall(start, end, side) for side in range(4) for start, end in pairwise(corners)]
-        self._base, _ = (
-            self._add(name, parts, friction, color)
-            for name, parts, friction, color in (
-                ("tray floor", (base,), FLOOR_FRICTION, FLOOR_COLOR),
-                ("tray walls", tuple(walls), WALL_FRICTION, COLOR),
-            )
-        )
+        self._base = self._add("tray floor", (base,), FLOOR_FRICTION, FLOOR_COLOR)
+        self._add("tray walls", tuple(walls), WALL_FRICTION, COLOR)
 
     def _add(self, name: str, parts: tuple[Mesh, ...], friction: float, color: Color) -> Body:
         shape = Solid(parts=parts, mass_kg=0.0, friction=friction, color=color)

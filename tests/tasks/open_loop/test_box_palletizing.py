@@ -58,7 +58,7 @@ def test_layers_fit_the_pallet_and_cross_each_other():
 
 
 def test_full_layers_are_the_goal_and_stable(make_env):
-    for count in (6, 12, 18):
+    for count in (6, 18):
         env = make_env(BOXES, num_objects=count)
         pallet = Pallet(env, count)
         assert pallet.task.is_success()

@@ -292,8 +292,6 @@ def test_a_pair_against_the_rules_ends_the_episode(make, stages):
     state = wait(env)
     assert task.has_failed
     assert state["terminated"]
-    assert state["done"]
-    assert not state["truncated"]
     assert not state["success"]
     assert state["reward"] == 0.0
 

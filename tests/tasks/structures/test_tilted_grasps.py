@@ -34,7 +34,7 @@ SIDES = [  # rotations that turn a cube onto each of its sides
 ]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def body():
     with World() as world:
         yield world.add(Box(size_m=(0.03, 0.12, 0.03)), "body")
