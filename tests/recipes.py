@@ -22,12 +22,12 @@ def load_recipe(name):
     return module
 
 
-def recipe(name, *overrides):
-    """Run a recipe in this process."""
+def recipe(name, *overrides, config_name=None):
+    """Run a recipe in this process, with the configuration of its name or another one."""
     module = load_recipe(name)
     hydra_schema.register()
     with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
-        settings = compose(name, overrides=list(overrides), return_hydra_config=True)
+        settings = compose(config_name or name, overrides=list(overrides), return_hydra_config=True)
         HydraConfig.instance().set_config(settings)
         with open_dict(settings):
             del settings["hydra"]

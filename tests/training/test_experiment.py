@@ -2,12 +2,11 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import SeedUse
@@ -26,8 +25,8 @@ from ba_torchrl.training.collection import gather_demonstrations
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
+from tests.recipes import recipe
 
-ROOT = Path(__file__).parents[2]
 TINY = {
     "task": "close_loop/block_reaching",
     "env": {"obs_size": 64, "max_steps": 8},
@@ -118,9 +117,6 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
         assert torch.equal(value, state[key]), key
     pixels = torch.rand(3, 1, 64, 64) * 0.3
     holding = torch.zeros(3, 1, dtype=torch.bool)
-    from tensordict import TensorDict
-    from torchrl.envs.utils import ExplorationType, set_exploration_type
-
     observation = TensorDict({"pixels": pixels, "holding": holding}, batch_size=[3])
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         a = experiment.algorithm.policy(observation.clone())
@@ -337,28 +333,25 @@ def test_a_run_survives_a_worker_that_dies(tmp_path, monkeypatch):
     assert experiment.algorithm.replay.faults_dropped >= 1  # more while the worker starts
 
 
-def run_recipe(name, *arguments):
-    command = [sys.executable, f"recipes/{name}.py", *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
+def test_the_recipes_from_collection_to_evaluation(tmp_path, capsys):
+    def printed(name, *overrides, config_name=None):
+        recipe(name, *overrides, config_name=config_name)
+        return capsys.readouterr().out
 
-
-def test_the_recipes_from_the_command_line(tmp_path):
     demos = tmp_path / "demos"
-    out = run_recipe(
+    out = printed(
         "collect_demos",
         "task=close_loop/block_reaching",
         "episodes=4",
         "num_envs=2",
+        "parallel=false",
         "env.obs_size=64",
         "env.max_steps=10",
         f"path={demos}",
     )
     assert "4 episodes of close_loop/block_reaching, success 1.00" in out
-    out = run_recipe(
+    out = printed(
         "train",
-        "--config-name=quickstart",
         "task=close_loop/block_reaching",
         "network=cnn",
         "network.width=0.25",
@@ -374,14 +367,17 @@ def test_the_recipes_from_the_command_line(tmp_path):
         "num_envs=2",
         "video_episodes=1",
         f"run_dir={tmp_path}/run",
+        config_name="quickstart",
     )
     assert "over 4 episodes" in out
     assert f"{tmp_path}/run/learning_curve.png" in out
     gif = tmp_path / "film.gif"
-    out = run_recipe(
+    out = printed(
         "evaluate",
         f"checkpoint={tmp_path}/run",
         "episodes=3",
+        "num_envs=2",
+        "parallel=false",
         "expert=true",
         f"video={gif}",
         "video_episodes=1",

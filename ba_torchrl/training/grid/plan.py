@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -120,6 +121,7 @@ def plan(
         ConfigError: a name is unknown, a value cannot be used, or parts do not go together.
     """
     load_plugins(common.get("plugins", ()))
+    preset = functools.cache(preset)
     _check_axes(config, preset)
     presets = {
         (group, name): preset(group, name)
