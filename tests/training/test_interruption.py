@@ -16,8 +16,8 @@ from ba_torchrl.training import experiment as experiments
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.interruption import RunStopped
+from ba_torchrl.training.persistence import lock_holder
 from ba_torchrl.training.resume import resumable_updates
-from ba_torchrl.training.run_lock import lock_holder
 
 SAC = {
     "task": "close_loop/block_reaching",

@@ -1,6 +1,7 @@
 """Runs of a grid in separate processes: failures, interruptions, resumption."""
 
 import fcntl
+import functools
 import json
 import os
 import signal
@@ -17,8 +18,9 @@ from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
+from ba_torchrl.training.grid.launchers import local
 from ba_torchrl.training.grid.plan import status
-from ba_torchrl.training.run_lock import RunLock
+from ba_torchrl.training.persistence import RunLock
 from tests.recipes import recipe
 from tests.training.grid.grids import COMMON, REACH, planned
 
@@ -296,36 +298,36 @@ def children_of(pid):
     return found
 
 
-def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys):
+def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monkeypatch):
     small = [f"{name}={value}" for name, value in COMMON.items() if not isinstance(value, dict)]
-    arguments = (
-        *small,
-        f"tasks=[{REACH}]",
-        "algorithms=[sacfd]",
-        "networks=[cnn]",
-        "seeds=2",
-        "env.obs_size=64",
-        "env.max_steps=8",
-        "algorithm.batch_size=8",
-        "network.width=0.25",
-        f"folder={tmp_path}/grid",
-    )
-    # a run that cannot start, since its folder is taken by a file
-    (tmp_path / "grid/close_loop_block_reaching/sacfd_cnn/seed0").mkdir(parents=True)
-    blocked = tmp_path / "grid/close_loop_block_reaching/sacfd_cnn/seed0/checkpoints"
-    blocked.write_text("a file")
-    handler = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(SystemExit) as end:
-            recipe("benchmark", *arguments)
-    finally:
-        signal.signal(signal.SIGTERM, handler)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the recipe's handler would stay
+
+    def printed(*arguments):
+        recipe(
+            "benchmark",
+            *small,
+            f"tasks=[{REACH}]",
+            "algorithms=[sacfd]",
+            "networks=[cnn]",
+            "env.obs_size=64",
+            "env.max_steps=8",
+            "algorithm.batch_size=8",
+            "network.width=0.25",
+            f"folder={tmp_path}/grid",
+            *arguments,
+        )
+        return capsys.readouterr().out
+
+    assert "1 of 1 runs done" in printed("seeds=1")
+    breaking = [sys.executable, "-c", "raise SystemExit('it broke')"]
+    monkeypatch.setattr(local, "run_all", functools.partial(run_all, worker=breaking))
+    with pytest.raises(SystemExit) as end:
+        printed("seeds=2")
     assert end.value.code == 1
     out = capsys.readouterr().out
     assert "1 of 2 runs done" in out
     assert "failed  " in out
-    recipe("benchmark", *arguments, "dry_run=true")
-    assert "2 runs: 1 failed, 1 done" in capsys.readouterr().out
+    assert "2 runs: 1 done, 1 failed" in printed("seeds=2", "dry_run=true")
     page = write_report([tmp_path / "grid"], tmp_path / "report").read_text()
     assert "close_loop_4d" in page
     assert "sacfd cnn" in page
