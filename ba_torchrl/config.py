@@ -354,4 +354,19 @@ def env_config_model(parameters: type[TaskParameters]) -> type[EnvConfig]:
             f"{parameters.__qualname__} repeats parameters of every environment: "
             f"{', '.join(sorted(repeated))}"
         )
-    return type(EnvConfig.__name__, (parameters, EnvConfig), {"__module__": __name__})
+    return type(
+        EnvConfig.__name__,
+        (parameters, EnvConfig),
+        {
+            "__module__": __name__,
+            "__reduce__": lambda self: (_restored, (parameters, self.__getstate__())),
+        },
+    )
+
+
+def _restored(parameters: type[TaskParameters], state: dict[str, Any]) -> EnvConfig:
+    """Return a configuration of `env_config_model` from its pickled state."""
+    model = env_config_model(parameters)
+    config = model.__new__(model)
+    config.__setstate__(state)
+    return config

@@ -21,6 +21,7 @@ def load_recipe(name):
     return module
 
 
-def recipe(name, *words):
-    """Run a command or a recipe in this process."""
-    load_recipe(name).COMMAND.run(words)
+def recipe(name, *words, config_name=None):
+    """Run a command or a recipe in this process, with the configuration of its name or another."""
+    chosen = [] if config_name is None else ["--config-name", config_name]
+    load_recipe(name).COMMAND.run([*chosen, *words])

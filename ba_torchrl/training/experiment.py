@@ -27,8 +27,8 @@ from ba_torchrl.training.duration import UpdateTimer, compute_path
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
 from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
+from ba_torchrl.training.persistence import RunLock
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
-from ba_torchrl.training.run_lock import RunLock
 
 logger = logging.getLogger(__name__)
 
