@@ -115,6 +115,7 @@ def check() -> dict[str, object]:
     checks["quick start"] = check_quick_start
     failures = []
     for name, each in checks.items():
+        print(f"{time.strftime('%X')} {name}", file=sys.stderr)
         try:
             each()
         except Exception as error:  # all of them are listed
