@@ -244,7 +244,7 @@ def test_demonstrations_of_a_folder_are_filtered(tmp_path, caplog):
 
 def test_a_logger_without_its_package_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("ba_torchrl.training.config.is_available", lambda backend: False)
-    with pytest.raises(ConfigError, match="pip install .*wandb"):
+    with pytest.raises(ConfigError, match=r"pip install .*wandb"):
         tiny(tmp_path, logger="wandb")
 
 
