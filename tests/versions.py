@@ -186,12 +186,16 @@ def updates() -> list[tuple[str, object]]:
         for name, values in presets["network"].items()
     ]
 
+    def small(values: dict[str, object]) -> dict[str, object]:
+        has_width = "width" in NETWORKS[values["name"]].model_fields
+        return {**values, **({"width": 0.25} if has_width else {})}
+
     def one_update(control: str, algorithm: str, network: str) -> None:
         values = {
             "task": usual[control][0],
             "env": {"obs_size": 142 if algorithm == "ferm" else 64},
             "algorithm": {**presets["algorithm"][algorithm], "batch_size": 2},
-            "network": presets["network"][network],
+            "network": small(presets["network"][network]),
             "pretrain_updates": 1,
         }
         check_update(values)
