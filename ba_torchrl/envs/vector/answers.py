@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from ctypes import Array, c_byte
-from multiprocessing.connection import wait
 from typing import Any
 
 from ba_torchrl.envs.vector.worker import Worker, wait_until
@@ -16,7 +15,7 @@ _HEALTH_CHECK_S = 5e-3
 def collect_flags(
     workers: Sequence[Worker], pending: set[int], flags: Array[c_byte]
 ) -> dict[int, WorkerError]:
-    """Wait briefly for workers that answer through shared memory.
+    """Wait briefly for the workers' answers, which are in shared memory.
 
     Args:
         workers: all workers.
@@ -43,20 +42,6 @@ def collect_flags(
         except WorkerError as error:
             if not flags[index]:  # else it answered before it ended
                 failures[index] = error
-    return failures
-
-
-def collect_messages(workers: Sequence[Worker], pending: set[int]) -> dict[int, WorkerError]:
-    """As `collect_flags`, for workers that answer through pipes."""
-    failures: dict[int, WorkerError] = {}
-    pipes = {workers[index].pipe: index for index in pending}
-    for pipe in wait(list(pipes), _HEALTH_CHECK_S):
-        worker = workers[pipes[pipe]]
-        try:
-            worker.inbox.append(worker.read(0.0))  # TorchRL reads it from the inbox
-            pending.discard(pipes[pipe])
-        except WorkerError as error:
-            failures[pipes[pipe]] = error
     return failures
 
 

@@ -11,7 +11,6 @@ import signal
 import sys
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable
 from multiprocessing import util
 from multiprocessing.connection import Connection
@@ -40,8 +39,8 @@ class EnvironmentRaisedError(WorkerError):
 class Worker:
     """A process that runs one of TorchRL's worker loops, and the pipe to it.
 
-    It has the interface of a pipe, which TorchRL expects. It stores the last command and the
-    answers that were read in advance. Reading from a broken pipe raises a `WorkerError`.
+    It has the interface of a pipe, which TorchRL expects, and stores the last command. Reading from
+    a broken pipe raises a `WorkerError`.
 
     Args:
         loop: TorchRL's worker loop.
@@ -62,7 +61,6 @@ class Worker:
         context = mp.get_context(start_method)
         self.pipe, child_pipe = context.Pipe()
         self.event = context.Event()
-        self.inbox: deque[Any] = deque()
         self.message: tuple[Any, Any] = ("start", None)
         self.muted = False  # commands are dropped, because the episode is lost
         self._timeout_s, self._start_timeout_s = timeout_s, start_timeout_s
@@ -129,7 +127,7 @@ class Worker:
         Raises:
             WorkerError: the worker failed.
         """
-        return self.inbox.popleft() if self.inbox else self.read(self._timeout_s)
+        return self.read(self._timeout_s)
 
     def read(self, timeout_s: float, *, limit_s: float | None = None) -> Any:
         """Return the next message of the pipe.
@@ -159,7 +157,6 @@ class Worker:
         Raises:
             WorkerError: the worker has ended.
         """
-        self.inbox.clear()
         while self.process.exitcode is not None or self.pipe.poll():
             self.read(0.0)
 

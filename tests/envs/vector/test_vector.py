@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
+from fake_env import FakeEnv, act, assert_lost, assert_stepped
 from torchrl.collectors import Collector
 
 import ba_torchrl
@@ -28,10 +28,9 @@ class TestSeeds:
         rollout = env.rollout(3, auto_reset=True, break_when_any_done=False)
         return torch.cat([first[:, None], rollout["pixels"]], 1)
 
-    @pytest.mark.parametrize("options", [{}, {"use_buffers": False}], ids=["buffers", "pipes"])
-    def test_serial_and_parallel_agree(self, make_fakes, options):
+    def test_serial_and_parallel_agree(self, make_fakes):
         serial = make_fakes(3, seed=5, parallel=False)
-        parallel = make_fakes(3, seed=5, **options)
+        parallel = make_fakes(3, seed=5)
         expected = self.pixels(serial)
         assert torch.equal(self.pixels(parallel), expected)
         assert len(expected[:, 0].unique(dim=0)) == 3
@@ -59,7 +58,7 @@ class TestSeeds:
 
 
 class TestResets:
-    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}])
     def test_partial(self, make_fakes, options):
         env = make_fakes(3, **options)
         state = env.reset()
@@ -78,7 +77,7 @@ class TestResets:
         assert torch.equal(after["pixels"], state["pixels"])
         assert after["step_count"].flatten().tolist() == [1, 1]
 
-    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}])
     def test_rollout_continues_after_done(self, make_fakes, options):
         env = make_fakes(horizon=3, **options)
         rollout = env.rollout(7, break_when_any_done=False)
@@ -97,7 +96,7 @@ class TestResets:
 
 
 class TestActions:
-    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}])
     @pytest.mark.parametrize("method", ["step", "step_and_maybe_reset"])
     @pytest.mark.parametrize(
         ("action", "message"),
@@ -135,9 +134,8 @@ class TestActions:
 
 
 class TestWithTheRestOfTorchRL:
-    @BUFFERS
-    def test_a_collector_survives_a_kill(self, make_fakes, use_buffers):
-        env = make_fakes(2, use_buffers=use_buffers, horizon=5)
+    def test_a_collector_survives_a_kill(self, make_fakes):
+        env = make_fakes(2, horizon=5)
         collector = Collector(env, None, frames_per_batch=20, total_frames=60)
         batches = []
         for batch in collector:
@@ -176,10 +174,9 @@ class TestWithTheRestOfTorchRL:
 
 
 class TestResources:
-    @BUFFERS
-    def test_restarts_and_close_leak_nothing(self, use_buffers):
+    def test_restarts_and_close_leak_nothing(self):
         def live():
-            env = make_vector(FakeEnv, 2, seed=0, workers=FORK, use_buffers=use_buffers)
+            env = make_vector(FakeEnv, 2, seed=0, workers=FORK)
             state = env.reset()
             for _ in range(4):
                 os.kill(env.worker_pids[0], signal.SIGKILL)
@@ -209,13 +206,12 @@ class TestResources:
         env.close()
         assert time.perf_counter() - start < 3
 
-    @pytest.mark.parametrize("num_threads", [None, 1])
-    def test_threads_of_this_process(self, make_fakes, num_threads):
+    def test_threads_of_this_process(self, make_fakes):
         before = torch.get_num_threads()
         torch.set_num_threads(2)
         try:
-            env = make_fakes(2, num_threads=num_threads)
-            assert torch.get_num_threads() == (num_threads or 2)
+            env = make_fakes(2)
+            assert torch.get_num_threads() == 2
             env.close()
             assert torch.get_num_threads() == 2
         finally:

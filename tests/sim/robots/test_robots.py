@@ -301,7 +301,7 @@ def test_a_block_pushed_by_a_finger_is_not_held(scene):
 
 @pytest.mark.parametrize("shared", ["kuka"], indirect=True)
 def test_a_pushed_block_stays_at_the_finger(scene):
-    """Also after it has come to rest: too fast or too sudden a stop leaves a gap of 5 mm or more."""
+    """Too fast a motion or too sudden a stop leaves a gap of 5 mm or more when it is at rest."""
     block, motion = scene.put(), scene.motion
     motion.grip(0.5)
     motion.move_to((0.45, -0.06, 0.2), 0.0)
