@@ -153,6 +153,7 @@ class TestWithTheRestOfTorchRL:
         assert data["step_count"][0, 11].item() == 0
         assert data["step_count"][1].flatten().tolist() == [0, 1, 2, 3, 4] * 6
 
+    @pytest.mark.slow
     def test_spawn(self, make_fakes):
         env = make_fakes(2, seed=3, start_method="spawn", timeout_s=60.0)
         expected = make_fakes(2, seed=3, parallel=False).reset()
