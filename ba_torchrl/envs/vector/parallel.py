@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from ctypes import Array, c_byte
 from typing import Any
 
 import torch
@@ -17,10 +18,9 @@ from torchrl.envs.batched_envs import _run_worker_pipe_shared_mem
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.envs.vector.answers import ask_all, collect_flags
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.replacement import Replacements, seed_worker
-from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker
+from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker, wait_until
 from ba_torchrl.errors import WorkerError
 
 MakeEnv = Callable[[], EnvBase]
@@ -37,6 +37,7 @@ _LOST_STEP = {
 }
 _ABSENT = {**_LOST_STEP, keys.TRUNCATED: False, keys.DONE: False}
 _START_POLL_S = 1.0
+_HEALTH_CHECK_S = 5e-3
 
 
 class VectorEnv(SeededVector, ParallelEnv):
@@ -364,3 +365,65 @@ class VectorEnv(SeededVector, ParallelEnv):
                 answer.get(key).copy_(root.get(key))
         for key in values.keys() & set(answer.keys()):
             answer.get(key).fill_(values[key])
+
+
+def collect_flags(
+    workers: Sequence[Worker], pending: set[int], flags: Array[c_byte]
+) -> dict[int, WorkerError]:
+    """Wait briefly for the workers' answers, which are in shared memory.
+
+    Args:
+        workers: all workers.
+        pending: indices of those that have not answered; those that answer are removed.
+        flags: set by the workers.
+
+    Returns:
+        The errors of ended workers, by index.
+    """
+
+    def all_answered() -> bool:
+        for index in tuple(pending):
+            if flags[index]:
+                flags[index] = 0
+                pending.discard(index)
+        return not pending
+
+    failures: dict[int, WorkerError] = {}
+    if wait_until(all_answered, _HEALTH_CHECK_S):
+        return failures
+    for index in pending:
+        try:
+            workers[index].check()
+        except WorkerError as error:
+            if not flags[index]:  # else it answered before it ended
+                failures[index] = error
+    return failures
+
+
+def ask_all(
+    workers: Sequence[Worker], method: str, arguments: Sequence[tuple[Any, ...]], timeout_s: float
+) -> list[Any]:
+    """Call a method of every worker's environment and return the results.
+
+    Args:
+        workers: all workers.
+        method: name of the method.
+        arguments: of each worker's call.
+        timeout_s: seconds to wait for each answer.
+
+    Raises:
+        WorkerError: a worker has failed.
+    """
+    for worker, args in zip(workers, arguments, strict=True):
+        worker.check()
+        worker.send((method, (args, {})))
+    results, failure = [], None
+    for worker in workers:
+        try:
+            results.append(worker.read(timeout_s)[1])
+        except WorkerError as error:
+            worker.abort()  # a late answer would be taken for that to the next command
+            failure = error
+    if failure is not None:
+        raise failure
+    return results

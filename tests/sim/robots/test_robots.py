@@ -416,7 +416,6 @@ def test_random_actions_keep_blocks_in_place_and_repeat_bit_by_bit(name):
 
 EXPERTS = [
     ("picking", {}),
-    ("pulling", {"random_orientation": False, "action_sequence": "pxyz"}),
     *(
         pytest.param(task, variant, marks=pytest.mark.slow)
         for task in ("reaching", "picking", "pushing", "pulling")
