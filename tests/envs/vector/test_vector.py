@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from functools import partial
+from typing import ClassVar
 
 import pytest
 import torch
@@ -48,13 +49,13 @@ class TestSeeds:
         assert torch.equal(env.reset()["pixels"], at_start)
 
     @pytest.mark.parametrize("parallel", [False, True])
-    @pytest.mark.parametrize("seed", [-1, 1.5, True])
-    def test_refuses_invalid_seeds(self, make_fakes, parallel, seed):
+    def test_refuses_invalid_seeds(self, make_fakes, parallel):
         env = make_fakes(1, parallel=parallel)
-        with pytest.raises(ValueError, match="natural number"):
-            env.set_seed(seed)
-        with pytest.raises(ValueError, match="natural number"):
-            env.reset(seed=seed)
+        for seed in (-1, 1.5, True):
+            with pytest.raises(ValueError, match="natural number"):
+                env.set_seed(seed)
+            with pytest.raises(ValueError, match="natural number"):
+                env.reset(seed=seed)
 
 
 class TestResets:
@@ -96,27 +97,25 @@ class TestResets:
 
 
 class TestActions:
-    @pytest.mark.parametrize("options", [{"parallel": False}, {}])
+    invalid: ClassVar = {
+        "environment 1 holds NaN": torch.tensor([[0.0, 0.0], [0.0, torch.nan]]),
+        "environment 0 holds an infinite": torch.tensor([[0.0, torch.inf], [0.0, 0.0]]),
+        r"environment 0 has shape \[3\]": torch.zeros(2, 3),
+        "environment 0 has type torch.int64": torch.zeros(2, 2, dtype=torch.int64),
+        "there is no action": None,
+    }
+    """Actions by the message."""
+
+    @pytest.mark.parametrize("parallel", [False, True])
     @pytest.mark.parametrize("method", ["step", "step_and_maybe_reset"])
-    @pytest.mark.parametrize(
-        ("action", "message"),
-        [
-            (torch.tensor([[0.0, 0.0], [0.0, torch.nan]]), "environment 1 holds NaN"),
-            (torch.tensor([[0.0, torch.inf], [0.0, 0.0]]), "environment 0 holds an infinite"),
-            (torch.zeros(2, 3), r"environment 0 has shape \[3\]"),
-            (torch.zeros(2, 2, dtype=torch.int64), "environment 0 has type torch.int64"),
-            (None, "there is no action"),
-        ],
-    )
-    def test_invalid_actions_are_refused_before_a_step(
-        self, make_fakes, options, method, action, message
-    ):
-        env = make_fakes(2, **options)
+    def test_invalid_actions_are_refused_before_a_step(self, make_fakes, parallel, method):
+        env = make_fakes(2, parallel=parallel)
         state = env.reset()
-        bad = state.clone() if action is None else state.clone().set("action", action)
         allowed = r"float32 tensor of shape \[2\], from \[-1.0, -1.0\] to \[1.0, 1.0\]"
-        with pytest.raises(ValueError, match=rf"{message}.*{allowed}"):
-            getattr(env, method)(bad)
+        for message, action in self.invalid.items():
+            bad = state.clone() if action is None else state.clone().set("action", action)
+            with pytest.raises(ValueError, match=rf"{message}.*{allowed}"):
+                getattr(env, method)(bad)
         result = env.step(act(env, state))
         assert result["next", "step_count"].flatten().tolist() == [1, 1]
         assert getattr(env, "restarts", 0) == 0
