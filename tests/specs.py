@@ -1,8 +1,17 @@
-"""What networks are built for in the tests."""
+"""What networks are built for in the tests, and which cases of a sweep are slow tests."""
+
+import pytest
 
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import ActorCriticSpec
 from ba_torchrl.modules.spatial.base import SpatialSpec
+
+
+def slow_except(values, fast):
+    """Return the cases of a sweep, of which all but some are slow tests."""
+    return [
+        value if value in fast else pytest.param(value, marks=pytest.mark.slow) for value in values
+    ]
 
 
 def close_loop_images(size=64, high_m=0.39):

@@ -13,7 +13,7 @@ from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.factory import make_resolved
+from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 
 SETTERS = {"dtype": torch.set_default_dtype, "device": torch.set_default_device}
@@ -48,7 +48,7 @@ def expected():
 
 def rollout(task, config):
     options = {"obs_size": 32, "seed": 0, "expert": True, "max_steps": 3, **config}
-    env = options.pop("make", make_resolved)(resolve_env(task, options))
+    env = options.pop("make", make)(resolve_env(task, options))
     data = env.rollout(4, lambda td: td.set(keys.ACTION, td[keys.EXPERT_ACTION]))
     env.close()
     return data
@@ -61,7 +61,7 @@ def test_environments_fulfil_their_specs(expected, other_default, case):
     options = {"obs_size": 32, "seed": 0, "expert": True, "max_steps": 3, **config}
     for env in (
         ba_torchrl.make_vector_env(task, 2, parallel=False, **options),
-        options.pop("make", make_resolved)(resolve_env(task, options)),
+        options.pop("make", make)(resolve_env(task, options)),
     ):
         check_env_specs(env, break_when_any_done="both", seed=0)
         env.close()

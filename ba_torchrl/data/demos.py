@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
 from ba_torchrl.data.time_reversal import DeconstructionEnv, is_reversible, reverse_episode
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.factory import make_resolved, make_vector_env
+from ba_torchrl.envs.factory import make, make_vector_env
 from ba_torchrl.errors import ConfigError
 
 Source = Literal["expert", "deconstruction"]
@@ -200,7 +200,7 @@ def check_turn_noise(noise: float, source: Source, turns: Sequence[int], name: s
 def source_config(source: Source) -> dict[str, Any]:
     """Return the keywords of `make_vector_env` with which a source makes its environments."""
     is_reversed = source == "deconstruction"
-    return {"expert": True, "make": DeconstructionEnv if is_reversed else make_resolved}
+    return {"expert": True, "make": DeconstructionEnv if is_reversed else make}
 
 
 class ExpertScores(NamedTuple):

@@ -31,17 +31,10 @@ def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv:
             ``expert=True``.
 
     Raises:
-        ConfigError: the task or a parameter is unknown, or its value cannot be used.
+        ConfigError: the task or a parameter is unknown, its value cannot be used, or the workspace
+            does not suit the objects or the robot.
     """
-    return make_resolved(_resolved(task, config))
-
-
-def make_resolved(resolved: ResolvedEnv) -> ManipulationEnv:
-    """Make an environment from what `resolve_env` returned.
-
-    Raises:
-        ConfigError: the workspace does not suit the objects or the robot.
-    """
+    resolved = resolve_env(task, config)
     return CONTROLS[resolved.task_class.control](resolved)
 
 
@@ -51,7 +44,7 @@ def make_vector_env(
     *,
     workers: WorkerOptions | None = None,
     register_modules: Sequence[str | ModuleType] = (),
-    make: Callable[[ResolvedEnv], ManipulationEnv] = make_resolved,
+    make: Callable[[ResolvedEnv], ManipulationEnv] = make,
     **options: Any,
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.
@@ -78,7 +71,7 @@ def make_vector_env(
         raise ConfigError(f"workers: must be WorkerOptions, got {workers!r}")
     given = {} if workers is None else workers.model_dump()
     workers = parse(WorkerOptions, {**given, **of_workers}, "workers")
-    resolved = _resolved(task, options, module_names(register_modules))
+    resolved = resolve_env(task, options, modules=module_names(register_modules))
     if workers.parallel is None:
         workers = workers.model_copy(update={"parallel": processes_save_time(num_envs)})
     if workers.parallel and workers.start_method == "spawn":
@@ -86,11 +79,3 @@ def make_vector_env(
     return make_vector(
         partial(make, resolved), num_envs, seed=resolved.config.seed, workers=workers
     )
-
-
-def _resolved(
-    task: str | ResolvedEnv, config: dict[str, Any], modules: Sequence[str] = ()
-) -> ResolvedEnv:
-    if not isinstance(task, ResolvedEnv):
-        return resolve_env(task, config, modules=modules)
-    return resolve_env(task.task_id, {**task.given, **config}, modules=[*task.modules, *modules])

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from typing_extensions import Self
 
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.factory import make_resolved
+from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, InvalidActionError
 
@@ -59,7 +59,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         if render_mode == "human":
             config = {**config, "render": True}
         self.render_mode = render_mode
-        self.torchrl_env = make_resolved(resolve_env(task, config, modules=register_modules))
+        self.torchrl_env = make(resolve_env(task, config, modules=register_modules))
         """The same environment for TorchRL; stepping it steps this one."""
         specs = self.torchrl_env.observation_spec
         self.observation_space = spaces.Dict(

@@ -101,7 +101,7 @@ class ResolvedEnv:
         Raises:
             ConfigError: as `resolve_env`.
         """
-        return resolve_env(self.task_id, {**self.given, **changes}, modules=self.modules)
+        return resolve_env(self, changes)
 
     def check_spawned_process_knows(self) -> None:
         """Check that a spawned process can import what registers the parts of the environment.
@@ -118,7 +118,7 @@ class ResolvedEnv:
 
 
 def resolve_env(
-    task_id: str,
+    task: str | ResolvedEnv,
     values: dict[str, Any],
     what: str | None = None,
     modules: Iterable[str] = (),
@@ -129,7 +129,8 @@ def resolve_env(
     configuration of one task is valid for another.
 
     Args:
-        task_id: as listed by `ba_torchrl.list_tasks`.
+        task: as listed by `ba_torchrl.list_tasks`, or what this function returned, whose values and
+            modules are used in addition.
         values: fields of `EnvConfig` and of the task's parameters.
         what: name of the configuration in the error message.
         modules: outside the package, to import first. Those that register the task, the robot and
@@ -140,6 +141,11 @@ def resolve_env(
             support a value, or a module does not exist.
     """
     modules = tuple(modules)
+    if isinstance(task, ResolvedEnv):
+        if not values and not modules:
+            return task
+        values, modules = {**task.given, **values}, (*task.modules, *modules)
+    task_id = task.task_id if isinstance(task, ResolvedEnv) else task
     import_modules(modules)
     task_class = TASKS[task_id]
     model = env_config_model(task_class.Parameters)

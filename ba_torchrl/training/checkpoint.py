@@ -13,7 +13,7 @@ from torchrl.checkpoint import CheckpointError, CheckpointRotation
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner, Problem
 from ba_torchrl.data.files import write_text
-from ba_torchrl.envs.factory import make_resolved
+from ba_torchrl.envs.factory import make
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import check_known
 from ba_torchrl.record.results import CONFIG_FILE
@@ -191,7 +191,7 @@ def problem_of(config: ExperimentConfig) -> Problem:
     Raises:
         ConfigError: the environment cannot be made.
     """
-    env = make_resolved(config.resolved_env)
+    env = make(config.resolved_env)
     env.close()
     return Problem(
         control=config.resolved_env.task_class.control,

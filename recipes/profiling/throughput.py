@@ -36,8 +36,7 @@ UNIT_STEPS = 100
 """Units of work that are timed together, since one is much shorter than a batch."""
 VECTORS: dict[str, dict[str, Any]] = {
     "one process": {"workers": WorkerOptions(parallel=False)},
-    "workers, shared memory": {"use_buffers": True},
-    "workers, pipes": {"use_buffers": False},
+    "workers, shared memory": {},
 }
 """Options of `make_vector` by name."""
 

@@ -12,7 +12,6 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 FLAGS = ("done", "terminated", "truncated")
-BUFFERS = pytest.mark.parametrize("use_buffers", [True, False], ids=["buffers", "pipes"])
 
 
 def flag():

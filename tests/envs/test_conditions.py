@@ -8,9 +8,16 @@ import torch
 import ba_torchrl
 from ba_torchrl.envs import keys
 from ba_torchrl.tasks.close_loop.block_picking import BlockPicking
+from tests.specs import slow_except
 
 
-@pytest.mark.parametrize("task", ba_torchrl.list_tasks())
+@pytest.mark.parametrize(
+    "task",
+    slow_except(
+        ba_torchrl.list_tasks(),
+        ["close_loop/block_stacking", "open_loop/covid_test", "bump/box_palletizing"],
+    ),
+)
 def test_success_is_the_conjunction_of_the_conditions(task):
     env = ba_torchrl.make(task, seed=3, obs_size=32, expert=True)
     state = env.reset()

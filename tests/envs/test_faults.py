@@ -1,6 +1,5 @@
 """A simulator fault ends the episode truncated, and the next one is in a new world."""
 
-import gc
 import math
 
 import pybullet
@@ -10,6 +9,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.envs import faults
 from ba_torchrl.errors import SimulationError
+from ba_torchrl.sim.world import World
 
 TASKS = {
     "close_loop/block_picking": {"obs_size": 16},
@@ -67,20 +67,27 @@ FAULTS = [give_nan, turn_nan, lose_below, throw, remove, disconnect, break_joint
 
 
 @pytest.fixture(autouse=True)
-def _no_client_is_left():
-    def clients():
-        return sum(map(pybullet.isConnected, range(32)))
+def _every_world_is_closed(monkeypatch):
+    worlds, construct = [], World.__init__
 
-    gc.collect()  # worlds of earlier tests, which would be closed during this one
-    before = clients()
+    def record(world, *args, **options):
+        construct(world, *args, **options)
+        worlds.append(world)
+
+    monkeypatch.setattr(World, "__init__", record)
     yield
-    assert clients() == before
+    assert worlds
+    assert all(world.is_closed for world in worlds)
 
 
 @pytest.mark.parametrize(
     ("task", "fault"),
-    # in open loop, the arm is moved to each pose at once, which repairs its joints
-    [(task, fault) for task in TASKS for fault in FAULTS if task == TASK or fault != break_joint],
+    [
+        *((TASK, fault) for fault in FAULTS),
+        # the arm is moved to each pose at once, which repairs its joints
+        *(("open_loop/block_stacking", fault) for fault in (give_nan, lose_below, disconnect)),
+        ("open_loop/bin_packing", throw),
+    ],
 )
 def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt(task, fault):
     env = make(task)
@@ -103,7 +110,7 @@ def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt
     env.close()
 
 
-@pytest.mark.parametrize("fault", [give_nan, disconnect, break_joint])
+@pytest.mark.parametrize("fault", [give_nan, disconnect])
 def test_the_episodes_after_a_fault_are_those_of_the_seed(fault):
     undisturbed, env = make(), make()
     expected = [undisturbed.reset(), undisturbed.reset(), undisturbed.reset()]
@@ -116,8 +123,9 @@ def test_the_episodes_after_a_fault_are_those_of_the_seed(fault):
     env.close()
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("fault", [disconnect, remove])
+@pytest.mark.parametrize(
+    ("task", "fault"), [(TASK, disconnect), (TASK, remove), ("open_loop/bin_packing", disconnect)]
+)
 def test_a_fault_between_two_episodes_starts_the_reset_again(task, fault):
     undisturbed, env = make(task), make(task)
     for each in (undisturbed, env):

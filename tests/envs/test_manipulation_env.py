@@ -43,27 +43,12 @@ def test_a_missing_action_is_an_error(env):
         env._step(env.reset())
 
 
-def test_nan_through_parallel_env_raises_in_the_parent():
-    env = ba_torchrl.make_vector_env(TASK, 2, start_method="fork", obs_size=16, seed=0)
-    try:
-        state = env.reset()
-        action = torch.zeros(2, 5)
-        action[1, 2] = float("nan")
-        with pytest.raises(ValueError, match="1"):
-            env.step(state.clone().set("action", action))
-        following = env.step(state.set("action", torch.zeros(2, 5)))["next"]
-        assert following["step_count"].flatten().tolist() == [1, 1]
-    finally:
-        env.close()
-
-
-@pytest.mark.parametrize("start_method", ["fork", "spawn"])
-def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel(start_method):
+def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel():
     policy = lambda td: td.set("action", torch.full((2, 5), -0.4))  # noqa: E731
     rollouts = []
     for parallel in (True, False):
         env = ba_torchrl.make_vector_env(
-            TASK, 2, parallel=parallel, start_method=start_method, obs_size=16, seed=5
+            TASK, 2, parallel=parallel, start_method="spawn", obs_size=16, seed=5
         )
         rollouts.append(env.rollout(6, policy, break_when_any_done=False))
         env.close()

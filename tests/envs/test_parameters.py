@@ -16,6 +16,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
 from ba_torchrl.tasks.base import TASKS
+from tests.specs import slow_except
 
 PICKING = "close_loop/block_picking"
 
@@ -124,11 +125,10 @@ def test_num_objects(make, task, number):
     assert len(env.scene.task.objects) == number
 
 
-@pytest.mark.parametrize("robot", list(ROBOTS))
-def test_robot(make, robot):
-    env = make(robot=robot)
+def test_robot(make):
+    env = make(robot="panda")
     env.reset()
-    assert type(env.scene.robot) is ROBOTS[robot]
+    assert type(env.scene.robot) is ROBOTS["panda"]
 
 
 def test_object_set_chooses_the_shapes(make):
@@ -152,7 +152,13 @@ def test_half_rotation_keeps_the_yaw_within_a_half_turn(make):
     assert reached[True] == pytest.approx(math.pi / 2, abs=0.02)
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].control == "close_loop"])
+@pytest.mark.parametrize(
+    "task",
+    slow_except(
+        [task for task in TASKS if TASKS[task].control == "close_loop"],
+        [PICKING, "close_loop/block_stacking", "close_loop/drawer_opening"],
+    ),
+)
 def test_experts_stay_within_the_half_turn(make, task):
     env = make(task, half_rotation=True, expert=True)
     successes = 0
@@ -237,7 +243,8 @@ def test_environments_are_made_from_resolved_parameters(make):
 
 def test_the_step_limit_grows_with_the_number_of_blocks(make):
     for count, limit in ((4, 10), (6, 10), (7, 12), (8, 14)):
-        assert make("open_loop/block_stacking", num_objects=count).max_steps == limit
+        resolved = resolve_env("open_loop/block_stacking", {"num_objects": count})
+        assert resolved.config.max_steps == limit
     env = make("open_loop/block_stacking", num_objects=7, expert=True)
     state = env.reset(seed=0)
     while not state["done"]:

@@ -79,10 +79,8 @@ def test_the_matrix_product_has_the_format_of_the_network():
 
 def test_frames_per_second(monkeypatch):
     # Forking is fast; it needs a process without an open simulator, so workers come first.
-    options = {"workers": WorkerOptions(start_method="fork")}
     vectors = {
-        "workers, shared memory": {**options, "use_buffers": True},
-        "workers, pipes": {**options, "use_buffers": False},
+        "workers, shared memory": {"workers": WorkerOptions(start_method="fork")},
         "one process": {"workers": WorkerOptions(parallel=False)},
     }
     monkeypatch.setattr(throughput, "VECTORS", vectors)

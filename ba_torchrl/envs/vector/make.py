@@ -63,8 +63,6 @@ def make_vector(
     *,
     seed: int | None = None,
     workers: WorkerOptions = WorkerOptions(),  # noqa: B008 -- immutable
-    num_threads: int | None = None,
-    use_buffers: bool = True,
 ) -> SerialVectorEnv | VectorEnv | PlainVectorEnv:
     """Return ``num_envs`` environments as one, with batch size [num_envs], ready to be reset.
 
@@ -74,10 +72,6 @@ def make_vector(
         num_envs: number of environments.
         seed: environment i is seeded with ``seed + i``, both in this process and in workers.
         workers: how the environments are started, and replaced when they fail.
-        num_threads: number of torch threads of this process while the environments are open; None
-            for no change.
-        use_buffers: whether data pass through shared memory (faster for steps of a few
-            milliseconds) or through pipes.
 
     Raises:
         ValueError: ``num_envs`` is below one or differs from the number of functions.
@@ -102,23 +96,16 @@ def make_vector(
             num_envs,
             make_env,
             mp_start_method=workers.start_method,
-            num_threads=num_threads,
-            use_buffers=use_buffers,
+            use_buffers=True,
         )
     elif workers.parallel:
         from ba_torchrl.envs.vector.parallel import VectorEnv
 
-        env = VectorEnv(
-            num_envs,
-            make_env,
-            workers=workers,
-            num_threads=num_threads,
-            use_buffers=use_buffers,
-        )
+        env = VectorEnv(num_envs, make_env, workers=workers)
     else:
         env = SerialVectorEnv(num_envs, make_env)
     try:
-        if workers.parallel and use_buffers:
+        if workers.parallel:
             _check_shared_memory(env)
         env.start()
     except OSError as error:

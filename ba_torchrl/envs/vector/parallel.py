@@ -5,22 +5,22 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from ctypes import Array, c_byte
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import multiprocessing as mp
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
-from torchrl.envs.batched_envs import _run_worker_pipe_direct, _run_worker_pipe_shared_mem
+from torchrl.envs.batched_envs import _run_worker_pipe_shared_mem
 
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.envs.vector.answers import ask_all, collect_flags, collect_messages
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.replacement import Replacements, seed_worker
-from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker
+from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker, wait_until
 from ba_torchrl.errors import WorkerError
 
 MakeEnv = Callable[[], EnvBase]
@@ -37,6 +37,7 @@ _LOST_STEP = {
 }
 _ABSENT = {**_LOST_STEP, keys.TRUNCATED: False, keys.DONE: False}
 _START_POLL_S = 1.0
+_HEALTH_CHECK_S = 5e-3
 
 
 class VectorEnv(SeededVector, ParallelEnv):
@@ -56,7 +57,6 @@ class VectorEnv(SeededVector, ParallelEnv):
         num_workers: number of environments.
         create_env_fn: builds one environment, or one such function per environment.
         workers: how processes start and when they are replaced.
-        parallel_options: further options of `torchrl.envs.ParallelEnv`.
 
     Raises:
         ValueError: the environments lack a ``truncated`` or a ``fault`` entry.
@@ -68,18 +68,19 @@ class VectorEnv(SeededVector, ParallelEnv):
         create_env_fn: MakeEnv | Sequence[MakeEnv],
         *,
         workers: WorkerOptions = WorkerOptions(),  # noqa: B008 -- immutable
-        **parallel_options: Any,
     ) -> None:
-        parallel_options.setdefault("shutdown_timeout", 5.0)
         super().__init__(
-            num_workers, create_env_fn, mp_start_method=workers.start_method, **parallel_options
+            num_workers,
+            create_env_fn,
+            mp_start_method=workers.start_method,
+            shutdown_timeout=5.0,
+            use_buffers=True,
         )
         missing = {keys.TRUNCATED, keys.FAULT} - {*self.done_keys, *self.observation_keys}
         if missing:
             raise ValueError(f"environments in workers need the entries {sorted(missing)}")
         self.workers, self.wait_for_restarts = workers, workers.wait_for_restarts
         self._lost: set[int] = set()  # without an episode, and the next step reports a fault
-        self._threads_before = torch.get_num_threads()
         self.parent_channels: list[Worker] = []
         self._replacements = Replacements(
             self.parent_channels, self._launch, self._close_all, workers.max_restarts, num_workers
@@ -114,19 +115,15 @@ class VectorEnv(SeededVector, ParallelEnv):
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """Step, and reset the environments that are done; see `EnvBase.step_and_maybe_reset`."""
-        if not self._use_buffers:
-            return super().step_and_maybe_reset(tensordict)  # calls _step and _reset
         self._check_actions(tensordict)
         with self._stepping():
             return super().step_and_maybe_reset(tensordict)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """End the workers and restore the number of torch threads."""
-        was_open, threads = not self.is_closed, torch.get_num_threads()
+        """End the workers, and keep the number of torch threads, which TorchRL increases."""
+        threads = torch.get_num_threads()
         super().close(raise_if_closed=raise_if_closed)
-        if was_open:
-            # TorchRL increases the number, assuming that it decreased it at the start.
-            torch.set_num_threads(threads if self.num_threads is None else self._threads_before)
+        torch.set_num_threads(threads)
 
     def __getitem__(self, item: Any) -> EnvBase:
         raise NotImplementedError("a VectorEnv cannot be indexed: its workers may be replaced")
@@ -146,7 +143,7 @@ class VectorEnv(SeededVector, ParallelEnv):
                 self._replacements.finish(wait_for_all=True)
                 return super()._reset(tensordict, **kwargs)
         self._replacements.finish(wait_for_all=self.wait_for_restarts)
-        if self._use_buffers and mask is not None and not mask.any():  # TorchRL would fail
+        if not mask.any():  # TorchRL would fail
             return self.shared_tensordict_parent.select(*self._selected_reset_keys_filt).clone()
         with self._muted(self._replacements.starting):
             return super()._reset(tensordict, **kwargs)
@@ -168,8 +165,8 @@ class VectorEnv(SeededVector, ParallelEnv):
         self._replacements.base_seed = self._base_seed
 
     def _start_workers(self) -> None:
-        if self._use_buffers and self._non_tensor_keys:
-            raise ValueError(f"use_buffers=False is needed for {self._non_tensor_keys}")
+        if self._non_tensor_keys:
+            raise ValueError(f"workers cannot share {self._non_tensor_keys}, which are no tensors")
         # TorchRL raises if a process in `_workers` has ended; here it is replaced instead.
         self._workers: list[Any] = []
         self._timeout = self.shutdown_timeout
@@ -194,9 +191,6 @@ class VectorEnv(SeededVector, ParallelEnv):
                 worker.kill()
             self._forget_workers()
             raise
-        self._threads_before = torch.get_num_threads()
-        if self.num_threads is not None:
-            torch.set_num_threads(self.num_threads)
         self.is_closed = False
         self.set_spec_lock_()
 
@@ -205,18 +199,12 @@ class VectorEnv(SeededVector, ParallelEnv):
         make_env = self.create_env_fn[index]
         if not isinstance(make_env, EnvCreator | CloudpickleWrapper):
             make_env = CloudpickleWrapper(make_env)
+        self._shm_done_flags[index] = 0
         options = {
             "env_fun": make_env,
             "env_fun_kwargs": self.create_env_kwargs[index],
             "num_threads": self.num_sub_threads,
             "filter_warnings": self._filter_warnings_subprocess(),
-        }
-        limits = self._mp_start_method, self.workers.timeout_s, self.workers.start_timeout_s
-        if not self._use_buffers:
-            options["consolidate"] = self.consolidate
-            return Worker(_run_worker_pipe_direct, options, *limits)
-        self._shm_done_flags[index] = 0
-        options |= {
             "worker_idx": index,
             "shm_done_flags": self._shm_done_flags,
             "shared_tensordict": self.shared_tensordicts[index],
@@ -225,6 +213,7 @@ class VectorEnv(SeededVector, ParallelEnv):
             "_selected_step_keys": self._selected_step_keys,
             "_non_tensor_keys": self._non_tensor_keys,
         }
+        limits = self._mp_start_method, self.workers.timeout_s, self.workers.start_timeout_s
         return Worker(_run_worker_pipe_shared_mem, options, *limits)
 
     @property
@@ -242,9 +231,8 @@ class VectorEnv(SeededVector, ParallelEnv):
         for worker in self.parent_channels:
             worker.join(deadline - time.monotonic())
         self._forget_workers()
-        if self._use_buffers:
-            del self.shared_tensordicts, self.shared_tensordict_parent
-            del self._shared_tensordict_parent_next, self._shared_tensordict_parent_root
+        del self.shared_tensordicts, self.shared_tensordict_parent
+        del self._shared_tensordict_parent_next, self._shared_tensordict_parent_root
 
     def _forget_workers(self) -> None:
         self.parent_channels.clear()
@@ -327,11 +315,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         deadline = time.monotonic() + self.workers.timeout_s
         try:
             while pending:
-                workers = self.parent_channels
-                if self._use_buffers:
-                    failed = collect_flags(workers, pending, self._shm_done_flags)
-                else:
-                    failed = collect_messages(workers, pending)
+                failed = collect_flags(self.parent_channels, pending, self._shm_done_flags)
                 if time.monotonic() > deadline:
                     late = f"it did not finish within {self.workers.timeout_s:g} s"
                     failed = {index: WorkerError(late) for index in pending} | failed
@@ -373,18 +357,73 @@ class VectorEnv(SeededVector, ParallelEnv):
             values: of the flags and the reward.
             to_next: answer a step, otherwise a reset.
         """
-        if self._use_buffers:
-            root = self.shared_tensordicts[index]
-            answer = root.get("next") if to_next else root
-        else:
-            root = self._last_worker_outputs[index]
-            answer = TensorDict(device=self.device)
-            specs = [self.full_observation_spec, self.full_done_spec]
-            for spec in specs + [self.full_reward_spec] * to_next:
-                answer.update(spec[index].zero())
-            self.parent_channels[index].inbox.append(answer)
-        if root is not None and answer is not root:
+        root = self.shared_tensordicts[index]
+        answer = root
+        if to_next:
+            answer = root.get("next")
             for key in self.observation_keys:
                 answer.get(key).copy_(root.get(key))
         for key in values.keys() & set(answer.keys()):
             answer.get(key).fill_(values[key])
+
+
+def collect_flags(
+    workers: Sequence[Worker], pending: set[int], flags: Array[c_byte]
+) -> dict[int, WorkerError]:
+    """Wait briefly for the workers' answers, which are in shared memory.
+
+    Args:
+        workers: all workers.
+        pending: indices of those that have not answered; those that answer are removed.
+        flags: set by the workers.
+
+    Returns:
+        The errors of ended workers, by index.
+    """
+
+    def all_answered() -> bool:
+        for index in tuple(pending):
+            if flags[index]:
+                flags[index] = 0
+                pending.discard(index)
+        return not pending
+
+    failures: dict[int, WorkerError] = {}
+    if wait_until(all_answered, _HEALTH_CHECK_S):
+        return failures
+    for index in pending:
+        try:
+            workers[index].check()
+        except WorkerError as error:
+            if not flags[index]:  # else it answered before it ended
+                failures[index] = error
+    return failures
+
+
+def ask_all(
+    workers: Sequence[Worker], method: str, arguments: Sequence[tuple[Any, ...]], timeout_s: float
+) -> list[Any]:
+    """Call a method of every worker's environment and return the results.
+
+    Args:
+        workers: all workers.
+        method: name of the method.
+        arguments: of each worker's call.
+        timeout_s: seconds to wait for each answer.
+
+    Raises:
+        WorkerError: a worker has failed.
+    """
+    for worker, args in zip(workers, arguments, strict=True):
+        worker.check()
+        worker.send((method, (args, {})))
+    results, failure = [], None
+    for worker in workers:
+        try:
+            results.append(worker.read(timeout_s)[1])
+        except WorkerError as error:
+            worker.abort()  # a late answer would be taken for that to the next command
+            failure = error
+    if failure is not None:
+        raise failure
+    return results

@@ -9,7 +9,7 @@ from functools import cache
 from torchrl.envs import batched_envs
 
 MODULE_NAMES = {
-    "torchrl.envs.batched_envs": ("_run_worker_pipe_direct", "_run_worker_pipe_shared_mem"),
+    "torchrl.envs.batched_envs": ("_run_worker_pipe_shared_mem",),
     "torchrl._utils": ("BATCHED_PIPE_TIMEOUT",),
 }
 """Names of modules, by module."""
@@ -24,7 +24,6 @@ METHODS = (
 )
 """Methods of ``ParallelEnv`` that are overridden or called."""
 ATTRIBUTES = (
-    "_last_worker_outputs",
     "_mp_start_method",
     "_non_tensor_keys",
     "_selected_input_keys",
@@ -35,7 +34,6 @@ ATTRIBUTES = (
     "_shared_tensordict_parent_root",
     "_shm_done_flags",
     "_timeout",
-    "_use_buffers",
     "parent_channels",
     "shared_tensordict_parent",
     "shared_tensordicts",

@@ -9,19 +9,20 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from multiprocessing import util
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from queue import SimpleQueue
 from typing import Any
 
 import torchrl
 from torch import multiprocessing as mp
 
-from ba_torchrl.envs.vector.launcher import start_process
 from ba_torchrl.errors import WorkerError
 
 logger = logging.getLogger(__name__)
@@ -40,8 +41,8 @@ class EnvironmentRaisedError(WorkerError):
 class Worker:
     """A process that runs one of TorchRL's worker loops, and the pipe to it.
 
-    It has the interface of a pipe, which TorchRL expects. It stores the last command and the
-    answers that were read in advance. Reading from a broken pipe raises a `WorkerError`.
+    It has the interface of a pipe, which TorchRL expects, and stores the last command. Reading from
+    a broken pipe raises a `WorkerError`.
 
     Args:
         loop: TorchRL's worker loop.
@@ -62,7 +63,6 @@ class Worker:
         context = mp.get_context(start_method)
         self.pipe, child_pipe = context.Pipe()
         self.event = context.Event()
-        self.inbox: deque[Any] = deque()
         self.message: tuple[Any, Any] = ("start", None)
         self.muted = False  # commands are dropped, because the episode is lost
         self._timeout_s, self._start_timeout_s = timeout_s, start_timeout_s
@@ -129,7 +129,7 @@ class Worker:
         Raises:
             WorkerError: the worker failed.
         """
-        return self.inbox.popleft() if self.inbox else self.read(self._timeout_s)
+        return self.read(self._timeout_s)
 
     def read(self, timeout_s: float, *, limit_s: float | None = None) -> Any:
         """Return the next message of the pipe.
@@ -159,7 +159,6 @@ class Worker:
         Raises:
             WorkerError: the worker has ended.
         """
-        self.inbox.clear()
         while self.process.exitcode is not None or self.pipe.poll():
             self.read(0.0)
 
@@ -234,3 +233,56 @@ def wait_until(condition: Callable[[], bool], timeout_s: float) -> bool:
         if elapsed > _BUSY_WAIT_S:
             time.sleep(_POLL_INTERVAL_S)  # free the core for the workers
     return True
+
+
+def start_process(process: BaseProcess) -> None:
+    """Start a worker process.
+
+    Linux kills a worker when the thread that started it ends (``PR_SET_PDEATHSIG``), which is the
+    end of this process only for the main thread. On behalf of other threads, a thread that never
+    ends starts the process.
+
+    Args:
+        process: not started yet.
+
+    Raises:
+        OSError: the process cannot be started.
+    """
+    if threading.current_thread() is threading.main_thread():
+        process.start()
+        return
+    global _launcher
+    with _lock:
+        if _launcher is None or not _launcher.is_alive():  # no thread survives a fork
+            _launcher = _Launcher()
+            _launcher.start()
+    _launcher.start_process(process)
+
+
+class _Launcher(threading.Thread):
+    """A thread that starts processes."""
+
+    def __init__(self) -> None:
+        super().__init__(name="worker launcher", daemon=True)
+        self._requests: SimpleQueue[tuple[BaseProcess, Future[None]]] = SimpleQueue()
+
+    def start_process(self, process: BaseProcess) -> None:
+        """Start a process in this thread, and wait until it is started."""
+        started: Future[None] = Future()
+        self._requests.put((process, started))
+        started.result()
+
+    def run(self) -> None:
+        """Serve requests until the process ends."""
+        while True:
+            process, started = self._requests.get()
+            try:
+                process.start()
+            except BaseException as error:  # raised in the thread that asked
+                started.set_exception(error)
+            else:
+                started.set_result(None)
+
+
+_launcher: _Launcher | None = None
+_lock = threading.Lock()

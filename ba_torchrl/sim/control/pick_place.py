@@ -113,8 +113,7 @@ class PickPlaceLimits:
     """Height by which a grasp is lifted before it is checked."""
     max_slip_m: float = 0.002
     """Displacement of a held body in the tool frame, in a simulated motion, above which it slips. A
-    body that is accelerated by `held_acceleration_m_s2` alone lags by 3 mm behind the lift.
-    Infinity: slipping is not tested."""
+    body that is accelerated by `held_acceleration_m_s2` alone lags by 3 mm behind the lift."""
     min_motion_steps: int = 4
     """Least number of physics steps of a simulated straight motion."""
     transit_height_m: float = 0.3
@@ -134,11 +133,6 @@ class PickPlaceLimits:
     """Physics steps after which a body that is not grasped is no longer held."""
     max_vertical_force_n: float = 40.0
     """Sum of vertical contact forces at which a simulated downward motion stops."""
-
-    @property
-    def tests_slip(self) -> bool:
-        """Whether a held body that slips is carried by simulation instead of teleports."""
-        return math.isfinite(self.max_slip_m)
 
 
 class PickPlace:
@@ -260,12 +254,7 @@ class PickPlace:
         self.held = self.grasp = None
 
     def _touched_poses(self) -> dict[Body, Pose]:
-        """Return the poses in the tool frame of the bodies that the hand touches.
-
-        There are none if slipping is not tested.
-        """
-        if not self.limits.tests_slip:
-            return {}
+        """Return the poses in the tool frame of the bodies that the hand touches."""
         touched = {contact.other_id for contact in contacts(self.world.client, self.robot.id)}
         return {
             body: pose_in_tool_frame(self.robot, body)
@@ -278,8 +267,6 @@ class PickPlace:
 
         Its pose before the motion is None if the hand did not touch it.
         """
-        if not self.limits.tests_slip:
-            return False
         if before is None:
             return True
         return math.dist(before.position, self.grasp.position) > self.limits.max_slip_m

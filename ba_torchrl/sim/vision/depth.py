@@ -288,14 +288,13 @@ def point_cloud(
     lenses: Sequence[Lens],
     count: int,
     bounds_m: tuple[Range, Range, Range],
-    rng: np.random.Generator | None = None,
 ) -> np.ndarray:
     """Return a random sample [count, 3] float32 of the points that cameras see, metres.
 
     The points are drawn without replacement; if there are fewer than ``count``, each is repeated
     equally often, up to one. Those outside of ``bounds_m``, ranges of x, y and z, are omitted; the
     lower bound of z is ignored, so that the floor is included where the workspace starts above it.
-    Without a generator, the same scene gives the same points.
+    The same scene gives the same points.
 
     Raises:
         ValueError: the cameras see nothing inside the bounds.
@@ -306,7 +305,7 @@ def point_cloud(
     n = len(points)
     if not n:
         raise ValueError(f"the cameras see nothing inside {bounds_m} m")
-    rng = np.random.default_rng(0) if rng is None else rng
+    rng = np.random.default_rng(0)
     repeats, rest = divmod(count, n)
     chosen = np.concatenate(
         [np.tile(np.arange(n), repeats), rng.choice(n, rest, replace=False, shuffle=False)]

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
+from fake_env import FakeEnv, act, assert_lost, assert_stepped
 
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector import parallel
@@ -14,10 +14,9 @@ from ba_torchrl.envs.vector.parallel import VectorEnv
 
 
 class TestFailures:
-    @BUFFERS
     @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
-    def test_in_a_step(self, make_fakes, tmp_path, use_buffers, order, caplog):
-        env = make_fakes(3, folder=tmp_path, use_buffers=use_buffers, timeout_s=1.0)
+    def test_in_a_step(self, make_fakes, tmp_path, order, caplog):
+        env = make_fakes(3, folder=tmp_path, timeout_s=1.0)
         before = env.step(act(env, env.reset()))["next"].exclude("reward")
         pids = env.worker_pids
         (tmp_path / f"{pids[1]}.step").write_text(order)
@@ -39,10 +38,9 @@ class TestFailures:
         )
         assert state["step_count"].flatten().tolist() == [3, 1, 3]
 
-    @BUFFERS
     @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
-    def test_in_step_and_maybe_reset(self, make_fakes, tmp_path, use_buffers, order):
-        env = make_fakes(3, folder=tmp_path, use_buffers=use_buffers, timeout_s=1.0)
+    def test_in_step_and_maybe_reset(self, make_fakes, tmp_path, order):
+        env = make_fakes(3, folder=tmp_path, timeout_s=1.0)
         _, before = env.step_and_maybe_reset(act(env, env.reset()))
         (tmp_path / f"{env.worker_pids[2]}.step").write_text(order)
         result, state = env.step_and_maybe_reset(act(env, before.clone()))
@@ -56,10 +54,9 @@ class TestFailures:
         assert state["step_count"].flatten().tolist() == [3, 3, 1]
         assert env.restarts == 1
 
-    @BUFFERS
     @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
-    def test_in_a_reset_are_retried(self, make_fakes, tmp_path, use_buffers, order):
-        env = make_fakes(2, folder=tmp_path, use_buffers=use_buffers, timeout_s=1.0)
+    def test_in_a_reset_are_retried(self, make_fakes, tmp_path, order):
+        env = make_fakes(2, folder=tmp_path, timeout_s=1.0)
         expected = env.reset(seed=3)["pixels"]
         (tmp_path / f"{env.worker_pids[0]}.reset").write_text(order)
         state = env.reset(seed=3)
@@ -68,10 +65,9 @@ class TestFailures:
         assert not state["done"].any()
         assert_stepped(env.step(act(env, state.clone())), 0, state)
 
-    @BUFFERS
     @pytest.mark.parametrize("method", ["step", "step_and_maybe_reset"])
-    def test_between_two_steps(self, make_fakes, use_buffers, method):
-        env = make_fakes(3, use_buffers=use_buffers)
+    def test_between_two_steps(self, make_fakes, method):
+        env = make_fakes(3)
         before = env.reset()
         os.kill(env.worker_pids[1], signal.SIGKILL)
         result = getattr(env, method)(act(env, before.clone()))
@@ -80,9 +76,8 @@ class TestFailures:
         assert_stepped(result, 2, before)
         assert env.restarts == 1
 
-    @BUFFERS
-    def test_a_death_is_reported_after_a_reset_of_others(self, make_fakes, use_buffers):
-        env = make_fakes(2, use_buffers=use_buffers)
+    def test_a_death_is_reported_after_a_reset_of_others(self, make_fakes):
+        env = make_fakes(2)
         before = env.reset()
         os.kill(env.worker_pids[1], signal.SIGKILL)
         mask = torch.tensor([[True], [False]])
@@ -91,9 +86,8 @@ class TestFailures:
         assert_stepped(result, 0, state)
         assert_lost(result, 1, before)
 
-    @BUFFERS
-    def test_a_death_before_a_full_reset_is_not_reported(self, make_fakes, use_buffers):
-        env = make_fakes(2, use_buffers=use_buffers)
+    def test_a_death_before_a_full_reset_is_not_reported(self, make_fakes):
+        env = make_fakes(2)
         env.reset()
         os.kill(env.worker_pids[1], signal.SIGKILL)
         state = env.reset()
@@ -126,9 +120,8 @@ class TestFailures:
         assert torch.equal(run(4), pixels)
         assert len(torch.cat([pixels, run(5)]).unique(dim=0)) == 6
 
-    @BUFFERS
-    def test_without_end_raise(self, make_fakes, tmp_path, use_buffers):
-        env = make_fakes(2, folder=tmp_path, use_buffers=use_buffers, max_restarts=2)
+    def test_without_end_raise(self, make_fakes, tmp_path):
+        env = make_fakes(2, folder=tmp_path, max_restarts=2)
         state = env.reset()
         (tmp_path / "all.step").write_text("always raise")
         for _ in range(2):
@@ -171,17 +164,15 @@ class TestFailures:
         with pytest.raises(RuntimeError, match=r"(?s)failed 2 times.*no simulator today"):
             env.step(state)
 
-    @BUFFERS
-    def test_an_interrupted_step_leaves_no_stale_answer(self, make_fakes, use_buffers, monkeypatch):
-        env = make_fakes(2, use_buffers=use_buffers)
+    def test_an_interrupted_step_leaves_no_stale_answer(self, make_fakes, monkeypatch):
+        env = make_fakes(2)
         before = env.reset()
 
         def interrupt(*_):
             raise KeyboardInterrupt
 
-        name = "collect_flags" if use_buffers else "collect_messages"
         with monkeypatch.context() as patch:
-            patch.setattr(parallel, name, interrupt)
+            patch.setattr(parallel, "collect_flags", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 env.step(act(env, before.clone()))
         state = env.reset()

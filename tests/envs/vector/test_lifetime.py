@@ -10,7 +10,7 @@ from pathlib import Path
 import fake_env
 import pytest
 import torch
-from fake_env import BUFFERS, act
+from fake_env import act
 
 import ba_torchrl
 from ba_torchrl.config import WorkerOptions
@@ -107,9 +107,8 @@ def start_parent(folder, source):
     return parent, pids
 
 
-@BUFFERS
-def test_a_trickle_of_deaths_does_not_end_the_environments(make_fakes, use_buffers):
-    env = make_fakes(2, use_buffers=use_buffers, max_restarts=1)
+def test_a_trickle_of_deaths_does_not_end_the_environments(make_fakes):
+    env = make_fakes(2, max_restarts=1)
     state, lost = env.reset(), 0
     for number in range(8):
         # between two steps, in turn, and sooner than any completes one

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 import torch
-from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
+from fake_env import FakeEnv, act, assert_lost, assert_stepped
 
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector.parallel import VectorEnv
@@ -33,9 +33,8 @@ def step_until(env, state, condition, seconds=20.0):
     raise AssertionError(f"not within {seconds} s")
 
 
-@BUFFERS
-def test_other_workers_step_before_a_start_is_awaited(make_fakes, tmp_path, use_buffers):
-    env = make_fakes(2, folder=tmp_path, use_buffers=use_buffers)
+def test_other_workers_step_before_a_start_is_awaited(make_fakes, tmp_path):
+    env = make_fakes(2, folder=tmp_path)
     state = env.reset()
     kill(env, 0)
     awaited, finish = [], env._replacements.finish
@@ -51,10 +50,9 @@ def test_other_workers_step_before_a_start_is_awaited(make_fakes, tmp_path, use_
     assert_stepped(result, 1, state)
 
 
-@BUFFERS
 @pytest.mark.parametrize("how", ["idle", "in a step"])
-def test_environments_are_absent_while_their_worker_starts(make_fakes, tmp_path, use_buffers, how):
-    env = make_fakes(2, folder=tmp_path, use_buffers=use_buffers, wait_for_restarts=False)
+def test_environments_are_absent_while_their_worker_starts(make_fakes, tmp_path, how):
+    env = make_fakes(2, folder=tmp_path, wait_for_restarts=False)
     state = env.reset()
     (tmp_path / "build").write_text("wait")
     if how == "idle":

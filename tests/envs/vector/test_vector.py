@@ -4,10 +4,11 @@ import os
 import signal
 import time
 from functools import partial
+from typing import ClassVar
 
 import pytest
 import torch
-from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
+from fake_env import FakeEnv, act, assert_lost, assert_stepped
 from torchrl.collectors import Collector
 
 import ba_torchrl
@@ -28,10 +29,9 @@ class TestSeeds:
         rollout = env.rollout(3, auto_reset=True, break_when_any_done=False)
         return torch.cat([first[:, None], rollout["pixels"]], 1)
 
-    @pytest.mark.parametrize("options", [{}, {"use_buffers": False}], ids=["buffers", "pipes"])
-    def test_serial_and_parallel_agree(self, make_fakes, options):
+    def test_serial_and_parallel_agree(self, make_fakes):
         serial = make_fakes(3, seed=5, parallel=False)
-        parallel = make_fakes(3, seed=5, **options)
+        parallel = make_fakes(3, seed=5)
         expected = self.pixels(serial)
         assert torch.equal(self.pixels(parallel), expected)
         assert len(expected[:, 0].unique(dim=0)) == 3
@@ -49,17 +49,17 @@ class TestSeeds:
         assert torch.equal(env.reset()["pixels"], at_start)
 
     @pytest.mark.parametrize("parallel", [False, True])
-    @pytest.mark.parametrize("seed", [-1, 1.5, True])
-    def test_refuses_invalid_seeds(self, make_fakes, parallel, seed):
+    def test_refuses_invalid_seeds(self, make_fakes, parallel):
         env = make_fakes(1, parallel=parallel)
-        with pytest.raises(ValueError, match="natural number"):
-            env.set_seed(seed)
-        with pytest.raises(ValueError, match="natural number"):
-            env.reset(seed=seed)
+        for seed in (-1, 1.5, True):
+            with pytest.raises(ValueError, match="natural number"):
+                env.set_seed(seed)
+            with pytest.raises(ValueError, match="natural number"):
+                env.reset(seed=seed)
 
 
 class TestResets:
-    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}])
     def test_partial(self, make_fakes, options):
         env = make_fakes(3, **options)
         state = env.reset()
@@ -78,7 +78,7 @@ class TestResets:
         assert torch.equal(after["pixels"], state["pixels"])
         assert after["step_count"].flatten().tolist() == [1, 1]
 
-    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    @pytest.mark.parametrize("options", [{"parallel": False}, {}])
     def test_rollout_continues_after_done(self, make_fakes, options):
         env = make_fakes(horizon=3, **options)
         rollout = env.rollout(7, break_when_any_done=False)
@@ -97,27 +97,25 @@ class TestResets:
 
 
 class TestActions:
-    @pytest.mark.parametrize("options", [{"parallel": False}, {}, {"use_buffers": False}])
+    invalid: ClassVar = {
+        "environment 1 holds NaN": torch.tensor([[0.0, 0.0], [0.0, torch.nan]]),
+        "environment 0 holds an infinite": torch.tensor([[0.0, torch.inf], [0.0, 0.0]]),
+        r"environment 0 has shape \[3\]": torch.zeros(2, 3),
+        "environment 0 has type torch.int64": torch.zeros(2, 2, dtype=torch.int64),
+        "there is no action": None,
+    }
+    """Actions by the message."""
+
+    @pytest.mark.parametrize("parallel", [False, True])
     @pytest.mark.parametrize("method", ["step", "step_and_maybe_reset"])
-    @pytest.mark.parametrize(
-        ("action", "message"),
-        [
-            (torch.tensor([[0.0, 0.0], [0.0, torch.nan]]), "environment 1 holds NaN"),
-            (torch.tensor([[0.0, torch.inf], [0.0, 0.0]]), "environment 0 holds an infinite"),
-            (torch.zeros(2, 3), r"environment 0 has shape \[3\]"),
-            (torch.zeros(2, 2, dtype=torch.int64), "environment 0 has type torch.int64"),
-            (None, "there is no action"),
-        ],
-    )
-    def test_invalid_actions_are_refused_before_a_step(
-        self, make_fakes, options, method, action, message
-    ):
-        env = make_fakes(2, **options)
+    def test_invalid_actions_are_refused_before_a_step(self, make_fakes, parallel, method):
+        env = make_fakes(2, parallel=parallel)
         state = env.reset()
-        bad = state.clone() if action is None else state.clone().set("action", action)
         allowed = r"float32 tensor of shape \[2\], from \[-1.0, -1.0\] to \[1.0, 1.0\]"
-        with pytest.raises(ValueError, match=rf"{message}.*{allowed}"):
-            getattr(env, method)(bad)
+        for message, action in self.invalid.items():
+            bad = state.clone() if action is None else state.clone().set("action", action)
+            with pytest.raises(ValueError, match=rf"{message}.*{allowed}"):
+                getattr(env, method)(bad)
         result = env.step(act(env, state))
         assert result["next", "step_count"].flatten().tolist() == [1, 1]
         assert getattr(env, "restarts", 0) == 0
@@ -135,9 +133,8 @@ class TestActions:
 
 
 class TestWithTheRestOfTorchRL:
-    @BUFFERS
-    def test_a_collector_survives_a_kill(self, make_fakes, use_buffers):
-        env = make_fakes(2, use_buffers=use_buffers, horizon=5)
+    def test_a_collector_survives_a_kill(self, make_fakes):
+        env = make_fakes(2, horizon=5)
         collector = Collector(env, None, frames_per_batch=20, total_frames=60)
         batches = []
         for batch in collector:
@@ -155,6 +152,7 @@ class TestWithTheRestOfTorchRL:
         assert data["step_count"][0, 11].item() == 0
         assert data["step_count"][1].flatten().tolist() == [0, 1, 2, 3, 4] * 6
 
+    @pytest.mark.slow
     def test_spawn(self, make_fakes):
         env = make_fakes(2, seed=3, start_method="spawn", timeout_s=60.0)
         expected = make_fakes(2, seed=3, parallel=False).reset()
@@ -176,10 +174,9 @@ class TestWithTheRestOfTorchRL:
 
 
 class TestResources:
-    @BUFFERS
-    def test_restarts_and_close_leak_nothing(self, use_buffers):
+    def test_restarts_and_close_leak_nothing(self):
         def live():
-            env = make_vector(FakeEnv, 2, seed=0, workers=FORK, use_buffers=use_buffers)
+            env = make_vector(FakeEnv, 2, seed=0, workers=FORK)
             state = env.reset()
             for _ in range(4):
                 os.kill(env.worker_pids[0], signal.SIGKILL)
@@ -209,13 +206,12 @@ class TestResources:
         env.close()
         assert time.perf_counter() - start < 3
 
-    @pytest.mark.parametrize("num_threads", [None, 1])
-    def test_threads_of_this_process(self, make_fakes, num_threads):
+    def test_threads_of_this_process(self, make_fakes):
         before = torch.get_num_threads()
         torch.set_num_threads(2)
         try:
-            env = make_fakes(2, num_threads=num_threads)
-            assert torch.get_num_threads() == (num_threads or 2)
+            env = make_fakes(2)
+            assert torch.get_num_threads() == 2
             env.close()
             assert torch.get_num_threads() == 2
         finally:

@@ -301,15 +301,17 @@ def test_a_block_pushed_by_a_finger_is_not_held(scene):
 
 @pytest.mark.parametrize("shared", ["kuka"], indirect=True)
 def test_a_pushed_block_stays_at_the_finger(scene):
+    """Too fast a motion or too sudden a stop leaves a gap of 5 mm or more when it is at rest."""
     block, motion = scene.put(), scene.motion
     motion.grip(0.5)
     motion.move_to((0.45, -0.06, 0.2), 0.0)
     motion.move_to((0.45, -0.06, 0.03), 0.0)
-    for _ in range(3):
+    for distance_m in (0.05, 0.05, 0.1):
         y = scene.robot.tool_pose()[0][1]
-        motion.move_to((0.45, y + 0.05, 0.03), 0.0)
+        motion.move_to((0.45, y + distance_m, 0.03), 0.0)
+        scene.world.settle()
         gap = block.position[1] - scene.robot.tool_pose()[0][1]
-        assert gap == pytest.approx(0.025 + 0.0095, abs=6e-3)
+        assert gap == pytest.approx(0.0325, abs=2e-3)
 
 
 def test_unlimited_rotation_of_the_wrist(scene):
@@ -414,7 +416,6 @@ def test_random_actions_keep_blocks_in_place_and_repeat_bit_by_bit(name):
 
 EXPERTS = [
     ("picking", {}),
-    ("pulling", {"random_orientation": False, "action_sequence": "pxyz"}),
     *(
         pytest.param(task, variant, marks=pytest.mark.slow)
         for task in ("reaching", "picking", "pushing", "pulling")
