@@ -67,7 +67,7 @@ def mermaid() -> str:
     """Return the picture as a Mermaid flowchart."""
     edges = graph()
     # `make` builds environments, which import nothing of it: the functions import when called
-    edges["make"] = edges.get("make", set()) | {"envs"}
+    edges["make"] = {"envs"}
     lines = ["```mermaid", "flowchart TB"]
     labels = {
         "base": "errors, config, registry,\\nplugins, actions",

@@ -26,8 +26,8 @@ SUBJECTS = {
         (f"{PACKAGE}.algorithms.", f"{PACKAGE}.objectives."),
     ),
     "a training run": (
-        Definition("recipes.train", "main"),
-        ("recipes.", f"{PACKAGE}.training.", f"{PACKAGE}.record."),
+        Definition(f"{PACKAGE}.commands.train", "main"),
+        (f"{PACKAGE}.cli.", f"{PACKAGE}.commands.", f"{PACKAGE}.training.", f"{PACKAGE}.record."),
     ),
 }
 """By subject, the entry, and the folders that one reads."""

@@ -192,7 +192,7 @@ def updates() -> list[tuple[str, object]]:
 
     def one_update(control: str, algorithm: str, network: str) -> None:
         values = {
-            "task": usual[control][0],
+            "task": "ramp/block_stacking" if "deictic" in network else usual[control][0],
             "env": {"obs_size": 142 if algorithm == "ferm" else 64},
             "algorithm": {**presets["algorithm"][algorithm], "batch_size": 2},
             "network": small(presets["network"][network]),
