@@ -138,7 +138,7 @@ def _vector() -> Finding:
     missing = missing_names()
     if not missing:
         return Finding("make_vector_env", "replaces workers that fail")
-    fix = f"pip install 'torchrl==0.14.*' (without {', '.join(missing)})"
+    fix = f"pip install 'torchrl>=0.14' (without {', '.join(missing)})"
     return Finding("make_vector_env", "TorchRL's ParallelEnv: workers are not replaced", fix)
 
 
