@@ -25,10 +25,15 @@ def onednn_max_cpu_isa() -> str | None:
     return None if value.upper() in ("", "DEFAULT", "ALL") else value.upper()
 
 
+def _capabilities() -> dict[str, Any]:
+    """Return torch's flags of the processor; none before torch 2.11, which then uses float32."""
+    return dict(getattr(torch.cpu, "get_capabilities", dict)())
+
+
 def amx_is_used() -> bool:
     """Return whether the processor has AMX and oneDNN may use it."""
     allowed = onednn_max_cpu_isa()
-    has_amx = bool(torch.cpu.get_capabilities().get("amx_bf16"))
+    has_amx = bool(_capabilities().get("amx_bf16"))
     return has_amx and (allowed is None or "AMX" in allowed)
 
 
@@ -39,7 +44,7 @@ def bfloat16_is_fast() -> bool:
     """
     if amx_is_used():
         return True
-    has, allowed = torch.cpu.get_capabilities(), onednn_max_cpu_isa()
+    has, allowed = _capabilities(), onednn_max_cpu_isa()
     is_intel = str(has.get("cpu_name", "")).startswith("Intel")
     is_allowed = allowed is None or allowed.startswith(WITH_AVX512_BF16)
     return bool(has.get("avx512_bf16")) and not is_intel and is_allowed
@@ -50,7 +55,7 @@ def processor() -> str:
 
     AMX is left out where oneDNN may not use it; a limit of oneDNN's instructions is named.
     """
-    has, allowed = dict(torch.cpu.get_capabilities()), onednn_max_cpu_isa()
+    has, allowed = _capabilities(), onednn_max_cpu_isa()
     has["amx_bf16"] = amx_is_used()
     widest = next((name for flag, name in INSTRUCTIONS.items() if has.get(flag)), None)
     limit = None if allowed is None else f"oneDNN limited to {allowed}"
