@@ -104,7 +104,9 @@ def test_yaws_of_half_a_turn(quarters, trained):
     assert is_swapped.any()
     with torch.no_grad():
         pixels, yaws, *others = values_of(network, *observation, chosen)
-        found = values_of(network, *scene, moved)[:2] + values_of(network, *swapped_scene, moved)[2:]
+        found = (
+            values_of(network, *scene, moved)[:2] + values_of(network, *swapped_scene, moved)[2:]
+        )
         assert_equal(found[0], torch.rot90(pixels, quarters, (-2, -1)))
         assert_equal(found[1], yaws.roll(4 * quarters, dims=1))
         for actual, expected in zip(found[2:], others, strict=True):
