@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
-from torch.optim import Optimizer
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
@@ -29,7 +29,7 @@ from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
-from ba_torchrl.algorithms.optimizers import Optimizers, make_adam
+from ba_torchrl.algorithms.optimizers import Optimizers
 from ba_torchrl.config import StrictModel, changed
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import ReplayKind, make_replay
@@ -311,8 +311,11 @@ class Learner(ABC):
         policy = self.make_policy(networks)
         self.loss = self.make_loss(networks).to(problem.device)
         self.trained_policy = policy.to(problem.device)
-        self.averaged_policy = averaged = self.make_averaged_policy()
-        acting = self.trained_policy if averaged is None else averaged.module
+        self.averaged_policy = None
+        if config.policy_average:
+            average = get_ema_multi_avg_fn(config.policy_average)
+            self.averaged_policy = AveragedModel(self.trained_policy, multi_avg_fn=average)
+        acting = self.averaged_policy.module if self.averaged_policy else self.trained_policy
         self.policy = ActingPolicy(
             acting, self.make_acting_transforms(), self.make_exploration()
         ).to(problem.device)
@@ -344,13 +347,6 @@ class Learner(ABC):
     @abstractmethod
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
-
-    def make_averaged_policy(self) -> AveragedModel | None:
-        """Return the moving average of the policy that acts; None if the policy itself acts."""
-        if not self.config.policy_average:
-            return None
-        average = get_ema_multi_avg_fn(self.config.policy_average)
-        return AveragedModel(self.trained_policy, multi_avg_fn=average)
 
     def make_init_loss(self) -> LossModule:
         """Return the loss of the pretraining updates with ``init="bc"``.
@@ -425,8 +421,14 @@ class Learner(ABC):
     def adam(self, parameters: Iterable[nn.Parameter], factor: float = 1.0) -> Optimizer:
         """Return Adam for some parameters with a factor on the learning rate, and with weight decay
         on those of the networks only."""
-        config, decayed = self.config, self.network_parameters()
-        return make_adam(parameters, decayed, factor * config.learning_rate, config.weight_decay)
+        others = {id(parameter): parameter for parameter in parameters}
+        decayed = [p for p in self.network_parameters() if others.pop(id(p), None) is not None]
+        groups = [
+            {"params": decayed, "weight_decay": self.config.weight_decay},
+            {"params": list(others.values()), "weight_decay": 0.0},
+        ]
+        groups = [group for group in groups if group["params"]]
+        return Adam(groups, lr=factor * self.config.learning_rate, fused=True)
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return the parameters to which weight decay and the gradient's bound apply."""
@@ -491,17 +493,15 @@ class Learner(ABC):
         if sampler is not None:
             sampler.anneal(self._annealing_progress())
         batch, device = self.replay.sample(), self.problem.device
-        rows = (
-            batch[keys.IS_DEMONSTRATION].reshape(-1).nonzero()[:, 0]
-            if demonstrations_only
-            else None
-        )
+        is_demonstration = batch[keys.IS_DEMONSTRATION] if demonstrations_only else None
         if device.type == "cpu":
             batch = self.augmentation(batch)
         else:
             batch = decoded_on_device(batch, self.codecs, device)
             batch = batch_to_device(self.augmentation(batch), device)
-        return batch if rows is None else batch[to_device(rows, device)]
+        if is_demonstration is None:
+            return batch
+        return batch[to_device(is_demonstration.reshape(-1).nonzero()[:, 0], device)]
 
     # -- updates -----------------------------------------------------------------------------
 
@@ -547,20 +547,13 @@ class Learner(ABC):
 
     def pretrain_update(self) -> TensorDict:
         """Take one update before the first collection; with ``init="bc"``, of behaviour cloning of
-        the expert's transitions in a batch.
-
-        An override increments `updates`, and returns and raises as `update` does.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+        the expert's transitions in a batch. It counts, returns and raises as `update`."""
         if self.init_loss is None:
             return self.update()
         return self.minimize([self.init_loss(self.sample(demonstrations_only=True))])
 
     def minimize(self, stages: Iterable[TensorDictBase]) -> TensorDict:
-        """Take the steps of `step`, update the average, and count the update; see there for
-        argument, result and errors."""
+        """Take the steps of `step`, with its argument and result, and count the update."""
         before = len(self.host_tasks)
         scalars = self.step(stages)
         if self.averaged_policy is not None:
@@ -606,11 +599,10 @@ class Learner(ABC):
 
     # -- state -------------------------------------------------------------------------------
 
-    def _stateful_parts(self) -> dict[str, Any]:
-        names = ["loss", "stored_augmentation", "augmentation"]
-        if self.averaged_policy is not None:
-            names.append("averaged_policy")
-        return {name: getattr(self, name) for name in names}
+    def _stateful_parts(self) -> dict[str, nn.Module]:
+        names = ("loss", "stored_augmentation", "augmentation", "averaged_policy")
+        parts = {name: getattr(self, name) for name in names}
+        return {name: part for name, part in parts.items() if part is not None}
 
     def generators(self) -> Mapping[str, torch.Generator]:
         """Return the generators whose states are saved, by name, besides those of the replay and

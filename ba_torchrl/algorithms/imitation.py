@@ -88,13 +88,7 @@ class DAggerConfig(ImitationConfig):
 
 
 class BC(Learner):
-    """A policy trained on demonstrations only.
-
-    Args:
-        config: hyper-parameters.
-        network: builds the network of the policy.
-        problem: images, actions, device, seed and length of the run.
-    """
+    """A policy trained on demonstrations only."""
 
     actions: SpatialActions | None = None
     """The grid of actions of an open-loop policy."""
@@ -187,13 +181,7 @@ class MixedPolicy(TensorDictModuleBase):
 
 
 class DAgger(BC):
-    """A policy trained on the expert's actions in the states of both.
-
-    Args:
-        config: hyper-parameters.
-        network: builds the network of the policy.
-        problem: images, actions, device, seed and length of the run.
-    """
+    """A policy trained on the expert's actions in the states of both."""
 
     config: DAggerConfig
     policy: MixedPolicy

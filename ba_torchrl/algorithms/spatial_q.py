@@ -100,11 +100,6 @@ class SpatialQConfig(LearnerConfig):
 class SpatialQ(Learner):
     """A network of spatial Q values with a target network that is copied at intervals.
 
-    Args:
-        config: hyper-parameters.
-        network: builds the network.
-        problem: images, actions, device, seed and length of the run.
-
     Raises:
         ValueError: the network or the augmentation does not support the task's images or actions.
     """
