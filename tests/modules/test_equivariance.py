@@ -81,7 +81,7 @@ def test_quarter_turns_and_reflections_are_exact(size, sequence, group_order, op
     with torch.no_grad():
         loc, scale = networks.actor(pixels, holding)
         values = networks.critic(networks.encoder(pixels, holding), action)
-        assert loc.abs().max() > 1e-3
+        assert loc[:, [sequence.index("x"), sequence.index("y")]].abs().max() > 1e-3
         turns = range(0, 4, 1 if group_order > 2 else 2)
         for quarters, flips in product(turns, (False, True)[: 1 + ("reflections" in options)]):
             image = pixels.flip(-1) if flips else pixels
@@ -123,23 +123,6 @@ def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(trained):
         features = networks.encoder(turned, holding)
         turned_values = networks.critic(features, turn_action(action, "pxyzr", quarters))
         assert (turned_values - values).norm() < 0.005 * values.norm()
-
-
-def test_rotation_in_the_opposite_sense_is_not_equivariant():
-    """The previous test distinguishes the two senses of rotation."""
-    networks = actor_critic("equi", group_order=8)
-    pixels, holding = torch.rand(3, 1, 64, 64), torch.ones(3, 1, dtype=torch.bool)
-    action = torch.rand(3, 5) * 2 - 1
-    with torch.no_grad():
-        turned = torch.rot90(pixels, 1, (-2, -1))
-        loc, turned_loc = networks.actor(pixels, holding)[0], networks.actor(turned, holding)[0]
-        backwards = turn_action(loc, "pxyzr", 3)
-        gap = (turned_loc - backwards)[:, 1:3].norm() / loc[:, 1:3].norm()
-        assert gap > 1.9  # exactly opposite vectors differ by twice their length
-        features = networks.encoder(turned, holding)
-        right = networks.critic(features, turn_action(action, "pxyzr", 1))
-        wrong = networks.critic(features, turn_action(action, "pxyzr", 3))
-        assert not torch.allclose(right, wrong, rtol=1e-3)
 
 
 def blob(size, angle_rad, sigma=0.12, radius=0.25):

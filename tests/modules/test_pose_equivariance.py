@@ -139,14 +139,3 @@ def test_tilts_and_what_is_held_turn_over_with_the_fingers():
         assert_different(values_of(network, *observation, tilted)[4], expected)
         other = (pixels, in_hand.flip(-2), holding)
         assert_different(values_of(network, *other, chosen)[4], expected)
-
-
-def test_the_plain_network_is_not_equivariant():
-    network = build("asr")
-    *observation, chosen = batch()
-    with torch.no_grad():
-        values = values_of(network, *observation, chosen)
-        found = values_of(network, *turned(observation, chosen, 1, 2))
-    assert_different(found[1], values[1].roll(2, dims=1))
-    for actual, expected in zip(found[2:], values[2:], strict=True):
-        assert_different(actual, expected)
