@@ -93,13 +93,7 @@ class SeedUse(IntEnum):
 
 
 def derive_seed(seed: int, use: SeedUse, part: int = 0) -> int:
-    """Return the seed of one use of randomness in a run.
-
-    Args:
-        seed: of the run.
-        use: the use.
-        part: index among several seeds of the same use.
-    """
+    """Return the seed of one use of randomness in the run with a seed, or of one of its parts."""
     return int(np.random.SeedSequence([seed, use, part]).generate_state(1)[0])
 
 
@@ -126,13 +120,8 @@ class Problem:
 
 
 def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:
-    """Return the number format of a network's convolutions; float32 for one without the field
-    ``precision``.
-
-    Args:
-        network: hyper-parameters.
-        device: where it is computed.
-    """
+    """Return the number format of a network's convolutions on a device; float32 for a network
+    without the field ``precision``."""
     return compute_dtype(getattr(network, "precision", "float32"), device)
 
 
@@ -228,10 +217,6 @@ class LearnerConfig(StrictModel, ABC):
     def check(self, network: NetworkConfig, control: Control) -> None:
         """Check that the algorithm supports the task's control, and that the network does.
 
-        Args:
-            network: hyper-parameters of the network.
-            control: control of the task.
-
         Raises:
             ConfigError: the algorithm or the network does not support this control.
         """
@@ -250,12 +235,8 @@ class LearnerConfig(StrictModel, ABC):
             )
 
     def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """Yield a message for each value that has no effect together with the others; by default,
-        for fields of another replay.
-
-        Args:
-            network: hyper-parameters of the network.
-        """
+        """Yield a message for each value that has no effect together with the others and the
+        network; by default, for fields of another replay."""
         if self.replay != "prioritized":
             yield from changed(self, _OF_PRIORITIES, "without replay='prioritized'")
         elif self.importance_weighted == "none":
@@ -270,8 +251,8 @@ class Learner(ABC):
     """Networks, a loss, an optimiser and a replay, which `ba_torchrl.training.experiment` fills.
 
     The constructor calls the ``make_...`` methods. An algorithm implements the first three and can
-    override the others. An update minimises the sums of the
-    ``loss_...`` entries of its stages one after the other, by default that of the loss module.
+    override the others. An update minimises the sums of the ``loss_...`` entries of its stages one
+    after the other, by default that of the loss module.
 
     On a CUDA device the host does not wait for an update: batches are copied as uint8 codes from
     pinned memory, and priorities are set, and losses checked, at the end of the next update. From a
@@ -437,14 +418,8 @@ class Learner(ABC):
     # -- data --------------------------------------------------------------------------------
 
     def nearest_action(self, action: Tensor) -> Tensor:
-        """Return the action nearest to a given one among those that the policy can choose.
-
-        Demonstrations execute this action, so that the executed action is the one that is learnt.
-        By default the policy can choose every action.
-
-        Args:
-            action: [..., A].
-        """
+        """Return the actions nearest to given ones [..., A] among those that the policy can choose;
+        by default it can choose all. Demonstrations execute what is learnt: these actions."""
         return action
 
     def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
@@ -462,11 +437,8 @@ class Learner(ABC):
         )
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Process the demonstrations before the first update; by default they enter the replay.
-
-        Args:
-            episodes: TensorDicts [T].
-        """
+        """Process the demonstrations, TensorDicts [T], before the first update; by default they
+        enter the replay."""
         for episode in episodes:
             self.extend(self.to_transitions(episode, is_demonstration=True))
 
@@ -484,11 +456,8 @@ class Learner(ABC):
         return len(self.replay)
 
     def sample(self, *, demonstrations_only: bool = False) -> TensorDictBase:
-        """Return an augmented batch from the replay, on the learner's device.
-
-        Args:
-            demonstrations_only: leave out the batch's other transitions.
-        """
+        """Return an augmented batch from the replay on the learner's device, on request only its
+        demonstrations."""
         sampler = self._prioritized_sampler()
         if sampler is not None:
             sampler.anneal(self._annealing_progress())
@@ -521,9 +490,6 @@ class Learner(ABC):
 
     def compile(self, mode: CompileMode) -> None:
         """Compile the loss and its gradient, except those of ``pretraining_option``.
-
-        Args:
-            mode: of `torch.compile`.
 
         Raises:
             ConfigError: the algorithm cannot be compiled, the mode is unknown, or the system has no

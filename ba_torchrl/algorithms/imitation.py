@@ -51,11 +51,7 @@ class BCConfig(ImitationConfig):
     imitates: ClassVar[Imitation] = "expert"
 
     def build(self, network: NetworkConfig, problem: Problem) -> BC:
-        """Return a freshly initialised learner.
-
-        Raises:
-            ValueError: the network does not support the task's images or actions.
-        """
+        """Return a freshly initialised learner."""
         return BC(self, network, problem)
 
 
@@ -79,11 +75,7 @@ class DAggerConfig(ImitationConfig):
     alone included."""
 
     def build(self, network: NetworkConfig, problem: Problem) -> DAgger:
-        """Return a freshly initialised learner.
-
-        Raises:
-            ValueError: the network does not support the task's images or actions.
-        """
+        """Return a freshly initialised learner."""
         return DAgger(self, network, problem)
 
 
@@ -124,12 +116,8 @@ class BC(Learner):
         return action if self.actions is None else self.actions.nearest(action)
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store the steps of demonstrations in which the expert's action is known, as an action
-        that the policy can choose.
-
-        Args:
-            episodes: TensorDicts [T].
-        """
+        """Store the steps of demonstrations [T] in which the expert's action is known, as an action
+        that the policy can choose."""
         for episode in episodes:
             if self.actions is not None:
                 episode = demonstration_on_grid(episode, self.actions, self.images)
@@ -193,11 +181,7 @@ class DAgger(BC):
         self._set_beta()
 
     def update(self) -> TensorDict:
-        """Take one step as `Learner.update`, and update beta.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+        """Take one step as `Learner.update`, and update beta."""
         scalars = super().update()
         self._set_beta()
         return scalars

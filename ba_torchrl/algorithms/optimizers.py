@@ -45,9 +45,6 @@ class Optimizers:
     def of(self, terms: Collection[str]) -> list[Optimizer]:
         """Return the optimisers that minimise a sum of terms.
 
-        Args:
-            terms: names of the terms.
-
         Raises:
             ValueError: the terms have different optimisers.
         """

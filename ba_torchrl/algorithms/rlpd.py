@@ -106,11 +106,7 @@ class RLPD(SAC):
         )
 
     def update(self) -> TensorDict:
-        """Take the critic updates, the last one together with that of policy and temperature.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+        """Take the critic updates, the last one together with that of policy and temperature."""
         for _ in range(self.config.critic_updates - 1):
             self.step([self.loss.critic_loss(self.sample())])
         return super().update()

@@ -147,11 +147,8 @@ class LevelCrossEntropyLoss(_ImitationLoss):
         self._set_observation(value_network.in_keys)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``loss_bc``, and the fraction of choices that are the expert's as ``accuracy``.
-
-        Args:
-            tensordict: observations and expert actions [B].
-        """
+        """Return ``loss_bc`` of observations and expert actions [B], and the fraction of choices
+        that are the expert's as ``accuracy``."""
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             levels = self.value_network(*(tensordict[key] for key in self.in_keys))
         losses = [F.cross_entropy(values, chosen) for values, chosen in levels]

@@ -1,7 +1,8 @@
-"""The SACfD loss against plain arithmetic, and against TorchRL's contract."""
+"""The losses of SACfD and RLPD against plain arithmetic, and against TorchRL's contract."""
 
 import itertools
 import math
+import statistics
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from torch.distributions import Bernoulli, kl_divergence
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
 from ba_torchrl.envs import keys
+from ba_torchrl.objectives.rlpd import RLPDLoss
 from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SoftUpdateByNetwork
 from tests.linear_sac import batch, make
 
@@ -40,8 +42,12 @@ def by_hand(
     terms="critic_and_policy",
     norm="max",
     entropy_backup=True,
+    of_policy=min,
 ):
-    """The terms of the loss, computed with Python floats and loops."""
+    """The terms of the loss, computed with Python floats and loops.
+
+    ``of_policy`` is the value of the critics' values that the policy maximises.
+    """
 
     def parameters(name):
         tree = getattr(loss, name)
@@ -65,7 +71,8 @@ def by_hand(
 
     n = len(data)
     critic, policy_weights, others = importance(data, terms, norm)
-    qvalue = actor_term = alpha_term = entropy = value = behaviour = weighted_behaviour = 0.0
+    qvalue = actor_term = alpha_term = entropy = value = spread = 0.0
+    behaviour = weighted_behaviour = 0.0
     experts, priorities = 0, []
     for i in range(n):
         x, following = observation(data, i), observation(data[keys.NEXT], i)
@@ -76,12 +83,14 @@ def by_hand(
         y = float(data[keys.NEXT, keys.REWARD][i])
         if not data[keys.NEXT, keys.TERMINATED][i]:
             y += gamma * bootstrap
-        errors = [v - y for v in q(x, stored, "")]
+        values = q(x, stored, "")
+        errors = [v - y for v in values]
         qvalue += critic[i] * sum(e * e for e in errors) / n
-        value += sum(q(x, stored, "")) / 2 / n
-        priorities.append([sum(abs(e) for e in errors) / 2])
+        value += statistics.mean(values) / n
+        spread += statistics.stdev(values) / n
+        priorities.append([statistics.mean(map(abs, errors))])
         action, log_prob = policy(x)
-        actor_term += policy_weights[i] * (alpha * log_prob - min(q(x, action, ""))) / n
+        actor_term += policy_weights[i] * (alpha * log_prob - of_policy(q(x, action, ""))) / n
         alpha_term -= others[i] * math.log(alpha) * (log_prob + target_entropy) / n
         entropy -= log_prob / n
         if keys.IS_DEMONSTRATION in data and data[keys.IS_DEMONSTRATION][i]:
@@ -99,7 +108,13 @@ def by_hand(
         "entropy": entropy,
         "demonstration_error": behaviour,
         "q_value": value,
+        "q_std": spread,
     }, priorities
+
+
+def assert_terms(out, expected):
+    for name, value in out.items():
+        assert value.item() == pytest.approx(expected[name], rel=1e-6), name
 
 
 @pytest.mark.parametrize("weights", [(0.2, 0.8, 0.4, 0.1), None], ids=["weights", "uniform"])
@@ -112,9 +127,8 @@ def test_losses_equal_a_calculation_in_python(experts, weights, demonstration_we
     data = batch(experts, weights)
     expected, priorities = by_hand(loss, data, 0.9, 0.2, -1.5, demonstration_weight)
     out = loss(data)
-    assert set(out.keys()) == set(loss.out_keys) == set(expected)
-    for name, value in expected.items():
-        assert out[name].item() == pytest.approx(value, rel=1e-6), name
+    assert set(out.keys()) == set(loss.out_keys)
+    assert_terms(out, expected)
     assert data[keys.TD_ERROR].shape == (4, 1)
     expected_priorities = torch.tensor(priorities, dtype=torch.float64)
     torch.testing.assert_close(data[keys.TD_ERROR], expected_priorities, rtol=1e-6, atol=0)
@@ -126,9 +140,7 @@ def test_importance_weights_multiply_the_chosen_terms(terms, norm):
     loss = make(alpha_init=0.2, target_entropy=-1.5, weighted_terms=terms, weight_norm=norm)
     data = batch()
     expected, _ = by_hand(loss, data, 0.99, 0.2, -1.5, 1.0, terms, norm)
-    out = loss(data)
-    for name, value in expected.items():
-        assert out[name].item() == pytest.approx(value, rel=1e-6), name
+    assert_terms(loss(data), expected)
 
 
 def test_defaults_are_those_of_the_appendix_and_the_entropy_can_be_left_out_of_the_target():
@@ -137,8 +149,7 @@ def test_defaults_are_those_of_the_appendix_and_the_entropy_can_be_left_out_of_t
         loss = make(entropy_backup=backup)
         expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 1, entropy_backup=backup)
         out = loss(data)
-        for name, value in expected.items():
-            assert out[name].item() == pytest.approx(value, rel=1e-6), name
+        assert_terms(out, expected)
         losses.append(out["loss_qvalue"].item())
     assert losses[0] != pytest.approx(losses[1], rel=1e-4)
 
@@ -508,3 +519,48 @@ def test_targets_follow_and_the_encoders_can_have_a_rate_of_its_own(encoder_tau)
         for key, old in before[name].items(True, True):
             torch.testing.assert_close(target[key], old + tau * (online[key].detach() - old))
     assert not any(n.startswith("target") for n, _ in loss.named_parameters())
+
+
+# -- an ensemble of critics (RLPD) ---------------------------------------------------------------
+
+CRITICS = 4
+
+
+def rlpd(draws=0, **settings):
+    options = {"kind": RLPDLoss, "critics": CRITICS, "alpha_init": 0.2, "target_entropy": -1.5}
+    loss = make(**options, **settings)
+    loss.generator.manual_seed(draws)
+    return loss.make_value_estimator(gamma=0.9).double()
+
+
+@pytest.mark.parametrize("entropy_backup", [False, True])
+def test_the_policy_maximises_the_mean_of_the_ensemble(entropy_backup):
+    loss, data = rlpd(subset=CRITICS, entropy_backup=entropy_backup), batch(weights=None)
+    options = {"entropy_backup": entropy_backup, "of_policy": statistics.mean}
+    expected, _ = by_hand(loss, data, 0.9, 0.2, -1.5, 0, **options)
+    out = loss(data)
+    assert set(out.keys()) == set(loss.out_keys)
+    assert_terms(out, expected)
+
+
+def test_targets_are_from_random_subsets_of_the_given_size(monkeypatch):
+    loss, data = rlpd(subset=2, draws=3), batch(weights=None)
+
+    def target():
+        return tuple(loss._target(data)[:, 0].numpy().round(6).tolist())
+
+    drawn, expected = {target() for _ in range(60)}, set()
+    for pair in itertools.combinations(range(CRITICS), 2):
+        # pairs with the same lowest critic have the same target
+        lowest = lambda q, pair=pair: q[..., list(pair)].amin(dim=-1)  # noqa: E731
+        monkeypatch.setattr(loss, "_target_value", lowest)
+        expected.add(target())
+    assert drawn == expected
+    assert len(expected) >= 3
+
+
+def test_the_critics_alone_have_the_same_loss():
+    first, second, data = rlpd(draws=1), rlpd(draws=1), batch(weights=None)
+    critic = first.critic_loss(data)
+    assert "loss_actor" not in critic
+    torch.testing.assert_close(critic["loss_qvalue"], second(data)["loss_qvalue"])

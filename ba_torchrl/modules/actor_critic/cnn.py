@@ -76,13 +76,7 @@ def mlp(*sizes: int) -> nn.Sequential:
 def plain_trunk(
     config: ImageNetworkConfig, spec: ActorCriticSpec, widths: Sequence[int]
 ) -> ImageTrunk:
-    """Return a trunk of plain convolutions.
-
-    Args:
-        config: precision and the input's units.
-        spec: the images.
-        widths: of the stages of 128 px images.
-    """
+    """Return a trunk of plain convolutions with the widths of the stages of 128 px images."""
     stages = trunk_stages(spec.image_size, widths)
     inputs = [config.input_channels(spec.image_channels), *(width for width, _, _ in stages)]
     convs = [
