@@ -125,9 +125,6 @@ def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:
     return compute_dtype(getattr(network, "precision", "float32"), device)
 
 
-Init = Literal["random", "bc"]
-"""How the policy is initialised."""
-
 _OF_PRIORITIES = (
     "priority_exponent",
     "importance_exponent",
@@ -185,7 +182,7 @@ class LearnerConfig(StrictModel, ABC):
     (2016), or "mean"."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
-    init: Init = "random"
+    init: Literal["random", "bc"] = "random"
     """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
     updates are behaviour cloning of the demonstrations instead of updates of the algorithm. Critics
     are not trained meanwhile: without a behaviour term, SAC then unlearns the policy."""
