@@ -1,13 +1,14 @@
-# `make train` and `make test` need Python 3.11 and make, nothing else: they set up .venv first.
+# `make train` and `make test` need Python 3.10 to 3.13 and make, nothing else: they set up .venv first.
 
 VENV ?= .venv
 ARGS ?=
 # Another place to take torch from, as a URL for pip's --index-url. Empty: as pip is configured.
 TORCH_INDEX_URL ?=
 
-IS_311 := import sys; sys.exit(sys.version_info[:2] != (3, 11))
-PYTHON ?= $(shell for python in python3.11 python3 python; do \
-	if $$python -c "$(IS_311)" >/dev/null 2>&1; then echo $$python; break; fi; done)
+IS_SUPPORTED := import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
+# 3.11 first: the last version for which PyBullet has a wheel.
+PYTHON ?= $(shell for python in python3.11 python3 python3.12 python3.13 python3.10 python; do \
+	if $$python -c "$(IS_SUPPORTED)" >/dev/null 2>&1; then echo $$python; break; fi; done)
 
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -15,13 +16,14 @@ REQUIREMENTS := requirements.txt requirements-no-deps.txt pyproject.toml
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup train test test-slow lint
+.PHONY: help setup train test test-slow test-versions lint
 
 help:
 	@echo "make setup      create $(VENV) with everything this project uses"
 	@echo "make train      the quick start: train, evaluate, write curves and a video"
 	@echo "make test       the tests (minutes)"
 	@echo "make test-slow  the tests that take longer"
+	@echo "make test-versions  the lowest and newest versions, in fresh environments (gigabytes)"
 	@echo "make lint       check style; list long files, deep classes and lines to read"
 	@echo
 	@echo "ARGS='...' is passed on: make train ARGS='seed=1', make test ARGS='-k vector'."
@@ -31,7 +33,7 @@ help:
 setup: $(STAMP)
 
 train: $(STAMP)
-	$(BIN)/python recipes/train.py --config-name quickstart $(ARGS)
+	$(BIN)/ba-torchrl train --config-name quickstart $(ARGS)
 
 # One process per core, each with one thread: numeric libraries would fight over the cores.
 test: $(STAMP)
@@ -39,6 +41,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow $(ARGS)
+
+test-versions: $(STAMP)
+	$(BIN)/python tests/versions.py $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -49,9 +54,9 @@ lint: $(STAMP)
 # cannot reorder it: torch goes first, or a requirement would pull in another build of it.
 $(STAMP): $(REQUIREMENTS)
 	@rm -f $(STAMP)
-	@if ! $(BIN)/python -c "import pip; $(IS_311)" >/dev/null 2>&1; then \
-		if ! "$(PYTHON)" -c "$(IS_311)" >/dev/null 2>&1; then \
-			echo "Python 3.11 is needed (PyBullet has no ready-made build for later ones)." >&2; \
+	@if ! $(BIN)/python -c "import pip; $(IS_SUPPORTED)" >/dev/null 2>&1; then \
+		if ! "$(PYTHON)" -c "$(IS_SUPPORTED)" >/dev/null 2>&1; then \
+			echo "Python 3.10 to 3.13 is needed." >&2; \
 			echo "$(if $(PYTHON),'$(PYTHON)' is not one,None was found): make PYTHON=/path/to/python3.11 ..." >&2; \
 			exit 1; \
 		fi; \

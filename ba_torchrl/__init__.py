@@ -9,8 +9,10 @@ from ba_torchrl.envs.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
     from ba_torchrl.config import EnvConfig, WorkerOptions
+    from ba_torchrl.envs.description import describe
     from ba_torchrl.envs.factory import make, make_vector_env
     from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
+    from ba_torchrl.training.policy import load_policy
 
 __version__ = "0.1.0"
 
@@ -18,6 +20,8 @@ _MODULES = {
     "EnvConfig": "config",
     "ResolvedEnv": "envs.settings",
     "WorkerOptions": "config",
+    "describe": "envs.description",
+    "load_policy": "training.policy",
     "make": "envs.factory",
     "make_vector_env": "envs.factory",
     "resolve_env": "envs.settings",
@@ -29,7 +33,10 @@ __all__ = [
     "ResolvedEnv",
     "WorkerOptions",
     "__version__",
+    "describe",
+    "list_robots",
     "list_tasks",
+    "load_policy",
     "make",
     "make_vector_env",
     "resolve_env",
@@ -43,6 +50,13 @@ def list_tasks() -> list[str]:
     from ba_torchrl.tasks.base import TASKS
 
     return list(TASKS)
+
+
+def list_robots() -> list[str]:
+    """Return the names of all robots, such as ``kuka``."""
+    from ba_torchrl.sim.robots.base import ROBOTS
+
+    return list(ROBOTS)
 
 
 def __getattr__(name: str) -> Any:

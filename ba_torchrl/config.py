@@ -6,10 +6,11 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator
 from functools import cache
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from typing_extensions import Self
 
 from ba_torchrl.errors import ConfigError
 
@@ -56,7 +57,13 @@ def parse(model: type[Model], values: dict[str, Any], what: str) -> Model:
 class StrictModel(BaseModel):
     """Immutable settings that refuse unknown names, wrong types and infinite numbers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,  # the docstring below a field is its description
+    )
 
 
 def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str]:
@@ -115,12 +122,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 class TaskParameters(StrictModel):
-    """The parameters that one task adds to `EnvConfig`; a task without any uses this class.
-
-    The docstring below a field is its description in the page of the tasks.
-    """
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
+    """The parameters that one task adds to `EnvConfig`; a task without any uses this class."""
 
     @model_validator(mode="before")
     @classmethod
@@ -301,6 +303,43 @@ class EnvConfig(StrictModel):
 _GENERAL_FIELDS.update(EnvConfig.model_fields)
 
 
+class EnvKeywords(TypedDict, total=False):
+    """The keywords of `ba_torchrl.make`, for type checkers; `EnvConfig` describes them."""
+
+    robot: str
+    action_sequence: str | None
+    workspace: tuple[Interval, Interval, Interval] | None
+    object_scale_range: Interval | None
+    max_steps: int | None
+    num_objects: int | None
+    obs_size: int
+    in_hand_size: int | None
+    in_hand_mode: str | None
+    top_down_approach: bool
+    fast_mode: bool
+    render: bool
+    random_orientation: bool
+    half_rotation: bool | None
+    workspace_check: Literal["point", "bounding_box"]
+    close_loop_tray: bool
+    view_type: str
+    view_scale: float
+    dpos: float
+    drot: float
+    obs_type: Literal["pixel", "vec"]
+    rgb: bool
+    point_cloud: int
+    observations: tuple[str, ...]
+    floor_color: Rgb | None
+    workspace_color: Rgb | None
+    physics_mode: Literal["fast", "slow", "custom"]
+    time_step_s: float | None
+    solver_iterations: int | None
+    solver_residual: float | None
+    expert: bool
+    seed: int | None
+
+
 @cache
 def env_config_model(parameters: type[TaskParameters]) -> type[EnvConfig]:
     """Return `EnvConfig` with the fields of a task's own parameters added.
@@ -315,4 +354,19 @@ def env_config_model(parameters: type[TaskParameters]) -> type[EnvConfig]:
             f"{parameters.__qualname__} repeats parameters of every environment: "
             f"{', '.join(sorted(repeated))}"
         )
-    return type(EnvConfig.__name__, (parameters, EnvConfig), {"__module__": __name__})
+    return type(
+        EnvConfig.__name__,
+        (parameters, EnvConfig),
+        {
+            "__module__": __name__,
+            "__reduce__": lambda self: (_restored, (parameters, self.__getstate__())),
+        },
+    )
+
+
+def _restored(parameters: type[TaskParameters], state: dict[str, Any]) -> EnvConfig:
+    """Return a configuration of `env_config_model` from its pickled state."""
+    model = env_config_model(parameters)
+    config = model.__new__(model)
+    config.__setstate__(state)
+    return config

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
+from importlib.metadata import PackageNotFoundError, requires
 
 
 class ConfigError(ValueError):
@@ -19,6 +21,20 @@ class UnknownNameError(ConfigError, KeyError):
 
 class MissingPackageError(ConfigError, ImportError):
     """An optional package that is not installed; the message says how to install it."""
+
+
+def install_command(*packages: str) -> str:
+    """Return the command that installs optional packages in the versions that this one needs.
+
+    Args:
+        packages: as ``pyproject.toml`` names them, such as "hydra-core".
+    """
+    try:
+        listed = requires("ba-torchrl") or []
+    except PackageNotFoundError:  # run from sources that are not installed
+        listed = []
+    known = {re.split(r"[^\w.-]", line)[0]: line.split(";")[0].strip() for line in listed}
+    return shlex.join(["pip", "install", *(known.get(name, name) for name in packages)])
 
 
 class DamagedFilesError(ConfigError):

@@ -19,8 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from ba_torchrl.cli.types import check_writable_file
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.training.command_line import check_writable_file
 from profiling.fingerprint.cases import PARTS, cases
 from profiling.fingerprint.compare import compare, read_record
 from profiling.fingerprint.record import run_all, versions

@@ -7,38 +7,35 @@ python recipes/gallery.py tasks=[close_loop/block_picking] folder=pictures overv
 
 from pathlib import Path
 
-import hydra
+from pydantic import Field
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import Count, OutputFolder, Plugins, PngFile, Seed, Structures, Tasks
 from ba_torchrl.config import StrictModel
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
-from ba_torchrl.training.command_line import (
-    Count,
-    OutputFolder,
-    Plugins,
-    PngFile,
-    Seed,
-    Structures,
-    Tasks,
-    command,
-)
 
 
 class Settings(StrictModel):
     """Settings of this command."""
 
-    plugins: Plugins
-    tasks: Tasks
-    deconstructions: Structures
-    seed: Seed
-    pictures: Count
-    folder: OutputFolder
-    overview: PngFile | None
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    tasks: Tasks = None
+    """Ids of tasks; null for all."""
+    deconstructions: Structures = Field(["open_loop/house_building_4"])
+    """Structures whose deconstruction is drawn."""
+    seed: Seed = 5
+    """Of the episodes."""
+    pictures: Count = 4
+    """Of each episode."""
+    folder: OutputFolder = "runs/gallery"
+    """Of the pictures."""
+    overview: PngFile | None = "runs/gallery/all_tasks.png"
+    """Picture of all tasks, or null."""
 
 
-@hydra.main(config_path="../configs", config_name="gallery", version_base="1.3")
-@command(Settings)
 def main(settings: Settings) -> None:
     """Play one episode per task and write its pictures."""
     strips = {}
@@ -54,5 +51,7 @@ def main(settings: Settings) -> None:
         print(overview_figure(strips, settings.overview))
 
 
+COMMAND = Command(main, Settings, positional="tasks")
+
 if __name__ == "__main__":
-    main()
+    COMMAND.run()

@@ -5,15 +5,16 @@ python recipes/plot.py runs=[runs/first,runs/second] path=curves.png
 
 import csv
 
-import hydra
 import numpy as np
+from pydantic import Field
 
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import Folders, Plugins, PngFile
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.training.checkpoint import read_config
-from ba_torchrl.training.command_line import Folders, Plugins, PngFile, command
 
 RATE, ERROR = "eval/success_rate", "eval/standard_error"
 
@@ -21,14 +22,16 @@ RATE, ERROR = "eval/success_rate", "eval/standard_error"
 class Settings(StrictModel):
     """Settings of this command."""
 
-    plugins: Plugins
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
     runs: Folders
-    path: PngFile
-    title: str
+    """Run folders."""
+    path: PngFile = "curves.png"
+    """The picture."""
+    title: str = ""
+    """Of the picture."""
 
 
-@hydra.main(config_path="../configs", config_name="plot", version_base="1.3")
-@command(Settings)
 def main(settings: Settings) -> None:
     """Plot the success rate of the greedy policies against the updates."""
     curves = {}
@@ -69,5 +72,7 @@ def _curve(run: str) -> tuple[np.ndarray, ...]:
     return rate.steps, rate.values, rate.values - error.values, rate.values + error.values
 
 
+COMMAND = Command(main, Settings, positional="runs")
+
 if __name__ == "__main__":
-    main()
+    COMMAND.run()

@@ -21,12 +21,21 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks, make
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import (
+    OutputFolder,
+    Plugins,
+    Seed,
+    TaskId,
+    Tasks,
+    check_writable_file,
+    without,
+)
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.demos import expert_policy
 from ba_torchrl.data.files import write_text
@@ -35,20 +44,8 @@ from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.sim.world import count_clients
-from ba_torchrl.training.command_line import (
-    OutputFolder,
-    Plugins,
-    Seed,
-    TaskId,
-    Tasks,
-    check_writable_file,
-    command,
-    register_schemas,
-    without,
-)
 
 logger = logging.getLogger(__name__)
-register_schemas()
 
 JOB_FLAG = "--job"
 WORKER = (sys.executable, __file__, JOB_FLAG)
@@ -112,14 +109,29 @@ class SoakFigures(BaseModel):
 class Settings(StrictModel):
     """Settings of this command."""
 
-    plugins: Plugins
-    tasks: Tasks
-    env: dict[str, Any]
-    steps: int = Field(ge=10)
-    long_tasks: list[TaskId]
-    long_steps: int = Field(ge=10)
-    seed: Seed
-    folder: OutputFolder
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    tasks: Tasks = None
+    """Ids of tasks; null for all."""
+    env: dict[str, Any] = Field(default_factory=dict)
+    """Parameters of the environments."""
+    steps: int = Field(default=1000, ge=10)
+    """Steps of a task."""
+    long_tasks: list[TaskId] = Field(
+        [
+            "close_loop/block_picking",
+            "close_loop/object_grasping",
+            "open_loop/house_building_4",
+            "open_loop/bin_packing",
+        ]
+    )
+    """A task of each kind, with more steps."""
+    long_steps: int = Field(default=20_000, ge=10)
+    """Steps of these."""
+    seed: Seed = 0
+    """Of the episodes."""
+    folder: OutputFolder = "soak"
+    """One file of figures per task, and the table."""
 
     @field_validator("env")
     @classmethod
@@ -129,8 +141,6 @@ class Settings(StrictModel):
         )
 
 
-@hydra.main(config_path="../configs", config_name="soak", version_base="1.3")
-@command(Settings)
 def main(settings: Settings) -> None:
     """Run the tasks without figures, and print the table."""
     tasks = settings.tasks or list_tasks()
@@ -276,6 +286,9 @@ def soak(job: SoakJob) -> SoakFigures:
     )
 
 
+COMMAND = Command(main, Settings, positional="tasks")
+
+
 def run_job() -> None:
     """Read a job as JSON from standard input, and print its figures."""
     limit_library_logs()
@@ -287,4 +300,4 @@ if __name__ == "__main__":
     if sys.argv[1:] == [JOB_FLAG]:
         run_job()
     else:
-        main()
+        COMMAND.run()

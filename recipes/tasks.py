@@ -1,33 +1,8 @@
-"""Write the page of tasks: description, conditions of success and parameters of each.
+"""``ba-torchrl tasks`` in a clone; the code is in ba_torchrl/commands/tasks.py."""
 
-python recipes/tasks.py path=docs/tasks.md
-"""
+import sys
 
-from pathlib import Path
-
-import hydra
-
-from ba_torchrl.config import StrictModel
-from ba_torchrl.record.task_page import task_page
-from ba_torchrl.training.command_line import OutputFile, Plugins, Tasks, command
-
-
-class Settings(StrictModel):
-    """Settings of this command."""
-
-    plugins: Plugins
-    tasks: Tasks
-    path: OutputFile
-
-
-@hydra.main(config_path="../configs", config_name="tasks", version_base="1.3")
-@command(Settings)
-def main(settings: Settings) -> None:
-    """Write the page."""
-    path = Path(settings.path)
-    path.write_text(task_page(settings.tasks), encoding="utf-8")
-    print(path)
-
+from ba_torchrl.cli import main
 
 if __name__ == "__main__":
-    main()
+    main(["tasks", *sys.argv[1:]])

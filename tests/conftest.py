@@ -1,5 +1,13 @@
+import contextlib
+
 import pytest
 import torch
+
+from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.modules.steerable.planar_escnn import import_escnn
+
+with contextlib.suppress(MissingPackageError):  # else `importorskip("escnn")` skips its tests
+    import_escnn()
 
 
 def pytest_collection_modifyitems(items):

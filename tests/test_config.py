@@ -1,9 +1,11 @@
 import json
+import pickle
 
 import pytest
 
 import ba_torchrl
 from ba_torchrl.config import EnvConfig, TaskParameters, env_config_model, parse
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, UnknownNameError
 from ba_torchrl.registry import Registry
 
@@ -99,3 +101,11 @@ def test_list_tasks_is_sorted_and_complete():
     assert {
         f"close_loop/block_{verb}" for verb in ("reaching", "picking", "pushing", "pulling")
     } <= set(tasks)
+
+
+@pytest.mark.parametrize("task", ["open_loop/block_stacking", "close_loop/object_grasping"])
+def test_a_configuration_with_parameters_of_its_task_can_be_pickled(task):
+    config = resolve_env(task, {"seed": 3}).config
+    restored = pickle.loads(pickle.dumps(config))
+    assert restored == config
+    assert type(restored) is type(config)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
+from typing_extensions import Self
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.acting import ActingPolicy
@@ -354,6 +355,11 @@ class Learner(ABC):
         optimisers' step on the one before; by default the loss module alone."""
         return [self.loss]
 
+    def due_stages(self) -> Sequence[LossFunction]:
+        """Return the stages of the update that follows `updates` others; by default all. An
+        algorithm that updates its policy less often than its critics leaves one out."""
+        return self.stages
+
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""
         return None
@@ -479,7 +485,7 @@ class Learner(ABC):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.minimize(stage(batch) for stage in self.stages)
+        scalars = self.minimize(stage(batch) for stage in self.due_stages())
         if self._prioritized_sampler() is not None:  # whose trees are on the CPU
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
             self.host_tasks.submit(errors, self._set_priorities)
@@ -552,9 +558,13 @@ class Learner(ABC):
             self.optimizers.minimize(loss, terms, is_finite if is_deferred else None)
             taken.update(scalars.detach())
         self.optimizers.step_schedules()
+        self.update_target()
+        return taken
+
+    def update_target(self) -> None:
+        """Move the target network, if there is one, after the gradient steps of an update."""
         if self.target_updater is not None:
             self.target_updater.step()
-        return taken
 
     def _prioritized_sampler(self) -> ExpertPrioritizedSampler | None:
         sampler = self.replay.sampler

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -14,6 +14,7 @@ from torch.optim import Optimizer
 from torchrl.data import Bounded
 from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
+from typing_extensions import Self
 
 from ba_torchrl.algorithms.base import (
     ALGORITHMS,

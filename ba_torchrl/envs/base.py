@@ -215,6 +215,15 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         self._ends, self._conditions = state.ends, None
         return self._tensordict(self._observation, **self._ends)
 
+    def __repr__(self) -> str:
+        images = ", ".join(
+            f"{key} {' x '.join(map(str, image.shape))}" for key, image in self.images.items()
+        )
+        return (
+            f"{type(self).__name__}({self.task_id}, {self.config.robot}, "
+            f"{images or self.config.obs_type}, action {self.actions.sequence})"
+        )
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all worlds of this environment."""
         self._episodes.close()

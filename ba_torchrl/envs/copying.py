@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from torchrl.envs import EnvBase
+from typing_extensions import Self
 
 from ba_torchrl.envs.scene import SceneState
 from ba_torchrl.envs.settings import ResolvedEnv

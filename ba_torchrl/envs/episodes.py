@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
+from typing_extensions import Self
 
 from ba_torchrl.envs.faults import check_bodies
 from ba_torchrl.envs.scene import Scene, SceneState

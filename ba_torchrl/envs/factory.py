@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
-from typing import Any
+from typing import Any, overload
 
 from torchrl.envs import EnvBase
+from typing_extensions import Unpack
 
-from ba_torchrl.config import WorkerOptions, parse
+from ba_torchrl.config import EnvKeywords, WorkerOptions, parse
 from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
 from ba_torchrl.envs.vector.make import make_vector, processes_save_time
@@ -17,6 +18,10 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import module_names
 
 
+@overload
+def make(task: str | ResolvedEnv, **config: Unpack[EnvKeywords]) -> ManipulationEnv: ...
+@overload
+def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv: ...
 def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv:
     """Make a TorchRL environment.
 

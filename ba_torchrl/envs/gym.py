@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from typing_extensions import Self
 
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_resolved

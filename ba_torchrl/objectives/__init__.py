@@ -1,1 +1,15 @@
 """Loss modules that follow TorchRL's contract."""
+
+from ba_torchrl.objectives.dqn import LevelDQNLoss, SingleLevelValues
+from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
+from ba_torchrl.objectives.rlpd import RLPDLoss
+from ba_torchrl.objectives.sacfd import SACfDLoss
+
+__all__ = [
+    "BehaviourCloningLoss",
+    "LevelCrossEntropyLoss",
+    "LevelDQNLoss",
+    "RLPDLoss",
+    "SACfDLoss",
+    "SingleLevelValues",
+]

@@ -15,7 +15,7 @@ import numpy as np
 from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
-from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.errors import MissingPackageError, install_command
 from ba_torchrl.record.results import flat
 
 Backend = Literal["csv", "tensorboard", "wandb"]
@@ -52,7 +52,7 @@ def make_logger(
     if not is_available(backend):
         raise MissingPackageError(
             f"the logger {backend!r} needs a package that is not installed: "
-            f"pip install 'ba-torchrl[{backend}]'"
+            + install_command(backend)
         )
     options = {"wandb_kwargs": {"project": "ba-torchrl"}} if backend == "wandb" else {}
     logger = get_logger(backend, logger_name=str(run_dir), experiment_name=name, **options)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.errors import MissingPackageError, install_command
 from ba_torchrl.record.logging import read_scalars
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def _figure(size_in: tuple[float, float]) -> Figure:
     try:
         from matplotlib.figure import Figure  # no pyplot: it holds figures in a global list
     except ImportError as error:
-        fix = "drawing curves needs pip install 'ba-torchrl[recipes]'"
+        fix = f"drawing curves needs {install_command('matplotlib')}"
         raise MissingPackageError(fix) from error
     return Figure(figsize=size_in, dpi=150, layout="constrained")
 

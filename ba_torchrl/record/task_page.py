@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable, Sequence
 
-from ba_torchrl import make
-from ba_torchrl.envs import keys
+from ba_torchrl import describe
 from ba_torchrl.tasks.base import TASKS
 
 
@@ -21,9 +19,9 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
     lines = [
         "# Tasks",
         "",
-        "Written by `recipes/tasks.py` from the sources. Success is the conjunction of the",
-        "conditions in a valid scene at rest. `env.conditions` and Gymnasium's `info`",
-        "hold them after every step.",
+        "Written by `ba-torchrl tasks path=...` from the sources. Success is the conjunction of",
+        "the conditions in a valid scene at rest. `env.conditions` and Gymnasium's `info` hold",
+        "them after every step.",
     ]
     for heading, ids in tasks_by_heading(tasks).items():
         lines += ["", f"## {heading}"]
@@ -34,34 +32,9 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
 
 def _section(task: str) -> list[str]:
     """Return the lines of a task's section."""
-    cls = TASKS[task]
-    env = make(task, seed=0, obs_size=16)
-    env.reset()
-    conditions, steps, actions = list(env.conditions), env.max_steps, env.actions.sequence
-    env.close()
-    least, most = cls.num_objects_range
-    numbers = ", ".join(map(str, range(least, most + 1, cls.num_objects_step)))
-    rows = [
-        ("success", ", ".join(f"`{name}`" for name in conditions)),
-        ("steps", f"{steps}"),
-        ("action", f"`{actions}` by default"),
-        ("scale", "{:g} to {:g} (limits {:g} to {:g})".format(*cls.scale_range, *cls.scale_limits)),
-    ]
-    if keys.IN_HAND in env.images:
-        shape = " x ".join(map(str, env.images[keys.IN_HAND].shape))
-        rows.append(("in-hand image", f"{shape} by default"))
-    if least < most:
-        rows.append(("`num_objects`", f"{cls.num_objects} ({numbers})"))
-    for name, field in cls.Parameters.model_fields.items():
-        text = " ".join((field.description or "").split())
-        rows.append((f"`{name}`", f"{field.default!r}" + (f". {text}" if text else "")))
-    return [
-        f"### `{task}`",
-        "",
-        inspect.cleandoc(cls.__doc__),
-        "",
-        *(f"- {name}: {value}" for name, value in rows),
-    ]
+    found = describe(task)
+    rows = (f"- {name}: {value}" for name, value in found.rows().items())
+    return [f"### `{task}`", "", found.text, "", *rows]
 
 
 _SIX_DOF = "Six degrees of freedom: ramps, bumps"

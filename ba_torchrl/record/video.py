@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ba_torchrl.envs.base import ManipulationEnv
-from ba_torchrl.errors import ConfigError, MissingPackageError
+from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
 
 _SUFFIXES = (".mp4", ".gif")
 MIN_FPS, MAX_FPS = 1, 240
@@ -79,7 +79,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
         import imageio
         import imageio_ffmpeg  # noqa: F401  imageio reports it later and with less detail
     except ImportError as error:
-        fix = "writing videos needs pip install 'ba-torchrl[recipes]'"
+        fix = f"writing videos needs {install_command('imageio', 'imageio-ffmpeg')}"
         raise MissingPackageError(fix) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".gif":

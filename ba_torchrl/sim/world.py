@@ -12,10 +12,11 @@ import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn, Protocol, Self
+from typing import NoReturn, Protocol
 
 import pybullet
 import pybullet_data
+from typing_extensions import Self
 
 from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.articulated import ArticulatedBody, PrismaticJoint

@@ -250,7 +250,7 @@ class Task(ABC):
         Raises:
             PlacementError: the workspace is too small.
         """
-        return self.terrain.random_point(rng, padding_m)
+        return self.terrain.spawn_area.random_point(rng, padding_m)
 
     def random_yaw(self, rng: np.random.Generator, span_rad: float) -> float:
         """Return a random yaw from a range of ``span_rad`` about 0; 0 with fixed orientations."""

@@ -51,7 +51,12 @@ ON_SLOPES: dict[str, Any] = {
 """Attributes of every task on slopes."""
 TERRAINS: dict[str, dict[str, Any]] = {
     "ramp": {**ON_SLOPES, "make_terrain": _ramps},
-    "bump": {**ON_SLOPES, "make_terrain": _bumps, "default_in_hand_size": 40},  # appendix G.1
+    "bump": {
+        **ON_SLOPES,
+        "make_terrain": _bumps,
+        "platform_m": (0.13, 0.13),
+        "default_in_hand_size": 40,  # appendix G.1
+    },
 }
 """Attributes of the tasks on each terrain, by the first part of their ids."""
 DESCRIPTIONS = {
@@ -73,7 +78,7 @@ VARIANTS: tuple[tuple[str, type[OpenLoopTask], dict[str, Any]], ...] = (
     ("ramp/house_building_4", HouseBuilding4, {}),
     ("ramp/improvise_house_building_2", ImproviseHouseBuilding2, {}),
     ("ramp/improvise_house_building_3", ImproviseHouseBuilding3, {}),
-    ("bump/house_building_4", HouseBuilding4, {"platform_m": (0.13, 0.13)}),
+    ("bump/house_building_4", HouseBuilding4, {}),
     (
         "bump/box_palletizing",
         BoxPalletizing,
@@ -87,6 +92,7 @@ VARIANTS: tuple[tuple[str, type[OpenLoopTask], dict[str, Any]], ...] = (
 def task_on(task_id: str, level: type[OpenLoopTask], attributes: dict[str, Any]) -> type:
     """Return the task of a variant; its name is that on level ground after that of the terrain."""
     terrain, _, name = task_id.partition("/")
+    attributes = {**TERRAINS[terrain], **attributes}
     size_cm = (f"{100 * size:g}" for size in attributes.get("platform_m", ()))
     description = f"""{name.replace("_", " ").title()} {DESCRIPTIONS[terrain].format(*size_cm)}
     The episode ends early when a piece that must stay upright lies on its side, or a piece leaves
@@ -94,7 +100,7 @@ def task_on(task_id: str, level: type[OpenLoopTask], attributes: dict[str, Any])
     """
     own = {"__module__": __name__, "__doc__": description}
     name = f"{terrain.title()}{level.__name__}"
-    return type(level)(name, (level,), {**TERRAINS[terrain], **attributes, **own})
+    return type(level)(name, (level,), {**attributes, **own})
 
 
 for _id, _level, _attributes in VARIANTS:

@@ -36,6 +36,11 @@ class Workspace:
         """Extent along x."""
         return self.x[1] - self.x[0]
 
+    @property
+    def upper_corner(self) -> Vector:
+        """The corner with the largest coordinates."""
+        return (self.x[1], self.y[1], self.z[1])
+
     def contains(self, point: Vector) -> bool:
         """Whether a point lies strictly inside."""
         return all(
@@ -115,28 +120,6 @@ class Area(NamedTuple):
             point.append(float(rng.uniform(low, high)))
         return tuple(point)
 
-    def random_points(
-        self, rng: np.random.Generator, spacings: Sequence[Spacing]
-    ) -> list[tuple[float, float]]:
-        """Return uniformly random points, one for each object, that keep their distances.
-
-        Raises:
-            PlacementError: no layout was found.
-        """
-        for _ in range(LAYOUT_ATTEMPTS):
-            points: list[tuple[float, float]] = []
-            for spacing in spacings:
-                point = self.random_point(rng, spacing.padding_m)
-                if any(math.dist(point, other) < spacing.distance_m for other in points):
-                    break
-                points.append(point)
-            else:
-                return points
-        raise PlacementError(
-            f"no room for {len(spacings)} objects apart from each other: enlarge `workspace`, or "
-            "lower `num_objects` or `object_scale_range`"
-        )
-
 
 class OrientedArea(NamedTuple):
     """A rectangle at any heading, cut off at the borders of an axis-aligned one.
@@ -202,6 +185,29 @@ class OrientedArea(NamedTuple):
 
 Region = Area | OrientedArea
 """A convex part of the horizontal plane."""
+
+
+def random_points(
+    region: Region, rng: np.random.Generator, spacings: Sequence[Spacing]
+) -> list[tuple[float, float]]:
+    """Return uniformly random points of a region, one for each object, that keep their distances.
+
+    Raises:
+        PlacementError: no layout was found.
+    """
+    for _ in range(LAYOUT_ATTEMPTS):
+        points: list[tuple[float, float]] = []
+        for spacing in spacings:
+            point = region.random_point(rng, spacing.padding_m)
+            if any(math.dist(point, other) < spacing.distance_m for other in points):
+                break
+            points.append(point)
+        else:
+            return points
+    raise PlacementError(
+        f"no room for {len(spacings)} objects apart from each other: enlarge `workspace`, or "
+        "lower `num_objects` or `object_scale_range`"
+    )
 
 
 def _grid(low: float, high: float) -> list[float]:

@@ -18,7 +18,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import check_known
 from ba_torchrl.record.results import CONFIG_FILE
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.durable import (
+from ba_torchrl.training.persistence import (
     DurableCheckpoint,
     first_sound,
     remove_leftovers,

@@ -28,7 +28,7 @@ from ba_torchrl.data.demos import (
 )
 from ba_torchrl.data.time_reversal import check_has_structure
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, install_command
 from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectorConfig
@@ -79,6 +79,8 @@ class ExperimentConfig(WorkerOptions):
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool | None = None
+    """One process per environment, or all in this process, with the same episodes; None for
+    processes where at least three can run at a time."""
     wait_for_restarts: bool = False
     """In collection; evaluations wait. See `WorkerOptions` for the fields of processes."""
     collector: dict[str, Any] = Field(default_factory=lambda: {"name": "single"})
@@ -101,7 +103,7 @@ class ExperimentConfig(WorkerOptions):
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
     policy that has not learnt to turn arrives. None in the appendix."""
     demonstrations_path: str | None = None
-    """Folder that `recipes/collect_demos.py` wrote; its episodes replace newly collected ones, and
+    """Folder that `ba-torchrl collect` wrote; its episodes replace newly collected ones, and
     source and noise are those of the folder."""
     pretrain_updates: int = Field(default=0, ge=0)
     """Updates on the demonstrations before the first environment step."""
@@ -250,7 +252,7 @@ class ExperimentConfig(WorkerOptions):
         if not is_available(config.logger):
             raise ConfigError(
                 f"logger: {config.logger!r} needs a package that is not installed: "
-                f"pip install 'ba-torchrl[{config.logger}]'"
+                + install_command(config.logger)
             )
         usable_device(config.device)
         return config.model_copy(update={"plugins": config._all_plugins()})

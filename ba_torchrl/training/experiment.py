@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
-from typing import Self
 
 import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase
+from typing_extensions import Self
 
 from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.episodes import mean_length, success_rate
@@ -25,8 +27,8 @@ from ba_torchrl.training.duration import UpdateTimer, compute_path
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
 from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
+from ba_torchrl.training.persistence import RunLock
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
-from ba_torchrl.training.run_lock import RunLock
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +67,8 @@ class Experiment:
         self._progress = Progress()
         self._state = ResumeState(config.folder, self.algorithm, self._progress)
         self._timer = UpdateTimer()
+        self._seconds_per_update: float | None = None
+        self._phase_name = ""
         self._signals = StopSignals()
         self._is_between_updates = False
         """Whether the state can be saved: there is one, and no update is under way."""
@@ -137,9 +141,10 @@ class Experiment:
         self._is_between_updates = True
 
     def _store_demonstrations(self) -> None:
-        episodes = gather_demonstrations(
-            self.config, self.algorithm, lambda _: self._signals.check()
-        )
+        with self._phase("demonstrations"):
+            episodes = gather_demonstrations(
+                self.config, self.algorithm, lambda _: self._signals.check()
+            )
         self.algorithm.on_demonstrations(episodes)
         self.log.write(
             0,
@@ -154,17 +159,19 @@ class Experiment:
         config, algorithm = self.config, self.algorithm
         collects = config.algorithm_config.collects
         pretrain_updates = config.pretrain_updates if collects else config.total_updates
-        while algorithm.updates < pretrain_updates and not self._is_complete:
-            self._update(algorithm.pretrain_update)
+        with self._phase("pretraining"):
+            while algorithm.updates < pretrain_updates and not self._is_complete:
+                self._update(algorithm.pretrain_update)
         if self._is_complete:
             return
         self._collection = self._start_collection()
         self._timer.restart()  # collection between updates takes time
-        while not self._take_pending_updates():
-            steps = self._store(next(self._collection))
-            if algorithm.replay_size >= config.min_replay:
-                self._progress.pending_updates = steps * config.updates_per_step
-            self._stop_or_save()
+        with self._phase("training"):
+            while not self._take_pending_updates():
+                steps = self._store(next(self._collection))
+                if algorithm.replay_size >= config.min_replay:
+                    self._progress.pending_updates = steps * config.updates_per_step
+                self._stop_or_save()
         if algorithm.updates < config.total_updates:
             logger.info("the run ends at update %d: stop_at_success", algorithm.updates)
 
@@ -206,7 +213,8 @@ class Experiment:
         evaluation = self._evaluate(config.final_eval_episodes, SeedUse.REPORT)
         self.log.write(updates, evaluation.scalars("final"))
         curve = plot_curve(config, progress.curve)
-        video = record_video(config, self._greedy)
+        with self._phase("video"):
+            video = record_video(config, self._greedy)
         seconds = time.perf_counter() - self._started
         files = {"curve": curve, "checkpoint": checkpoint, "video": video}
         record = write_record(config, evaluation, updates, progress, seconds, files)
@@ -214,6 +222,18 @@ class Experiment:
         return Result(evaluation, updates, checkpoint, curve, video, record, seconds)
 
     # -- parts -------------------------------------------------------------------------------
+
+    @contextmanager
+    def _phase(self, name: str) -> Iterator[None]:
+        """Context in which the progress bar names what the run does."""
+        before, self._phase_name = self._phase_name, name
+        shows = sys.stderr.isatty()  # in a file, each refresh is a line
+        self._bar.set_description(name, refresh=shows)
+        try:
+            yield
+        finally:
+            self._phase_name = before
+            self._bar.set_description(before, refresh=shows)
 
     def _store(self, data: TensorDict) -> int:
         """Add collected transitions to the replay and count steps, faults and successes.
@@ -265,6 +285,7 @@ class Experiment:
         """Log the expected duration of the remaining updates, if it has just been measured."""
         if seconds_per_update is None:
             return
+        self._seconds_per_update = seconds_per_update
         target = self.config.stop_at_success
         remaining = self.config.total_updates - self.algorithm.updates
         logger.info(
@@ -284,7 +305,20 @@ class Experiment:
         if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
             start = time.perf_counter()
             self._evaluate_and_save()
-            self._timer.exclude(time.perf_counter() - start)
+            seconds = time.perf_counter() - start
+            self._timer.exclude(seconds)
+            self._log_end(seconds)
+
+    def _log_end(self, seconds_per_evaluation: float) -> None:
+        """Log the expected duration of the rest of the run after its first two evaluations."""
+        config, updates = self.config, self.algorithm.updates
+        if self._seconds_per_update is None or len(self._progress.curve) > 2:
+            return
+        remaining = config.total_updates - updates
+        last = config.final_eval_episodes / config.eval_episodes
+        evaluations = remaining // config.eval_every + last
+        seconds = remaining * self._seconds_per_update + evaluations * seconds_per_evaluation
+        logger.info("about %.0f minutes to the end, evaluations included", seconds / 60)
 
     def _stop_or_save(self) -> None:
         """Stop after a signal; save the state if the last save was long ago."""
@@ -336,6 +370,7 @@ class Experiment:
         seed = self.config.derived_seed(use, part)
         if self._eval_env is None:
             self._eval_env = make_env(self.config, seed)
-        return evaluate(
-            self._eval_env, self._greedy, episodes, seed, lambda _: self._signals.check()
-        )
+        with self._phase("evaluation"):
+            return evaluate(
+                self._eval_env, self._greedy, episodes, seed, lambda _: self._signals.check()
+            )

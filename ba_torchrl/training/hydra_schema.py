@@ -122,14 +122,14 @@ def preset(group: str, name: str) -> dict[str, Any]:
     Raises:
         ConfigError: there is no such preset; the message lists the known ones.
     """
-    known = _presets(group)
+    known = preset_names(group)
     first = max((each for each in known if f"{name}_".startswith(f"{each}_")), key=len, default="")
     overrides, parts = [f"+{group}={first}"], name.removeprefix(first).split("_")[1:]
     if first in ("rad", "drq", "ferm") and parts[:1] in (["sac"], ["sacfd"]):
         is_plain = parts.pop(0) == "sac"
         overrides += ["algorithm.demonstration_weight=0.0"] if is_plain else []
     for other in ("replay", "rotation") if group == "algorithm" else ():
-        if parts and parts[0] in _presets(other):
+        if parts and parts[0] in preset_names(other):
             overrides.append(f"+{other}={parts.pop(0)}")
     if not first or parts:
         close = difflib.get_close_matches(name, known, n=1)
@@ -146,11 +146,11 @@ def presets_of(group: str, names: Iterable[str]) -> list[str]:
         group: folder in ``configs``, such as "algorithm".
         names: in the group's registry.
     """
-    return [each for each in _presets(group) if preset(group, each)["name"] in names]
+    return [each for each in preset_names(group) if preset(group, each)["name"] in names]
 
 
-def _presets(group: str) -> list[str]:
-    """Return the names of a group's presets."""
+def preset_names(group: str) -> list[str]:
+    """Return the names of a group's presets; Hydra must have been started."""
     files = GlobalHydra.instance().config_loader().get_group_options(group)
     registry = GROUPS.get(group, {})
     plugins = [name for name in registry if registry.plugin_module(name) is not None]

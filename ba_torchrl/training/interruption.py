@@ -7,9 +7,9 @@ import signal
 import threading
 from pathlib import Path
 from types import FrameType
-from typing import Self
 
 from torchrl.envs import EnvBase
+from typing_extensions import Self
 
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import SimulationError, WorkerError

@@ -6,7 +6,7 @@ import importlib
 from importlib.util import find_spec
 from types import ModuleType
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, install_command
 
 
 def check_installed(option: str) -> None:
@@ -20,7 +20,7 @@ def check_installed(option: str) -> None:
     """
     if find_spec("ray") is None:
         raise ConfigError(
-            f"{option}: 'ray' needs a package that is not installed: pip install 'ba-torchrl[ray]'"
+            f"{option}: 'ray' needs a package that is not installed: {install_command('ray')}"
         )
 
 

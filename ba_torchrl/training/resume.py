@@ -26,7 +26,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
 from ba_torchrl.training.checkpoint import read_config, write_config
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.durable import (
+from ba_torchrl.training.persistence import (
     DurableCheckpoint,
     first_sound,
     remove_leftovers,

@@ -1,4 +1,4 @@
-"""Files of measured rows, written and compared by `recipes/speed.py`."""
+"""Files of measured rows, written and compared by `recipes/measure.py`."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def read_speed_file(path: str | Path) -> SpeedFile:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "content"
         raise ConfigError(
-            f"{path} is not a file that recipes/speed.py wrote ({where}: {first['msg']})"
+            f"{path} is not a file that recipes/measure.py wrote ({where}: {first['msg']})"
         ) from None
 
 

@@ -176,7 +176,13 @@ def test_an_action_that_moved_no_or_two_bodies_has_no_inverse():
     assert before.undo_command(body, grasp) is None
 
 
-@pytest.mark.parametrize("task", STRUCTURES)
+@pytest.mark.parametrize(
+    "task",
+    [
+        f"open_loop/{name}"
+        for name in ("block_stacking", "house_building_4", "improvise_house_building_2")
+    ],
+)
 def test_reversed_actions_build_the_structure(task):
     scores = replay_scores(task, 8, seed=100)
     assert scores.reversible >= 0.75

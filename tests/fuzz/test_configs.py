@@ -36,7 +36,7 @@ def fields_of(task):
     return EnvConfig.model_fields.keys() | TASKS[task].Parameters.model_fields.keys()
 
 
-@examples(250)
+@examples(100)
 def test_parameters_of_environments(count):
     def prop(values):
         task, changes = values
@@ -88,7 +88,7 @@ def run_values():
     )
 
 
-@examples(250)
+@examples(100)
 def test_configurations_of_runs(count):
     def prop(values):
         try:

@@ -38,7 +38,7 @@ CHANGES = st.one_of(
 )
 
 
-@examples(150)
+@examples(40)
 def test_grids(tmp_path, count):
     def prop(changes):
         try:

@@ -44,7 +44,7 @@ class Tables(SpatialQNetwork):
 
     def later(self, level, state, chosen):
         primitive, scale = state
-        return self.tables[level][primitive, *chosen.unbind(1)] * scale[:, None]
+        return self.tables[level][(primitive, *chosen.unbind(1))] * scale[:, None]
 
 
 def batch(size=10, experts="some", seed=0):

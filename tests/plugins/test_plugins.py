@@ -1,6 +1,6 @@
 """Tasks, robots, observations, networks and algorithms from a user's own module.
 
-Everything runs in processes of its own: a registered task stays registered.
+What registers runs in processes of its own: a registered task stays registered.
 """
 
 import json
@@ -9,8 +9,11 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+from ba_torchrl import make_vector_env
 
 ROOT = Path(__file__).parents[2]
 PLUGINS = ("my_tasks", "my_learning")
@@ -48,29 +51,60 @@ def last_line(done):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_make_knows_a_task_and_a_robot_after_the_import(folder):
+def test_the_parts_of_a_plugin_are_known_after_the_import_and_runs_record_it(folder):
     code = f"""
-import json, ba_torchrl, my_tasks
+import json, ba_torchrl, my_tasks, my_learning
+from ba_torchrl.training.config import ExperimentConfig
+
 env = ba_torchrl.make("mine/reach_near", robot="mine/kuka", expert=True, {SMALL})
 robot = type(env.scene.robot).__name__ if env.reset() is not None else None
 print(json.dumps([robot, env.task_class.__name__, "mine/reach_near" in ba_torchrl.list_tasks()]))
+for task, observations, network in (
+    ("mine/reach_near", [], "mine/flat"),
+    ("close_loop/block_reaching", ["mine/opening"], "cnn"),
+):
+    config = ExperimentConfig.parse(
+        {{
+            "task": task,
+            "env": {{"obs_size": 16, "observations": observations}},
+            "algorithm": {{"name": "sac"}},
+            "network": {{"name": network}},
+        }}
+    )
+    print(json.dumps(config.plugins))
 """
-    assert last_line(run(folder, "-c", code)) == ["MyKuka", "ReachNear", True]
+    known, *recorded = map(json.loads, run(folder, "-c", code).stdout.splitlines()[-3:])
+    assert known == ["MyKuka", "ReachNear", True]
+    assert recorded == [list(PLUGINS), ["my_tasks"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "imports",
     [
-        pytest.param("import my_tasks, gymnasium", marks=pytest.mark.slow),
-        pytest.param("import gymnasium, my_tasks", marks=pytest.mark.slow),
-        pytest.param("import ba_torchrl, gymnasium, my_tasks", marks=pytest.mark.slow),
-        "import gymnasium, ba_torchrl; ba_torchrl.list_tasks(); import my_tasks",
+        "import my_tasks, gymnasium",
+        "import gymnasium, my_tasks",
+        "import ba_torchrl, gymnasium, my_tasks",
     ],
 )
 def test_gymnasium_knows_a_task_in_any_order_of_imports(folder, imports):
     code = f"{imports}\nimport json; print(json.dumps(gymnasium.spec({GYM_ID!r}).kwargs))"
     kwargs = last_line(run(folder, "-c", code))
     assert kwargs == {"task": "mine/reach_near", "register_modules": ["my_tasks"]}
+
+
+def test_gymnasium_knows_a_task_and_two_with_one_id_are_refused(folder):
+    code = f"""
+import json, gymnasium, ba_torchrl
+ba_torchrl.list_tasks()
+import my_tasks
+from ba_torchrl.tasks.base import TASKS
+print(json.dumps(gymnasium.spec({GYM_ID!r}).kwargs))
+TASKS.register("mine_reach/near")(my_tasks.ReachNear)
+"""
+    done = run(folder, "-c", code, check=False)
+    assert last_line(done) == {"task": "mine/reach_near", "register_modules": ["my_tasks"]}
+    assert "'mine/reach_near' and 'mine_reach/near' have the same Gymnasium id" in done.stderr
 
 
 @pytest.mark.slow
@@ -87,21 +121,16 @@ print(json.dumps(observation["pixels"].shape))
     assert last_line(run(folder, "-c", code)) == [2, 1, 16, 16]
 
 
-@pytest.mark.parametrize(
-    "options", [pytest.param("", marks=pytest.mark.slow), "register_modules=['extra'],"]
-)
-def test_spawned_workers_import_the_modules_of_task_and_robot(folder, options):
-    (folder / "extra.py").write_text("import os\nopen(f'seen-{os.getpid()}', 'w').close()\n")
+@pytest.mark.slow
+def test_spawned_workers_import_the_modules_of_task_and_robot(folder):
     code = f"""
 import json, ba_torchrl, my_tasks
-env = ba_torchrl.make_vector_env("mine/reach_near", 1, robot="mine/kuka", {options} {SMALL})
+env = ba_torchrl.make_vector_env("mine/reach_near", 1, robot="mine/kuka", {SMALL})
 rollout = env.rollout(3)
 env.close()
 print(json.dumps(list(rollout["pixels"].shape)))
 """
     assert last_line(run(folder, "-c", code)) == [1, 3, 1, 16, 16]
-    processes = len(list(folder.glob("seen-*")))
-    assert processes == (2 if options else 0)
 
 
 IN_MAIN = f"""
@@ -144,25 +173,29 @@ print(json.dumps([message, play(parallel=False), play(start_method="fork")]))
     assert shapes == [[1, 2, 1, 16, 16]] * 2
 
 
-def test_a_task_of_a_script_reaches_its_workers(folder):
+def test_a_task_of_a_script_and_the_modules_of_robot_and_options_reach_its_workers(folder):
+    (folder / "extra.py").write_text("import os\nopen(f'seen-{os.getpid()}', 'w').close()\n")
     script = folder / "script.py"
-    script.write_text(f'{IN_MAIN}\nif __name__ == "__main__":\n    print(json.dumps(play()))\n')
-    assert last_line(run(folder, script)) == [1, 2, 1, 16, 16]
+    script.write_text(
+        f"""{IN_MAIN}
+if __name__ == "__main__":
+    import my_tasks
 
-
-def test_a_module_that_workers_cannot_import_is_named(folder):
-    code = f"""
-import importlib.util, sys, ba_torchrl
-spec = importlib.util.spec_from_file_location("hidden_name", "my_tasks.py")
-module = importlib.util.module_from_spec(spec)
-sys.modules["hidden_name"] = module
-spec.loader.exec_module(module)
-ba_torchrl.make_vector_env("mine/reach_near", 1, {SMALL})
+    print(json.dumps(play(robot="mine/kuka", register_modules=["extra"])))
 """
-    done = run(folder, "-c", code, check=False)
-    assert done.returncode != 0
-    assert "cannot import the plugin 'hidden_name'" in done.stderr
-    assert "PYTHONPATH" in done.stderr
+    )
+    assert last_line(run(folder, script)) == [1, 2, 1, 16, 16]
+    assert len(list(folder.glob("seen-*"))) == 2
+
+
+def test_a_module_that_workers_cannot_import_is_named(monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, "hidden_name", ModuleType("hidden_name"))
+    options = {"register_modules": ["hidden_name"], "obs_size": 16, "max_restarts": 0}
+    with pytest.raises(RuntimeError, match="ended with exit code 1"):
+        make_vector_env("close_loop/block_reaching", 1, **options)
+    error = capfd.readouterr().err
+    assert "cannot import the plugin 'hidden_name'" in error
+    assert "PYTHONPATH" in error
 
 
 def install(folder, name, module):
@@ -186,16 +219,6 @@ def test_installed_plugins_are_found_and_a_broken_one_does_not_stop_the_others(t
     assert done.stderr.count("PluginWarning") == 1
     assert "plugin 'broken' (broken_plugin) of broken is not loaded" in done.stderr
     assert "RuntimeError: no licence" in done.stderr
-
-
-def test_two_tasks_with_one_gymnasium_id_are_refused(folder):
-    code = """
-import gymnasium, my_tasks
-from ba_torchrl.tasks.base import TASKS
-TASKS.register("mine_reach/near")(my_tasks.ReachNear)
-"""
-    done = run(folder, "-c", code, check=False)
-    assert "'mine/reach_near' and 'mine_reach/near' have the same Gymnasium id" in done.stderr
 
 
 def test_a_users_task_passes_or_fails_the_contract(folder):
@@ -255,7 +278,7 @@ def test_the_recipes_take_a_plugin(folder):
     assert result["config"]["network"] == {"name": "mine/flat", "hidden": 4}
     assert result["config"]["algorithm"]["gamma"] == 0.9
 
-    evaluate = (recipes / "evaluate.py", "checkpoint=runs/one", "episodes=2")
+    evaluate = (recipes / "evaluate.py", "policy=runs/one", "episodes=2")
     assert "over 2 episodes of mine/reach_near" in run(folder, *evaluate, PLUGIN).stdout
     done = run(folder, *evaluate, check=False)
     assert "runs/one/config.json uses the plugins [my_tasks,my_learning]" in done.stderr
@@ -263,43 +286,9 @@ def test_the_recipes_take_a_plugin(folder):
 
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
-    again = (recipes / "evaluate.py", PLUGIN, f"checkpoint={folder}/runs/one", "episodes=1")
+    again = (recipes / "evaluate.py", PLUGIN, f"policy={folder}/runs/one", "episodes=1")
     done = run(elsewhere, *again, check=False)
     assert "cannot import the plugin 'my_tasks'" in done.stderr
-
-
-def test_a_run_from_a_script_records_its_plugins(folder):
-    code = """
-import json, my_tasks, my_learning
-from ba_torchrl.training.config import ExperimentConfig
-config = ExperimentConfig.parse(
-    {
-        "task": "mine/reach_near",
-        "env": {"obs_size": 16},
-        "algorithm": {"name": "sac"},
-        "network": {"name": "mine/flat"},
-    }
-)
-print(json.dumps(config.plugins))
-"""
-    assert last_line(run(folder, "-c", code)) == list(PLUGINS)
-
-
-def test_a_run_with_an_observation_of_a_plugin_records_it(folder):
-    code = """
-import json, my_tasks
-from ba_torchrl.training.config import ExperimentConfig
-config = ExperimentConfig.parse(
-    {
-        "task": "close_loop/block_reaching",
-        "env": {"obs_size": 16, "observations": ["mine/opening"]},
-        "algorithm": {"name": "sac"},
-        "network": {"name": "cnn"},
-    }
-)
-print(json.dumps(config.plugins))
-"""
-    assert last_line(run(folder, "-c", code)) == ["my_tasks"]
 
 
 @pytest.mark.slow
@@ -336,7 +325,7 @@ def test_a_benchmark_with_a_plugin_runs_its_jobs(folder):
 def test_the_other_recipes_take_a_plugin(folder):
     recipes = ROOT / "recipes"
     demos = ("task=mine/reach_near", "episodes=2", "num_envs=1", "env.obs_size=16", "path=demos")
-    out = run(folder, recipes / "collect_demos.py", PLUGIN, *demos).stdout
+    out = run(folder, recipes / "collect.py", PLUGIN, *demos).stdout
     assert "episodes of mine/reach_near" in out
     out = run(
         folder, recipes / "play.py", PLUGIN, "task=mine/reach_near", "video=null", "env.obs_size=16"

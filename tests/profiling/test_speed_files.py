@@ -83,7 +83,7 @@ def test_a_foreign_file_is_refused_in_one_line(damage, reason, tmp_path, content
     path.write_text(json.dumps(damage(json.loads(path.read_text()))))
     with pytest.raises(ConfigError, match=reason) as raised:
         read_speed_file(path)
-    assert str(raised.value).startswith(f"{path} is not a file that recipes/speed.py wrote (")
+    assert str(raised.value).startswith(f"{path} is not a file that recipes/measure.py wrote (")
     assert "\n" not in str(raised.value)
 
 
@@ -103,7 +103,7 @@ def test_the_recipe_writes_a_file_and_compares_with_it(monkeypatch, tmp_path, co
     old = Row("depth image, 128 px, compiled", "ms", [1e3] * 20, unit_s=[1e-3] * 20)
     write_speed_file(tmp_path / "old.json", SpeedFile(machine=content.machine, rows=[old]))
     recipe(
-        "speed",
+        "measure",
         "which=simulation/depth_image",
         "repeats=1",
         "compare=old.json",
@@ -150,7 +150,7 @@ def test_mistakes_are_reported_in_one_line_before_the_measurement(
 ):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        recipe("speed", *arguments)
+        recipe("measure", *arguments)
     assert ended.value.code == 2
     out, error = capsys.readouterr()
     assert error.startswith(message)

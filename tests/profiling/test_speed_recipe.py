@@ -1,9 +1,5 @@
 """The rows of the table of measurements; the times are not tested."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 from tqdm import tqdm
@@ -22,20 +18,23 @@ from profiling.table import (
     as_markdown,
     measure,
 )
+from tests.recipes import recipe
 
-ROOT = Path(__file__).parents[2]
+
+@pytest.fixture
+def printed_table(tmp_path, monkeypatch, capsys):
+    """Return a function that runs the recipe and returns the header, the rows and their work."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(which):
+        recipe("measure", f"which={which}", "repeats=1")
+        return cells(capsys.readouterr().out)
+
+    return run
 
 
-def printed_table(folder, which):
-    """Run the recipe; return the header, the rows and the column of work."""
-    done = subprocess.run(
-        [sys.executable, ROOT / "recipes" / "speed.py", f"which={which}", "repeats=1"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    header, rule, *rows, empty, where = done.stdout.strip().split("\n")
+def cells(text):
+    header, rule, *rows, empty, where = text.strip().split("\n")
     assert set(rule) == {"|", "-"}
     assert empty == ""
     assert "torch" in where
@@ -44,16 +43,16 @@ def printed_table(folder, which):
     return header, rows, [row.split("|")[1].strip() for row in rows]
 
 
-def test_the_recipe_prints_a_table(tmp_path):
-    header, rows, work = printed_table(tmp_path, "simulation/depth_image")
+def test_the_recipe_prints_a_table(printed_table):
+    header, rows, work = printed_table("simulation/depth_image")
     assert len(work) == len(set(work)) == 2
     median = header.split("|").index(" median ")
     assert all(float(row.split("|")[median].split()[0]) > 0 for row in rows)
 
 
 @pytest.mark.slow
-def test_the_recipe_prints_the_simulation_rows(tmp_path):
-    _, rows, work = printed_table(tmp_path, "simulation")
+def test_the_recipe_prints_the_simulation_rows(printed_table):
+    _, rows, work = printed_table("simulation")
     tasks = ba_torchrl.list_tasks()
     # step and reset, physics, reset with a seed, expert; depth images
     assert len(work) == len(set(work)) == 7 * len(tasks) + 2

@@ -1,6 +1,21 @@
-"""Episodes that the tests play."""
+"""The tasks of the tests, and the episodes that they play."""
 
+import pytest
 import torch
+
+SLOW_VARIANTS = [f"ramp/house_building_{i}" for i in (1, 2, 3, 4)]
+SLOW_VARIANTS += ["ramp/block_stacking", "ramp/improvise_house_building_2"]
+"""Tasks of `six_dof.VARIANTS` that only slow tests play: three rows represent the others."""
+
+
+def slow(values):
+    """Return the values of a parameter of slow tests."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+
+
+def slow_variants(tasks):
+    """Return tasks, of which `SLOW_VARIANTS` are for the slow tests."""
+    return [pytest.param(t, marks=[pytest.mark.slow] * (t in SLOW_VARIANTS)) for t in tasks]
 
 
 def follow(env, state, steps=1000, action=None):

@@ -79,22 +79,6 @@ def test_the_past_activity_of_bodies_does_not_affect_a_restored_world():
         assert all(poses == played[0] for poses in played[1:])  # bit for bit
 
 
-def test_bodies_continue_from_a_snapshot_as_after_it_was_taken():
-    with World() as world:
-        pool = make_pool(world, 0.1)
-        world.seal()
-        world.step(5)
-        snapshot, state = world.snapshot(), pool.get_state()
-        expected = drop(world, pool)
-        pool.clear()
-        world.step(3)
-        for _ in range(2):
-            world.restore(snapshot)
-            pool.clear()
-            pool.set_state(state)
-            assert drop(world, pool) == expected
-
-
 def test_a_body_is_visible_while_it_is_active():
     with World() as world:
         pool = make_pool(world, 0.1)

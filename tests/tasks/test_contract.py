@@ -5,6 +5,8 @@ import pytest
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS as REGISTRY
 from ba_torchrl.testing import tasks as checks
+from tests.tasks.episodes import slow, slow_variants
+from tests.tasks.packing.scenes import BIN
 
 TASKS = [task for task in REGISTRY if REGISTRY.plugin_module(task) is None]
 
@@ -70,6 +72,7 @@ OTHERS_NOT_WITHOUT_YAW = {
 
 UNSOLVED = {
     "close_loop/corner_picking": (0.04, "a block that leans on a wall slides away from the hand"),
+    "bump/box_palletizing": (0.1, "a box in the gap beside the platform takes many random picks"),
     "open_loop/bin_packing": (0.1, "a dropped object may lie on the rim of the bin"),
     "open_loop/covid_test": (0.25, "fingers do not fit between a wall and a swab that touches it"),
 }
@@ -84,25 +87,17 @@ LONG_EPISODES = [
 ]
 """Tasks with slow episodes, of which the tests play fewer."""
 
-SLOW_VARIANTS = [f"ramp/house_building_{i}" for i in (1, 2, 3, 4)]
-SLOW_VARIANTS.append("ramp/improvise_house_building_2")
-"""Tasks with the expert of other ones, which only slow tests play from disturbed scenes."""
-
-PROGRESS = [(task, {}) for task in TASKS] + [
-    ("close_loop/block_pulling", {"object_scale_range": (0.6, 0.6)}),  # fits between the fingers
-]
-"""Tasks and parameters of the check of disturbed scenes."""
+SMALL_BLOCKS = ("close_loop/block_pulling", {"object_scale_range": (0.6, 0.6)})
+"""Blocks that fit between the fingers."""
 
 OPEN_LOOP = [task for task in TASKS if REGISTRY[task].control == "open_loop"]
 LOW = ["open_loop/improvise_house_building_3", "open_loop/covid_test"]
 """Tasks with objects so low that the fingers of a deep grasp would touch the floor."""
 
 OTHER_ROBOTS = [robot for robot in ROBOTS if robot != "kuka"]
-SAMPLE = [(task, OTHER_ROBOTS[i % len(OTHER_ROBOTS)]) for i, task in enumerate(TASKS)]
-"""One robot for each task; the slow tests check every pair."""
 
 
-@pytest.fixture(params=TASKS)
+@pytest.fixture(params=slow_variants(TASKS))
 def task(request):
     return request.param
 
@@ -133,15 +128,15 @@ def test_contract(task, check):
     check(task)
 
 
-@pytest.mark.parametrize(
-    "task",
-    [*TASKS[::8], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[4::8])],
-)
+@pytest.mark.parametrize("task", [*TASKS[::12], *slow(TASKS[6::12])])
 def test_vector_specs_of_worker_processes(task):
     checks.check_vector_specs(task, parallel=True)
 
 
-@pytest.mark.parametrize(("task", "robot"), SAMPLE)
+@pytest.mark.parametrize(
+    ("task", "robot"),
+    zip(["close_loop/house_building", BIN, "ramp/block_stacking"], OTHER_ROBOTS, strict=True),
+)
 def test_an_episode_of_another_robot_starts_valid_and_unsolved(task, robot):
     checks.check_resets(task, robot=robot, episodes=3)
 
@@ -159,7 +154,7 @@ def test_the_expert_succeeds(task):
 def test_the_expert_succeeds_without_yaw(task):
     if task in NOT_WITHOUT_YAW:
         pytest.skip(NOT_WITHOUT_YAW[task])
-    check_expert(task, episodes=10, margin=0.1, **without_yaw(task))
+    check_expert(task, episodes=5, margin=0.2, **without_yaw(task))
 
 
 @pytest.mark.parametrize("task", LOW)
@@ -221,32 +216,24 @@ def test_the_expert_succeeds_with_every_robot(task, robot, yaw):
     )
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if task not in SLOW_VARIANTS])
-def test_the_expert_recovers_from_random_actions(task):
-    check_recovery(task, episodes=10, margin=0.15)
-
-
 @pytest.mark.slow
 def test_the_expert_recovers_from_random_actions_over_60_episodes(task):
-    check_recovery(task, episodes=60, margin=0.05)
-
-
-def check_recovery(task, episodes, margin):
     if REGISTRY[task].terminates_at_limit:
         pytest.skip("an episode has no second step")
-    least = SUCCESS.get(task, 0.99) - margin
-    checks.check_recovery(task, episodes=episodes, min_success_rate=least)
+    least = SUCCESS.get(task, 0.99) - 0.05
+    checks.check_recovery(task, episodes=60, min_success_rate=least)
 
 
-@pytest.mark.parametrize(
-    ("task", "config"), [(task, config) for task, config in PROGRESS if task not in SLOW_VARIANTS]
-)
-def test_the_expert_repeats_no_action_in_an_unchanged_scene(task, config):
-    check_progress(task, episodes=2 if task in LONG_EPISODES else 5, **config)
+def test_the_expert_repeats_no_action_in_an_unchanged_scene(task):
+    check_progress(task, episodes=2 if task in LONG_EPISODES else 4)
+
+
+def test_the_expert_repeats_no_action_with_small_blocks():
+    check_progress(SMALL_BLOCKS[0], episodes=4, **SMALL_BLOCKS[1])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "config"), PROGRESS)
+@pytest.mark.parametrize(("task", "config"), [*((task, {}) for task in TASKS), SMALL_BLOCKS])
 def test_the_expert_repeats_no_action_in_an_unchanged_scene_over_60_episodes(task, config):
     check_progress(task, episodes=60, **config)
 

@@ -84,13 +84,13 @@ def test_a_hand_whose_fingertips_press_on_the_floor_moves_up(make_env):
 def test_a_piece_flush_with_the_roof_is_picked(make_env, task):
     env = make_env(f"open_loop/{task}", obs_size=128, max_steps=30)
     solved = 0
-    for seed in range(12):  # a finger may overturn the roof: a quarter of the episodes end so
+    for seed in range(8):  # a finger may overturn the roof: a quarter of the episodes end so
         state = env.reset(seed=seed)
         roof, piece, *_ = sorted(env.scene.task.objects, key=lambda body: body.name != "roof 1")
         put_beside(piece, roof)
         env.scene.world.settle()
         solved += bool(play(env, idle(env, state))["success"])
-    assert solved >= 6
+    assert solved >= 4
 
 
 def test_a_piece_beside_the_supports_of_a_bridge_is_removed_first(make_env):

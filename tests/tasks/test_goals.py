@@ -52,10 +52,8 @@ def test_an_object_that_leaves_the_workspace_terminates_without_reward(make):
     env = make("block_picking")
     env.scene.task.block.place((0.45, 0.16, 0.025))
     outcome = env._step(env.full_action_spec.zero())
-    assert outcome["terminated"]
-    assert outcome["done"]
-    assert not outcome["success"]
-    assert outcome["reward"] == 0
+    ends = {name: bool(outcome[name]) for name in ("terminated", "done", "success", "reward")}
+    assert ends == {"terminated": True, "done": True, "success": False, "reward": False}
 
 
 def test_the_bounding_box_check_is_stricter_than_the_point_check(make):
@@ -65,14 +63,13 @@ def test_the_bounding_box_check_is_stricter_than_the_point_check(make):
         assert env.scene.task.is_valid() is valid
 
 
-@pytest.mark.parametrize("yaw_rad", [0.0, 0.3, 0.8, 1.2])
-def test_the_bounding_box_of_a_bowl_does_not_depend_on_its_yaw(make, yaw_rad):
-    env = make("block_in_bowl", workspace_check="bounding_box")
-    env.scene.task.bowl.place((0.49, 0.0, 1e-3), yaw_rad)
-    env.scene.task.block.place((0.35, 0.1, 0.025))
-    assert env.scene.task.is_valid()
-    env.scene.task.bowl.place((0.53, 0.0, 1e-3), yaw_rad)
-    assert not env.scene.task.is_valid()
+def test_the_bounding_box_of_a_bowl_does_not_depend_on_its_yaw(make):
+    task = make("block_in_bowl", workspace_check="bounding_box").scene.task
+    task.block.place((0.35, 0.1, 0.025))
+    for yaw_rad in (0.0, 0.3, 0.8, 1.2):
+        for x, valid in ((0.49, True), (0.53, False)):
+            task.bowl.place((x, 0.0, 1e-3), yaw_rad)
+            assert task.is_valid() is valid
 
 
 def test_fixed_orientations_are_at_yaw_zero(make):
@@ -88,7 +85,7 @@ def test_fixed_orientations_are_at_yaw_zero(make):
 def test_scales_are_drawn_in_steps_and_visible_in_the_image(make):
     env = make("block_picking", object_scale_range=(0.8, 0.9))
     seen = set()
-    for _ in range(40):
+    for _ in range(30):
         state = env.reset()
         edge = env.scene.task.block.shape.size_m[0]
         seen.add(round(edge / 0.05, 4))

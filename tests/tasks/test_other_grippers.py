@@ -12,7 +12,7 @@ from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
 
 MODELS = Path(ur5.__file__).parent / "models"
 WIDTH_M, WIDER_M = "0.019", "0.0285"
-EPISODES = 20
+EPISODES = 10
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,13 @@ from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.manipulation.primitives import CLOSED, OPEN, can_descend, grasp
+from ba_torchrl.tasks.manipulation.primitives import (
+    CLOSED,
+    OPEN,
+    can_descend,
+    grasp,
+    nearest_equivalent_yaw,
+)
 from ba_torchrl.tasks.manipulation.transport import TRAVEL_CLEARANCE_M, pick_up, travel
 from ba_torchrl.tasks.workspace import ActionLimits
 
@@ -22,8 +28,8 @@ TOP_M = SIDE + BELOW_M + TRAVEL_CLEARANCE_M
 class Table:
     """Kuka and cubes on the floor."""
 
-    def __init__(self):
-        self.world = World()
+    def __init__(self, world):
+        self.world = world
         self.robot = ROBOTS["kuka"](self.world)
         self.robot.set_opening(1.0)
 
@@ -41,9 +47,8 @@ class Table:
 
 @pytest.fixture
 def table():
-    found = Table()
-    yield found
-    found.world.close()
+    with World() as world:
+        yield Table(world)
 
 
 def over(table, obstacle, z=TOP_M):
@@ -121,3 +126,12 @@ def test_another_body_below_a_turned_finger_prevents_the_descent(table):
         table.tool(0.45, 0.0, 0.06, turn)
         assert can_descend(table.robot, block, 0.0, LIMITS)
         assert can_descend(table.robot, block, 0.0, LIMITS, [other]) == expected
+
+
+@pytest.mark.parametrize(("yaw", "target"), [(0.9, 1.3), (-0.9, -1.3)])
+def test_a_yaw_out_of_the_range_of_the_gripper_is_replaced_by_an_equivalent_one(yaw, target):
+    quarter, limits = math.pi / 2, ActionLimits(0.05, 0.8, yaw_range_rad=(-1.0, 1.0))
+    inside = target - math.copysign(quarter, target)
+    assert nearest_equivalent_yaw(yaw, target, limits, quarter) == pytest.approx(inside)
+    assert nearest_equivalent_yaw(yaw, target, LIMITS, quarter) == pytest.approx(target)
+    assert nearest_equivalent_yaw(yaw, target, ActionLimits(0.05, 0.0), quarter) == yaw

@@ -12,7 +12,7 @@ NICENESS = "RAY_worker_niceness"
 @contextlib.contextmanager
 def ray_nodes(count, cpus=1):
     """Start a cluster and connect to it; yield the cluster, its nodes and the module `ray`."""
-    pytest.importorskip("ray", reason="Ray is an optional package: pip install 'ba-torchrl[ray]'")
+    pytest.importorskip("ray", reason="Ray is an optional package: pip install ray")
     os.environ[NICENESS] = "0"  # workers are not slower than the processes of other tests
     import ray
     from ray.cluster_utils import Cluster

@@ -20,8 +20,8 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_failure, read_result
 from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.durable import remove_leftovers
 from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.persistence import remove_leftovers
 from ba_torchrl.training.resume import resumable_updates
 from tests.planted import Planted
 

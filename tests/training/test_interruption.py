@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -18,8 +16,8 @@ from ba_torchrl.training import experiment as experiments
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.interruption import RunStopped
+from ba_torchrl.training.persistence import lock_holder
 from ba_torchrl.training.resume import resumable_updates
-from ba_torchrl.training.run_lock import lock_holder
 
 SAC = {
     "task": "close_loop/block_reaching",
@@ -123,7 +121,7 @@ def undisturbed(tmp_path_factory):
     return run(config_for(tmp_path_factory.mktemp("whole") / "run"))
 
 
-@pytest.mark.parametrize("after", [1, 3, pytest.param(4, marks=SLOW), 9, 20])
+@pytest.mark.parametrize("after", [1, 3, pytest.param(4, marks=SLOW), 20])
 def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, undisturbed, after):
     experiment = Experiment(config_for(tmp_path), progress=False)
     at_call(experiment, experiment.algorithm, "update", after, terminate)
@@ -286,17 +284,10 @@ def test_an_evaluation_draws_nothing_from_the_process_generators(tmp_path):
     experiment.close()
 
 
-def test_a_second_process_cannot_open_a_running_run(tmp_path):
+def test_a_running_run_cannot_be_opened_again(tmp_path):
     experiment = Experiment(config_for(tmp_path), progress=False)
     assert lock_holder(tmp_path).startswith(f"process {os.getpid()} on ")
-    code = f"""
-from ba_torchrl.training.run_lock import RunLock
-from pathlib import Path
-RunLock(Path({str(tmp_path)!r}))
-"""
-    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert f"process {os.getpid()} on " in other.stderr
-    with pytest.raises(ConfigError, match="runs the experiment"):
+    with pytest.raises(ConfigError, match=f"process {os.getpid()} on .* runs the experiment"):
         Experiment(config_for(tmp_path, resume=True), progress=False)
     experiment.close()
     assert lock_holder(tmp_path) is None

@@ -7,7 +7,8 @@ import os
 import pytest
 
 import ba_torchrl
-from ba_torchrl.training.command_line import EXIT_CODE, plain_errors
+from ba_torchrl.cli import EXIT_CODE
+from ba_torchrl.cli.errors import plain_errors
 from tests.training.test_resume import config_for, interrupt, run
 
 resource = pytest.importorskip("resource")

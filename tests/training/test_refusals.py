@@ -6,10 +6,10 @@ import sys
 import pytest
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.training.command_line import EXIT_CODE
+from tests.cli.test_commands import RUN
 from tests.recipes import recipe
-from tests.training.test_command_line import RUN
 from tests.training.test_experiment import TINY, tiny
 
 OPEN = ("task=open_loop/block_stacking", "algorithm=dqn")
@@ -18,8 +18,8 @@ OPEN = ("task=open_loop/block_stacking", "algorithm=dqn")
 @pytest.mark.parametrize(
     ("name", "package", "overrides"),
     [
-        ("train", "escnn", ("network=equi", "algorithm=sac", "label=a", "run_dir=new")),
-        ("train", "escnn", ("network=equi_fcn", *OPEN, "label=a", "run_dir=new")),
+        ("train", "escnn", ("network=equi", "algorithm=sac", "run_dir=new")),
+        ("train", "escnn", ("network=equi_fcn", *OPEN, "run_dir=new")),
         ("benchmark", "escnn", ("benchmark=close_loop_small", "folder=new")),
         ("plot", "matplotlib.figure", ("runs=[run]",)),
     ],
@@ -77,5 +77,5 @@ def test_refused_networks_and_algorithms_have_the_names_of_the_registry(tmp_path
 def test_the_command_line_names_presets(overrides, message, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
-        recipe("train", *overrides, "label=a", "run_dir=new")
+        recipe("train", *overrides, "run_dir=new")
     assert message in capsys.readouterr().err

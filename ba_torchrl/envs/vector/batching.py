@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any, Self, SupportsIndex
+from typing import Any, SupportsIndex
 
 import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import ParallelEnv
+from typing_extensions import Self
 
 from ba_torchrl.envs.checks import check_actions
 from ba_torchrl.envs.positions import Position

@@ -5,24 +5,27 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase, SerialEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.checks import check_actions
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
-from ba_torchrl.envs.vector.parallel import VectorEnv
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.envs.vector.torchrl_names import missing_names
+from ba_torchrl.errors import ConfigError, WorkerError
+
+if TYPE_CHECKING:
+    from ba_torchrl.envs.vector.parallel import VectorEnv
 
 __all__ = [
     "SerialVectorEnv",
-    "VectorEnv",
     "check_actions",
     "make_vector",
     "processes_save_time",
@@ -62,7 +65,7 @@ def make_vector(
     workers: WorkerOptions = WorkerOptions(),  # noqa: B008 -- immutable
     num_threads: int | None = None,
     use_buffers: bool = True,
-) -> SerialVectorEnv | VectorEnv:
+) -> SerialVectorEnv | VectorEnv | PlainVectorEnv:
     """Return ``num_envs`` environments as one, with batch size [num_envs], ready to be reset.
 
     Args:
@@ -88,8 +91,23 @@ def make_vector(
         raise ValueError(f"{len(make_env)} functions were given for {num_envs} environments")
     if num_envs > MAX_ENVS:
         raise ConfigError(f"num_envs: at most {MAX_ENVS}, the number of worlds of PyBullet")
-    env: SerialVectorEnv | VectorEnv
-    if workers.parallel:
+    env: SerialVectorEnv | VectorEnv | PlainVectorEnv
+    if workers.parallel and missing_names():
+        warnings.warn(
+            f"this version of TorchRL lacks {', '.join(missing_names())}: the environments are "
+            "its ParallelEnv, which does not replace workers that fail",
+            stacklevel=3,
+        )
+        env = PlainVectorEnv(
+            num_envs,
+            make_env,
+            mp_start_method=workers.start_method,
+            num_threads=num_threads,
+            use_buffers=use_buffers,
+        )
+    elif workers.parallel:
+        from ba_torchrl.envs.vector.parallel import VectorEnv
+
         env = VectorEnv(
             num_envs,
             make_env,
@@ -130,6 +148,29 @@ def _check_shared_memory(env: VectorEnv) -> None:
             f"{_SHARED_MEMORY} has {free / 1e6:.1f} MB free, {env.num_workers} environments need "
             f"{needed / 1e6:.1f} MB: lower num_envs, or enlarge it (docker run --shm-size)"
         )
+
+
+class PlainVectorEnv(SeededVector, ParallelEnv):
+    """Environments in worker processes that are not replaced, by TorchRL's public interface."""
+
+    _is_seeded = False
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int:
+        """Seed environment i with ``seed + i`` at the next reset of all; see `SeededVector`."""
+        self._set_base_seed(seed)
+        self._is_seeded = True
+        return seed if static_seed else seed + self.num_workers
+
+    def get_positions(self) -> list[Position]:
+        """Raise a `WorkerError`: a run that is resumed plays other episodes."""
+        raise WorkerError("TorchRL's ParallelEnv does not tell the episodes of its workers")
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any
+    ) -> TensorDictBase:
+        if seed is None and self._is_seeded and (tensordict is None or "_reset" not in tensordict):
+            seed, self._is_seeded = self._base_seed, False
+        return super()._reset(tensordict, seed=seed, **kwargs)
 
 
 class SerialVectorEnv(SeededVector, SerialEnv):

@@ -80,19 +80,20 @@ class BoundedScale(nn.Module):
 
 
 def truncated_gaussian_policy(
-    actor: nn.Module, in_keys: Sequence[str], *, std_min: float
+    actor: nn.Module, in_keys: Sequence[str], *, std_min: float, std_max: float = 1.0
 ) -> ProbabilisticActor:
     """Return the policy whose action is a Gaussian variable truncated to [-1, 1].
 
-    Its mode is tanh(loc), and its standard deviation at most 1. In contrast to the squashed
-    Gaussian, the likelihood of actions at the ends of the range is bounded.
+    Its mode is tanh(loc). In contrast to the squashed Gaussian, the likelihood of actions at the
+    ends of the range is bounded.
 
     Args:
         actor: from the observation to (loc, scale), each [..., A].
         in_keys: keys of the observation, in the order of the actor's arguments.
         std_min: least standard deviation.
+        std_max: greatest standard deviation.
     """
-    bounded = BoundedScale(actor, std_min, 1.0)
+    bounded = BoundedScale(actor, std_min, std_max)
     return ProbabilisticActor(
         TensorDictModule(bounded, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

@@ -210,7 +210,7 @@ class TiltedView:
         """Return projections [B, K, 3, p, p], voxels; ry is the outer index of the poses."""
         patch = patches(pixels, chosen[:, :2], self.size)[:, 0]
         table = cell_table(*self.grid[1:], self.size, pixels.device)
-        cells = table[chosen[:, 2], *chosen[:, 4:].unbind(1)]
+        cells = table[(chosen[:, 2], *chosen[:, 4:].unbind(1))]
         cells = cells.reshape(len(patch), -1, *cells.shape[-3:])
         heights = constants(tuple(self.grid.z_m), pixels.device)
         z = heights[chosen[:, 3:4]].expand(-1, cells.shape[1])

@@ -9,7 +9,6 @@ parameters only.
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Iterator
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.errors import MissingPackageError
 from ba_torchrl.modules.steerable.cpu_threads import is_plain_float32
 from ba_torchrl.modules.steerable.irrep_convolution import (
     IrrepKernels,
@@ -33,19 +31,11 @@ from ba_torchrl.modules.steerable.kernels import (
     kernel_block,
     regular_irrep_kernels,
 )
+from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from escnn.group import Representation
     from escnn.gspaces import GSpace2D
-
-ESCNN_FIX = (
-    "equivariant networks need escnn; install it without its Fortran dependency by "
-    "`pip install --no-deps escnn==1.0.11 && pip install lie_learn joblib pymanopt autograd`, "
-    "or run `make setup`"
-)
-
 
 _expanded: ContextVar[dict[tuple[Any, ...], tuple[Any, ...]] | None] = ContextVar(
     "expanded", default=None
@@ -67,24 +57,13 @@ def reuse_filters() -> Iterator[None]:
         _expanded.reset(token)
 
 
-def _gspaces() -> ModuleType:
-    try:
-        with warnings.catch_warnings():
-            # escnn warns that the SO(3) package is missing; planar groups do not need it.
-            warnings.filterwarnings("ignore", message=".*py3nj")
-            from escnn import gspaces
-    except ImportError as error:
-        raise MissingPackageError(ESCNN_FIX) from error
-    return gspaces
-
-
 def planar_rotations(order: int) -> GSpace2D:
     """Return escnn's space of planar images under the rotations of the cyclic group C_order.
 
     Raises:
         ImportError: escnn is not installed; the message names the fix.
     """
-    return _gspaces().rot2dOnR2(order)
+    return import_escnn("escnn.gspaces").rot2dOnR2(order)
 
 
 def planar_rotations_and_flips(order: int) -> GSpace2D:
@@ -93,7 +72,7 @@ def planar_rotations_and_flips(order: int) -> GSpace2D:
     Raises:
         ImportError: escnn is not installed; the message names the fix.
     """
-    return _gspaces().flipRot2dOnR2(order)
+    return import_escnn("escnn.gspaces").flipRot2dOnR2(order)
 
 
 def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representation]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import pybullet
 import pybullet_data
@@ -40,13 +41,14 @@ class Kuka(Robot):
     camera_height_m = 0.12
     finger_span_m = 45 * 0.3 / 128
 
+    model_file: ClassVar[str] = f"{pybullet_data.getDataPath()}/kuka_iiwa/kuka_with_gripper2.sdf"
+    """SDF model of arm and gripper; another has the same joints and links."""
     _tip_joints = (10, 13)
 
     def load(self) -> int:
         """Load the model, couple the fingers by a gear, and widen the joint limits."""
-        model = f"{pybullet_data.getDataPath()}/kuka_iiwa/kuka_with_gripper2.sdf"
-        with loading(model):
-            robot = pybullet.loadSDF(model, physicsClientId=self.client)[0]
+        with loading(self.model_file):
+            robot = pybullet.loadSDF(self.model_file, physicsClientId=self.client)[0]
         # PyBullet sets the pose of the centre of mass, not of the link frame
         offset = pybullet.getDynamicsInfo(robot, -1, physicsClientId=self.client)[3]
         pybullet.resetBasePositionAndOrientation(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import pybullet
 import pybullet_data
@@ -59,15 +59,16 @@ class Panda(Robot):
     finger_span_m = 42 * 0.3 / 128
     hand_half_extents_m = (0.105, 0.035)
 
+    model_file: ClassVar[str] = f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf"
+    """URDF model of arm and hand; another has the same joints and links."""
     finger_force = 10.0
     finger_speed = 0.4
 
     def load(self) -> int:
         """Load the model, couple the fingers by a gear, and widen the joint limits."""
-        model = f"{pybullet_data.getDataPath()}/franka_panda/panda.urdf"
-        with loading(model):
+        with loading(self.model_file):
             robot = pybullet.loadURDF(
-                model, _BASE_M, useFixedBase=True, physicsClientId=self.client
+                self.model_file, _BASE_M, useFixedBase=True, physicsClientId=self.client
             )
         self._widen_joint_limits(robot)
         self._couple_fingers(robot, -1)

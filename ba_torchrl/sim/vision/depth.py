@@ -2,7 +2,7 @@
 
 PyBullet's TinyRenderer is not used: it takes milliseconds for 128 x 128 pixels and four cubes,
 cannot omit the arm at low cost, shifts edges by half a pixel, and its orthographic depth is not
-linear. The compiled kernels take hundredths of a millisecond (`recipes/speed.py` measures both).
+linear. The compiled kernels take hundredths of a millisecond (`recipes/measure.py` measures both).
 
 Depth is linear, in metres, along the optical axis. Image rows follow +x as far as the viewing
 direction allows, columns +y. Pixels are sampled at their centres.

@@ -15,7 +15,7 @@ from ba_torchrl.sim.shapes import Solid
 from ba_torchrl.tasks.base import BLUE, TASKS, CloseLoopTask
 from ba_torchrl.tasks.manipulation.primitives import CLOSED, OPEN, grasped_body, move_toward
 from ba_torchrl.tasks.manipulation.transport import pick_up, travel
-from ba_torchrl.tasks.workspace import Spacing
+from ba_torchrl.tasks.workspace import Spacing, random_points
 
 RELEASE_GAP_M = 4e-3
 """Height of the block above the floor of the bowl at its release; it lands before the action
@@ -71,7 +71,8 @@ class BlockInBowl(CloseLoopTask):
         """Place block and bowl at random poses, at least 17 cm apart."""
         block = 2.4 * self.block_m
         bowl = 0.17 * self.settings.scale
-        points = self.terrain.random_points(rng, (Spacing(block, block), Spacing(bowl, bowl)))
+        spacings = Spacing(block, block), Spacing(bowl, bowl)
+        points = random_points(self.terrain.spawn_area, rng, spacings)
         for body, xy in zip((self.block, self.bowl), points, strict=True):
             self.stand(body, xy, self.random_yaw(rng, math.pi))
 

@@ -155,8 +155,7 @@ class ClutterTask(Task):
     @property
     def landmarks(self) -> list[YawPose]:
         """Poses of the objects; the upper corner of the workspace for each removed one."""
-        workspace = self.settings.workspace
-        corner = (workspace.x[1], workspace.y[1], workspace.z[1])
+        corner = self.settings.workspace.upper_corner
         poses = [(body.position, body.yaw_rad) for body in self.objects]
         return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
 

@@ -10,7 +10,7 @@ from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Pose, tool_angles
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.workspace import Workspace
+from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 LEVEL_RAD = 0.02
 """A tilt below this counts as zero; the home pose is tilted by up to 1e-3."""
@@ -80,14 +80,11 @@ def scene_generator(world: World) -> np.random.Generator:
     return np.random.default_rng(np.array(poses).view(np.uint64).ravel())
 
 
-def perturbed_pick(world: World, body: Body, grasp: Pose, *, can_turn: bool) -> PickPlaceCommand:
+def perturbed_pick(world: World, body: Body, grasp: Pose, limits: ActionLimits) -> PickPlaceCommand:
     """Return a pick with a random deviation from a grasp, the same for the same scene.
 
     It may succeed where the grasp fails, or push the body to where the grasp succeeds. Small
-    deviations are more likely than large ones.
-
-    Args:
-        can_turn: whether the yaw of the tool may deviate.
+    deviations are more likely than large ones. The yaw deviates if the gripper can turn.
     """
     rng = scene_generator(world)
     low, high = np.array(body.shape.bounds_m)
@@ -95,5 +92,5 @@ def perturbed_pick(world: World, body: Body, grasp: Pose, *, can_turn: bool) -> 
     half = OFFSET_SHARE * share * (high - low) / 2
     dx, dy, _ = body.pose.rotate(rng.uniform(-half, half)[None])[0].tolist()
     x, y, z = grasp.position
-    turn = share * float(rng.uniform(-math.pi / 2, math.pi / 2)) if can_turn else 0.0
+    turn = share * float(rng.uniform(-math.pi / 2, math.pi / 2)) if limits.turn_rad else 0.0
     return pick_command(grasp.moved_to((x + dx, y + dy, z), turn))

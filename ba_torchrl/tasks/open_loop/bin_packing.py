@@ -189,8 +189,7 @@ class BinPacking(PackingTask):
         body = max(outside, key=order)
         grasp = grasps[body]
         if grasp.clearance_m <= 0:
-            can_turn = self.action_limits.turn_rad > 0
-            return perturbed_pick(self.world, body, grasp.tool, can_turn=can_turn)
+            return perturbed_pick(self.world, body, grasp.tool, self.action_limits)
         return pick_command(grasp.tool)
 
     # ----------------------------------------------------------------------------------------

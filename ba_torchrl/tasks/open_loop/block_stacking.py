@@ -28,7 +28,6 @@ class BlockStacking(StructureTask):
         object_type: Literal["cube", "cylinder"] = "cube"
         """Shape of all blocks."""
 
-    max_steps = 10
     num_objects = 4
     num_objects_range = (2, 8)
     clears_blocked_pieces = True

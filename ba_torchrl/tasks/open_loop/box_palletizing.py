@@ -32,6 +32,7 @@ from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.packing.tilted_grasps import tilted_grasp
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 from ba_torchrl.tasks.structures.pieces import CUBOID
+from ba_torchrl.tasks.structures.tilts import release_pose
 
 PALLET_M = (0.232, 0.192, 0.03)
 """Extents of the pallet; all lengths are at the appendix's size."""
@@ -204,8 +205,7 @@ class BoxPalletizing(PackingTask):
             if tilted is not None:
                 tool, clearance_m = tilted
         if clearance_m < BLOCKED_M:
-            can_turn = self.action_limits.turn_rad > 0
-            return perturbed_pick(self.world, body, tool, can_turn=can_turn)
+            return perturbed_pick(self.world, body, tool, self.action_limits)
         return pick_command(tool)
 
     # ----------------------------------------------------------------------------------------
@@ -312,7 +312,7 @@ class BoxPalletizing(PackingTask):
         tool, heading = self.robot.tool_frame(), CUBOID.yaw_rad(held)
         turn = wrap_angle(yaw_rad - heading, math.pi)
         for yaw in (heading + turn, heading + turn + math.pi):
-            target = CUBOID.release_pose(held, Pose(position), yaw)
+            target = release_pose(CUBOID, held, Pose(position), yaw)
             pose = carrying_pose(tool, held.pose, target)
             if not swaps_fingers(pose) and is_reachable(
                 self.robot, self.terrain.support_ids, pose, PickPlaceLimits().pre_place_height_m

@@ -306,8 +306,7 @@ class CovidTest(OpenLoopTask):
     @property
     def landmarks(self) -> Sequence[YawPose]:
         """Poses of areas, tubes and swabs; the upper corner of the workspace for used swabs."""
-        workspace, layout = self.settings.workspace, self.layout
-        corner = ((workspace.x[1], workspace.y[1], workspace.z[1]), 0.0)
+        layout, corner = self.layout, (self.settings.workspace.upper_corner, 0.0)
         areas = (layout.new_box, layout.used_box, layout.test_area)
         return [
             corner if body in self._used_swabs else (body.position, body.yaw_rad)
@@ -395,8 +394,7 @@ class CovidTest(OpenLoopTask):
         z = vertical_extent(body)[0] + self._grasp_m
         grasp = downward_pose((x, y, z), self._grasp_yaw(body))
         if not self._can_grasp(body):
-            can_turn = self.action_limits.turn_rad > 0
-            return perturbed_pick(self.world, body, grasp, can_turn=can_turn)
+            return perturbed_pick(self.world, body, grasp, self.action_limits)
         return pick_command(grasp)
 
     def _pick_candidates(self) -> list[Body]:

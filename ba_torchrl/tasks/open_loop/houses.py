@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, tower
-from ba_torchrl.tasks.structures.improvise import (
-    START_GAP_M,
-    any_cuboid,
-    any_shape,
-    shape_span,
-    with_circular_spacing,
-)
+from ba_torchrl.tasks.structures.improvise import START_GAP_M, any_cuboid, any_shape, shape_span
 from ba_torchrl.tasks.structures.pieces import cube, cuboid, pair_span, roof, triangle
 
 
@@ -23,7 +19,6 @@ class HouseBuilding1(StructureTask):
     triangle tips over or a piece leaves the workspace. Appendix A.1.
     """
 
-    max_steps = 10
     num_objects = 4
     num_objects_range = (2, 6)
 
@@ -41,7 +36,6 @@ class HouseBuilding2(StructureTask):
     piece leaves the workspace. Appendix A.1.
     """
 
-    max_steps = 10
     num_objects = 3
     num_objects_range = (3, 3)
 
@@ -62,7 +56,6 @@ class HouseBuilding3(StructureTask):
     """
 
     scale_limits = (0.55, 0.9)
-    max_steps = 10
     num_objects = 4
     num_objects_range = (4, 4)
 
@@ -116,7 +109,6 @@ class ImproviseHouseBuilding2(StructureTask):
     tips over or leaves the workspace. Appendix A.1.
     """
 
-    max_steps = 10
     num_objects = 3
     num_objects_range = (3, 3)
     start_gap_m = START_GAP_M
@@ -125,7 +117,7 @@ class ImproviseHouseBuilding2(StructureTask):
     def blueprint(self) -> Blueprint:
         """Return two shapes that support the roof."""
         shape = any_shape()
-        across = Slot(with_circular_spacing(roof(self.block_m)), on=(0, 1), span=shape_span())
+        across = Slot(replace(roof(self.block_m), spacing=None), on=(0, 1), span=shape_span())
         return Blueprint((Slot(shape), Slot(shape), across))
 
 
@@ -139,7 +131,6 @@ class ImproviseHouseBuilding3(StructureTask):
     """
 
     scale_limits = (0.55, 0.9)
-    max_steps = 10
     num_objects = 4
     num_objects_range = (4, 4)
     start_gap_m = START_GAP_M
@@ -153,6 +144,6 @@ class ImproviseHouseBuilding3(StructureTask):
                 Slot(shape),
                 Slot(shape),
                 Slot(any_cuboid(), on=(0, 1), span=shape_span()),
-                Slot(with_circular_spacing(roof(self.block_m)), on=(2,), centered_over=(0, 1)),
+                Slot(replace(roof(self.block_m), spacing=None), on=(2,), centered_over=(0, 1)),
             )
         )

@@ -100,8 +100,7 @@ class PackingTask(OpenLoopTask):
     @property
     def landmarks(self) -> Sequence[YawPose]:
         """Poses of objects and container; the workspace's upper corner for inactive objects."""
-        workspace = self.settings.workspace
-        corner = (workspace.x[1], workspace.y[1], workspace.z[1])
+        corner = self.settings.workspace.upper_corner
         bodies = [*self.pool.active, self.container]
         missing = self.settings.num_objects - len(self.pool.active)
         return [(body.position, body.yaw_rad) for body in bodies] + [(corner, 0.0)] * missing

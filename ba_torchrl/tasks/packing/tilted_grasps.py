@@ -22,6 +22,7 @@ from ba_torchrl.tasks.manipulation.clearance import tool_clearances_m
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.packing.base import SUFFICIENT_CLEARANCE_M
 from ba_torchrl.tasks.structures.pieces import CUBOID
+from ba_torchrl.tasks.structures.tilts import resting_frame
 
 ROLL_SHARES = (1.0, 0.75, 0.5, 0.25, 0.0)
 """Tilts of the closing axis that are compared: 1 is perpendicular to the sides of the box, so that
@@ -67,7 +68,7 @@ def tilted_grasp(
     Returns:
         The grasp; None if none is within reach.
     """
-    frame = Pose(body.position, CUBOID.resting_frame(body))
+    frame = Pose(body.position, resting_frame(CUBOID, body))
     closing, _, normal = zip(*quaternion_matrix(frame.orientation), strict=True)
     roll_rad, tilt_rad = abs(math.asin(closing[2])), math.acos(min(normal[2], 1.0))
     candidates = sorted(

@@ -78,20 +78,6 @@ def read_piece_states(
     return states
 
 
-def has_tipped(
-    pieces: Mapping[Body, Piece], held: Body | None, tipped_rad: float = UPRIGHT_RAD
-) -> bool:
-    """Whether a piece that must stay upright has tipped over and is not held.
-
-    Args:
-        tipped_rad: tilt of a piece that has tipped over.
-    """
-    return any(
-        piece.stays_upright and body is not held and piece.tilt_rad(body) >= tipped_rad
-        for body, piece in pieces.items()
-    )
-
-
 class SlotAssigner:
     """Finds the assignments of the pieces, in their present states, to the slots of a blueprint.
 
@@ -116,24 +102,13 @@ class SlotAssigner:
 
     def evaluate(self) -> dict[str, bool]:
         """Return whether the structure stands and whether no piece is held."""
-        is_built = any(not self.misplaced(found) for found in self.assignments())
+        assignments, most = self.largest_assignments()
+        is_built = most == len(self.blueprint.slots) and not all(map(self.misplaced, assignments))
         return {"is_released": self.held not in self.pieces, "is_built": is_built}
 
     def placed(self) -> set[Body]:
         """Return the pieces that are in slots in every largest assignment."""
         return set.intersection(*map(set, self.largest_assignments()[0]))
-
-    def assignments(self) -> Iterator[Assignment]:
-        """Yield every assignment that fills all slots."""
-
-        def fill(assignment: Assignment) -> Iterator[Assignment]:
-            if len(assignment) == len(self.blueprint.slots):
-                yield assignment
-                return
-            for body in self._candidates(assignment):
-                yield from fill((*assignment, body))
-
-        return fill(())
 
     def largest_assignments(self) -> tuple[list[Assignment], int]:
         """Return all assignments that fill as many slots as possible, and that number of slots."""

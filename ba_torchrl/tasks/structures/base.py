@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, PickPlaceCommand
-from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.shapes import Color
 from ba_torchrl.tasks.base import BLUE, GREEN, RED, CloseLoopTask, OpenLoopTask, Task
-from ba_torchrl.tasks.structures.assignment import has_tipped
-from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint
+from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
 from ba_torchrl.tasks.structures.experts import PickPlaceExpert, gripper_command
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
 from ba_torchrl.tasks.structures.structure import Structure
-from ba_torchrl.tasks.workspace import Spacing
+from ba_torchrl.tasks.workspace import Spacing, random_points
 
 WINDOW_SHARE = 0.375
 """Half the width of the window for a long piece, as a multiple of its length."""
@@ -59,14 +58,17 @@ class StructureGoal(Task):
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""
-        return super().is_valid() and not has_tipped(
-            self.structure.pieces, self.robot.held_body(), self.tipped_rad
+        held = self.robot.held_body()
+        return super().is_valid() and not any(
+            piece.stays_upright and body is not held and piece.tilt_rad(body) >= self.tipped_rad
+            for body, piece in self.structure.pieces.items()
         )
 
 
 class StructureTask(StructureGoal, OpenLoopTask):
     """A structure in open loop."""
 
+    max_steps = 10
     clears_blocked_pieces: ClassVar[bool] = False
     """Whether the expert removes pieces that block the grasp of another piece. Off for structures
     with long pieces, for which the removals would not end."""
@@ -79,7 +81,8 @@ class StructureTask(StructureGoal, OpenLoopTask):
     def load_scene(self) -> None:
         """Load the pieces."""
         self.structure = Structure(self.blueprint(), self.world, self.block_m, self.terrain)
-        self.terrain.reserve(self.structure.widest_base_m(of_all=True))
+        slots = self.structure.blueprint.slots
+        self._reserve(piece for slot in slots for piece in slot.piece.variants or (slot.piece,))
 
     def grasps(self) -> PickPlaceGrasps:
         """Return the grasps of the pieces in the present scene."""
@@ -94,7 +97,7 @@ class StructureTask(StructureGoal, OpenLoopTask):
     def choose_objects(self, rng: np.random.Generator) -> None:
         """Draw the variants of the pieces."""
         self.structure.draw(rng)
-        self.terrain.reserve(self.structure.widest_base_m())
+        self._reserve(self.structure.pieces.values())
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
         """Place the pieces at random poses, apart from each other.
@@ -102,12 +105,14 @@ class StructureTask(StructureGoal, OpenLoopTask):
         With fixed orientations, a gripper at yaw 0 can grasp each of them. On a terrain that only
         supports a structure in a part of it, one piece of the lowest layer starts there.
         """
+        pieces = self.structure.pieces
+        lowest = self.structure.blueprint.slots[0].piece.kind
         self.terrain.scatter(
             rng,
-            list(self.structure.pieces),
-            self.structure.spacings(self.start_gap_m),
-            lambda body: self._random_yaw_of(body, rng),
-            base=self.structure.base_body(),
+            list(pieces),
+            self._spacings(),
+            lambda body: self.random_yaw(rng, 2 * math.pi) - pieces[body].grasp_yaws_rad[0],
+            base=next(body for body, piece in pieces.items() if piece.kind == lowest),
         )
 
     def expert_command(self) -> PickPlaceCommand:
@@ -131,14 +136,33 @@ class StructureTask(StructureGoal, OpenLoopTask):
         longest = max(high[0] - low[0], high[1] - low[1])
         return max(super().window_m(held), WINDOW_SHARE * longest)
 
-    def _random_yaw_of(self, body: Body, rng: np.random.Generator) -> float:
-        """Return a random yaw of a piece; with fixed orientations, one for a gripper at yaw 0."""
-        return self.random_yaw(rng, 2 * math.pi) - self.structure.pieces[body].grasp_yaws_rad[0]
+    def _reserve(self, pieces: Iterable[Piece]) -> None:
+        """Leave space on the terrain for the widest of the pieces that stand on the ground."""
+        slots = self.structure.blueprint.slots
+        kinds = {slot.piece.kind for slot in slots if not slot.on}
+        self.terrain.reserve(max(_grasped_width_m(p) for p in pieces if p.kind in kinds))
+
+    def _spacings(self) -> list[Spacing]:
+        """Return the space that each piece needs at the start of an episode."""
+        spacings, largest_radius_m = [], 0.0
+        for body, piece in self.structure.pieces.items():
+            radius = footprint_radius_m(body)
+            padding_m, distance_m = (2 * radius, 0.0) if piece.spacing is None else piece.spacing
+            distance_m = max(distance_m, radius + largest_radius_m + self.start_gap_m)
+            spacings.append(Spacing(padding_m, distance_m))
+            largest_radius_m = max(largest_radius_m, radius)
+        return spacings
 
     def _rests_on_pieces(self, body: Body) -> bool:
         """Whether a slot for this kind of piece is supported by other pieces."""
         kind = self.structure.pieces[body].kind
         return any(slot.on and slot.piece.kind == kind for slot in self.structure.blueprint.slots)
+
+
+def _grasped_width_m(piece: Piece) -> float:
+    """Return the extent of a piece between the fingers."""
+    yaw = piece.grasp_yaws_rad[0]
+    return float(np.ptp(piece.shape.vertices[:, :2] @ (math.cos(yaw), math.sin(yaw))))
 
 
 class CloseLoopStructureTask(StructureGoal, CloseLoopTask):
@@ -172,7 +196,7 @@ class CloseLoopStructureTask(StructureGoal, CloseLoopTask):
         spacings = self.spacing_blocks
         padding, distance = spacings.get(len(pieces), spacings[max(spacings)])
         spacing = Spacing(padding * self.block_m, distance * self.block_m)
-        points = self.terrain.random_points(rng, [spacing] * len(pieces))
+        points = random_points(self.terrain.spawn_area, rng, [spacing] * len(pieces))
         for (body, piece), xy in zip(pieces.items(), points, strict=True):
             fixed_yaw = -piece.grasp_yaws_rad[0] % math.pi
             self.stand(body, xy, fixed_yaw + self.random_yaw(rng, piece.yaw_period_rad))

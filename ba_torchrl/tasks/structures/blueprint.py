@@ -11,19 +11,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import (
-    Pose,
-    Quaternion,
-    Vector,
-    axes_quaternion,
-    cross,
-    quaternion_matrix,
-    quaternion_product,
-    surface_quaternion,
-)
+from ba_torchrl.sim.geometry import Vector, quaternion_matrix
 from ba_torchrl.sim.shapes import Shape
 from ba_torchrl.tasks.workspace import Spacing
 
@@ -68,42 +57,6 @@ class Piece:
         if abs(y_axis[2]) <= abs(x_axis[2]):  # the y axis is closer to horizontal than the x axis
             return math.atan2(y_axis[1], y_axis[0]) - math.pi / 2
         return math.atan2(x_axis[1], x_axis[0])
-
-    def resting_frame(self, body: Body) -> Quaternion:
-        """Return the orientation of the frame of the side on which a body lies.
-
-        Its z axis is the direction of `up` closest to the vertical. For a body that lies level, the
-        heading of its x axis is `yaw_rad`.
-        """
-        rows = quaternion_matrix(body.pose.orientation)
-        up = max(self.up, key=lambda up: sum(d * u for d, u in zip(rows[2], up, strict=True)))
-        z_axis = tuple(sum(r * u for r, u in zip(row, up, strict=True)) for row in rows)
-        x_axis, y_axis, _ = zip(*rows, strict=True)
-        if abs(y_axis[2]) <= abs(x_axis[2]):
-            x_axis = cross(y_axis, z_axis)
-        return axes_quaternion(x_axis, z_axis)
-
-    def in_resting_frame(self, body: Body) -> Quaternion:
-        """Return the orientation of a body relative to the frame of the side on which it lies."""
-        x, y, z, w = self.resting_frame(body)
-        return quaternion_product((-x, -y, -z, w), body.pose.orientation)
-
-    def release_pose(self, body: Body, origin: Pose, yaw_rad: float) -> Pose:
-        """Return the pose at which a body rests on its support.
-
-        Args:
-            origin: a frame at its origin whose z axis is the normal of the support.
-            yaw_rad: yaw of the frame of the side on which it lies.
-        """
-        normal = tuple(row[2] for row in quaternion_matrix(origin.orientation))
-        frame = surface_quaternion(normal, yaw_rad)
-        return Pose(origin.position, quaternion_product(frame, self.in_resting_frame(body)))
-
-    @property
-    def grasped_width_m(self) -> float:
-        """Extent between the fingers."""
-        yaw = self.grasp_yaws_rad[0]
-        return float(np.ptp(self.shape.vertices[:, :2] @ (math.cos(yaw), math.sin(yaw))))
 
     def grasp_yaws(self, body: Body) -> list[float]:
         """Return the yaws of the gripper at which the fingers close on a body."""

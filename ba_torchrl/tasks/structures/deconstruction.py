@@ -32,7 +32,8 @@ from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Slot
 from ba_torchrl.tasks.structures.experts import PickPlaceExpert
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
-from ba_torchrl.tasks.workspace import Spacing
+from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
+from ba_torchrl.tasks.workspace import Spacing, random_points
 
 LowestToolHeight = Callable[[tuple[float, float], Matrix], float]
 """Function of x and y of the tool and its rotation, which returns its least height."""
@@ -94,7 +95,7 @@ class Deconstruction(OpenLoopTask):
         ]
         width_m = 2 * max(map(footprint_radius_m, bodies)) + self.block_m
         spacings = [Spacing(width_m, width_m)] * len(on_ground)
-        points = self.terrain.random_base_points(rng, spacings)
+        points = random_points(self.terrain.build_area, rng, spacings)
         self._heading_rad = self.terrain.build_area.shrunk(width_m / 2).heading_rad
         centers = dict(zip(on_ground, points, strict=True))
         for number, slot in enumerate(slots):
@@ -306,8 +307,8 @@ class Deconstruction(OpenLoopTask):
                 target = pose.moved_to(origin.position, yaw - tool.yaw_rad)
                 if self.action_limits.can_tilt:
                     piece = self.task.structure.pieces[held]
-                    frame_yaw = quaternion_yaw(piece.resting_frame(held)) + yaw - tool.yaw_rad
-                    target = piece.release_pose(held, origin, frame_yaw)
+                    frame_yaw = quaternion_yaw(resting_frame(piece, held)) + yaw - tool.yaw_rad
+                    target = release_pose(piece, held, origin, frame_yaw)
                 place = place_command(tool, pose, target)
             if margin >= 0:
                 break

@@ -36,6 +36,7 @@ from ba_torchrl.tasks.structures.grasps import (
 )
 from ba_torchrl.tasks.structures.planner import next_move
 from ba_torchrl.tasks.structures.structure import Structure
+from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
 from ba_torchrl.tasks.workspace import ActionLimits
 
 RELEASE_YAWS = 8
@@ -69,7 +70,7 @@ class PickPlaceExpert:
             # straight down, so that the arm reaches it with any deviation
             upright = self.grasps.best(body)._replace(tool=None)
             grasp = self.grasps.tool_pose(body, upright)
-            return perturbed_pick(self.structure.world, body, grasp, can_turn=True)
+            return perturbed_pick(self.structure.world, body, grasp, self.limits)
         return self.pick(body)
 
     def pick(self, body: Body) -> PickPlaceCommand:
@@ -128,7 +129,7 @@ class PickPlaceExpert:
 
     def _release_poses(self, move: Move) -> list[Pose]:
         """Return the poses at which the held body can be released parallel to its support."""
-        heading = quaternion_yaw(move.piece.resting_frame(move.body))
+        heading = quaternion_yaw(resting_frame(move.piece, move.body))
         if move.yaw_rad is None:
             first = heading - self.robot.tool_frame().yaw_rad  # the tool at yaws from zero
             yaws = [first + math.pi * i / RELEASE_YAWS for i in range(2 * RELEASE_YAWS)]
@@ -137,7 +138,7 @@ class PickPlaceExpert:
             yaws = [move.yaw_rad + move.yaw_period_rad * i for i in range(count)]
             yaws.sort(key=lambda yaw: abs(wrap_angle(yaw - heading)))
         origin = Pose(move.position, move.surface)
-        return [move.piece.release_pose(move.body, origin, yaw) for yaw in yaws]
+        return [release_pose(move.piece, move.body, origin, yaw) for yaw in yaws]
 
     def _best_release(self, move: Move) -> Pose:
         """Return the pose of the held body at its release, the best of those within reach.

@@ -16,10 +16,7 @@ from ba_torchrl.sim.geometry import (
     Pose,
     Quaternion,
     Vector,
-    axes_quaternion,
-    dot,
     downward_pose,
-    perpendicular,
     quaternion_matrix,
     quaternion_yaw,
 )
@@ -36,6 +33,7 @@ from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.structures.blueprint import Piece
 from ba_torchrl.tasks.structures.free_space import extent_along_m
 from ba_torchrl.tasks.structures.structure import Structure
+from ba_torchrl.tasks.structures.tilts import in_resting_frame, tilted_tools
 from ba_torchrl.tasks.workspace import ActionLimits
 
 EDGE_CLEARANCE_M = 2e-3
@@ -46,9 +44,6 @@ LENGTH_SHARES = (-0.1, 0.1, -0.2, 0.2, -0.3, 0.3)
 """Positions of grasps off the centre of a long piece, as a multiple of its length."""
 SUFFICIENT_CLEARANCE_M = 0.02
 """Clearances above this are equally good."""
-TILT_SHARES = (1.0, 0.5, 0.0)
-"""Approach directions that are compared: 1 along the normal of the piece's side, 0 as close to the
-vertical as the closing axis allows."""
 SITE_GAP_M = 0.01
 """Gap wanted between a structure and the hand that picks a piece beside it."""
 DEFICIT_WEIGHT = 10.0
@@ -172,7 +167,7 @@ class PickPlaceGrasps(Grasps):
         """
         if not self.limits.can_tilt:
             return super().rise_m(body)
-        rows = quaternion_matrix(self.structure.pieces[body].in_resting_frame(body))
+        rows = quaternion_matrix(in_resting_frame(self.structure.pieces[body], body))
         return -float((body.shape.vertices @ rows[2]).min())
 
     def pick_cost_m(self, body: Body) -> float:
@@ -592,22 +587,6 @@ def edge_grasps(
             near_finger_range_m = (-near_m - EDGE_CLEARANCE_M - finger_m, -near_m)
             candidates.append(GraspCandidate(yaw, shift_m, far_finger_range_m, near_finger_range_m))
     return candidates
-
-
-def tilted_tools(piece: Piece, body: Body) -> list[Quaternion]:
-    """Return the orientations of the tool at which the fingers close on a tilted body."""
-    rows = quaternion_matrix(piece.resting_frame(body))
-    down = tuple(-row[2] for row in rows)
-    tools = []
-    for share in TILT_SHARES:
-        for yaw in piece.grasp_yaws_rad:
-            closing = tuple(dot(row, (math.cos(yaw), math.sin(yaw), 0.0)) for row in rows)
-            vertical = perpendicular((0.0, 0.0, -1.0), closing)
-            between = tuple(
-                share * d + (1 - share) * v for d, v in zip(down, vertical, strict=True)
-            )
-            tools.append(axes_quaternion(closing, perpendicular(between, closing)))
-    return tools
 
 
 def _tool_position(position: Vector, candidate: GraspCandidate) -> Vector:

@@ -68,11 +68,6 @@ def any_cuboid() -> Piece:
     return replace(CUBOID, variants=tuple(replace(CUBOID, shape=box) for box in random_cuboids()))
 
 
-def with_circular_spacing(piece: Piece) -> Piece:
-    """Return a piece that needs only the space of its bounding circle at the start."""
-    return replace(piece, spacing=None)
-
-
 def shape_span() -> Span:
     """Return the distance between the two shapes under a bridge."""
     least, aim, most = SHAPE_GAP_M

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.meshes import centroid, gable_mesh, lathe_parts, transform_mesh
-from ba_torchrl.sim.shapes import Box, Color, Solid
+from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
 from ba_torchrl.tasks.base import BLUE, GREEN, ORANGE, RED
 from ba_torchrl.tasks.structures.blueprint import Piece, Span
 from ba_torchrl.tasks.workspace import Spacing
@@ -59,11 +59,7 @@ CYLINDER = Piece(
 
 def cube(block_m: float, color: Color = RED) -> Piece:
     """Return a cube."""
-    return replace(
-        CUBE,
-        shape=Box(size_m=(block_m,) * 3, color=color),
-        spacing=_spacing(SHORT_SPACING * block_m),
-    )
+    return _shaped(CUBE, Box(size_m=(block_m,) * 3, color=color), SHORT_SPACING * block_m)
 
 
 def cylinder(block_m: float) -> Piece:
@@ -72,26 +68,24 @@ def cylinder(block_m: float) -> Piece:
     (upright,) = lathe_parts(((radius, -half), (radius, half)), CYLINDER_SIDES)
     # rotated by half a side, so that sides and not edges are perpendicular to x
     mesh = transform_mesh(upright, (0.0, 0.0, 0.0), math.pi / CYLINDER_SIDES)
-    shape = Solid(parts=(mesh,), color=ORANGE)
-    return replace(CYLINDER, shape=shape, spacing=_spacing(SHORT_SPACING * block_m))
+    return _shaped(CYLINDER, Solid(parts=(mesh,), color=ORANGE), SHORT_SPACING * block_m)
 
 
 def cuboid(block_m: float) -> Piece:
     """Return a cuboid, longest along y."""
     shape = Box(size_m=(block_m, LENGTH * block_m, block_m), color=BLUE)
-    return replace(CUBOID, shape=shape, spacing=_spacing(LONG_SPACING * block_m))
+    return _shaped(CUBOID, shape, LONG_SPACING * block_m)
 
 
 def roof(block_m: float) -> Piece:
     """Return a roof with its ridge along y."""
     shape = _gable((block_m, LENGTH * block_m, block_m), EAVES * block_m)
-    return replace(ROOF, shape=shape, spacing=_spacing(LONG_SPACING * block_m))
+    return _shaped(ROOF, shape, LONG_SPACING * block_m)
 
 
 def triangle(block_m: float) -> Piece:
     """Return a triangle with its ridge along y."""
-    shape = _gable((block_m,) * 3, 0.0)
-    return replace(TRIANGLE, shape=shape, spacing=_spacing(SHORT_SPACING * block_m))
+    return _shaped(TRIANGLE, _gable((block_m,) * 3, 0.0), SHORT_SPACING * block_m)
 
 
 def pair_span(block_m: float, most: float) -> Span:
@@ -103,8 +97,9 @@ def pair_span(block_m: float, most: float) -> Span:
     return Span(0.0, 1.75 * block_m, most * block_m)
 
 
-def _spacing(width_m: float) -> Spacing:
-    return Spacing(width_m, width_m)
+def _shaped(piece: Piece, shape: Shape, spacing_m: float) -> Piece:
+    """Return a piece with a shape and the space around it at the start."""
+    return replace(piece, shape=shape, spacing=Spacing(spacing_m, spacing_m))
 
 
 def _gable(size_m: Vector, eaves_m: float) -> Solid:

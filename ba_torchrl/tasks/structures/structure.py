@@ -11,13 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, footprint_radius_m
+from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.structures.assignment import SlotAssigner, read_piece_states
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece
 from ba_torchrl.tasks.terrain.flat import Terrain
-from ba_torchrl.tasks.workspace import Spacing
 
 
 class _Variants(NamedTuple):
@@ -95,36 +94,6 @@ class Structure:
         ground, base = self.terrain.support_ids, self.terrain.base_ids
         states = read_piece_states(self.world, self.pieces, ground, base, self.block_m)
         return SlotAssigner(self.blueprint, self.pieces, states, self.block_m, held)
-
-    def spacings(self, gap_m: float) -> list[Spacing]:
-        """Return the space that each piece needs at the start of an episode.
-
-        Args:
-            gap_m: least gap between the bounding circles of two pieces.
-        """
-        spacings, largest_radius_m = [], 0.0
-        for body, piece in self.pieces.items():
-            radius = footprint_radius_m(body)
-            padding_m, distance_m = (2 * radius, 0.0) if piece.spacing is None else piece.spacing
-            distance_m = max(distance_m, radius + largest_radius_m + gap_m)
-            spacings.append(Spacing(padding_m, distance_m))
-            largest_radius_m = max(largest_radius_m, radius)
-        return spacings
-
-    def widest_base_m(self, *, of_all: bool = False) -> float:
-        """Return the largest extent between the fingers of the pieces that stand on the ground.
-
-        Args:
-            of_all: whether all variants are considered, instead of those of the episode.
-        """
-        kinds = {slot.piece.kind for slot in self.blueprint.slots if not slot.on}
-        pieces = [*self._fixed.values(), *self._pool_pieces] if of_all else self.pieces.values()
-        return max(piece.grasped_width_m for piece in pieces if piece.kind in kinds)
-
-    def base_body(self) -> Body:
-        """Return a body that can fill the first slot."""
-        kind = self.blueprint.slots[0].piece.kind
-        return next(body for body, piece in self.pieces.items() if piece.kind == kind)
 
     def get_state(self) -> tuple[int, ...]:
         """Return the indices of the active variants."""

@@ -18,7 +18,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
 from ba_torchrl.tasks.terrain.sloped import SlopedTerrain
-from ba_torchrl.tasks.workspace import Area, OrientedArea, Spacing, Workspace
+from ba_torchrl.tasks.workspace import OrientedArea, Spacing, Workspace
 
 SLOPE_RAD = (0.0, math.pi / 12)
 """Range of the slope of a pyramid."""
@@ -112,11 +112,6 @@ class Bumps(SlopedTerrain):
         return OrientedArea(self.layout.platform, half_x, half_y, self.spawn_area)
 
     @property
-    def aside_area(self) -> Area:
-        """The whole workspace; `uneven_m` excludes the platform."""
-        return self.spawn_area
-
-    @property
     def goal_frame(self) -> PlanarFrame:
         """Centre and heading of the platform."""
         return self.layout.platform
@@ -141,10 +136,6 @@ class Bumps(SlopedTerrain):
                 )
             center.append(float(rng.uniform(low + extent, high - extent)))
         self._set_layout(BumpLayout(tuple(pyramids.tolist()), heading, PlanarFrame(*center, yaw)))
-
-    def get_state(self) -> BumpLayout:
-        """Return the layout."""
-        return self.layout
 
     def set_state(self, state: BumpLayout) -> None:
         """Restore the layout; the world restores the poses of pyramids and platform."""
@@ -188,18 +179,7 @@ class Bumps(SlopedTerrain):
         super().scatter(rng, bodies, spacings, draw_yaw, base=base)
         self.world.step(ROCKING_STEPS)
 
-    def random_base_pose(
-        self, rng: np.random.Generator, body: Body, draw_yaw: Callable[[Body], float]
-    ) -> None:
-        """Return None: all objects start off the platform."""
-        return None
-
     # ----------------------------------------------------------------------------------------
-
-    @property
-    def _frame(self) -> PlanarFrame:
-        """The frame at the centre of the pyramids, its x axis along the rows."""
-        return PlanarFrame(*self.workspace.center, self.layout.heading_rad)
 
     def _use_layout(self, layout: BumpLayout) -> None:
         """Compute heights from a layout."""
@@ -220,7 +200,7 @@ class Bumps(SlopedTerrain):
         half = (PYRAMIDS_PER_ROW - 1) / 2
         for cell, number in enumerate(layout.pyramids):
             row, column = divmod(cell, PYRAMIDS_PER_ROW)
-            x, y = self._frame.to_world((row - half) * self.base_m, (column - half) * self.base_m)
+            x, y = self.frame.to_world((row - half) * self.base_m, (column - half) * self.base_m)
             body = self.pool.bodies[number]
             self.pool.activate(body)
             body.place((x, y, 0.0), layout.heading_rad)

@@ -16,7 +16,7 @@ from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import Matrix, PlanarFrame, Pose, yaw_quaternion
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.workspace import Area, Region, Spacing, Workspace
+from ba_torchrl.tasks.workspace import Area, Region, Spacing, Workspace, random_points
 
 
 class Terrain(ABC):
@@ -40,15 +40,6 @@ class Terrain(ABC):
     @abstractmethod
     def height_m(self, xy: tuple[float, float]) -> float:
         """Return the height of the surface at a point, metres."""
-
-    @abstractmethod
-    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
-        """Return the pose of a frame on the surface, whose z axis is the surface normal.
-
-        Args:
-            xy: point of the workspace, metres.
-            yaw_rad: yaw of the frame's x axis in the horizontal plane.
-        """
 
     @property
     def base_ids(self) -> frozenset[int]:
@@ -75,9 +66,17 @@ class Terrain(ABC):
         """Centre and heading of the place where a container stands; None if it stands anywhere."""
         return None
 
-    def contact_pose(self, xy: tuple[float, float], radius_m: float) -> Pose:
-        """Return `surface_pose` for an object of a radius, which may cover several faces."""
-        return self.surface_pose(xy)
+    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
+        """Return the pose of a frame on the surface, whose z axis is the surface normal.
+
+        This, `origin_pose`, `gap_below_m` and `lowest_tool_m` assume that the surface is level; one
+        with slopes overrides them.
+
+        Args:
+            xy: point of the workspace, metres.
+            yaw_rad: yaw of the frame's x axis in the horizontal plane.
+        """
+        return Pose((*xy, self.height_m(xy)), yaw_quaternion(yaw_rad))
 
     def origin_pose(self, xy: tuple[float, float], rise_m: float, radius_m: float) -> Pose:
         """Return a frame whose z axis is the surface normal, at the origin of an object.
@@ -85,9 +84,9 @@ class Terrain(ABC):
         Args:
             xy: point of the ground below the object, metres.
             rise_m: distance of the origin above the surface, along the normal.
-            radius_m: radius of the object.
+            radius_m: radius of the object, which may cover several faces.
         """
-        return self.contact_pose(xy, radius_m).compose(Pose((0.0, 0.0, rise_m)))
+        return self.surface_pose(xy).compose(Pose((0.0, 0.0, rise_m)))
 
     def uneven_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
         """Return how uneven the surface is below objects of a radius at points [N, 2], [N] metres.
@@ -122,30 +121,6 @@ class Terrain(ABC):
 
     # -- placements --------------------------------------------------------------------------
 
-    def random_point(self, rng: np.random.Generator, padding_m: float) -> tuple[float, float]:
-        """Return a random point at least half of ``padding_m`` from the border.
-
-        Raises:
-            PlacementError: the area is too small.
-        """
-        return self.random_points(rng, [Spacing(padding_m, 0.0)])[0]
-
-    def random_points(
-        self, rng: np.random.Generator, spacings: Sequence[Spacing]
-    ) -> list[tuple[float, float]]:
-        """Return random points of the spawn area that keep their distances.
-
-        Raises:
-            PlacementError: no layout was found.
-        """
-        return self.spawn_area.random_points(rng, spacings)
-
-    def random_base_points(
-        self, rng: np.random.Generator, spacings: Sequence[Spacing]
-    ) -> list[tuple[float, float]]:
-        """Return random points of the build area that keep their distances, as `random_points`."""
-        return self.random_points(rng, spacings)
-
     def scatter(
         self,
         rng: np.random.Generator,
@@ -165,7 +140,7 @@ class Terrain(ABC):
         Raises:
             PlacementError: no layout was found.
         """
-        points = self.random_points(rng, spacings)
+        points = random_points(self.spawn_area, rng, spacings)
         for body, xy in zip(bodies, points, strict=True):
             self.stand(body, xy, draw_yaw(body))
 
@@ -177,10 +152,7 @@ class Terrain(ABC):
     # -- heights -----------------------------------------------------------------------------
 
     def gap_below_m(self, body: Body) -> float:
-        """Return the height of the lowest point of a body above the surface below its origin.
-
-        This and `lowest_tool_m` assume that the surface is level; one with slopes overrides them.
-        """
+        """Return the height of the lowest point of a body above the surface below its origin."""
         return vertical_extent(body)[0] - self.height_m(body.position[:2])
 
     def lowest_tool_m(
@@ -210,7 +182,3 @@ class Flat(Terrain):
     def height_m(self, xy: tuple[float, float]) -> float:
         """Return zero."""
         return 0.0
-
-    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
-        """Return the pose of an upright frame on the floor."""
-        return Pose((*xy, self.height_m(xy)), yaw_quaternion(yaw_rad))

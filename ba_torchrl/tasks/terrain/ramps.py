@@ -14,7 +14,7 @@ from ba_torchrl.sim.geometry import PlanarFrame, Pose, quaternion_product, yaw_q
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain.sloped import SlopedTerrain, footprint
-from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Area, OrientedArea, Workspace
+from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, OrientedArea, Workspace
 
 GAP_M = (0.04, 0.2)
 """Range of the distance between the ramps."""
@@ -88,14 +88,9 @@ class Ramps(SlopedTerrain):
         """The strip between the ramps."""
         first, second = self.layout.distances_m
         offset, half = (first - second) / 2, (first + second) / 2
-        center = self._frame.to_world(0.0, offset)
+        center = self.frame.to_world(0.0, offset)
         frame = PlanarFrame(*center, self.layout.heading_rad)
         return OrientedArea(frame, self.size_m[0] / 2, half, self.spawn_area)
-
-    @property
-    def aside_area(self) -> Area:
-        """The whole workspace; `uneven_m` prefers the ramps."""
-        return self.spawn_area
 
     def reserve(self, width_m: float) -> None:
         """Leave a gap between the ramps of the next episodes in which such a piece can be grasped.
@@ -119,17 +114,13 @@ class Ramps(SlopedTerrain):
         distances = (gap / 2 + offset, gap / 2 - offset)
         self._set_layout(RampLayout(heading, distances, edges, slopes))
 
-    def get_state(self) -> RampLayout:
-        """Return the layout."""
-        return self.layout
-
     def set_state(self, state: RampLayout) -> None:
         """Restore the layout; the world restores the poses of the ramps."""
         self.layout = state
 
     def heights_m(self, points: np.ndarray) -> np.ndarray:
         """Return the heights [N] of the surface at points [N, 2], metres."""
-        _, across = self._frame.to_local(*points.T)
+        _, across = self.frame.to_local(*points.T)
         heights = np.zeros(len(points))
         for side, distance, edge, slope in zip(
             (1, -1),
@@ -149,7 +140,7 @@ class Ramps(SlopedTerrain):
 
     def can_start_at(self, outline: np.ndarray) -> bool:
         """Whether an outline [V, 2] lies on one side of each edge, with a margin."""
-        _, across = self._frame.to_local(*outline.T)
+        _, across = self.frame.to_local(*outline.T)
         first, second = self.layout.distances_m
         return all(
             offsets.min() > EDGE_MARGIN_M or offsets.max() < -EDGE_MARGIN_M
@@ -180,11 +171,6 @@ class Ramps(SlopedTerrain):
 
     # ----------------------------------------------------------------------------------------
 
-    @property
-    def _frame(self) -> PlanarFrame:
-        """The frame at the centre of the workspace whose x axis is the heading of the edges."""
-        return PlanarFrame(*self.workspace.center, self.layout.heading_rad)
-
     def _set_layout(self, layout: RampLayout) -> None:
         """Move the ramps to a layout."""
         self.layout = layout
@@ -192,7 +178,7 @@ class Ramps(SlopedTerrain):
         from_edge = Pose((0.0, length / 2, -thickness / 2))
         for i, (ramp, turn) in enumerate(zip(self.ramps, (0.0, math.pi), strict=True)):
             side = 1 if i == 0 else -1
-            x, y = self._frame.to_world(0.0, side * layout.distances_m[i])
+            x, y = self.frame.to_world(0.0, side * layout.distances_m[i])
             half = layout.slopes_rad[i] / 2
             tilt = (math.sin(half), 0.0, 0.0, math.cos(half))
             orientation = quaternion_product(yaw_quaternion(layout.heading_rad + turn), tilt)

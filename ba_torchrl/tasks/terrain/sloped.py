@@ -6,6 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from ba_torchrl.sim.geometry import (
 )
 from ba_torchrl.sim.robots.gripper import FLOOR_CLEARANCE_M, Gripper
 from ba_torchrl.tasks.terrain.flat import Terrain
-from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Spacing
+from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Area, Spacing
 
 PROBE_M = 1e-4
 """Distance at which the slope at a point is measured."""
@@ -52,6 +53,23 @@ _RING = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS)], axis=1)
 class SlopedTerrain(Terrain):
     """A surface of plane faces; subclasses return its heights."""
 
+    layout: Any
+    """The random parts of the episode; its faces are aligned with a `heading_rad`."""
+
+    @property
+    def frame(self) -> PlanarFrame:
+        """The frame at the centre of the workspace whose x axis is the heading of the layout."""
+        return PlanarFrame(*self.workspace.center, self.layout.heading_rad)
+
+    @property
+    def aside_area(self) -> Area:
+        """The whole workspace; `uneven_m` excludes parts of it, or prefers others."""
+        return self.spawn_area
+
+    def get_state(self) -> Any:
+        """Return the layout."""
+        return self.layout
+
     @abstractmethod
     def heights_m(self, points: np.ndarray) -> np.ndarray:
         """Return the heights [N] of the surface at points [N, 2], metres."""
@@ -65,11 +83,15 @@ class SlopedTerrain(Terrain):
         _, slopes, _ = self._planes(np.array([xy]), PROBE_M)
         return Pose((*xy, self.height_m(xy)), surface_quaternion(_normal(slopes[0]), yaw_rad))
 
-    def contact_pose(self, xy: tuple[float, float], radius_m: float) -> Pose:
-        """Return a frame on the plane that approximates the surface within a radius from above."""
+    def origin_pose(self, xy: tuple[float, float], rise_m: float, radius_m: float) -> Pose:
+        """Return a frame above the plane that approximates the surface within a radius from above.
+
+        Arguments as for `Terrain`.
+        """
         heights, slopes, deviations = self._planes(np.array([xy]), radius_m)
-        height = float(heights[0] + deviations[0])
-        return Pose((*xy, height), surface_quaternion(_normal(slopes[0])))
+        contact = (*xy, float(heights[0] + deviations[0]))
+        orientation = surface_quaternion(_normal(slopes[0]))
+        return Pose(contact, orientation).compose(Pose((0.0, 0.0, rise_m)))
 
     def uneven_m(self, points: np.ndarray, radius_m: float) -> np.ndarray:
         """Return the weighted deviation of the surface from a plane within a radius, [N] metres."""
@@ -88,7 +110,6 @@ class SlopedTerrain(Terrain):
             outline: [V, 2] points of the ground, metres.
         """
 
-    @abstractmethod
     def random_base_pose(
         self, rng: np.random.Generator, body: Body, draw_yaw: Callable[[Body], float]
     ) -> tuple[tuple[float, float], float] | None:
@@ -100,24 +121,7 @@ class SlopedTerrain(Terrain):
         Raises:
             PlacementError: it does not fit.
         """
-
-    def random_base_points(
-        self, rng: np.random.Generator, spacings: Sequence[Spacing]
-    ) -> list[tuple[float, float]]:
-        """Return random points of the build area, as far from its border as it allows.
-
-        Raises:
-            PlacementError: no layout was found.
-        """
-        for _ in range(LAYOUT_ATTEMPTS):
-            points = [self.build_area.random_point(rng, spacing.padding_m) for spacing in spacings]
-            if all(
-                math.dist(point, other) >= spacing.distance_m
-                for i, (point, spacing) in enumerate(zip(points, spacings, strict=True))
-                for other in points[:i]
-            ):
-                return points
-        raise PlacementError("no room for the structure: enlarge `workspace`")
+        return None
 
     def scatter(
         self,

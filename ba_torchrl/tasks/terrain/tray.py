@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Matrix, Pose, yaw_quaternion
+from ba_torchrl.sim.geometry import Matrix
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Color, Solid
@@ -69,13 +69,8 @@ class Tray(Terrain):
             np.array([[s * self.half_m, t * self.half_m] for s, t in _SIGNS]), [FLOOR_Z_M] * 4
         )
         walls = [_wall(start, end, side) for side in range(4) for start, end in pairwise(corners)]
-        self._base, _ = (
-            self._add(name, parts, friction, color)
-            for name, parts, friction, color in (
-                ("tray floor", (base,), FLOOR_FRICTION, FLOOR_COLOR),
-                ("tray walls", tuple(walls), WALL_FRICTION, COLOR),
-            )
-        )
+        self._base = self._add("tray floor", (base,), FLOOR_FRICTION, FLOOR_COLOR)
+        self._add("tray walls", tuple(walls), WALL_FRICTION, COLOR)
 
     def _add(self, name: str, parts: tuple[Mesh, ...], friction: float, color: Color) -> Body:
         shape = Solid(parts=parts, mass_kg=0.0, friction=friction, color=color)
@@ -105,10 +100,6 @@ class Tray(Terrain):
         objects fail: of 200 picks without yaw 167 succeed instead of 175.
         """
         return gripper.lowest_tool_m(rotation, opening)
-
-    def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
-        """Return the pose of an upright frame on the base."""
-        return Pose((*xy, FLOOR_Z_M), yaw_quaternion(yaw_rad))
 
 
 _SIGNS = ((-1, -1), (1, -1), (1, 1), (-1, 1))

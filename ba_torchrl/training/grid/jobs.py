@@ -23,7 +23,7 @@ from ba_torchrl.data.files import write_text
 from ba_torchrl.record.results import FAILURE_FILE, now
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import status
-from ba_torchrl.training.run_lock import lock_holder
+from ba_torchrl.training.persistence import lock_holder
 
 LOG_FILE = "run.log"
 LOG_LINES = 20

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,8 +28,8 @@ from ba_torchrl.record.results import (
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.checkpoint import build_algorithm, problem_of, read_config
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.persistence import lock_holder
 from ba_torchrl.training.resume import check_same_run, resumable_updates
-from ba_torchrl.training.run_lock import lock_holder
 
 SET_BY_THE_GRID = ("task", "seed", "label", "run_dir", "resume", "benchmark")
 """Fields of `ExperimentConfig` that differ from run to run."""
@@ -120,6 +121,7 @@ def plan(
         ConfigError: a name is unknown, a value cannot be used, or parts do not go together.
     """
     load_plugins(common.get("plugins", ()))
+    preset = functools.cache(preset)
     _check_axes(config, preset)
     presets = {
         (group, name): preset(group, name)

@@ -138,11 +138,17 @@ check(third)
 @pytest.mark.parametrize(
     "start",
     [
-        "ba_torchrl.make('close_loop/block_reaching', obs_size=24).close()",
         "import ba_torchrl.envs.base",
-        "import gymnasium; gymnasium.make('BulletArm/CloseLoopBlockReaching-v0').close()",
+        pytest.param(
+            "ba_torchrl.make('close_loop/block_reaching', obs_size=24).close()",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "import gymnasium; gymnasium.make('BulletArm/CloseLoopBlockReaching-v0').close()",
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["make", "import", "gymnasium"],
+    ids=["import", "make", "gymnasium"],
 )
 def test_prioritised_buffers_of_torchrl_work_once_environments_are_imported(start, tmp_path):
     script = OF_TORCHRL.format(start=start)

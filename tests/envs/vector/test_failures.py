@@ -10,7 +10,7 @@ from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
 
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector import parallel
-from ba_torchrl.envs.vector.make import VectorEnv
+from ba_torchrl.envs.vector.parallel import VectorEnv
 
 
 class TestFailures:

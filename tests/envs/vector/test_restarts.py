@@ -12,7 +12,7 @@ import torch
 from fake_env import BUFFERS, FakeEnv, act, assert_lost, assert_stepped
 
 from ba_torchrl.config import WorkerOptions
-from ba_torchrl.envs.vector.make import VectorEnv
+from ba_torchrl.envs.vector.parallel import VectorEnv
 from ba_torchrl.errors import WorkerError
 
 METHODS = pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])

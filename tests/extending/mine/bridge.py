@@ -10,7 +10,6 @@ from ba_torchrl.tasks.structures.pieces import cube, cuboid, pair_span
 class Bridge(StructureTask):
     """Two cubes of 3 cm and a cuboid of 12 cm; success when it lies on both."""
 
-    max_steps = 10
     num_objects = 3
     num_objects_range = (3, 3)
 

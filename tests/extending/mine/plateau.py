@@ -1,6 +1,5 @@
 """A terrain: a level plateau above the floor, and a stack that is built on it."""
 
-from ba_torchrl.sim.geometry import Pose, yaw_quaternion
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.base import StructureTask
@@ -29,16 +28,11 @@ class Plateau(Terrain):
         """Return the height of the slab's top."""
         return HEIGHT_M
 
-    def surface_pose(self, xy, yaw_rad=0.0):
-        """Return the pose of an upright frame on the slab."""
-        return Pose((*xy, HEIGHT_M), yaw_quaternion(yaw_rad))
-
 
 @TASKS.register("mine/stack_on_plateau")
 class StackOnPlateau(StructureTask):
     """Three cubes on the plateau; success when they stand in a stack."""
 
-    max_steps = 10
     num_objects = 3
     num_objects_range = (2, 4)
 

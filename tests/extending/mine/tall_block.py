@@ -18,7 +18,6 @@ class TallBlock(CloseLoopTask):
         tolerance_m: float = 0.03
         """Distance from the corner that still counts."""
 
-    num_objects = 1
     lift_height_m = 0.12
 
     def load_scene(self):

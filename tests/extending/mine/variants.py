@@ -33,11 +33,6 @@ class RandomPlateau(Plateau):
         """Return the height of the slab's top."""
         return super().height_m(xy) - self.sunk_m
 
-    def surface_pose(self, xy, yaw_rad=0.0):
-        """Return the pose of an upright frame on the slab."""
-        pose = super().surface_pose(xy, yaw_rad)
-        return pose._replace(position=(*xy, self.height_m(xy)))
-
 
 @TASKS.register("mine/stack_on_random_plateau")
 class StackOnRandomPlateau(StackOnPlateau):

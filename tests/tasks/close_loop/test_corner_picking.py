@@ -42,25 +42,21 @@ def test_the_corner_has_its_sizes(env):
     assert image[15 + 12, 15 + 12] == pytest.approx(0.052, abs=5e-4)
 
 
-def test_base_and_walls_are_static_and_the_base_is_smooth(env):
+def test_base_and_walls_do_not_move_and_the_base_is_smooth(env):
     task, scene = env.scene.task, env.scene
-    before = [body.pose for body in (task.base, task.walls)]
-    assert all(body.is_static for body in (task.base, task.walls))
     assert task.base.shape.friction == 0.001
     task.put_corner((0.45, 0.0), 0.0)
+    at_rest = [body.pose for body in (task.base, task.walls)]
     scene.controller.reset(((0.42, 0.0, 0.05), 0.0), 0.0)
     scene.controller.move_to((0.3, 0.0, 0.05), 0.0)  # into the wall
     assert scene.robot.tool_pose()[0][0] > 0.36
-    assert before != [body.pose for body in (task.base, task.walls)]
-    task.put_corner((0.45, 0.0), 0.0)
-    at_rest = [body.pose for body in (task.base, task.walls)]
     scene.world.step(50)
     assert at_rest == [body.pose for body in (task.base, task.walls)]
 
 
 def test_the_block_stays_in_the_corner_without_contact(env):
     task = env.scene.task
-    for _ in range(5):
+    for _ in range(3):
         env.reset()
         env.scene.world.step(600)
         x, y = task.corner.to_local(*task.block.position[:2])

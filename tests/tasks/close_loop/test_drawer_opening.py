@@ -12,7 +12,7 @@ import ba_torchrl
 from ba_torchrl.envs.episodes import evaluate_at_rest
 from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.close_loop.drawer_opening import cabinet_parts, drawer_parts
+from ba_torchrl.tasks.close_loop.drawer_opening import cabinet_parts
 from tests.tasks.episodes import play
 
 TASK = "close_loop/drawer_opening"
@@ -98,14 +98,6 @@ def test_the_cabinet_is_hollow_in_front_and_between_its_walls():
             ((0, 0, 0.055), (0, 0, -0.05), 2, 0.01),
         ):
             assert first_hit(start, end)[axis] == pytest.approx(expected, abs=1e-3)
-
-
-def test_sizes_of_cabinet_and_rod():
-    low, high = Solid(parts=cabinet_parts()).bounds_m
-    np.testing.assert_allclose(np.subtract(high, low), (0.22, 0.23, 0.11))
-    rod = drawer_parts()[-1].vertices
-    np.testing.assert_allclose(np.ptp(rod, axis=0), (0.015, 0.1, 0.015))
-    np.testing.assert_allclose(rod.mean(axis=0), (0.11 + 0.05, 0.0, 0.08), atol=1e-9)
 
 
 def test_layouts_open_towards_the_centre_with_the_handle_in_the_workspace(make):
@@ -215,9 +207,8 @@ def test_the_expert_descends_where_its_fingers_have_a_free_way(
 
 
 def test_the_expert_succeeds_from_states_of_random_actions_and_turns(make):
-    """As in demonstrations with noise; before it turned on its way, it took 24 steps."""
     env, rng, lengths = make(expert=True), np.random.default_rng(0), []
-    for _ in range(25):
+    for _ in range(15):
         state = env.reset()
         while not state["done"]:
             action = state["expert_action"].clone()
@@ -227,7 +218,7 @@ def test_the_expert_succeeds_from_states_of_random_actions_and_turns(make):
                 action[4] = float(rng.uniform(-1, 1))
             state = env.step(state.set("action", action))["next"]
         lengths.append(int(state["step_count"]))
-    assert np.mean(lengths) < 17
+    assert np.mean(lengths) < 17  # 24, if the gripper does not turn on its way
 
 
 def test_a_pulled_drawer_follows_the_fingers_and_stays(make):
@@ -317,9 +308,9 @@ def test_episodes_repeat_in_a_used_and_in_a_fresh_world(make):
         return torch.equal(one[0], other[0]) and one[1:] == other[1:]
 
     used, fresh = make(expert=True, obs_size=32), make(expert=True, obs_size=32)
-    first = {seed: episode(used, seed) for seed in range(25)}
+    first = {seed: episode(used, seed) for seed in range(8)}
     assert same(episode(fresh, 7), first[7])
-    for seed in np.random.default_rng(0).permutation(25).tolist():
+    for seed in np.random.default_rng(0).permutation(8).tolist():
         assert same(episode(used, seed), first[seed])
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.sim.shapes import Box
+from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M, RIM_Z_M, Tray, profile
@@ -70,6 +70,18 @@ def test_corners_are_closed(world):
     assert inside.min() >= FLOOR_Z_M - 1e-9
     diagonal = np.diagonal(heights)[: len(heights) // 2]
     assert np.all(np.diff(diagonal[8:]) <= 1e-9)  # decreases from rim to base without a gap
+
+
+def test_the_tray_hides_a_goal_area_below_it(world):
+    goal = world.add(Decal(size_m=(0.09, 0.09, 1e-3), recess_depth_m=0.02), "goal")
+    block = world.add(Box(size_m=(0.03, 0.03, 0.03)), "block")
+    camera = HeightCamera(world.bodies)
+    for y in (-0.05, 0.05):  # the second image is drawn over that of the static bodies
+        goal.place((*CENTER, 0.0))
+        block.place((CENTER[0], y, 0.017))
+        heights = camera.heightmap(CENTER, 0.5, 500)
+        assert height(heights, *CENTER) == pytest.approx(FLOOR_Z_M)
+        assert heights.min() >= 0.0
 
 
 def test_blocks_slide_off_the_walls_and_stay_on_the_base(world):

@@ -95,29 +95,12 @@ def test_the_pick_height_is_below_the_highest_point_between_the_fingers(with_bri
     assert task.window_m(None) == pytest.approx(task.robot.gripper.half_width_m, abs=4e-3)
 
 
-def successes(env, episodes, policy=lambda: None):
-    return sum(bool(play(env, env.reset(), policy())["success"]) for _ in range(episodes))
-
-
 def test_the_expert_selects_another_grasp_after_failures(make):
     env = make(expert=True)
     first = env.reset()["expert_action"]
     play(env, env.reset(), NO_OP)
     second = env.reset()["expert_action"]
     assert math.dist(first[1:3].tolist(), second[1:3].tolist()) > 0.03
-
-
-def test_random_picks_succeed_less_often_than_the_expert(make):
-    env = make()
-    rng = torch.Generator().manual_seed(0)
-    low, high = env.action_spec.space.low, env.action_spec.space.high
-
-    def anywhere():
-        action = low + torch.rand(4, generator=rng) * (high - low)
-        action[0] = PICK
-        return action
-
-    assert successes(env, 40, anywhere) <= 20
 
 
 def test_without_a_feasible_grasp_the_expert_picks_the_highest_object(make, tmp_path):
@@ -134,4 +117,6 @@ def test_without_a_feasible_grasp_the_expert_picks_the_highest_object(make, tmp_
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [{"action_sequence": "pxyzrrr"}, {"object_set": "household"}])
 def test_expert_over_200_episodes(make, config):
-    assert successes(make(expert=True, **config), 200) >= 0.85 * 200
+    env = make(expert=True, **config)
+    solved = sum(bool(play(env, env.reset())["success"]) for _ in range(200))
+    assert solved >= 0.85 * 200

@@ -95,12 +95,16 @@ def test_the_expert_takes_the_fewest_steps(task, config, optimum):
     checks.check_expert(task, episodes=4, min_success_rate=1.0, max_typical_steps=optimum, **config)
 
 
-@pytest.mark.parametrize("robot", ["panda", "ur5", "ur5_robotiq"])
 @pytest.mark.parametrize(
-    ("task", "config"), [(BIN, {"num_objects": 3}), (BOTTLES, {}), (BOXES, {})]
+    ("task", "config"),
+    [
+        (BIN, {"robot": "panda", "num_objects": 3}),
+        (BOTTLES, {"robot": "ur5"}),
+        (BOXES, {"robot": "ur5_robotiq"}),
+    ],
 )
-def test_the_expert_succeeds_with_other_robots(task, config, robot):
-    checks.check_expert(task, episodes=1, min_success_rate=1.0, robot=robot, **config)
+def test_the_expert_succeeds_with_other_robots(task, config):
+    checks.check_expert(task, episodes=1, min_success_rate=1.0, **config)
 
 
 @pytest.mark.parametrize(("task", "least"), [(BIN, 0.7), (BOXES, 0.9)])
@@ -108,7 +112,7 @@ def test_the_expert_recovers_from_noisy_actions(make_env, task, least):
     env = make_env(task, obs_size=128, num_objects=6, max_steps=60)
     space = env.action_spec.space
     outcomes = []
-    for episode in range(14):
+    for episode in range(8):
         state = env.reset(seed=episode)
         rng = np.random.default_rng(episode)
         for _ in range(6):
@@ -122,5 +126,5 @@ def test_the_expert_recovers_from_noisy_actions(make_env, task, least):
         else:
             outcomes.append(bool(play(env, state)["success"]))
     # an object that lies against the outside of the bin leaves no clearance for a finger
-    assert len(outcomes) >= 9
+    assert len(outcomes) >= 5
     assert np.mean(outcomes) >= least, outcomes

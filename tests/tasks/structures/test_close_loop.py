@@ -17,6 +17,7 @@ from tests.tasks.episodes import play_scene
 STACKING, HOUSE = "close_loop/block_stacking", "close_loop/house_building"
 OPEN_STACKING = "open_loop/block_stacking"
 FIXED = {"random_orientation": False, "action_sequence": "pxyz"}
+OPEN_FIXED = {**FIXED, "action_sequence": "pxy"}
 
 
 def cubes_of(task):
@@ -131,11 +132,16 @@ def test_stacking_is_evaluated_at_rest(make_started, position, expected):
     assert outcome["reward"] == float(expected)
 
 
-def test_a_tipped_triangle_ends_the_episode_without_reward(make_started):
+def test_a_tipped_triangle_ends_the_episode_without_reward(make_started, monkeypatch):
     env = make_started(HOUSE)
-    triangle = triangle_of(env.scene.task)
+    task, triangle = env.scene.task, triangle_of(env.scene.task)
     slope = math.pi - math.atan2(0.05, 0.025)
-    triangle.set_pose((0.45, 0.0, 0.04), (0.0, math.sin(slope / 2), 0.0, math.cos(slope / 2)))
+    for tilt, valid in ((math.pi / 9 - 0.02, True), (math.pi / 9 + 0.02, False), (slope, False)):
+        triangle.set_pose((0.45, 0.0, 0.04), (0.0, math.sin(tilt / 2), 0.0, math.cos(tilt / 2)))
+        assert task.is_valid() is valid
+    with monkeypatch.context() as patch:
+        patch.setattr(task.robot, "held_body", lambda: triangle)
+        assert task.is_valid()
     env.scene.world.settle()
     assert triangle.tilt_rad > 1.0
     outcome = no_op(env)
@@ -157,10 +163,11 @@ def test_a_cube_may_lie_on_any_side(make_started):
 # -- expert ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", [STACKING, HOUSE])
-@pytest.mark.parametrize("variant", [{}, FIXED], ids=["random orientations", "fixed"])
-@pytest.mark.parametrize(("count", "most"), [(2, 12.0), (3, 24.0), (4, 40.0)])
-def test_expert_builds_structures_of_two_to_four_pieces(make_started, task, variant, count, most):
+@pytest.mark.parametrize(
+    ("task", "count", "variant", "most"),
+    [(STACKING, 4, {}, 40), (STACKING, 4, FIXED, 40), (HOUSE, 3, FIXED, 24), (HOUSE, 4, {}, 40)],
+)
+def test_expert_builds_structures_of_up_to_four_pieces(make_started, task, count, variant, most):
     env = make_started(task, num_objects=count, **variant)
     lengths = []
     for _ in range(5):
@@ -245,13 +252,6 @@ def test_cylinders_may_stand_on_either_end(cylinders):
     assert cylinders.is_valid()
 
 
-def test_a_cylinder_over_the_edge_ends_the_episode_unless_it_lands_on_an_end(cylinders):
-    cylinders.objects[-1].place((0.45, 0.018, 0.1055))
-    cylinders.world.settle(max_steps=1000)
-    assert not cylinders.is_success()
-    assert cylinders.is_valid() == (abs(math.cos(cylinders.objects[-1].tilt_rad)) > 0.5)
-
-
 LYING = (0.0, math.sin(math.pi / 4), 0.0, math.cos(math.pi / 4))
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
@@ -275,28 +275,17 @@ def test_a_cylinder_off_the_stack_is_no_success_and_on_its_side_ends_the_episode
     assert cylinders.is_valid() == (orientation == UPRIGHT)
 
 
-@pytest.mark.parametrize(
-    ("settings", "steps"),
-    [
-        ({}, 6),
-        ({"random_orientation": False, "action_sequence": "pxy"}, 6),
-        ({"num_objects": 6}, 10),
-    ],
-)
+@pytest.mark.parametrize(("settings", "steps"), [(OPEN_FIXED, 6), ({"num_objects": 6}, 10)])
 def test_expert_stacks_cylinders_in_the_fewest_steps(settings, steps):
+    cylinders = {"object_type": "cylinder", **settings}
     checks.check_expert(
-        OPEN_STACKING,
-        episodes=10,
-        min_success_rate=1.0,
-        max_typical_steps=steps,
-        object_type="cylinder",
-        **settings,
+        OPEN_STACKING, episodes=5, min_success_rate=1.0, max_typical_steps=steps, **cylinders
     )
 
 
 def test_the_reversed_deconstruction_builds_a_stack_of_cylinders():
-    scores = replay_scores(OPEN_STACKING, 10, object_type="cylinder")
-    assert scores.reversible * scores.success_rate >= 0.9
+    scores = replay_scores(OPEN_STACKING, 5, object_type="cylinder")
+    assert scores.reversible * scores.success_rate >= 0.8
 
 
 @pytest.mark.parametrize("task", [STACKING, "open_loop/house_building_1"])
@@ -316,15 +305,12 @@ def test_expert_removes_a_tower_that_blocks_the_grasp_of_the_last_cube(make_star
 
 
 @pytest.mark.parametrize(
-    ("robot", "gap_m"),
-    [("kuka", 0.01), ("kuka", 0.025), ("panda", 0.001), ("panda", 0.01), ("panda", 0.025)],
+    ("robot", "gap_m"), [("kuka", 0.01), ("kuka", 0.025), ("panda", 0.001), ("panda", 0.025)]
 )
 def test_expert_without_yaw_stacks_cubes_that_stand_side_by_side(make_started, robot, gap_m):
     """In a row along the closing direction, cubes block the centred grasps of their neighbours."""
-    fixed = {"action_sequence": "pxy", "random_orientation": False}
-    env = make_started(
-        OPEN_STACKING, expert=True, max_steps=30, robot=robot, num_objects=3, **fixed
-    )
+    config = {"expert": True, "max_steps": 30, "num_objects": 3, **OPEN_FIXED}
+    env = make_started(OPEN_STACKING, robot=robot, **config)
     for i, cube in enumerate(env.scene.task.objects):
         cube.place((0.42 + i * (0.03 + gap_m), 0.02, 0.015))
     assert play_scene(env)["success"]

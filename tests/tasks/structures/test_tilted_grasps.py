@@ -17,8 +17,13 @@ from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
-from ba_torchrl.tasks.structures.grasps import tilted_tools
 from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF
+from ba_torchrl.tasks.structures.tilts import (
+    in_resting_frame,
+    release_pose,
+    resting_frame,
+    tilted_tools,
+)
 
 NORMAL = (math.sin(0.4), 0.0, math.cos(0.4))
 SIDES = [  # rotations that turn a cube onto each of its sides
@@ -29,7 +34,7 @@ SIDES = [  # rotations that turn a cube onto each of its sides
 ]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def body():
     with World() as world:
         yield world.add(Box(size_m=(0.03, 0.12, 0.03)), "body")
@@ -49,7 +54,7 @@ def columns(quaternion):
 @pytest.mark.parametrize("yaw", [0.3, 1.4, -2.0])
 def test_the_resting_frame_of_a_cube_has_the_normal_of_the_slope(body, side, yaw):
     frame = columns(on_slope(body, yaw, side))
-    resting = columns(CUBE.resting_frame(body))
+    resting = columns(resting_frame(CUBE, body))
     assert resting[2] == pytest.approx(NORMAL, abs=1e-6)
     turn = math.atan2(resting[0] @ frame[1], resting[0] @ frame[0])
     assert math.cos(4 * turn) == pytest.approx(1.0, abs=1e-6)  # up to quarter turns
@@ -58,7 +63,7 @@ def test_the_resting_frame_of_a_cube_has_the_normal_of_the_slope(body, side, yaw
 @pytest.mark.parametrize("piece", [CUBE, CUBOID, ROOF], ids=lambda piece: piece.kind)
 def test_the_resting_frame_of_a_level_piece_has_its_yaw(body, piece):
     body.place((0.45, 0.0, 0.1), 0.7)
-    x_axis = columns(piece.resting_frame(body))[0]
+    x_axis = columns(resting_frame(piece, body))[0]
     assert math.atan2(x_axis[1], x_axis[0]) == pytest.approx(piece.yaw_rad(body))
 
 
@@ -79,14 +84,14 @@ def test_the_tools_close_across_the_piece_and_approach_between_normal_and_vertic
 @pytest.mark.parametrize("side", SIDES)
 def test_a_release_lays_the_side_on_the_support_at_the_yaw(body, side):
     on_slope(body, 0.9, side)
-    inner = CUBE.in_resting_frame(body)
-    level = CUBE.release_pose(body, Pose((0.4, 0.1, 0.2)), 0.25)
+    inner = in_resting_frame(CUBE, body)
+    level = release_pose(CUBE, body, Pose((0.4, 0.1, 0.2)), 0.25)
     assert level.position == (0.4, 0.1, 0.2)
     assert columns(level.orientation) == pytest.approx(
         columns(quaternion_product(surface_quaternion((0.0, 0.0, 1.0), 0.25), inner)), abs=1e-9
     )
     assert np.abs(columns(level.orientation)[:, 2]).max() == pytest.approx(1.0, abs=1e-6)
-    slope = CUBE.release_pose(body, Pose((0.4, 0.1, 0.2), surface_quaternion(NORMAL)), 0.25)
+    slope = release_pose(CUBE, body, Pose((0.4, 0.1, 0.2), surface_quaternion(NORMAL)), 0.25)
     along = columns(slope.orientation) @ np.array(NORMAL)
     assert np.abs(along).max() == pytest.approx(1.0, abs=1e-6)
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.vector.make import SerialVectorEnv, VectorEnv
+from ba_torchrl.envs.vector.make import SerialVectorEnv
+from ba_torchrl.envs.vector.parallel import VectorEnv
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.experiment import Experiment

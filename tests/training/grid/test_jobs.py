@@ -1,6 +1,7 @@
 """Runs of a grid in separate processes: failures, interruptions, resumption."""
 
 import fcntl
+import functools
 import json
 import os
 import signal
@@ -17,11 +18,11 @@ from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
+from ba_torchrl.training.grid.launchers import local
 from ba_torchrl.training.grid.plan import status
-from ba_torchrl.training.run_lock import RunLock
+from ba_torchrl.training.persistence import RunLock
+from tests.recipes import recipe
 from tests.training.grid.grids import COMMON, REACH, planned
-
-ROOT = Path(__file__).parents[3]
 
 FAKE_WORKER = """
 import json, os, pathlib, signal, sys, time
@@ -163,7 +164,7 @@ signal.signal(signal.SIGTERM, lambda *_: asked.append(0))
 (folder / "calls").write_text("x")
 while not asked:
     time.sleep(0.05)
-time.sleep(2 + 2 * config["seed"])
+time.sleep(0.5 + 0.5 * config["seed"])
 (folder / "asked").write_text(str(len(asked)))
 """
 
@@ -219,24 +220,24 @@ def test_a_run_that_still_works_is_skipped_by_the_name_of_its_process(tmp_path, 
     assert status(runs[0]).state == "done"
 
 
-@pytest.mark.parametrize("content", [b"", b'{"task": "clo', b"\x80\x04\x95", b"[]"])
-def test_a_damaged_result_concerns_its_run_only(tmp_path, fake, content):
-    runs = planned(tmp_path, seeds=3)
+def test_a_damaged_result_concerns_its_run_only(tmp_path, fake):
+    runs = planned(tmp_path)
     assert fake(runs) == {}
-    (runs[1].folder / "result.json").write_bytes(content)
-    assert [status(run).state for run in runs] == ["done", "failed", "done"]
-    assert "delete the folder" in status(runs[1]).detail
-    page = write_report([tmp_path], tmp_path / "report")
-    assert "result.json is damaged" in (page.parent / "table.md").read_text()
+    for content in (b"", b'{"task": "clo', b"\x80\x04\x95", b"[]"):
+        (runs[0].folder / "result.json").write_bytes(content)
+        assert [status(run).state for run in runs] == ["failed", "done"]
+        assert "delete the folder" in status(runs[0]).detail
+        page = write_report([tmp_path], tmp_path / "report")
+        assert "result.json is damaged" in (page.parent / "table.md").read_text()
 
 
-@pytest.mark.parametrize("content", [b"", b'{"rea', b"\x80\x04\x95", b"[]", b"{}"])
-def test_a_damaged_record_of_a_failure_concerns_its_run_only(tmp_path, fake, content):
+def test_a_damaged_record_of_a_failure_concerns_its_run_only(tmp_path, fake):
     runs = planned(tmp_path)
     assert len(fake(runs, {0: "fail"})) == 1
-    (runs[0].folder / "failure.json").write_bytes(content)
-    assert str(status(runs[0])) == "failed: failure.json is damaged"
-    write_report([tmp_path], tmp_path / "report")
+    for content in (b"", b'{"rea', b"\x80\x04\x95", b"[]", b"{}"):
+        (runs[0].folder / "failure.json").write_bytes(content)
+        assert str(status(runs[0])) == "failed: failure.json is damaged"
+        write_report([tmp_path], tmp_path / "report")
     assert fake(runs) == {}
 
 
@@ -297,35 +298,36 @@ def children_of(pid):
     return found
 
 
-def test_the_recipe_from_the_command_line(tmp_path):
-    def recipe(*arguments, code=0):
-        command = [sys.executable, "recipes/benchmark.py", *arguments]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
-        assert done.returncode == code, done.stderr[-3000:]
-        return done.stdout + done.stderr
-
+def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monkeypatch):
     small = [f"{name}={value}" for name, value in COMMON.items() if not isinstance(value, dict)]
-    arguments = (
-        *small,
-        f"tasks=[{REACH}]",
-        "algorithms=[sacfd]",
-        "networks=[cnn]",
-        "seeds=2",
-        "env.obs_size=64",
-        "env.max_steps=8",
-        "algorithm.batch_size=8",
-        "network.width=0.25",
-        f"folder={tmp_path}/grid",
-    )
-    # a run that cannot start, since its folder is taken by a file
-    (tmp_path / "grid/close_loop_block_reaching/sacfd_cnn/seed0").mkdir(parents=True)
-    blocked = tmp_path / "grid/close_loop_block_reaching/sacfd_cnn/seed0/checkpoints"
-    blocked.write_text("a file")
-    out = recipe(*arguments, code=1)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # the recipe's handler would stay
+
+    def printed(*arguments):
+        recipe(
+            "benchmark",
+            *small,
+            f"tasks=[{REACH}]",
+            "algorithms=[sacfd]",
+            "networks=[cnn]",
+            "env.obs_size=64",
+            "env.max_steps=8",
+            "algorithm.batch_size=8",
+            "network.width=0.25",
+            f"folder={tmp_path}/grid",
+            *arguments,
+        )
+        return capsys.readouterr().out
+
+    assert "1 of 1 runs done" in printed("seeds=1")
+    breaking = [sys.executable, "-c", "raise SystemExit('it broke')"]
+    monkeypatch.setattr(local, "run_all", functools.partial(run_all, worker=breaking))
+    with pytest.raises(SystemExit) as end:
+        printed("seeds=2")
+    assert end.value.code == 1
+    out = capsys.readouterr().out
     assert "1 of 2 runs done" in out
     assert "failed  " in out
-    out = recipe(*arguments, "dry_run=true")
-    assert "2 runs: 1 failed, 1 done" in out
+    assert "2 runs: 1 done, 1 failed" in printed("seeds=2", "dry_run=true")
     page = write_report([tmp_path / "grid"], tmp_path / "report").read_text()
     assert "close_loop_4d" in page
     assert "sacfd cnn" in page

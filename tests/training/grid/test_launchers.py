@@ -21,7 +21,7 @@ from tests.training.grid.grids import COMMON, REACH, planned
 from tests.training.ray_nodes import ray_nodes
 
 ROOT = Path(__file__).parents[3]
-COMMAND = [sys.executable, "recipes/benchmark.py", "seeds=2", "launcher=submitit", "jobs=3"]
+WORDS = ["seeds=2", "launcher=submitit", "jobs=3"]
 
 
 def launcher(name, **options):
@@ -29,7 +29,7 @@ def launcher(name, **options):
 
 
 def grid_of(runs, folder, **changes):
-    values = {"jobs": 1, "max_hours": None, "command": COMMAND}
+    values = {"jobs": 1, "max_hours": None, "words": WORDS}
     return Grid(runs=runs, folder=Path(folder), **{**values, **changes})
 
 
@@ -37,7 +37,7 @@ def grid_of(runs, folder, **changes):
 def test_without_the_package_one_line_says_how_to_install_it(name, tmp_path, monkeypatch):
     for module in ("ray_cluster", "grid.launchers.submitit"):
         monkeypatch.setattr(f"ba_torchrl.training.{module}.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=rf"pip install 'ba-torchrl\[{name}\]'") as raised:
+    with pytest.raises(ConfigError, match=rf"pip install .*{name}") as raised:
         launcher(name).check(planned(tmp_path))
     assert "\n" not in str(raised.value)
 
@@ -73,8 +73,9 @@ def test_submitit_repeats_the_command_as_a_multirun_of_the_unfinished_runs(tmp_p
     found = launcher("submitit", gpus=1, options=options).command(
         grid_of(runs, "runs/g", jobs=3, max_hours=2.0), runs[1:]
     )
-    assert found[:5] == [*COMMAND[:2], "--multirun", "seeds=2", "jobs=3"]
-    assert found[5:] == [
+    start = [sys.executable, "-m", "ba_torchrl", "benchmark", "--multirun"]
+    assert found[:7] == [*start, "seeds=2", "jobs=3"]
+    assert found[7:] == [
         "only=1,2",
         "hydra/launcher=submitit_slurm",
         "hydra.sweep.dir=runs/g/submitit",

@@ -24,8 +24,8 @@ class Grid:
     """Runs at the same time."""
     max_hours: float | None
     """Time limit of each run."""
-    command: Sequence[str]
-    """Command line of the benchmark: the interpreter, the script and its arguments."""
+    words: Sequence[str]
+    """Arguments of ``ba-torchrl benchmark`` that give these runs."""
 
 
 class LauncherConfig(StrictModel, ABC):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import subprocess
+import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, Literal
 from pydantic import Field
 from tqdm import tqdm
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, install_command
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.jobs import unfinished
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid, LauncherConfig
@@ -53,7 +54,7 @@ class SubmititConfig(LauncherConfig):
         if find_spec("submitit") is None:
             raise ConfigError(
                 "launcher: 'submitit' needs a package that is not installed: "
-                "pip install 'ba-torchrl[submitit]'"
+                f"{install_command('hydra-submitit-launcher')}"
             )
 
     def run_all(self, grid: Grid) -> dict[Path, str]:
@@ -95,10 +96,9 @@ class SubmititConfig(LauncherConfig):
             **({} if grid.max_hours is None else {"timeout_min": self._minutes(grid.max_hours)}),
             **self.options,
         }
-        interpreter, script, *words = grid.command
         return [
-            *(interpreter, script, "--multirun"),
-            *(word for word in words if not _OWN_OPTION.match(word)),
+            *(sys.executable, "-m", "ba_torchrl", "benchmark", "--multirun"),
+            *(word for word in grid.words if not _OWN_OPTION.match(word)),
             f"only={','.join(map(str, indices))}",
             f"hydra/launcher=submitit_{self.cluster}",
             f"hydra.sweep.dir={grid.folder / 'submitit'}",

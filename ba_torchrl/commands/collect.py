@@ -1,16 +1,19 @@
 """Collect demonstrations from a task's expert or by deconstruction of structures, and save them.
 
-python recipes/collect_demos.py task=close_loop/block_picking episodes=100 path=demos/picking
-python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction
-python recipes/collect_demos.py task=open_loop/house_building_4 source=deconstruction replays=200
+ba-torchrl collect task=close_loop/block_picking episodes=100 path=demos/picking
+ba-torchrl collect task=open_loop/house_building_4 source=deconstruction
+ba-torchrl collect task=open_loop/house_building_4 source=deconstruction replays=200
 """
+
+from __future__ import annotations
 
 from typing import Any
 
-import hydra
 from pydantic import Field, field_validator
 
 from ba_torchrl import make_vector_env
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import Count, NewPath, NumEnvs, Plugins, Seed, TaskId, without
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.demo_files import save_demonstrations
 from ba_torchrl.data.demos import (
@@ -25,37 +28,37 @@ from ba_torchrl.data.time_reversal import replay_scores
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.training.command_line import (
-    Count,
-    NewPath,
-    NumEnvs,
-    Plugins,
-    Seed,
-    TaskId,
-    command,
-    register_schemas,
-    without,
-)
-
-register_schemas()
 
 
 class Settings(StrictModel):
     """Settings of this command."""
 
-    plugins: Plugins
-    task: TaskId
-    env: dict[str, Any]
-    path: NewPath
-    source: Source
-    episodes: Count
-    replays: int = Field(ge=0)
-    only_successful: bool
-    noise: float = Field(ge=0, lt=1)
-    turn_noise: float = Field(ge=0, lt=1)
-    num_envs: NumEnvs
-    parallel: bool | None
-    seed: Seed
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    task: TaskId = "close_loop/block_picking"
+    """Id of the task."""
+    env: dict[str, Any] = Field(default_factory=dict)
+    """Parameters of the environment."""
+    path: NewPath = "demos/${file_name:${task}}"
+    """New folder of the demonstrations."""
+    source: Source = "expert"
+    """The expert's episodes, or structures that are taken apart, reversed in time."""
+    episodes: Count = 100
+    """Their number."""
+    replays: int = Field(default=0, ge=0)
+    """Deconstruction: number of episodes whose reversal is checked in the simulator."""
+    only_successful: bool = True
+    """Leave out failed episodes."""
+    noise: float = Field(default=0.0, ge=0, lt=1)
+    """Probability of a random action in each step; the expert's is stored beside it."""
+    turn_noise: float = Field(default=0.0, ge=0, lt=1)
+    """Probability of a random turn beside the expert's other components."""
+    num_envs: NumEnvs = 5
+    """Environments that step together."""
+    parallel: bool | None = None
+    """Worker processes; null for processes where at least three can run at a time."""
+    seed: Seed = 0
+    """Of the episodes."""
 
     @field_validator("env")
     @classmethod
@@ -63,8 +66,6 @@ class Settings(StrictModel):
         return without(env, seed="set seed", expert="set source")
 
 
-@hydra.main(config_path="../configs", config_name="collect_demos", version_base="1.3")
-@command(Settings)
 def main(settings: Settings) -> None:
     """Play the expert's episodes and write them into a folder."""
     actions = resolve_env(settings.task, settings.env).actions
@@ -115,5 +116,4 @@ def main(settings: Settings) -> None:
         )
 
 
-if __name__ == "__main__":
-    main()
+COMMAND = Command(main, Settings, positional="task")

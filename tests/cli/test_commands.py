@@ -12,14 +12,11 @@ import torch
 from pydantic import create_model
 
 import ba_torchrl
+from ba_torchrl.cli import EXIT_CODE, types
+from ba_torchrl.cli.errors import plain_errors
+from ba_torchrl.cli.types import check_writable_file
 from ba_torchrl.config import StrictModel, parse
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.training import command_line
-from ba_torchrl.training.command_line import (
-    EXIT_CODE,
-    check_writable_file,
-    plain_errors,
-)
 from ba_torchrl.training.config import ExperimentConfig
 from tests.recipes import load_recipe, recipe
 
@@ -32,14 +29,16 @@ RUN = {
 
 COMMANDS = (
     "benchmark",
-    "collect_demos",
+    "collect",
     "evaluate",
     "experts",
+    "export",
     "gallery",
     "play",
     "plot",
     "report",
     "soak",
+    "measure",
     "speed",
     "tasks",
 )
@@ -54,31 +53,32 @@ REFUSED = [
     ("benchmark", "dry_run=maybe", "dry_run: Input should be a valid boolean"),
     ("benchmark", "seeds=100000000000", "seeds"),
     ("benchmark", "folder=file", "it is not a folder"),
-    ("collect_demos", "+foo=1", "unknown parameter 'foo'. Known: "),
-    ("collect_demos", "+env.seed=5", "env: seed is set by the command; leave it out, and set seed"),
-    ("collect_demos", "+env.expert=false", "leave it out, and set source"),
-    ("collect_demos", "path=run", "run exists already"),
-    ("collect_demos", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
-    ("play", "+env.seed=5", "leave it out, and set seed"),
-    ("play", "+env.expert=true", "leave it out, and set policy"),
-    ("experts", "+env.num_objects=3", "unknown parameter 'env'. Known: episodes, num_envs"),
+    ("collect", "foo=1", "unknown setting 'foo'. Known: "),
+    ("collect", "env.seed=5", "env: seed is set by the command; leave it out, and set seed"),
+    ("collect", "env.expert=false", "leave it out, and set source"),
+    ("collect", "path=run", "run exists already"),
+    ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
+    ("play", "env.seed=5", "leave it out, and set seed"),
+    ("play", "env.expert=true", "leave it out, and set policy"),
+    ("experts", "env.num_objects=3", "unknown setting 'env'. Known: plugins, tasks, robots"),
     ("experts", "variants.close_loop=null", "variants.close_loop: Input should be a valid dict"),
-    ("experts", "+variants.open_loop.x={seed: 3}", "variants: seed is set by the command"),
+    ("experts", "variants.open_loop.x={seed: 3}", "variants: seed is set by the command"),
     ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
     ("gallery", "deconstructions=[open_loop/bin_packing]", "deconstruction has no meaning"),
     ("plot", "runs=[run]", "cannot read the scalars of run"),
     ("report", "runs=run", "no finished run below run"),
     ("report", "folder=file/x", "cannot write to "),
-    ("soak", "+env.seed=3", "leave it out, and set seed"),
+    ("soak", "env.seed=3", "leave it out, and set seed"),
     ("soak", "tasks=[mine/none]", "unknown task 'mine/none'"),
     ("soak", "steps=1", "steps"),
-    ("speed", "+foo=1", "unknown"),
-    ("speed", "output=folder.json", "cannot write to "),
+    ("speed", "foo=1", "unknown"),
+    ("measure", "output=folder.json", "cannot write to "),
 ]
 REQUIRED = {
-    "train": ("label=a", "run_dir=new"),
-    "benchmark": ("name=a", "folder=new"),
-    "evaluate": ("checkpoint=run",),
+    "train": ("run_dir=new",),
+    "benchmark": ("folder=new",),
+    "evaluate": ("policy=run",),
+    "export": ("policy=run",),
     "plot": ("runs=[run]",),
     "report": ("runs=run",),
 }
@@ -143,18 +143,17 @@ def test_types_of_settings(kind, right, wrong, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("a file")
     for name in ("run", "folder.png"):
         (tmp_path / name).mkdir()
-    model = create_model("Settings", __base__=StrictModel, value=(getattr(command_line, kind), ...))
+    model = create_model("Settings", __base__=StrictModel, value=(getattr(types, kind), ...))
     parse(model, {"value": right}, "settings")
     for value in wrong:
         with pytest.raises(ConfigError, match=r"^invalid settings:\n  value"):
             parse(model, {"value": value}, "settings")
 
 
-@pytest.mark.parametrize("name", ["train", "collect_demos", "benchmark"])
-def test_an_unknown_plugin_on_the_command_line_is_one_line(name, capsys, monkeypatch):
-    monkeypatch.setattr("sys.argv", [name, "plugins=[no_such_module]"])
+@pytest.mark.parametrize("name", ["train", "collect", "benchmark"])
+def test_an_unknown_plugin_on_the_command_line_is_one_line(name, capsys):
     with pytest.raises(SystemExit) as end:
-        recipe(name)
+        recipe(name, "plugins=[no_such_module]")
     error = capsys.readouterr().err
     assert end.value.code == EXIT_CODE
     assert error.startswith("error: cannot import the plugin 'no_such_module': there is no module")

@@ -1,10 +1,10 @@
 """Print times of steps, images and updates, frames per second, and the replay's memory, as a table.
 
-python recipes/speed.py
-python recipes/speed.py which=simulation repeats=50 output=before.json
-python recipes/speed.py which=simulation repeats=50 compare=before.json
-python recipes/speed.py which=learning/equi_sdqfd_update profile=true
-python recipes/speed.py which=learning device=cuda
+python recipes/measure.py
+python recipes/measure.py which=simulation repeats=50 output=before.json
+python recipes/measure.py which=simulation repeats=50 compare=before.json
+python recipes/measure.py which=learning/equi_sdqfd_update profile=true
+python recipes/measure.py which=learning device=cuda
 """
 
 from ba_torchrl._malloc import tune_malloc
@@ -14,17 +14,11 @@ tune_malloc()  # before torch allocates anything: halves the time of an update o
 from functools import partial  # noqa: E402
 from typing import Annotated  # noqa: E402
 
-import hydra  # noqa: E402
+from pydantic import Field  # noqa: E402
 
+from ba_torchrl.cli.command import Command  # noqa: E402
+from ba_torchrl.cli.types import Count, Plugins, Text, check_writable_file, checked  # noqa: E402
 from ba_torchrl.config import StrictModel  # noqa: E402
-from ba_torchrl.training.command_line import (  # noqa: E402
-    Count,
-    Plugins,
-    Text,
-    check_writable_file,
-    checked,
-    command,
-)
 from ba_torchrl.training.config import usable_device  # noqa: E402
 from profiling.comparison import columns_of_changes  # noqa: E402
 from profiling.speed_file import (  # noqa: E402
@@ -41,19 +35,26 @@ JsonFile = Annotated[Text, checked(partial(check_writable_file, suffixes=(".json
 class Settings(StrictModel):
     """Settings of this command."""
 
-    plugins: Plugins
-    which: Text
-    repeats: Count
-    device: Text
-    precision: Precision
-    compile_mode: CompileMode | None
-    output: JsonFile | None
-    compare: Text | None
-    profile: bool
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    which: Text = "all"
+    """simulation, learning, throughput, memory, or one of their measurements."""
+    repeats: Count = 20
+    """Rounds: episodes of each task, updates of each learner, batches of each collector."""
+    device: Text = "cpu"
+    """Of the learners."""
+    precision: Precision = "auto"
+    """Of the learners' networks."""
+    compile_mode: CompileMode | None = None
+    """`torch.compile` of the learners' losses."""
+    output: JsonFile | None = None
+    """Write all values, machine, versions and commit to this file."""
+    compare: Text | None = None
+    """Print ratios to the rows of this file."""
+    profile: bool = False
+    """Print a profile of each timed call."""
 
 
-@hydra.main(config_path="../configs", config_name="speed", version_base="1.3")
-@command(Settings)
 def main(settings: Settings) -> None:
     """Measure, print a table, and write or compare it."""
     device = usable_device(settings.device)
@@ -74,5 +75,7 @@ def main(settings: Settings) -> None:
         print(f"old: {old}")
 
 
+COMMAND = Command(main, Settings, positional="which")
+
 if __name__ == "__main__":
-    main()
+    COMMAND.run()

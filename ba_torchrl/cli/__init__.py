@@ -1,0 +1,102 @@
+"""The command line: ``ba-torchrl COMMAND [FIELD=VALUE ...]``.
+
+Each module of `ba_torchrl.commands` is a command, and its docstring is the command's description.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+
+from ba_torchrl import __version__
+from ba_torchrl._malloc import tune_malloc
+from ba_torchrl.errors import install_command
+
+PROGRAM = "ba-torchrl"
+EXIT_CODE = 2
+"""Exit code of a command line that cannot be used."""
+OF_TRAINING = (
+    "hydra-core",
+    "omegaconf",
+    "matplotlib",
+    "jinja2",
+    "imageio",
+    "imageio-ffmpeg",
+    "pillow",
+    "joblib",
+)
+"""Packages of the extra [train]."""
+_FOLDER = Path(__file__).parents[1] / "commands"
+
+
+def command_names() -> list[str]:
+    """Return the names of the commands."""
+    return sorted(path.stem for path in _FOLDER.glob("[!_]*.py"))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command that a command line names.
+
+    Args:
+        arguments: of the command line, without the program; those of this process if None.
+    """
+    first, *rest = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
+    if first in ("--help", "-h", "help"):
+        print(overview())  # noqa: T201
+    elif first == "--version":
+        print(f"{PROGRAM} {__version__}")  # noqa: T201
+    elif first in command_names():
+        tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
+        if os.getcwd() not in sys.path:  # where `plugins` are, as with `python -m`
+            sys.path.insert(0, os.getcwd())
+        _import(first).COMMAND.run(rest)
+    else:
+        close = difflib.get_close_matches(first, command_names(), n=1)
+        hint = f" Did you mean {close[0]!r}?" if close else ""
+        known = ", ".join(command_names())
+        sys.stderr.write(f"error: unknown command {first!r}.{hint} Known: {known}\n")
+        sys.exit(EXIT_CODE)
+
+
+def config_dir() -> Path:
+    """Return the folder of the configurations: in the installed package, or in a clone."""
+    package = _FOLDER.parent
+    installed = package / "configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def _import(command: str) -> ModuleType:
+    """Return the module of a command; end the process if a package of an extra is missing."""
+    try:
+        return importlib.import_module(f"ba_torchrl.commands.{command}")
+    except ModuleNotFoundError as error:
+        package = {"hydra": "hydra-core", "PIL": "pillow"}.get(error.name or "", error.name or "")
+        if package not in OF_TRAINING:
+            raise
+        sys.stderr.write(
+            f"error: {PROGRAM} {command} needs the extra [train] of the package, of which "
+            f"{package!r} is missing: {install_command(*OF_TRAINING)}\n"
+        )
+        sys.exit(EXIT_CODE)
+
+
+def overview() -> str:
+    """Return the list of the commands, each with the first line of its description."""
+    lines = [
+        "BulletArm's robot-manipulation tasks and equivariant baselines, native to TorchRL.",
+        "",
+        f"usage: {PROGRAM} COMMAND [FIELD=VALUE ...]",
+        f"       {PROGRAM} COMMAND --help",
+        "",
+    ]
+    for name in command_names():
+        # read, not imported: the import of torch takes seconds
+        source = ast.parse((_FOLDER / f"{name}.py").read_text(encoding="utf-8"))
+        lines.append(f"  {name:10} {(ast.get_docstring(source) or '').splitlines()[0]}")
+    return "\n".join(lines)

@@ -1,0 +1,282 @@
+"""A command: Hydra composes its settings, a model validates them, and a function does the work."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import logging
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf, open_dict
+from pydantic import BaseModel
+
+from ba_torchrl.cli import PROGRAM, config_dir
+from ba_torchrl.cli.errors import name_presets, plain_errors
+from ba_torchrl.cli.help import describe
+from ba_torchrl.config import parse
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.logging import limit_library_logs
+from ba_torchrl.training import hydra_schema
+
+_OF_HYDRA = ("--multirun", "-m", "--cfg", "-c", "--info", "-i", "--package", "-p", "--resolve")
+"""Options of Hydra that a command with a configuration has too."""
+LOG_FORMAT = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
+
+
+@dataclass
+class Arguments:
+    """The parts of a command line."""
+
+    overrides: list[str] = field(default_factory=list)
+    """In Hydra's grammar, such as ``env.obs_size=64``."""
+    config_name: str | None = None
+    """Of another configuration than the command's own."""
+    config_dir: str | None = None
+    """A further folder of configurations."""
+    asks_for_help: bool = False
+    is_for_hydra: bool = False
+    """Whether an option is one of Hydra's."""
+
+    @property
+    def names(self) -> set[str]:
+        """The settings that are given, such as ``env.obs_size``."""
+        return {override.split("=")[0].lstrip("+~") for override in self.overrides}
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the command line, or a recipe of its own."""
+
+    main: Callable[[Any], None]
+    """Does the work, with the validated settings."""
+    settings: type[BaseModel]
+    """Model of the settings. Without ``config``, its defaults are those of the command."""
+    positional: str | None = None
+    """Field that words without "=" set."""
+    config: str | None = None
+    """Name of the configuration file that is used unless ``--config-name`` is given."""
+    parse: Callable[[dict[str, Any], Arguments], Any] | None = None
+    """Returns what ``main`` gets; by default an instance of ``settings``."""
+
+    @property
+    def name(self) -> str:
+        """The command's name, that of its module."""
+        return self.main.__module__.split(".")[-1]
+
+    @plain_errors
+    def run(self, words: Sequence[str] | None = None) -> None:
+        """Run the command; an error in its arguments is one line, and ends the process.
+
+        Args:
+            words: of the command line, after the command's name; those of this process if None.
+        """
+        words = sys.argv[1:] if words is None else words
+        arguments = self.read(words)
+        hydra_schema.register(arguments.overrides)
+        if arguments.is_for_hydra:
+            self._run_in_hydra(words)
+            return
+        logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
+        with self.composed(arguments) as settings:
+            if arguments.asks_for_help:
+                print(self._help(OmegaConf.to_container(settings)))  # noqa: T201
+            else:
+                self._run_composed(settings, arguments)
+
+    def _help(self, values: dict[str, Any]) -> str:
+        word = f" [{self.positional.upper()}]" if self.positional else ""
+        usage = f"{self.name}{word} [FIELD=VALUE ...]"
+        text = sys.modules[self.main.__module__].__doc__ or ""
+        return describe(usage, text, self.settings, values, self.config_names())
+
+    def config_names(self, further: str | None = None) -> list[str]:
+        """Return the names that ``--config-name`` takes.
+
+        Args:
+            further: a folder besides that of the package.
+        """
+        if self.config is None:
+            return []
+        folders = [config_dir(), *([] if further is None else [Path(further)])]
+        found = {path.stem for folder in folders for path in folder.glob("[!_]*.yaml")}
+        is_own = self.config.__eq__ if self.config == "benchmark" else "benchmark".__ne__
+        return sorted(filter(is_own, found))
+
+    def read(self, words: Sequence[str]) -> Arguments:
+        """Return the parts of a command line.
+
+        Raises:
+            ConfigError: an option is unknown, or a word sets nothing.
+        """
+        parser = argparse.ArgumentParser(PROGRAM, add_help=False, exit_on_error=False)
+        parser.add_argument("-h", "--help", action="store_true")
+        parser.add_argument("-cn", "--config-name")
+        parser.add_argument("-cd", "--config-dir")
+        try:
+            found, rest = parser.parse_known_args(words)
+        except argparse.ArgumentError as error:
+            raise ConfigError(str(error)) from None
+        options = [word for word in rest if word.startswith("-")]
+        is_for_hydra = self.config is not None and any(each in _OF_HYDRA for each in options)
+        known = ["--help", *(["--config-name", "--config-dir", *_OF_HYDRA] if self.config else [])]
+        if not is_for_hydra and options:
+            raise ConfigError(f"unknown option {options[0]!r}.{_known(options[0], known)}")
+        if self.config is None and (found.config_name or found.config_dir):
+            raise ConfigError(f"{self.name} has no configuration files; set its fields")
+        if found.config_dir is not None and not Path(found.config_dir).is_dir():
+            raise ConfigError(f"there is no folder {found.config_dir}")
+        return Arguments(
+            rest if is_for_hydra else list(self._overrides(rest)),
+            found.config_name,
+            found.config_dir,
+            found.help,
+            is_for_hydra,
+        )
+
+    def _overrides(self, words: Sequence[str]) -> Iterator[str]:
+        """Yield overrides; words without "=" set the positional field.
+
+        Raises:
+            ConfigError: the command has none, or it takes one word only.
+        """
+        bare = [word for word in words if "=" not in word and not word.startswith("~")]
+        yield from (word for word in words if word not in bare)
+        if not bare:
+            return
+        if self.positional is None:
+            raise ConfigError(f"{bare[0]!r} sets nothing; settings are FIELD=VALUE, see --help")
+        quoted = ["'" + word.replace("'", "\\'") + "'" for word in bare]
+        if "list[" in str(self.settings.model_fields[self.positional].annotation):
+            yield f"{self.positional}=[{','.join(quoted)}]"
+        elif len(bare) == 1:
+            yield f"{self.positional}={quoted[0]}"
+        else:
+            raise ConfigError(f"one {self.positional} is expected, got {' '.join(bare)}")
+
+    @contextmanager
+    def composed(self, arguments: Arguments) -> Iterator[DictConfig]:
+        """Context with the settings, in which presets can be composed.
+
+        Raises:
+            ConfigError: a name is unknown, or the grammar of a word is wrong.
+        """
+        overrides, main_folder = list(arguments.overrides), config_dir()
+        name = arguments.config_name or self.config or self._store_defaults()
+        known = self.config_names(arguments.config_dir)
+        if self.config is not None and name not in known:
+            raise ConfigError(f"unknown configuration {name!r}.{_known(name, known)}")
+        if arguments.config_dir is not None:
+            other = Path(arguments.config_dir).resolve()
+            if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
+                main_folder, other = other, main_folder
+            overrides.append(f"hydra.searchpath=['file://{other}']")
+        with initialize_config_dir(str(main_folder), version_base="1.3", job_name=self.name):
+            try:
+                settings = compose(name, overrides=overrides, return_hydra_config=True)
+            except HydraException as error:
+                raise ConfigError(_explain(error, name, overrides)) from None
+            HydraConfig.instance().set_config(settings)
+            with open_dict(settings):
+                del settings["hydra"]
+            try:
+                yield settings
+            finally:
+                HydraConfig.instance().cfg = None
+
+    def _store_defaults(self) -> str:
+        """Make the model's defaults a configuration; return its name."""
+        values = dict.fromkeys(self.settings.model_fields, "???")
+        node = OmegaConf.create({**values, **hydra_schema.defaults_of(self.settings)})
+        for name in node:
+            if not OmegaConf.is_missing(node, name) and OmegaConf.is_dict(node[name]):
+                OmegaConf.set_struct(node[name], False)  # its entries are checked by the model
+        ConfigStore.instance().store(name=f"_{self.name}", node=node)
+        return f"_{self.name}"
+
+    def _run_composed(self, settings: DictConfig, arguments: Arguments) -> None:
+        limit_library_logs()
+        missing = sorted(name for name in settings if OmegaConf.is_missing(settings, name))
+        if missing:
+            raise ConfigError(f"{missing[0]} is missing; see --help")
+        values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
+        try:
+            if self.parse is None:
+                found = parse(self.settings, values, "settings")
+            else:
+                found = self.parse(values, arguments)
+            self.main(found)
+        except ConfigError as error:
+            raise ConfigError(name_presets(str(error), settings)) from error
+
+    def _run_in_hydra(self, words: Sequence[str]) -> None:
+        """Run with an option of Hydra, such as ``--multirun`` or ``--cfg job``."""
+
+        @plain_errors
+        def job(settings: DictConfig) -> None:
+            self._run_composed(settings, Arguments([*HydraConfig.get().overrides.task]))
+
+        sys.argv[1:] = words
+        folder = str(config_dir())
+        hydra.main(config_path=folder, config_name=self.config, version_base="1.3")(job)()
+
+
+def _explain(error: HydraException, config: str, overrides: Sequence[str]) -> str:
+    """Return the message of an error of Hydra on one line, with the known names."""
+    first = str(error).splitlines()[0]
+    if isinstance(error, OverrideParseException):
+        return f"cannot read {error.override!r}: {first}"
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        known = [option for option in error.options or () if option != "schema"]
+        return f"unknown {group} {name!r}.{_known(name, known)}"
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    is_preset = {each.input_line: _is_preset(each) for each in parsed}
+    try:  # what the presets alone give
+        base = compose(config, overrides=[line for line in overrides if is_preset[line]])
+    except HydraException:
+        return first
+    for override in parsed:
+        if not is_preset[override.input_line] and not override.is_add():
+            unknown = _unknown_name(base, override.key_or_group)
+            if unknown is not None:
+                return unknown
+    return first
+
+
+def _is_preset(override: Override) -> bool:
+    group = override.key_or_group.split("@")[0]
+    loader = GlobalHydra.instance().config_loader()
+    return group.startswith("hydra.") or bool(loader.get_group_options(group))
+
+
+def _unknown_name(settings: DictConfig, path: str) -> str | None:
+    """Return a message if there is no setting of that name, such as ``env.obs_size``."""
+    node: Any = settings
+    parts = path.split(".")
+    for index, part in enumerate(parts):
+        if not OmegaConf.is_dict(node):
+            return None
+        if part not in node:
+            known = [str(key) for key in node]
+            return f"unknown setting {'.'.join(parts[: index + 1])!r}.{_known(part, known)}"
+        node = None if OmegaConf.is_missing(node, part) else node[part]
+    return None
+
+
+def _known(name: str, known: Sequence[str]) -> str:
+    """Return the end of a message on an unknown name: the nearest one, and all."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return (f" Did you mean {close[0]!r}?" if close else "") + f" Known: {', '.join(known)}"

@@ -1,0 +1,127 @@
+"""The help of a command: each setting with its default, its choices and one line."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import textwrap
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+from ba_torchrl.cli import PROGRAM
+from ba_torchrl.config import EnvConfig, env_config_model
+from ba_torchrl.envs.observations import OBSERVATIONS
+from ba_torchrl.sim.robots.base import ROBOTS
+from ba_torchrl.sim.vision.views import VIEWS
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.collectors.base import COLLECTORS
+from ba_torchrl.training.grid.launchers.base import LAUNCHERS
+
+CHOICES = {"robot": ROBOTS, "robots": ROBOTS, "view_type": VIEWS, "observations": OBSERVATIONS}
+"""Registries that fields of these names choose from."""
+_PRESETS = ("algorithm", "replay", "rotation", "network", "collector", "launcher", "benchmark")
+_REGISTRIES = {
+    "algorithm": ALGORITHMS,
+    "network": NETWORKS,
+    "collector": COLLECTORS,
+    "launcher": LAUNCHERS,
+}
+_INDENT = 6
+
+
+def describe(
+    usage: str, text: str, model: type[BaseModel], values: Mapping[str, Any], names: Sequence[str]
+) -> str:
+    """Return the help of a command.
+
+    Args:
+        usage: what follows the program's name.
+        text: description of the command.
+        model: of its settings.
+        values: its composed settings, unresolved; the presets among them decide which fields the
+            parts of the settings have.
+        names: of its configuration files.
+    """
+    lines = [f"usage: {PROGRAM} {usage}", "", *text.strip().splitlines()]
+    if names:
+        lines += ["", f"--config-name: {' | '.join(names)}"]
+        lines += ["--config-dir: a further folder of configurations"]
+        lines += ["", "presets:"]
+        for group in _PRESETS:
+            if group in values or group in ("replay", "rotation"):
+                known = hydra_schema.preset_names(group)
+                if known:
+                    lines += _wrapped(f"  {group}=", " | ".join(known))
+    parts = list(_parts(model, values))
+    expanded = {prefix for _, _, _, prefix in parts}
+    for title, model, own, prefix in parts:
+        lines += ["", f"{title}:"]
+        for name, field in model.model_fields.items():
+            if (name in own or field.is_required()) and f"{prefix}{name}." not in expanded:
+                lines += _field(f"{prefix}{name}", field, own.get(name))
+    return "\n".join(lines)
+
+
+def _parts(
+    settings: type[BaseModel], values: Mapping[str, Any]
+) -> Iterator[tuple[str, type[BaseModel], Mapping[str, Any], str]]:
+    """Yield title, model, values and prefix of each part of the settings."""
+    yield "settings", settings, values, ""
+    if "env" in values:
+        task = values.get("task")
+        known = isinstance(task, str) and task in TASKS
+        model = env_config_model(TASKS[task].Parameters) if known else EnvConfig
+        own = {**hydra_schema.defaults_of(model), **values["env"]}
+        for name in {"seed", "expert"} - values["env"].keys():
+            del own[name]
+        yield f"env, the environment{f' of {task}' if known else ''}", model, own, "env."
+    for group, registry in _REGISTRIES.items():
+        chosen = values.get(group) or {}
+        if chosen.get("name") in registry:
+            model = registry[chosen["name"]]
+            yield f"{group}={chosen['name']}", model, chosen, f"{group}."
+
+
+def _field(name: str, field: FieldInfo, value: Any) -> list[str]:
+    shown = "" if field.is_required() and value in (None, "???") else f"={_short(value)}"
+    choices = _choices(name.split(".")[-1], field.annotation)
+    lines = [f"  {name}{shown}" + (f"   {{{', '.join(choices)}}}" if choices else "")]
+    if field.description:
+        text = " ".join(field.description.replace("`", "").split())
+        first = re.split(r"(?<=[^ ]{2}\.) (?=[A-Z\"])", text)[0]
+        lines += _wrapped(" " * _INDENT, first)
+    return lines
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "null"
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    return text if len(text) < 60 else f"{text[:57]}..."
+
+
+def _choices(name: str, annotation: Any) -> list[str]:
+    if name in CHOICES:
+        return list(CHOICES[name])
+    return [_short(value) for value in _literals(annotation)]
+
+
+def _literals(annotation: Any) -> Iterator[Any]:
+    if get_origin(annotation) is Literal:
+        yield from get_args(annotation)
+    elif get_origin(annotation) in (Union, types.UnionType):
+        for part in get_args(annotation):
+            yield from _literals(part)
+
+
+def _wrapped(start: str, text: str) -> list[str]:
+    width = max(60, min(shutil.get_terminal_size().columns, 110))
+    return textwrap.wrap(
+        text, width, initial_indent=start, subsequent_indent=" " * max(_INDENT, len(start))
+    )

@@ -1,0 +1,132 @@
+"""Types of settings, whose values are checked before a command starts."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from ba_torchrl.config import MAX_SEED
+from ba_torchrl.data.time_reversal import check_has_structure
+from ba_torchrl.envs.vector.make import MAX_ENVS
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import load_plugins
+from ba_torchrl.tasks.base import TASKS
+
+MAX_NAME_BYTES = 230
+"""Longest name of a file that a command writes. File systems allow 255 bytes, of which temporary
+files need some for a prefix and a suffix."""
+
+
+def checked(check: Callable[[Any], Any]) -> AfterValidator:
+    """Return the annotation of a field whose value is kept if ``check`` raises no `ConfigError`."""
+
+    def validate(value: Any) -> Any:
+        check(value)
+        return value
+
+    return AfterValidator(validate)
+
+
+def without(values: dict[str, Any], **reserved: str) -> dict[str, Any]:
+    """Return fields of `EnvConfig`, none of which the command sets itself.
+
+    Args:
+        values: the fields.
+        reserved: by the name of each field that the command sets, what to do instead.
+
+    Raises:
+        ConfigError: one of them is given.
+    """
+    for name, instead in reserved.items():
+        if name in values:
+            raise ConfigError(f"{name} is set by the command; leave it out, and {instead}")
+    return values
+
+
+def _is_new(path: str) -> None:
+    if os.path.exists(path):
+        raise ConfigError(f"{path} exists already; choose another path")
+
+
+def _folder_exists(path: str) -> None:
+    if not os.path.isdir(path):  # False also if the name is too long
+        raise ConfigError(f"there is no folder {path}")
+
+
+def check_writable_folder(folder: str | Path) -> None:
+    """Check that files can be written to a folder, which is created if needed.
+
+    Raises:
+        ConfigError: they cannot.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except FileExistsError:
+        raise ConfigError(f"cannot write to {_short(folder)}: it is not a folder") from None
+    except OSError as error:
+        raise ConfigError(f"cannot write to {_short(folder)}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"cannot write to {folder!r}: {error}") from None
+
+
+def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
+    """Check that a file can be written; its folder is created if needed.
+
+    Args:
+        path: of the file.
+        suffixes: allowed ends of its name; any if left out.
+
+    Raises:
+        ConfigError: it cannot, its name has another end, or it is a folder.
+    """
+    path = Path(path)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise ConfigError(f"the name of the file ends in {' or '.join(suffixes)}, not {path.name}")
+    if len(os.fsencode(path.name)) > MAX_NAME_BYTES:
+        raise ConfigError(f"cannot write to {_short(path)}: the name is too long")
+    check_writable_folder(path.parent)
+    if os.path.isdir(path):
+        raise ConfigError(f"cannot write to {path}: it is a folder; name a file")
+    if os.path.exists(path) and not os.access(path, os.W_OK):
+        raise ConfigError(f"cannot write to {path}: {os.strerror(errno.EACCES)}")
+
+
+Count = Annotated[int, Field(ge=1)]
+NumEnvs = Annotated[int, Field(ge=1, le=MAX_ENVS)]
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+Text = Annotated[str, Field(min_length=1)]
+Plugins = Annotated[list[str], checked(load_plugins)]
+"""Modules outside the package, imported at once; the first field of a model, as others use them."""
+TaskId = Annotated[str, checked(TASKS.__getitem__)]
+Tasks = Annotated[list[TaskId], Field(min_length=1)] | None
+"""Ids of tasks; None for all."""
+Folders = Annotated[
+    list[Annotated[Text, checked(_folder_exists)]],
+    Field(min_length=1),
+    BeforeValidator(lambda value: [value] if isinstance(value, str) else value),
+]
+"""Existing folders, or one."""
+OutputFolder = Annotated[Text, checked(check_writable_folder)]
+OutputFile = Annotated[Text, checked(check_writable_file)]
+NewPath = Annotated[Text, checked(_is_new), checked(check_writable_file)]
+PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(".png",)))]
+VideoFile = Annotated[
+    Text, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))
+]
+Structures = list[Annotated[str, checked(check_has_structure)]]
+"""Ids of tasks whose structures can be deconstructed."""
+
+
+def _short(path: str | Path) -> str:
+    """Return a path as text of at most 200 characters."""
+    text = str(path)
+    return text if len(text) <= 200 else f"{text[:100]}...{text[-80:]}"

@@ -1,0 +1,102 @@
+"""Run a benchmark: tasks x algorithms x networks x seeds. The same command continues a grid.
+
+ba-torchrl benchmark benchmark=close_loop_4d seeds=4
+ba-torchrl benchmark benchmark=close_loop_4d dry_run=true       # list the states of the runs
+ba-torchrl benchmark tasks=[close_loop/block_picking] networks=[cnn] total_updates=600 \
+    env.obs_size=64 network.width=0.5 folder=runs/small
+ba-torchrl benchmark benchmark=close_loop_4d launcher=ray launcher.cpus=4
+ba-torchrl benchmark benchmark=close_loop_4d launcher=submitit launcher.options.partition=gpu
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from ba_torchrl import config as configuration
+from ba_torchrl.cli.command import Arguments, Command
+from ba_torchrl.cli.types import check_writable_folder
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.config import ExperimentConfig, choose
+from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
+from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
+
+
+class Settings(BenchmarkConfig):
+    """The grid, and what to do with it."""
+
+    dry_run: bool = False
+    """List the runs and their states."""
+    only: int | None = Field(default=None, ge=0)
+    """Number of the only run to start, from 0 on; the jobs of launcher=submitit set it."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A grid, its runs, and the words of the command line."""
+
+    settings: Settings
+    runs: list[ExperimentConfig]
+    words: list[str]
+
+
+def parse(values: dict[str, Any], arguments: Arguments) -> Task:
+    """Return the grid with its runs, all of them checked.
+
+    Args:
+        values: of all settings: those of `Settings`, and fields of `ExperimentConfig`.
+        arguments: the command line.
+    """
+    values = dict(values)
+    grid = {name: values.pop(name) for name in Settings.model_fields if name in values}
+    settings = configuration.parse(Settings, grid, "benchmark")
+    if not settings.dry_run:
+        check_writable_folder(settings.folder)
+    runs = plan(settings, values, hydra_schema.preset)
+    if settings.only is not None and settings.only >= len(runs):
+        raise ConfigError(f"only: must be a number from 0 to {len(runs) - 1}, got {settings.only}")
+    return Task(settings, runs, arguments.overrides)
+
+
+def main(task: Task) -> None:
+    """Run the unfinished runs of the grid, or list all of them."""
+    config, runs, only = task.settings, task.runs, task.settings.only
+    if config.dry_run:
+        states = {run.run_dir: status(run) for run in runs}
+        for run in runs:
+            print(f"{run.task:36} {run.label:20} seed {run.seed:<3} {states[run.run_dir]}")
+        counts = Counter(state.state for state in states.values())
+        print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
+        return
+    if only is not None:
+        runs = [runs[only]]
+    launcher = choose(LAUNCHERS, config.launcher, "launcher")
+    launcher.check(runs)
+    # the runs end with this process
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    failures = launcher.run_all(
+        Grid(runs, Path(config.folder), config.jobs, config.max_hours, task.words)
+    )
+    states = {run.run_dir: status(run) for run in runs}
+    done = sum(state.state == "done" for state in states.values())
+    print(f"{done} of {len(runs)} runs done in {config.folder}")
+    for folder, state in states.items():
+        if state.state == "running":
+            print(f"  running {folder}: {state.detail}")
+    for folder, reason in failures.items():
+        print(f"  failed  {folder}: {reason}")
+    if only is not None:
+        return  # one of several jobs, which all end; the failure is recorded
+    if failures:
+        sys.exit(1)
+    print(f"  next    ba-torchrl report {config.folder}")
+
+
+COMMAND = Command(main, Settings, config="benchmark", parse=parse)

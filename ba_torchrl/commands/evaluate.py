@@ -1,0 +1,142 @@
+"""Evaluate a trained policy.
+
+ba-torchrl evaluate runs/my-run episodes=100 video=my-run.mp4
+ba-torchrl evaluate runs/my-run which=latest
+ba-torchrl evaluate runs/my-run expert=true        # close loop: compare the actions
+ba-torchrl evaluate trained task=close_loop/block_picking
+ba-torchrl evaluate trained                        # all policies that the package ships
+"""
+
+from __future__ import annotations
+
+from pydantic import Field
+from tensordict import TensorDict
+
+from ba_torchrl import load_policy, make_vector_env
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import Count, NumEnvs, Plugins, Seed, TaskId, Text, VideoFile
+from ba_torchrl.config import StrictModel
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.logging import progress_bar
+from ba_torchrl.record.video import write_video
+from ba_torchrl.training.agreement import agreement_table, check_comparable
+from ba_torchrl.training.checkpoint import Which
+from ba_torchrl.training.evaluation import Evaluation, evaluate, record_episodes
+from ba_torchrl.training.policy import TrainedPolicy, shipped_policies, wilson_interval
+
+FPS = 5
+
+
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package, those that the run names among them: [my_tasks]."""
+    policy: Text
+    """A run folder, one of the checkpoints in it, a .safetensors file, or "trained" for those that
+    the package ships."""
+    task: TaskId | None = None
+    """Of policy=trained; null for all of them."""
+    which: Which = "best"
+    """Of a run folder: the checkpoint with the best evaluation, or the latest."""
+    device: Text = "auto"
+    """Where the policy is computed, whatever device it was trained on."""
+    episodes: Count = 100
+    """Their number."""
+    num_envs: NumEnvs = 5
+    """Environments that step together."""
+    expert: bool = False
+    """Close loop: compare the policy's actions with the expert's, by component."""
+    parallel: bool | None = None
+    """Worker processes; null for processes where at least three can run at a time."""
+    seed: Seed | None = None
+    """Of the episodes; null for episodes that training did not use."""
+    video: VideoFile | None = None
+    """A file such as evaluation.mp4 or evaluation.gif."""
+    video_episodes: Count = 5
+    """Episodes in the video."""
+
+
+def main(settings: Settings) -> None:
+    """Play greedy episodes with a policy, or with every policy that the package ships."""
+    if settings.policy != "trained":
+        if settings.task is not None:
+            raise ConfigError("task: the policy names its task; leave it out")
+        _evaluate(load(settings.policy, settings), settings)
+    elif settings.task is not None:
+        _evaluate(load(settings.task, settings), settings)
+    else:
+        if settings.video is not None:
+            raise ConfigError("video: name the task of the policy")
+        for task in shipped_policies():
+            _evaluate(load(task, settings), settings)
+
+
+def load(source: str, settings: Settings) -> TrainedPolicy:
+    """Load a policy, and check that it can be compared with the expert if that is asked for."""
+    policy = load_policy(source, settings.which, settings.device)
+    if settings.expert:
+        check_comparable(policy.task)
+    return policy
+
+
+def play(
+    policy: TrainedPolicy, settings: Settings, episodes: list[TensorDict] | None = None
+) -> Evaluation:
+    """Play greedy episodes in new environments.
+
+    Args:
+        policy: acts.
+        settings: of the episodes.
+        episodes: which they are appended to.
+    """
+    seed = policy.test_seed if settings.seed is None else settings.seed
+    env = make_vector_env(
+        policy.config.resolved_env,
+        settings.num_envs,
+        parallel=settings.parallel,
+        register_modules=settings.plugins,
+        seed=seed,
+        expert=settings.expert,
+    )
+
+    def on_episode(episode: TensorDict) -> None:
+        if episodes is not None:
+            episodes.append(episode)
+        bar.update()
+
+    try:
+        with progress_bar(total=settings.episodes, unit="episode") as bar:
+            return evaluate(env, policy, settings.episodes, seed, on_episode)
+    finally:
+        env.close()
+
+
+def _evaluate(policy: TrainedPolicy, settings: Settings) -> None:
+    episodes: list[TensorDict] = []
+    found = play(policy, settings, episodes)
+    low, high = wilson_interval(found.successes, found.episodes)
+    print(
+        f"success_rate {found.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "
+        f"{found.episodes} episodes of {policy.task}, {found.mean_length:.1f} steps each"
+    )
+    if policy.card is not None:
+        card = policy.card
+        low, high = card.interval
+        print(
+            f"  card      {card.success_rate:.2f} ({low:.2f} to {high:.2f}) over {card.episodes} "
+            "episodes"
+        )
+    print(f"  policy    update {policy.updates}, {policy.source}")
+    chosen = ", none of which training used" if settings.seed is None else ""
+    seed = policy.test_seed if settings.seed is None else settings.seed
+    print(f"  episodes  seed {seed}{chosen}")
+    resolved = policy.config.resolved_env
+    if settings.expert:
+        print(f"\n{agreement_table(episodes, resolved.actions.sequence)}")
+    if settings.video is not None:
+        frames = record_episodes(resolved, policy, settings.video_episodes, seed)
+        print(f"  video     {write_video(settings.video, frames, fps=FPS)}")
+
+
+COMMAND = Command(main, Settings, positional="policy")

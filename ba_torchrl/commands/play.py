@@ -1,0 +1,81 @@
+"""Show a task: the expert, random actions or a trained policy, in a video or in a window.
+
+ba-torchrl play open_loop/covid_test
+ba-torchrl play close_loop/block_picking policy=trained
+ba-torchrl play close_loop/block_pushing policy=random episodes=3
+ba-torchrl play policy=runs/my-run video=my-run.gif
+ba-torchrl play close_loop/corner_picking video=null env.render=true   # needs a display
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pydantic import Field, field_validator
+
+from ba_torchrl import load_policy
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import Count, Plugins, Seed, TaskId, Text, VideoFile, without
+from ba_torchrl.config import StrictModel
+from ba_torchrl.data.demos import expert_policy
+from ba_torchrl.data.episodes import Policy
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
+from ba_torchrl.training.evaluation import record_episodes
+
+
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    task: TaskId | None = None
+    """Id of the task; a policy of a run knows its own."""
+    env: dict[str, Any] = Field(default_factory=dict)
+    """Parameters of the environment."""
+    policy: Text = "expert"
+    """expert, random, trained (the policy that the package ships), or a run folder, a checkpoint or
+    a .safetensors file."""
+    episodes: Count = 1
+    """Their number."""
+    seed: Seed = 0
+    """Of the episodes."""
+    video: VideoFile | None = "play.mp4"
+    """A file such as play.mp4 or play.gif, or null."""
+    fps: float = Field(default=5, ge=MIN_FPS, le=MAX_FPS)
+    """Frames a second."""
+
+    @field_validator("env")
+    @classmethod
+    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
+        return without(env, seed="set seed", expert="set policy")
+
+
+def main(settings: Settings) -> None:
+    """Play episodes and write a video of them."""
+    resolved, policy = _task_and_policy(settings)
+    torch.manual_seed(settings.seed)
+    frames = record_episodes(resolved, policy, settings.episodes, settings.seed)
+    print(f"{settings.episodes} episodes of {resolved.task_id}, {len(frames)} pictures")
+    if settings.video is not None:
+        print(f"  video  {write_video(settings.video, frames, fps=settings.fps)}")
+
+
+def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
+    """Return the environment and the policy that acts, None for random actions."""
+    is_loaded = settings.policy not in ("expert", "random")
+    if settings.task is None and (not is_loaded or settings.policy == "trained"):
+        raise ConfigError(f"task is missing: policy={settings.policy} acts in any, see --help")
+    if not is_loaded:
+        is_expert = settings.policy == "expert"
+        resolved = resolve_env(settings.task, {**settings.env, "expert": is_expert})
+        return resolved, expert_policy if is_expert else None
+    policy = load_policy(settings.task if settings.policy == "trained" else settings.policy)
+    if settings.task not in (None, policy.task):
+        raise ConfigError(f"task: {settings.policy} is a policy of {policy.task}")
+    return policy.config.resolved_env.changed(**settings.env), policy
+
+
+COMMAND = Command(main, Settings, positional="task")

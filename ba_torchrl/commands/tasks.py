@@ -1,0 +1,48 @@
+"""List the tasks, describe some of them, or write the page of all.
+
+ba-torchrl tasks
+ba-torchrl tasks close_loop/block_picking
+ba-torchrl tasks path=docs/tasks.md
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import Field
+
+from ba_torchrl import describe, list_tasks
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import OutputFile, Plugins, Tasks
+from ba_torchrl.config import StrictModel
+from ba_torchrl.envs.description import summary
+from ba_torchrl.record.task_page import task_page, tasks_by_heading
+
+
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks: [my_tasks]."""
+    tasks: Tasks = None
+    """Ids of tasks; null for all."""
+    path: OutputFile | None = None
+    """Write the page of the tasks, in Markdown, to this file."""
+
+
+def main(settings: Settings) -> None:
+    """Print or write what is known of the tasks."""
+    if settings.path is not None:
+        path = Path(settings.path)
+        path.write_text(task_page(settings.tasks), encoding="utf-8")
+        print(path)
+    elif settings.tasks is not None:
+        print("\n\n".join(str(describe(task)) for task in settings.tasks))
+    else:
+        for heading, tasks in tasks_by_heading(list_tasks()).items():
+            print(f"{heading}:")
+            for task in tasks:
+                print(f"  {task:34} {summary(task)}")
+
+
+COMMAND = Command(main, Settings, positional="tasks")

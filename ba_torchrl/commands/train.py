@@ -1,0 +1,63 @@
+"""Train a policy.
+
+ba-torchrl train --config-name quickstart
+ba-torchrl train task=close_loop/block_picking algorithm=sacfd rotation=none network=equi
+ba-torchrl train run_dir=runs/mine resume=true
+ba-torchrl train plugins=[my_tasks] task=mine/push_far
+ba-torchrl train num_envs=8 collector=multi_async collector.workers=4
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from ba_torchrl.cli.command import Arguments, Command
+from ba_torchrl.cli.types import check_writable_folder
+from ba_torchrl.record.results import CONFIG_FILE, NON_LEARNING_FIELDS
+from ba_torchrl.training.checkpoint import read_config
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.interruption import RunStopped
+
+
+def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
+    """Return the run; that of an existing folder if the command line only resumes it.
+
+    Args:
+        values: of all settings.
+        arguments: what of them the command line gives.
+    """
+    is_resumed = values["resume"] is True and (Path(values["run_dir"]) / CONFIG_FILE).exists()
+    if is_resumed and arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
+        return read_config(values["run_dir"], **{name: values[name] for name in arguments.names})
+    return ExperimentConfig.parse(values)
+
+
+def main(config: ExperimentConfig) -> None:
+    """Run or resume the experiment."""
+    check_writable_folder(config.run_dir)
+    try:
+        result = Experiment(config).run()
+    except RunStopped as stopped:
+        print(stopped, file=sys.stderr)
+        raise
+    evaluation = result.evaluation
+    print(f"success_rate {evaluation.success_rate:.2f} over {evaluation.episodes} episodes")
+    print(
+        f"  {config.report} policy, of update {result.updates}; "
+        f"{evaluation.mean_length:.1f} steps per episode; {result.seconds / 60:.1f} minutes"
+    )
+    print(f"  curve       {result.curve}")
+    if result.video is not None:
+        print(f"  video       {result.video}")
+    print(f"  checkpoint  {result.checkpoint}")
+    print(f"  result      {result.record}")
+    print("  to use it in Python:")
+    print(f'    policy = ba_torchrl.load_policy("{config.run_dir}")')
+    print("    env = ba_torchrl.make(policy.task, **policy.env_config)")
+    print("    env.rollout(env.max_steps, policy)")
+
+
+COMMAND = Command(main, ExperimentConfig, config="train", parse=parse)

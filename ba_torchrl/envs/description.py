@@ -1,0 +1,150 @@
+"""Description of a task: what `ba_torchrl.describe` returns and the page of the tasks shows."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from ba_torchrl.envs.factory import make
+from ba_torchrl.tasks.base import TASKS
+
+EXPERT_SCORES = "expert_scores.json"
+"""File of `ba_torchrl.tasks`: the first column of the tables of ``ba-torchrl experts``."""
+
+
+@dataclass(frozen=True)
+class ExpertScore:
+    """Score of a task's expert over random episodes."""
+
+    robot: str
+    episodes: int
+    success_rate: float
+    mean_length: float
+    """Steps of the successful episodes."""
+
+    def __str__(self) -> str:
+        return (
+            f"{self.success_rate:.3f} in {self.mean_length:.1f} steps "
+            f"({self.robot}, {self.episodes} episodes)"
+        )
+
+
+@dataclass(frozen=True)
+class TaskDescription:
+    """A task, with the parameters that `ba_torchrl.make` gives it by default."""
+
+    task: str
+    """Id of the task."""
+    text: str
+    """Objects and goal, and what ends an episode early."""
+    conditions: tuple[str, ...]
+    """Names of the conditions, all of which a success fulfils."""
+    randomised: tuple[str, ...]
+    """What differs from episode to episode."""
+    observations: dict[str, tuple[int, ...]]
+    """Shape of each observation, by key."""
+    actions: dict[str, tuple[float, float]]
+    """Least and largest value of each component of the action, by name."""
+    max_steps: int
+    """Steps until the episode is truncated."""
+    num_objects: int
+    """Number of objects."""
+    numbers_of_objects: tuple[int, ...]
+    """Allowed values of ``num_objects``."""
+    object_scale_range: tuple[float, float]
+    """Range of the objects' scale."""
+    object_scale_limits: tuple[float, float]
+    """Allowed scales."""
+    parameters: dict[str, tuple[Any, str]]
+    """Default and meaning of each parameter that only this task has, by name."""
+    expert: ExpertScore | None
+    """Score of the expert, if it was measured."""
+
+    def rows(self) -> dict[str, str]:
+        """Return everything except id and text, as text by heading."""
+        rows = {
+            "success": ", ".join(self.conditions),
+            "randomised": "; ".join(self.randomised),
+            "observations": ", ".join(
+                f"{key} {' x '.join(map(str, shape))}" for key, shape in self.observations.items()
+            ),
+            "actions": ", ".join(
+                f"{name} {low:g} to {high:g}" for name, (low, high) in self.actions.items()
+            ),
+            "max_steps": f"{self.max_steps}",
+            "scale": "{:g} to {:g} (limits {:g} to {:g})".format(
+                *self.object_scale_range, *self.object_scale_limits
+            ),
+        }
+        if len(self.numbers_of_objects) > 1:
+            allowed = ", ".join(map(str, self.numbers_of_objects))
+            rows["num_objects"] = f"{self.num_objects} ({allowed})"
+        for name, (default, meaning) in self.parameters.items():
+            rows[name] = f"{default!r}" + (f". {meaning}" if meaning else "")
+        if self.expert is not None:
+            rows["expert"] = str(self.expert)
+        return rows
+
+    def __str__(self) -> str:
+        rows = (f"  {name + ':':14}{value}" for name, value in self.rows().items())
+        return "\n".join([self.task, "", self.text, "", *rows])
+
+
+def describe(task: str) -> TaskDescription:
+    """Return the description of a task, with its default parameters.
+
+    Args:
+        task: one of `ba_torchrl.list_tasks`.
+
+    Raises:
+        ConfigError: there is no such task; the message lists the known ones.
+    """
+    cls = TASKS[task]
+    env = make(task, seed=0)
+    try:
+        env.reset()
+        conditions, components = tuple(env.conditions), env.actions.components
+        low, high = env.action_spec.space.low.tolist(), env.action_spec.space.high.tolist()
+        observed = {key: tuple(spec.shape) for key, spec in env.observation_spec.items()}
+        config = env.config
+    finally:
+        env.close()
+    least, most = cls.num_objects_range
+    positions = "positions and yaws" if config.random_orientation else "positions"
+    scales = config.object_scale_range
+    return TaskDescription(
+        task=task,
+        text=inspect.cleandoc(cls.__doc__ or ""),
+        conditions=conditions,
+        randomised=(f"{positions} of the objects", *(["their scale"] * (scales[0] < scales[1]))),
+        observations=observed,
+        actions=dict(zip(components, zip(low, high, strict=True), strict=True)),
+        max_steps=config.max_steps,
+        num_objects=cls.num_objects,
+        numbers_of_objects=tuple(range(least, most + 1, cls.num_objects_step)),
+        object_scale_range=scales,
+        object_scale_limits=cls.scale_limits,
+        parameters={
+            name: (field.default, " ".join((field.description or "").split()))
+            for name, field in cls.Parameters.model_fields.items()
+        },
+        expert=_expert_scores().get(task),
+    )
+
+
+def summary(task: str) -> str:
+    """Return the first sentence of a task's goal, or of its description."""
+    text = " ".join(inspect.cleandoc(TASKS[task].__doc__ or "").split())
+    _, _, goal = text.partition("Goal: ")
+    return f"{(goal or text).split('. ')[0].rstrip('.')}."
+
+
+@cache
+def _expert_scores() -> dict[str, ExpertScore]:
+    """Return the measured scores of the package's experts by task."""
+    text = files("ba_torchrl.tasks").joinpath(EXPERT_SCORES).read_text(encoding="utf-8")
+    return {task: ExpertScore(**values) for task, values in json.loads(text).items()}

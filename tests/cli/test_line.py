@@ -1,0 +1,191 @@
+"""The command line: names, mistakes, help, and what it is given to resume."""
+
+import random
+
+import pytest
+
+from ba_torchrl import cli
+from ba_torchrl.cli.command import Arguments
+from ba_torchrl.commands import train
+from ba_torchrl.training.checkpoint import write_config
+from ba_torchrl.training.config import ExperimentConfig
+from tests.recipes import load_recipe
+from tests.training.test_experiment import tiny
+
+
+def refused(words, capsys):
+    """The one line that a wrong command line prints."""
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+    line = capsys.readouterr().err
+    assert end.value.code == cli.EXIT_CODE, line
+    assert line.startswith("error: ")
+    assert line.count("\n") == 1
+    return line
+
+
+def test_the_overview_lists_every_command_with_its_first_line(capsys):
+    cli.main([])
+    out = capsys.readouterr().out
+    for name in cli.command_names():
+        first = load_recipe(name).__doc__.splitlines()[0]
+        assert f"{name:10} {first}" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["trian"], "unknown command 'trian'. Did you mean 'train'?"),
+        (["train", "--confg-name", "x"], "unknown option '--confg-name'. Did you mean '--config"),
+        (["train", "--config-name", "quikstart"], "Did you mean 'quickstart'?"),
+        (["train", "--config-name"], "expected one argument"),
+        (["train", "--config-dir", "nowhere"], "there is no folder nowhere"),
+        (["train", "env.obs_siez=64"], "Did you mean 'obs_size'?"),
+        (["train", "algorithm.lerning_rate=1"], "Did you mean 'learning_rate'?"),
+        (["train", "algorithm=dqn", "algorithm.magrin=1"], "unknown setting 'algorithm.magrin'"),
+        (["train", "network.wdith=1", "network=cnn"], "Did you mean 'width'?"),
+        (["train", "algorithm=sacd"], "unknown algorithm 'sacd'. Did you mean 'sacfd'?"),
+        (["train", "replay=pre"], "unknown replay 'pre'. Did you mean 'per'?"),
+        (["train", "task=close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
+        (["train", "env.workspace=[1,2"], "cannot read 'env.workspace=[1,2'"),
+        (["train", "block_picking"], "'block_picking' sets nothing; settings are FIELD=VALUE"),
+        (["evaluate"], "policy is missing; see --help"),
+        (["evaluate", "a", "b"], "one policy is expected, got a b"),
+        (["evaluate", "trained", "task=open_loop/covid_tets"], "unknown task 'open_loop/covid_"),
+        (["play"], "task is missing"),
+        (["play", "--config-name", "x"], "play has no configuration files"),
+        (["benchmark", "benchmark=close_loop_4"], "Did you mean 'close_loop_4d'?"),
+    ],
+)
+def test_a_mistake_is_one_line_with_the_nearest_name(words, message, capsys):
+    assert message in refused(words, capsys)
+
+
+def mistyped(word, rng):
+    """A word with two letters exchanged, one left out, or one twice."""
+    i = rng.randrange(1, len(word) - 1)
+    kind = rng.randrange(3)
+    if kind == 0 and word[i] != word[i + 1]:
+        return word[:i] + word[i + 1] + word[i] + word[i + 2 :]
+    return word[:i] + word[i + 1 :] if kind == 1 else word[: i + 1] + word[i:]
+
+
+def mistyped_lines(count):
+    """Command lines, each with a setting whose name has a slip of the keyboard."""
+    rng = random.Random(0)
+    for _ in range(count):
+        name = rng.choice([name for name in cli.command_names() if name != "doctor"])
+        fields = sorted(load_recipe(name).COMMAND.settings.model_fields)
+        field = rng.choice([field for field in fields if len(field) > 3])
+        wrong = mistyped(field, rng)
+        if wrong not in fields:
+            yield name, f"{wrong}=1", wrong
+
+
+@pytest.mark.parametrize("count", [12, pytest.param(110, marks=pytest.mark.slow)])
+def test_slips_of_the_keyboard(count, capsys):
+    lines = list(mistyped_lines(count))
+    assert len(lines) > 0.9 * count
+    for name, word, wrong in lines:
+        assert f"unknown setting '{wrong}'. Did you mean '" in refused([name, word], capsys)
+
+
+@pytest.mark.parametrize("name", [name for name in cli.command_names() if name != "doctor"])
+def test_the_help_describes_every_setting(name, capsys):
+    cli.main([name, "--help"])
+    out = capsys.readouterr().out
+    model = load_recipe(name).COMMAND.settings
+    for field, info in model.model_fields.items():
+        assert info.description, field
+        assert f"\n  {field}" in out or f"\n  {field}." in out
+
+
+def test_the_help_shows_the_fields_of_the_chosen_presets_and_their_choices(capsys):
+    cli.main(["train", "--help", "algorithm=dqn", "task=open_loop/bin_packing"])
+    out = capsys.readouterr().out
+    assert "algorithm.epsilon_" in out
+    assert "env.robot=kuka   {kuka, panda, ur5, ur5_robotiq}" in out
+    assert "--config-name: quickstart | " in out
+    assert "network=asr | cnn | " in out
+
+
+def test_a_package_of_the_extra_that_is_missing_is_one_line(monkeypatch, capsys):
+    def missing(name):
+        raise ModuleNotFoundError("No module named 'hydra'", name="hydra")
+
+    monkeypatch.setattr(cli.importlib, "import_module", missing)
+    line = refused(["train"], capsys)
+    assert "'hydra-core' is missing: pip install" in line
+
+
+def test_the_folder_alone_resumes_a_run(tmp_path):
+    config = tiny(tmp_path, total_updates=7)
+    write_config(config)
+    values = ExperimentConfig.parse(
+        {**config.model_dump(), "total_updates": 99, "resume": True, "threads": 1}
+    ).model_dump()
+    given = Arguments([f"run_dir={config.run_dir}", "resume=true", "threads=1"])
+    found = train.parse(values, given)
+    assert (found.total_updates, found.resume, found.threads) == (7, True, 1)
+    everything = Arguments([*given.overrides, "total_updates=99"])
+    assert train.parse(values, everything).total_updates == 99
+    (tmp_path / "other").mkdir()
+    new = {**values, "run_dir": str(tmp_path / "other")}
+    assert train.parse(new, given).total_updates == 99
+
+
+def test_an_own_configuration_in_a_further_folder(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text("defaults: [train, _self_]\nseed: 7\n")
+    cli.main(["train", "--config-dir", ".", "--config-name", "mine", "--help"])
+    assert "  seed=7" in capsys.readouterr().out
+
+
+def test_hydras_own_options_work(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["ba-torchrl"])
+    cli.main(["train", "--cfg", "job", "seed=5"])
+    assert "\nseed: 5\n" in capsys.readouterr().out
+
+
+def test_errors_of_a_run_are_not_hidden(tmp_path, monkeypatch):
+    def broken(_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(train, "Experiment", broken)
+    with pytest.raises(ZeroDivisionError):
+        train.main(tiny(tmp_path))
+
+
+def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
+    from ba_torchrl.commands import doctor
+
+    monkeypatch.setattr(doctor, "OPTIONAL", ())
+    monkeypatch.setattr(doctor, "NEEDED", ("torch", "no-such-package"))
+    monkeypatch.setattr(doctor, "missing_names", lambda: ("_gone",))
+    with pytest.raises(SystemExit) as end:
+        doctor.COMMAND.run([])
+    out = capsys.readouterr().out
+    assert end.value.code == 1
+    assert "no-such-package        missing\n" in out
+    assert "pip install no-such-package" in out
+    assert "workers are not replaced" in out
+    assert "trained policies       close_loop/block_picking" in out
+
+
+def test_speed_prints_rates(capsys, monkeypatch):
+    words = ["close_loop/block_reaching", "env.obs_size=64", "steps=4", "num_envs=2", "updates=1"]
+    monkeypatch.setattr("ba_torchrl.commands.speed.WARM_UP_UPDATES", 0)
+    cli.main(["speed", *words, "networks=[cnn]"])
+    rows = [line for line in capsys.readouterr().out.splitlines() if "block_reaching" in line]
+    assert len(rows) == 4
+    assert all(float(row.split(" steps")[0].split()[-1]) > 0 for row in rows[:3])
+    assert "updates" in rows[3]
+
+
+def test_tasks_are_listed_described_and_written(tmp_path, capsys):
+    cli.main(["tasks"])
+    assert "  close_loop/block_picking           the block is held" in capsys.readouterr().out
+    cli.main(["tasks", "close_loop/block_picking"])
+    assert "expert:       1.000 in 7.0 steps" in capsys.readouterr().out
+    cli.main(["tasks", "close_loop/block_picking", f"path={tmp_path / 'page.md'}"])
+    assert "### `close_loop/block_picking`" in (tmp_path / "page.md").read_text()

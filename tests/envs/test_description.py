@@ -1,0 +1,62 @@
+"""What a task tells of itself."""
+
+import typing
+
+import pytest
+
+import ba_torchrl
+from ba_torchrl.config import EnvConfig, EnvKeywords
+from ba_torchrl.envs import description
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
+
+
+def test_a_description_holds_what_the_environment_has():
+    found = ba_torchrl.describe("open_loop/bin_packing")
+    env = ba_torchrl.make("open_loop/bin_packing", seed=0)
+    env.reset()
+    try:
+        assert found.conditions == tuple(env.conditions)
+        assert found.observations["pixels"] == tuple(env.observation_spec["pixels"].shape)
+        assert list(found.actions) == list(env.actions.components)
+        assert found.actions["x"] == pytest.approx(env.config.workspace[0])
+        assert found.max_steps == env.max_steps
+    finally:
+        env.close()
+    assert found.numbers_of_objects == tuple(range(1, 11))
+    assert "a bin" in found.text
+    assert f"expert:       {found.expert}" in str(found)
+
+
+def test_every_task_of_the_package_has_a_goal_and_an_experts_score():
+    scores = description._expert_scores()
+    own = [task for task in TASKS if TASKS.plugin_module(task) is None]
+    assert sorted(scores) == sorted(own)
+    for task in own:
+        assert 0.9 < scores[task].success_rate <= 1
+        assert len(description.summary(task)) > 15
+
+
+def test_an_unknown_task_is_named():
+    with pytest.raises(ConfigError, match="Did you mean 'close_loop/block_picking'"):
+        ba_torchrl.describe("close_loop/block_pickin")
+
+
+def test_the_keywords_for_type_checkers_are_the_fields():
+    hints = typing.get_type_hints(EnvKeywords)
+    assert list(hints) == list(EnvConfig.model_fields)
+    fields = typing.get_type_hints(EnvConfig)
+    assert {name: fields[name] for name in hints} == hints
+
+
+def test_the_text_of_an_environment_names_task_robot_image_and_action():
+    env = ba_torchrl.make("close_loop/block_reaching", robot="panda", obs_size=32)
+    text = repr(env)
+    env.close()
+    assert text == (
+        "CloseLoopEnv(close_loop/block_reaching, panda, pixels 1 x 32 x 32, action pxyzr)"
+    )
+    env = ba_torchrl.make("close_loop/block_reaching", obs_type="vec")
+    assert "kuka, vec, action" in repr(env)
+    env.close()
+    assert ba_torchrl.list_robots() == ["kuka", "panda", "ur5", "ur5_robotiq"]

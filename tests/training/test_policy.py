@@ -1,0 +1,110 @@
+"""Trained policies: from a run, in a file with its card, and shipped."""
+
+import json
+
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.training import policy as policies
+from ba_torchrl.training.checkpoint import load
+from ba_torchrl.training.experiment import Experiment
+from tests.training.test_experiment import tiny
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """The folder of a finished run."""
+    config = tiny(tmp_path_factory.mktemp("policy"), video_episodes=0)
+    Experiment(config, progress=False).run()
+    return config.folder
+
+
+def observed(policy):
+    """An observation of the policy's environment."""
+    env = ba_torchrl.make(policy.task, seed=1, **policy.env_config)
+    state = env.reset()
+    env.close()
+    return state
+
+
+def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
+    policy = ba_torchrl.load_policy(run)
+    state = observed(policy)
+    first, second = policy(state.clone()), policy(state.clone())
+    assert policy.out_keys == ["action"]
+    assert set(policy.in_keys) <= set(state.keys())
+    assert not first["action"].requires_grad
+    assert not policy.training
+    torch.testing.assert_close(first["action"], second["action"], rtol=0, atol=0)
+    config, _ = load(run)
+    env = ba_torchrl.make(policy.task, **policy.env_config)
+    assert env.config.model_copy(update={"seed": None}) == config.resolved_env.config
+    env.rollout(2, policy)
+    env.close()
+
+
+def test_a_file_acts_like_the_run(run, tmp_path):
+    policy = ba_torchrl.load_policy(run)
+    path = tmp_path / "p.safetensors"
+    card = policies.save_policy(policy, path, successes=3, episodes=4, seed=9)
+    again = ba_torchrl.load_policy(path)
+    state = observed(policy)
+    torch.testing.assert_close(
+        again(state.clone())["action"], policy(state.clone())["action"], rtol=0, atol=0
+    )
+    assert again.card == card
+    assert (card.success_rate, card.episodes, card.seed) == (0.75, 4, 9)
+    assert card.evaluate == "ba-torchrl evaluate policy=p.safetensors episodes=4"
+    assert card.env_steps >= 0
+    assert again.env_config == policy.env_config
+    assert str(run) not in path.with_suffix(".json").read_text()
+
+
+def test_wilson_interval():
+    """(p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)."""
+    n, p, z = 50, 0.9, 1.959964
+    centre, scale = p + z**2 / (2 * n), 1 + z**2 / n
+    half = z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
+    expected = (centre - half) / scale, (centre + half) / scale
+    assert policies.wilson_interval(45, 50) == pytest.approx(expected, abs=1e-6)
+    assert policies.wilson_interval(50, 50)[0] < 1
+
+
+def test_what_is_no_policy_is_named(run, tmp_path):
+    with pytest.raises(ConfigError, match=r"is shipped; those that are: close_loop/block_picking"):
+        ba_torchrl.load_policy("open_loop/covid_test")
+    with pytest.raises(ConfigError, match="neither a run folder"):
+        ba_torchrl.load_policy(tmp_path / "none")
+    path = tmp_path / "p.safetensors"
+    with pytest.raises(ConfigError, match=r"cannot read .*p.json"):
+        ba_torchrl.load_policy(path)
+    policies.save_policy(ba_torchrl.load_policy(run), path, successes=1, episodes=1, seed=0)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ConfigError, match="does not hold the policy of its card"):
+        ba_torchrl.load_policy(path)
+    card = path.with_suffix(".json")
+    card.write_text(json.dumps({**json.loads(card.read_text()), "format": 2}))
+    with pytest.raises(ConfigError, match="cannot read"):
+        ba_torchrl.load_policy(path)
+
+
+@pytest.mark.parametrize("task", policies.shipped_policies())
+def test_a_shipped_policy_reaches_the_goal(task):
+    """Twenty episodes; the card's interval is of hundreds, so its lower end bounds the mean."""
+    policy = ba_torchrl.load_policy(task)
+    assert policy.task == task
+    assert policy.card.episodes >= 100
+    env = ba_torchrl.make_vector_env(task, 5, parallel=False, **policy.env_config)
+    try:
+        found = policies_evaluation(env, policy)
+    finally:
+        env.close()
+    assert found.success_rate >= policy.card.interval[0] - 0.2
+
+
+def policies_evaluation(env, policy):
+    from ba_torchrl.training.evaluation import evaluate
+
+    return evaluate(env, policy, 20, seed=policy.test_seed)
