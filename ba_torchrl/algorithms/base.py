@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
-from torch.optim import Optimizer
+from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
@@ -30,7 +30,7 @@ from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
-from ba_torchrl.algorithms.optimizers import Optimizers, make_adam
+from ba_torchrl.algorithms.optimizers import Optimizers
 from ba_torchrl.config import StrictModel, changed
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import ReplayKind, make_replay
@@ -94,13 +94,7 @@ class SeedUse(IntEnum):
 
 
 def derive_seed(seed: int, use: SeedUse, part: int = 0) -> int:
-    """Return the seed of one use of randomness in a run.
-
-    Args:
-        seed: of the run.
-        use: the use.
-        part: index among several seeds of the same use.
-    """
+    """Return the seed of one use of randomness in the run with a seed, or of one of its parts."""
     return int(np.random.SeedSequence([seed, use, part]).generate_state(1)[0])
 
 
@@ -127,18 +121,10 @@ class Problem:
 
 
 def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:
-    """Return the number format of a network's convolutions; float32 for one without the field
-    ``precision``.
-
-    Args:
-        network: hyper-parameters.
-        device: where it is computed.
-    """
+    """Return the number format of a network's convolutions on a device; float32 for a network
+    without the field ``precision``."""
     return compute_dtype(getattr(network, "precision", "float32"), device)
 
-
-Init = Literal["random", "bc"]
-"""How the policy is initialised."""
 
 _OF_PRIORITIES = (
     "priority_exponent",
@@ -197,7 +183,7 @@ class LearnerConfig(StrictModel, ABC):
     (2016), or "mean"."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
-    init: Init = "random"
+    init: Literal["random", "bc"] = "random"
     """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
     updates are behaviour cloning of the demonstrations instead of updates of the algorithm. Critics
     are not trained meanwhile: without a behaviour term, SAC then unlearns the policy."""
@@ -229,10 +215,6 @@ class LearnerConfig(StrictModel, ABC):
     def check(self, network: NetworkConfig, control: Control) -> None:
         """Check that the algorithm supports the task's control, and that the network does.
 
-        Args:
-            network: hyper-parameters of the network.
-            control: control of the task.
-
         Raises:
             ConfigError: the algorithm or the network does not support this control.
         """
@@ -251,12 +233,8 @@ class LearnerConfig(StrictModel, ABC):
             )
 
     def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """Yield a message for each value that has no effect together with the others; by default,
-        for fields of another replay.
-
-        Args:
-            network: hyper-parameters of the network.
-        """
+        """Yield a message for each value that has no effect together with the others and the
+        network; by default, for fields of another replay."""
         if self.replay != "prioritized":
             yield from changed(self, _OF_PRIORITIES, "without replay='prioritized'")
         elif self.importance_weighted == "none":
@@ -271,8 +249,8 @@ class Learner(ABC):
     """Networks, a loss, an optimiser and a replay, which `ba_torchrl.training.experiment` fills.
 
     The constructor calls the ``make_...`` methods. An algorithm implements the first three and can
-    override the others. An update minimises the sums of the
-    ``loss_...`` entries of its stages one after the other, by default that of the loss module.
+    override the others. An update minimises the sums of the ``loss_...`` entries of its stages one
+    after the other, by default that of the loss module.
 
     On a CUDA device the host does not wait for an update: batches are copied as uint8 codes from
     pinned memory, and priorities are set, and losses checked, at the end of the next update. From a
@@ -312,8 +290,11 @@ class Learner(ABC):
         policy = self.make_policy(networks)
         self.loss = self.make_loss(networks).to(problem.device)
         self.trained_policy = policy.to(problem.device)
-        self.averaged_policy = averaged = self.make_averaged_policy()
-        acting = self.trained_policy if averaged is None else averaged.module
+        self.averaged_policy = None
+        if config.policy_average:
+            average = get_ema_multi_avg_fn(config.policy_average)
+            self.averaged_policy = AveragedModel(self.trained_policy, multi_avg_fn=average)
+        acting = self.averaged_policy.module if self.averaged_policy else self.trained_policy
         self.policy = ActingPolicy(
             acting, self.make_acting_transforms(), self.make_exploration()
         ).to(problem.device)
@@ -345,13 +326,6 @@ class Learner(ABC):
     @abstractmethod
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
-
-    def make_averaged_policy(self) -> AveragedModel | None:
-        """Return the moving average of the policy that acts; None if the policy itself acts."""
-        if not self.config.policy_average:
-            return None
-        average = get_ema_multi_avg_fn(self.config.policy_average)
-        return AveragedModel(self.trained_policy, multi_avg_fn=average)
 
     def make_init_loss(self) -> LossModule:
         """Return the loss of the pretraining updates with ``init="bc"``.
@@ -431,8 +405,14 @@ class Learner(ABC):
     def adam(self, parameters: Iterable[nn.Parameter], factor: float = 1.0) -> Optimizer:
         """Return Adam for some parameters with a factor on the learning rate, and with weight decay
         on those of the networks only."""
-        config, decayed = self.config, self.network_parameters()
-        return make_adam(parameters, decayed, factor * config.learning_rate, config.weight_decay)
+        others = {id(parameter): parameter for parameter in parameters}
+        decayed = [p for p in self.network_parameters() if others.pop(id(p), None) is not None]
+        groups = [
+            {"params": decayed, "weight_decay": self.config.weight_decay},
+            {"params": list(others.values()), "weight_decay": 0.0},
+        ]
+        groups = [group for group in groups if group["params"]]
+        return Adam(groups, lr=factor * self.config.learning_rate, fused=True)
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return the parameters to which weight decay and the gradient's bound apply."""
@@ -441,14 +421,8 @@ class Learner(ABC):
     # -- data --------------------------------------------------------------------------------
 
     def nearest_action(self, action: Tensor) -> Tensor:
-        """Return the action nearest to a given one among those that the policy can choose.
-
-        Demonstrations execute this action, so that the executed action is the one that is learnt.
-        By default the policy can choose every action.
-
-        Args:
-            action: [..., A].
-        """
+        """Return the actions nearest to given ones [..., A] among those that the policy can choose;
+        by default it can choose all. Demonstrations execute what is learnt: these actions."""
         return action
 
     def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
@@ -466,11 +440,8 @@ class Learner(ABC):
         )
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Process the demonstrations before the first update; by default they enter the replay.
-
-        Args:
-            episodes: TensorDicts [T].
-        """
+        """Process the demonstrations, TensorDicts [T], before the first update; by default they
+        enter the replay."""
         for episode in episodes:
             self.extend(self.to_transitions(episode, is_demonstration=True))
 
@@ -488,26 +459,21 @@ class Learner(ABC):
         return len(self.replay)
 
     def sample(self, *, demonstrations_only: bool = False) -> TensorDictBase:
-        """Return an augmented batch from the replay, on the learner's device.
-
-        Args:
-            demonstrations_only: leave out the batch's other transitions.
-        """
+        """Return an augmented batch from the replay on the learner's device, on request only its
+        demonstrations."""
         sampler = self._prioritized_sampler()
         if sampler is not None:
             sampler.anneal(self._annealing_progress())
         batch, device = self.replay.sample(), self.problem.device
-        rows = (
-            batch[keys.IS_DEMONSTRATION].reshape(-1).nonzero()[:, 0]
-            if demonstrations_only
-            else None
-        )
+        is_demonstration = batch[keys.IS_DEMONSTRATION] if demonstrations_only else None
         if device.type == "cpu":
             batch = self.augmentation(batch)
         else:
             batch = decoded_on_device(batch, self.codecs, device)
             batch = batch_to_device(self.augmentation(batch), device)
-        return batch if rows is None else batch[to_device(rows, device)]
+        if is_demonstration is None:
+            return batch
+        return batch[to_device(is_demonstration.reshape(-1).nonzero()[:, 0], device)]
 
     # -- updates -----------------------------------------------------------------------------
 
@@ -527,9 +493,6 @@ class Learner(ABC):
 
     def compile(self, mode: CompileMode) -> None:
         """Compile the loss and its gradient, except those of ``pretraining_option``.
-
-        Args:
-            mode: of `torch.compile`.
 
         Raises:
             ConfigError: the algorithm cannot be compiled, the mode is unknown, or the system has no
@@ -553,20 +516,13 @@ class Learner(ABC):
 
     def pretrain_update(self) -> TensorDict:
         """Take one update before the first collection; with ``init="bc"``, of behaviour cloning of
-        the expert's transitions in a batch.
-
-        An override increments `updates`, and returns and raises as `update` does.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+        the expert's transitions in a batch. It counts, returns and raises as `update`."""
         if self.init_loss is None:
             return self.update()
         return self.minimize([self.init_loss(self.sample(demonstrations_only=True))])
 
     def minimize(self, stages: Iterable[TensorDictBase]) -> TensorDict:
-        """Take the steps of `step`, update the average, and count the update; see there for
-        argument, result and errors."""
+        """Take the steps of `step`, with its argument and result, and count the update."""
         before = len(self.host_tasks)
         scalars = self.step(stages)
         if self.averaged_policy is not None:
@@ -616,11 +572,10 @@ class Learner(ABC):
 
     # -- state -------------------------------------------------------------------------------
 
-    def _stateful_parts(self) -> dict[str, Any]:
-        names = ["loss", "stored_augmentation", "augmentation"]
-        if self.averaged_policy is not None:
-            names.append("averaged_policy")
-        return {name: getattr(self, name) for name in names}
+    def _stateful_parts(self) -> dict[str, nn.Module]:
+        names = ("loss", "stored_augmentation", "augmentation", "averaged_policy")
+        parts = {name: getattr(self, name) for name in names}
+        return {name: part for name, part in parts.items() if part is not None}
 
     def generators(self) -> Mapping[str, torch.Generator]:
         """Return the generators whose states are saved, by name, besides those of the replay and

@@ -43,17 +43,14 @@ class HostTasks:
         if not self.is_deferred:
             task({name: value.cpu() for name, value in values.items()})
             return
-        if self.device.type != "cuda":
-            self._waiting.append((None, {k: v.clone().cpu() for k, v in values.items()}, task))
-            return
-        copies = {
-            name: torch.empty(value.shape, dtype=value.dtype, device="cpu", pin_memory=True).copy_(
-                value, non_blocking=True
-            )
-            for name, value in values.items()
-        }
-        event = torch.Event(self.device)
-        event.record()
+        is_cuda, event = self.device.type == "cuda", None
+        copies = {}
+        for name, value in values.items():
+            copy = torch.empty(value.shape, dtype=value.dtype, device="cpu", pin_memory=is_cuda)
+            copies[name] = copy.copy_(value, non_blocking=True)
+        if is_cuda:
+            event = torch.Event(self.device)
+            event.record()
         self._waiting.append((event, copies, task))
 
     def run(self, count: int | None = None) -> None:

@@ -51,11 +51,7 @@ class BCConfig(ImitationConfig):
     imitates: ClassVar[Imitation] = "expert"
 
     def build(self, network: NetworkConfig, problem: Problem) -> BC:
-        """Return a freshly initialised learner.
-
-        Raises:
-            ValueError: the network does not support the task's images or actions.
-        """
+        """Return a freshly initialised learner."""
         return BC(self, network, problem)
 
 
@@ -79,22 +75,12 @@ class DAggerConfig(ImitationConfig):
     alone included."""
 
     def build(self, network: NetworkConfig, problem: Problem) -> DAgger:
-        """Return a freshly initialised learner.
-
-        Raises:
-            ValueError: the network does not support the task's images or actions.
-        """
+        """Return a freshly initialised learner."""
         return DAgger(self, network, problem)
 
 
 class BC(Learner):
-    """A policy trained on demonstrations only.
-
-    Args:
-        config: hyper-parameters.
-        network: builds the network of the policy.
-        problem: images, actions, device, seed and length of the run.
-    """
+    """A policy trained on demonstrations only."""
 
     actions: SpatialActions | None = None
     """The grid of actions of an open-loop policy."""
@@ -130,12 +116,8 @@ class BC(Learner):
         return action if self.actions is None else self.actions.nearest(action)
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store the steps of demonstrations in which the expert's action is known, as an action
-        that the policy can choose.
-
-        Args:
-            episodes: TensorDicts [T].
-        """
+        """Store the steps of demonstrations [T] in which the expert's action is known, as an action
+        that the policy can choose."""
         for episode in episodes:
             if self.actions is not None:
                 episode = demonstration_on_grid(episode, self.actions, self.images)
@@ -187,13 +169,7 @@ class MixedPolicy(TensorDictModuleBase):
 
 
 class DAgger(BC):
-    """A policy trained on the expert's actions in the states of both.
-
-    Args:
-        config: hyper-parameters.
-        network: builds the network of the policy.
-        problem: images, actions, device, seed and length of the run.
-    """
+    """A policy trained on the expert's actions in the states of both."""
 
     config: DAggerConfig
     policy: MixedPolicy
@@ -205,11 +181,7 @@ class DAgger(BC):
         self._set_beta()
 
     def update(self) -> TensorDict:
-        """Take one step as `Learner.update`, and update beta.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+        """Take one step as `Learner.update`, and update beta."""
         scalars = super().update()
         self._set_beta()
         return scalars

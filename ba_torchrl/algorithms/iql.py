@@ -67,13 +67,7 @@ class IQLNetworks(NamedTuple):
 
 
 class IQL(Learner):
-    """A truncated Gaussian policy, two critics and a state value.
-
-    Args:
-        config: hyper-parameters.
-        network: builds actor, encoders and critics.
-        problem: images, actions, device, seed and length of the run.
-    """
+    """A truncated Gaussian policy, two critics and a state value."""
 
     config: IQLConfig
     loss: IQLLoss

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from torch import Tensor, nn
-from torch.optim import Adam, Optimizer
+from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 
@@ -45,9 +45,6 @@ class Optimizers:
     def of(self, terms: Collection[str]) -> list[Optimizer]:
         """Return the optimisers that minimise a sum of terms.
 
-        Args:
-            terms: names of the terms.
-
         Raises:
             ValueError: the terms have different optimisers.
         """
@@ -82,7 +79,8 @@ class Optimizers:
             optimizer.zero_grad()
         loss.backward()
         if self._clamp is not None:
-            stepped = {id(p) for each in optimizers for p in parameters_of(each)}
+            groups = [group for each in optimizers for group in each.param_groups]
+            stepped = {id(p) for group in groups for p in group["params"]}
             clamped = [p for p in self._clamped if id(p) in stepped]
             nn.utils.clip_grad_value_(clamped, self._clamp)
         for optimizer in optimizers:
@@ -111,31 +109,3 @@ class Optimizers:
         for name, optimizer in self._named.items():
             optimizer.load_state_dict(state[f"{name}optimizer"])
             self.schedulers[name].load_state_dict(state[f"{name}scheduler"])
-
-
-def make_adam(
-    parameters: Iterable[nn.Parameter],
-    decayed: Iterable[nn.Parameter],
-    learning_rate: float,
-    weight_decay: float,
-) -> Adam:
-    """Return Adam with weight decay on a part of its parameters.
-
-    Args:
-        parameters: all of them.
-        decayed: those with weight decay, and possibly others.
-        learning_rate: of all.
-        weight_decay: factor of the L2 term.
-    """
-    others = {id(parameter): parameter for parameter in parameters}
-    chosen = [p for p in decayed if others.pop(id(p), None) is not None]
-    groups = [
-        {"params": chosen, "weight_decay": weight_decay},
-        {"params": list(others.values()), "weight_decay": 0.0},
-    ]
-    return Adam([group for group in groups if group["params"]], lr=learning_rate, fused=True)
-
-
-def parameters_of(optimizer: Optimizer) -> list[nn.Parameter]:
-    """Return the parameters of an optimiser."""
-    return [parameter for group in optimizer.param_groups for parameter in group["params"]]

@@ -69,11 +69,6 @@ class RLPDConfig(SACConfig):
 class RLPD(SAC):
     """A squashed Gaussian policy and an ensemble of critics on a shared encoder.
 
-    Args:
-        config: hyper-parameters.
-        network: builds actor, encoder and ensemble.
-        problem: images, actions, device, seed and length of the run.
-
     Raises:
         ConfigError: the network has no ensemble.
     """
@@ -97,7 +92,7 @@ class RLPD(SAC):
     def make_loss(self, networks: ActorCritic) -> RLPDLoss:
         """Return the loss of actor, critics and temperature."""
         seed = self.problem.derived_seed(SeedUse.ENSEMBLE)
-        return self.loss_of(RLPDLoss, networks, subset=self.config.subset, seed=seed)
+        return super().make_loss(networks, RLPDLoss, subset=self.config.subset, seed=seed)
 
     def make_scheduler(self, optimizer: Optimizer) -> LinearLR:
         """Return the schedule of the learning rate, which steps once per critic update."""
@@ -111,11 +106,7 @@ class RLPD(SAC):
         )
 
     def update(self) -> TensorDict:
-        """Take the critic updates, the last one together with that of policy and temperature.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+        """Take the critic updates, the last one together with that of policy and temperature."""
         for _ in range(self.config.critic_updates - 1):
             self.step([self.loss.critic_loss(self.sample())])
         return super().update()

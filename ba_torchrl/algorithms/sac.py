@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -41,8 +41,6 @@ from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_po
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.objectives.imitation import ActionDistance
 from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SACfDLoss, SoftUpdateByNetwork
-
-Loss = TypeVar("Loss", bound=SACfDLoss)
 
 
 @ALGORITHMS.register("sac")
@@ -165,11 +163,6 @@ class SACConfig(LearnerConfig):
 class SAC(Learner):
     """A squashed Gaussian policy and twin critics on a shared encoder.
 
-    Args:
-        config: hyper-parameters.
-        network: builds actor, encoder and critic.
-        problem: images, actions, device, seed and length of the run.
-
     Raises:
         ConfigError: an image is smaller than its crop.
     """
@@ -219,16 +212,14 @@ class SAC(Learner):
         actions = Bounded(-1.0, 1.0, (len(self.problem.actions.sequence),))
         return AdditiveGaussianModule(actions, sigma_init=sigma, sigma_end=sigma)
 
-    def make_loss(self, networks: ActorCritic) -> SACfDLoss:
-        """Return the loss of actor, critics, temperature and, if configured, encoder."""
-        return self.loss_of(SACfDLoss, networks)
-
-    def loss_of(self, kind: type[Loss], networks: ActorCritic, **options: Any) -> Loss:
+    def make_loss(
+        self, networks: ActorCritic, kind: type[SACfDLoss] = SACfDLoss, **options: Any
+    ) -> SACfDLoss:
         """Return the loss of actor, critics, temperature and, if configured, encoder.
 
         Args:
-            kind: its class.
             networks: actor, encoder and critic.
+            kind: its class.
             options: that only this class has.
         """
         config = self.config
@@ -272,8 +263,8 @@ class SAC(Learner):
     def make_stages(self) -> list[LossFunction]:
         """Return the loss of actor, critics and temperature and, if configured, then the
         contrastive one."""
-        has_own = self.loss.contrastive is not None
-        return [self.loss, *([self.loss.contrastive_loss] if has_own else [])]
+        contrastive = [] if self.loss.contrastive is None else [self.loss.contrastive_loss]
+        return [self.loss, *contrastive]
 
     def make_target_updater(self) -> SoftUpdate:
         """Return the soft update of the targets of critic and encoder."""

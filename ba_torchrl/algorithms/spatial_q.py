@@ -89,21 +89,12 @@ class SpatialQConfig(LearnerConfig):
         return "none" if self.demonstrations == "none" else "executed"
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
-        """Return a freshly initialised learner.
-
-        Raises:
-            ValueError: the network does not support the task's images or actions.
-        """
+        """Return a freshly initialised learner."""
         return SpatialQ(self, network, problem)
 
 
 class SpatialQ(Learner):
     """A network of spatial Q values with a target network that is copied at intervals.
-
-    Args:
-        config: hyper-parameters.
-        network: builds the network.
-        problem: images, actions, device, seed and length of the run.
 
     Raises:
         ValueError: the network or the augmentation does not support the task's images or actions.
@@ -170,20 +161,12 @@ class SpatialQ(Learner):
         return self.actions.nearest(action)
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
-        """Store demonstrations, with actions replaced by the nearest ones on the grid.
-
-        Args:
-            episodes: TensorDicts [T].
-        """
+        """Store demonstrations [T], with actions replaced by the nearest ones on the grid."""
         on_grid = [demonstration_on_grid(each, self.actions, self.images) for each in episodes]
         super().on_demonstrations(on_grid)
 
     def update(self) -> TensorDict:
-        """Take one step as `Learner.update`, and update epsilon.
-
-        Raises:
-            FloatingPointError: a loss is not finite.
-        """
+        """Take one step as `Learner.update`, and update epsilon."""
         scalars = super().update()
         self._set_epsilon()
         return scalars

@@ -131,35 +131,17 @@ class TransitionLoss(LossModule):
         names = [self.tensor_keys.action, *observation, *map(_next, (*observation, *ends))]
         return list(dict.fromkeys(names))
 
-    def _importance_weights(self, tensordict: TensorDictBase) -> ImportanceWeights:
-        """Return the batch's importance weights, divided by their largest or their mean."""
+    def _importance_weights(self, tensordict: TensorDictBase) -> dict[str, Tensor | None]:
+        """Return the weights [...] of a term's samples, divided by their largest or their mean, by
+        the narrowest of `WeightedTerms` that includes the term; None if the term is not weighted.
+        """
         weights = tensordict.get(self.tensor_keys.priority_weight, None)
         if weights is not None:
             weights = weights.reshape(tensordict.batch_size)
             weights = weights / (weights.amax() if self.weight_norm == "max" else weights.mean())
-        return ImportanceWeights(weights, self.weighted_terms)
-
-
-@dataclass(frozen=True)
-class ImportanceWeights:
-    """Normalised importance weights of a batch, and the terms that they multiply.
-
-    Args:
-        values: [...], None without prioritised replay.
-        terms: the weighted terms.
-    """
-
-    values: Tensor | None
-    terms: WeightedTerms
-
-    def of(self, term: WeightedTerms) -> Tensor | None:
-        """Return the weights [...] of a term's samples, None if the term is not weighted.
-
-        Args:
-            term: the narrowest choice of terms that includes the term.
-        """
         choices = get_args(WeightedTerms)
-        return self.values if choices.index(self.terms) >= choices.index(term) else None
+        last = choices.index(self.weighted_terms)
+        return {term: weights if number <= last else None for number, term in enumerate(choices)}
 
 
 def weighted(losses: Tensor, weights: Tensor | None) -> Tensor:

@@ -228,13 +228,13 @@ class LevelDQNLoss(TransitionLoss):
         q = torch.stack([values.gather(1, chosen[:, None]) for values, chosen in levels], dim=-1)
         errors = F.huber_loss(q, target[..., None].expand_as(q), reduction="none")
         weights = self._importance_weights(tensordict)
-        td_weights = weights.of("critic")
+        td_weights = weights["critic"]
         errors = weighted(errors, None if td_weights is None else td_weights[:, None, None])
         difference = (q.detach() - target[..., None]).abs().mean(dim=-1)
         tensordict.set(self.tensor_keys.priority, difference)
         demonstration, is_demonstration = self._demonstration_losses(tensordict, levels)
         of_batch = self._reduce_demonstrations(
-            weighted(demonstration, weights.of("all")), is_demonstration, self.reduction
+            weighted(demonstration, weights["all"]), is_demonstration, self.reduction
         )
         return TensorDict(
             {

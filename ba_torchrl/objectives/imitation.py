@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,7 +44,28 @@ def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance)
     return 2 * (cross_entropy - entropy).mean(dim=-1)
 
 
-class BehaviourCloningLoss(LossModule):
+class _ImitationLoss(LossModule):
+    """A loss on observations and the actions to imitate."""
+
+    @dataclass
+    class _AcceptedKeys:
+        """Entries that ``set_keys`` can rename."""
+
+        action: NestedKey = keys.ACTION
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def _set_observation(self, observation: Sequence[NestedKey]) -> None:
+        self._observation = list(observation)
+        self._forward_value_estimator_keys()
+
+    def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
+        """Recompute `in_keys`; the loss has no value estimator."""
+        self.in_keys = [*self._observation, self.tensor_keys.action]
+
+
+class BehaviourCloningLoss(_ImitationLoss):
     """Behaviour cloning of a stochastic policy: the distance of an action drawn from it.
 
     The mean over the batch of the `action_distance` of a ~ pi, drawn with gradient, from the
@@ -60,15 +82,6 @@ class BehaviourCloningLoss(LossModule):
         entropy_weight: weight w of the negative entropy of the policy.
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Entries that ``set_keys`` can rename."""
-
-        action: NestedKey = keys.ACTION
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
-
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
@@ -84,11 +97,7 @@ class BehaviourCloningLoss(LossModule):
         self.distance: ActionDistance = distance
         self.entropy_weight = entropy_weight
         self.out_keys = ["loss_bc", "entropy"] if entropy_weight else ["loss_bc"]
-        self._forward_value_estimator_keys()
-
-    def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
-        """Recompute `in_keys`; the loss has no value estimator."""
-        self.in_keys = [*self.actor_network.in_keys, self.tensor_keys.action]
+        self._set_observation(actor_network.in_keys)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_bc`` and, with the entropy term, ``entropy`` without gradient.
@@ -116,7 +125,7 @@ class BehaviourCloningLoss(LossModule):
         )
 
 
-class LevelCrossEntropyLoss(LossModule):
+class LevelCrossEntropyLoss(_ImitationLoss):
     """Behaviour cloning of a policy that chooses an action level by level.
 
     The cross-entropy of the softmax of each level's values with the expert's choice, conditioned on
@@ -125,15 +134,6 @@ class LevelCrossEntropyLoss(LossModule):
     Args:
         value_network: computes the values of the levels.
     """
-
-    @dataclass
-    class _AcceptedKeys:
-        """Entries that ``set_keys`` can rename."""
-
-        action: NestedKey = keys.ACTION
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
 
     value_network: nn.Module
     value_network_params: TensorDictParams
@@ -144,18 +144,11 @@ class LevelCrossEntropyLoss(LossModule):
     def __init__(self, value_network: LevelValues) -> None:
         super().__init__()
         self.convert_to_functional(value_network, "value_network")
-        self._forward_value_estimator_keys()
-
-    def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
-        """Recompute `in_keys`; the loss has no value estimator."""
-        self.in_keys = [*self.value_network.in_keys, self.tensor_keys.action]
+        self._set_observation(value_network.in_keys)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``loss_bc``, and the fraction of choices that are the expert's as ``accuracy``.
-
-        Args:
-            tensordict: observations and expert actions [B].
-        """
+        """Return ``loss_bc`` of observations and expert actions [B], and the fraction of choices
+        that are the expert's as ``accuracy``."""
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             levels = self.value_network(*(tensordict[key] for key in self.in_keys))
         losses = [F.cross_entropy(values, chosen) for values, chosen in levels]

@@ -64,19 +64,11 @@ class RLPDLoss(SACfDLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and detached diagnostics of a batch of transitions.
-
-        Args:
-            tensordict: transitions [B].
-        """
+        """Return the losses and detached diagnostics of transitions [B]."""
         return super().forward(tensordict).select(*self.out_keys)
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return ``loss_qvalue`` and its diagnostics only.
-
-        Args:
-            tensordict: transitions [B].
-        """
+        """Return ``loss_qvalue`` of transitions [B] and its diagnostics only."""
         features = self._features(
             self._observation(tensordict, self.views), self.encoder_network_params
         )

@@ -18,7 +18,6 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.base import (
-    ImportanceWeights,
     Reduction,
     TransitionLoss,
     WeightedTerms,
@@ -218,13 +217,13 @@ class SACfDLoss(TransitionLoss):
         is_demonstration = self._demonstration_flag(tensordict)
         error = self._demonstration_error(tensordict, sample)
         demonstration = reduce_over(
-            weighted(error, weights.of("all")), is_demonstration, self.reduction
+            weighted(error, weights["all"]), is_demonstration, self.reduction
         )
-        policy_term = self._reduced(policy_term, weights.of("critic_and_policy"))
+        policy_term = self._reduced(policy_term, weights["critic_and_policy"])
         loss_actor = policy_term + self.demonstration_weight * demonstration
         log_prob = self._over_views(log_prob.detach())
         temperature_term = self.log_alpha * (log_prob + self.target_entropy)
-        loss_alpha = -self._reduced(temperature_term, weights.of("all"))
+        loss_alpha = -self._reduced(temperature_term, weights["all"])
         return TensorDict(
             {
                 "loss_actor": loss_actor,
@@ -238,7 +237,7 @@ class SACfDLoss(TransitionLoss):
         )
 
     def _critic_terms(
-        self, tensordict: TensorDictBase, features: Tensor, weights: ImportanceWeights
+        self, tensordict: TensorDictBase, features: Tensor, weights: dict[str, Tensor | None]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the critics' loss and the diagnostics of their values; write the priority."""
         target = self._for_views(self._target(tensordict))
@@ -248,7 +247,7 @@ class SACfDLoss(TransitionLoss):
         priority = self._over_views(error.detach().abs().mean(dim=-1))
         tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
         squared = self._over_views(error.square().sum(dim=-1))
-        return self._reduced(squared, weights.of("critic")), self._diagnostics(q.detach())
+        return self._reduced(squared, weights["critic"]), self._diagnostics(q.detach())
 
     def _diagnostics(self, q: Tensor) -> dict[str, Tensor]:
         """Return scalars of the values [..., K] of the stored actions."""

@@ -9,23 +9,14 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import recurrent_mode, set_recurrent_mode
 
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.compilation import CompiledLoss, check_compiler
-from ba_torchrl.config import parse
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training.checkpoint import read_config
-from tests.algorithms.tiny import (
-    FERM,
-    SIZES,
-    make_experiment,
-    problem,
-    run,
-    spatial_problem,
-    spatial_transitions,
-    transitions,
-)
+from tests.algorithms import tiny
+from tests.algorithms.tiny import FERM, SIX_DOF, make_experiment, run, transitions
 
+FLOAT32 = {"precision": "float32"}
 SACFD = {"demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
 SDQFD = {"demonstrations": "sdqfd", "replay": "prioritized"}
 
@@ -47,27 +38,15 @@ def eager_backend(monkeypatch):
 
 
 def build(algorithm, network, precision="float32", **settings):
-    torch.manual_seed(0)
-    is_spatial = algorithm == "spatial_q"
-    sizes = {**SIZES[network], "precision": precision}
-    config = parse(ALGORITHMS[algorithm], {**settings, "batch_size": 8}, algorithm)
-    learner = config.build(
-        parse(NETWORKS[network], sizes, network), spatial_problem() if is_spatial else problem()
-    )
-    learner.extend((spatial_transitions if is_spatial else transitions)(learner))
+    sizes = {"precision": precision}
+    learner = tiny.build(algorithm, network, sizes=sizes, batch_size=8, **settings)
+    learner.extend(transitions(learner, 24 if network in ("cnn", "equi") else 8))
     return learner
 
 
-def build_spatial(network, channels):
-    """A learner with SDQfD, and its network's hyper-parameters."""
+def build_spatial(network, sequence):
     pytest.importorskip("escnn")
-    sizes = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
-    if channels == 3:
-        sizes |= {"num_z": 5, "num_tilts": 3}
-    spec = parse(NETWORKS[network], sizes, network)
-    config = parse(ALGORITHMS["spatial_q"], SDQFD, "spatial_q")
-    sequence = "pxyzrrr" if channels == 3 else "pxyr"
-    return config.build(spec, spatial_problem(sequence, channels)), spec
+    return tiny.build("spatial_q", network, sequence=sequence, sizes=FLOAT32, **SDQFD)
 
 
 def assert_one_graph(loss, batch):
@@ -95,30 +74,27 @@ def test_a_loss_is_one_graph(algorithm, network, settings, precision):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("network", "channels"),
+    ("network", "sequence"),
     [
-        ("asr", 1),
-        ("asr", 3),
-        ("equi_fcn", 1),
-        ("equi_asr", 1),
-        ("equi_deictic_asr", 3),
-        ("rot_fcn", 1),
+        *((name, None) for name in ("asr", "equi_fcn", "equi_asr", "equi_deictic_asr", "rot_fcn")),
+        ("asr", SIX_DOF),
     ],
 )
-def test_a_loss_of_a_spatial_network_is_one_graph(network, channels):
+def test_a_loss_of_a_spatial_network_is_one_graph(network, sequence):
     """On a CPU and on the device "meta", whose tensors have no values."""
-    learner, spec = build_spatial(network, channels)
+    learner = build_spatial(network, sequence)
+    config = tiny.network_config(network, sequence, **FLOAT32)
     for device in ("cpu", "meta"):
-        loss = learner.make_loss(learner.make_networks(spec).to(device))
-        assert_one_graph(loss, spatial_transitions(learner).to(device))
+        loss = learner.make_loss(learner.make_networks(config).to(device))
+        assert_one_graph(loss, transitions(learner, 8).to(device))
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("eager_backend")
-@pytest.mark.parametrize(("network", "channels"), [("equi_fcn", 1), ("asr", 3)])
-def test_the_number_of_demonstrations_does_not_change_the_graph(network, channels):
-    learner, _ = build_spatial(network, channels)
-    batch = spatial_transitions(learner)[:8]
+@pytest.mark.parametrize(("network", "sequence"), [("equi_fcn", None), ("asr", SIX_DOF)])
+def test_the_number_of_demonstrations_does_not_change_the_graph(network, sequence):
+    learner = build_spatial(network, sequence)
+    batch = transitions(learner, 8)
     learner.compile("default")
     learner.stages[0](batch.copy())
     with torch.compiler.set_stance("fail_on_recompile"):
@@ -218,25 +194,18 @@ def test_a_run_without_it_is_not_compiled(tmp_path):
     assert learner.stages == [learner.loss]
 
 
-def test_an_algorithm_that_cannot_be_compiled_says_so_before_the_run(tmp_path):
-    algorithm = {"name": "rlpd", "replay": "symmetric"}
-    with pytest.raises(ConfigError, match="compile_mode: algorithm 'rlpd'"):
-        make_experiment(tmp_path, "cnn", algorithm, compile_mode="default")
-
-
-def test_an_unknown_mode_lists_the_known_ones(tmp_path):
-    with pytest.raises(ConfigError, match=r"compile_mode.*reduce-overhead"):
-        make_experiment(tmp_path, "cnn", {"name": "sac"}, compile_mode="fast")
-
-
-def test_the_learner_names_the_known_modes():
-    with pytest.raises(ConfigError, match="'fast' is unknown; known: default, reduce-overhead"):
-        build("sac", "cnn").compile("fast")
-
-
-def test_a_learner_that_cannot_be_compiled_says_so():
-    with pytest.raises(ConfigError, match="compile_mode: this algorithm cannot be compiled"):
-        build("rlpd", "cnn").compile("default")
+@pytest.mark.parametrize(
+    ("name", "mode", "before_the_run", "of_the_learner"),
+    [
+        ("rlpd", "default", "algorithm 'rlpd'", "this algorithm cannot be compiled"),
+        ("sac", "fast", ".*reduce-overhead", "'fast' is unknown; known: default, reduce-overhead"),
+    ],
+)
+def test_what_cannot_be_compiled_is_refused(tmp_path, name, mode, before_the_run, of_the_learner):
+    with pytest.raises(ConfigError, match=f"compile_mode.*{before_the_run}"):
+        make_experiment(tmp_path, "cnn", {"name": name}, compile_mode=mode)
+    with pytest.raises(ConfigError, match=f"compile_mode: {of_the_learner}"):
+        build(name, "cnn").compile(mode)
 
 
 def test_a_missing_compiler_is_found_before_the_run(tmp_path):

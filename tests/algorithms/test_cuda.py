@@ -1,17 +1,14 @@
 """Learners on a GPU."""
 
-import dataclasses
-
 import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.config import parse
 from profiling import learning
 from profiling.table import Bench, Budget
-from tests.algorithms.tiny import OPEN, SIZES, make_experiment, problem, run, transitions
+from tests.algorithms import tiny
+from tests.algorithms.tiny import OPEN, make_experiment, run, transitions
 
 pytestmark = pytest.mark.cuda
 
@@ -20,11 +17,8 @@ SACFD = {"name": "sac", "demonstration_weight": 1.0, "replay": "prioritized", "a
 
 def build(network, device, algorithm="sac", **settings):
     """A learner that computes in float32."""
-    torch.manual_seed(0)
-    config = parse(NETWORKS[network], {**SIZES[network], "precision": "float32"}, network)
-    return ALGORITHMS[algorithm](**settings).build(
-        config, dataclasses.replace(problem(), device=device)
-    )
+    on = tiny.problem(network, device=device)
+    return tiny.build(algorithm, network, sizes={"precision": "float32"}, on=on, **settings)
 
 
 def parameters(learner):

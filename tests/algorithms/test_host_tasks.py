@@ -4,11 +4,9 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.host_tasks import HostTasks
-from ba_torchrl.config import parse
 from ba_torchrl.envs import keys
-from tests.algorithms.tiny import FERM, build, spatial_problem, spatial_transitions, transitions
+from tests.algorithms.tiny import FERM, SIX_DOF, build, network_config, transitions
 
 CPU = torch.device("cpu")
 SACFD = {"demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
@@ -174,29 +172,22 @@ def test_the_host_reads_no_result_during_an_update(algorithm, network, settings)
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
 @pytest.mark.parametrize(
-    ("network", "channels", "demonstrations"),
+    ("network", "sequence", "kind"),
     [
-        *(("asr", 1, demonstrations) for demonstrations in ("none", "adet", "dqfd", "sdqfd")),
-        ("asr", 3, "sdqfd"),
-        ("equi_asr", 1, "sdqfd"),
-        ("equi_deictic_asr", 3, "sdqfd"),
-        ("equi_fcn", 1, "sdqfd"),
-        ("fcn", 1, "sdqfd"),
-        ("rot_fcn", 1, "sdqfd"),
+        *(("asr", None, kind) for kind in ("none", "adet", "dqfd", "sdqfd")),
+        ("asr", SIX_DOF, "sdqfd"),
+        *(
+            (name, None, "sdqfd")
+            for name in ("equi_asr", "equi_deictic_asr", "equi_fcn", "rot_fcn")
+        ),
     ],
 )
-def test_losses_of_spatial_networks_read_no_result(network, channels, demonstrations):
+def test_losses_of_spatial_networks_read_no_result(network, sequence, kind):
     """Tensors of the device "meta" have no values, and reading one raises an error."""
     pytest.importorskip("escnn")
-    sizes = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
-    if channels == 3:
-        sizes |= {"num_z": 5, "num_tilts": 3}
-    sequence = "pxyzrrr" if channels == 3 else "pxyr"
-    config = parse(ALGORITHMS["spatial_q"], {"demonstrations": demonstrations}, "spatial_q")
-    spec = parse(NETWORKS[network], sizes, network)
-    learner = config.build(spec, spatial_problem(sequence, channels))
-    loss = learner.make_loss(learner.make_networks(spec).to("meta"))
-    terms = loss(spatial_transitions(learner).to("meta"))
+    learner = build("spatial_q", network, sequence=sequence, demonstrations=kind)
+    loss = learner.make_loss(learner.make_networks(network_config(network, sequence)).to("meta"))
+    terms = loss(transitions(learner, 8).to("meta"))
     sum(terms[key] for key in loss.out_keys if key.startswith("loss_")).backward()
     assert all(value.device.type == "meta" for value in terms.values())
 

@@ -1,4 +1,4 @@
-"""RLPD: every hyper-parameter has an effect, and it runs on both networks."""
+"""RLPD: what it adds to SAC has an effect, and it runs."""
 
 import dataclasses
 
@@ -14,20 +14,12 @@ from tests.algorithms.tiny import build, problem, run, transitions
 
 UNUSUAL = {
     "learning_rate": 0.003,
-    "weight_decay": 0.02,
-    "gradient_clamp": 1e-4,
-    "gamma": 0.7,
     "tau": 0.3,
-    "alpha_init": 0.25,
-    "target_entropy": -2.5,
     "critics": 5,
     "subset": 3,
     "critic_updates": 3,
     "entropy_backup": True,
     "batch_size": 6,
-    "buffer_size": 55,
-    "augmentation": "so2",
-    "augmentation_probability": 0.35,
 }
 
 
@@ -41,12 +33,11 @@ def flat(params):
     return torch.cat([value.detach().flatten() for value in params.values(True, True)])
 
 
-def test_the_terms_have_their_values():
-    loss = made().loss
-    assert float(loss.value_estimator.gamma) == pytest.approx(0.7)
-    assert float(loss.alpha) == pytest.approx(0.25)
-    assert (loss.target_entropy, loss.subset, loss.entropy_backup) == (-2.5, 3, True)
-    assert loss.qvalue_network.module.heads == 5
+def test_the_hyper_parameters_have_an_effect():
+    learner = made()
+    assert (learner.loss.subset, learner.loss.entropy_backup) == (3, True)
+    assert learner.loss.qvalue_network.module.heads == 5
+    assert isinstance(learner.replay.sampler, SymmetricSampler)
 
 
 def test_an_update_is_several_critic_updates_and_one_of_the_policy():
@@ -73,13 +64,6 @@ def test_an_update_is_several_critic_updates_and_one_of_the_policy():
     assert not torch.equal(drawn[0]["action"], drawn[1]["action"])
 
 
-def test_replay_and_augmentation_have_their_values():
-    learner = made()
-    assert isinstance(learner.replay.sampler, SymmetricSampler)
-    assert (learner.replay.storage.max_size, learner.replay.batch_size) == (55, 6)
-    assert learner.augmentation.probability == 0.35
-
-
 def test_a_restored_learner_draws_the_same_subsets():
     first, second = made(), made()
     first.update()
@@ -91,6 +75,8 @@ def test_a_restored_learner_draws_the_same_subsets():
 def test_what_cannot_be_built_is_refused():
     with pytest.raises(ConfigError, match="subset"):
         build("rlpd", critics=3, subset=4)
+    with pytest.raises(ConfigError, match="batch_size must be at least 2"):
+        build("rlpd", batch_size=1)
     with pytest.raises(ConfigError, match="replay"):
         parse(ALGORITHMS["rlpd"], {"replay": "uniform"}, "rlpd")
 
@@ -107,9 +93,8 @@ def test_a_network_without_an_ensemble_is_refused():
     learner.update()
 
 
-@pytest.mark.parametrize("network", ["cnn", "equi"])
-def test_two_iterations_of_a_run(tmp_path, network):
-    learner = run(tmp_path, network, {"name": "rlpd", "critics": 3, "critic_updates": 2})
+def test_two_iterations_of_a_run(tmp_path):
+    learner = run(tmp_path, "cnn", {"name": "rlpd", "critics": 3, "critic_updates": 2})
     assert 0 < learner.replay.num_demonstrations < len(learner.replay)
 
 
@@ -129,8 +114,3 @@ def test_the_learning_rate_ends_with_the_run(init, pretrained):
     assert rate > 0.15 * 0.003
     learner.update()
     assert learner.optimizer.param_groups[0]["lr"] == pytest.approx(0.1 * 0.003)
-
-
-def test_a_symmetric_batch_has_both_halves():
-    with pytest.raises(ConfigError, match="batch_size must be at least 2"):
-        build("rlpd", batch_size=1)

@@ -4,35 +4,19 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
-from ba_torchrl.actions import CloseLoopActions
-from ba_torchrl.algorithms.base import NETWORKS, Problem
-from ba_torchrl.algorithms.sac import SACConfig
-from ba_torchrl.config import parse
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from tests.algorithms import tiny
-from tests.specs import close_loop_images
 
 TASK = "close_loop/block_reaching"
 DEPTH_M = 0.39
 
 
 def build(network="cnn", **config):
-    torch.manual_seed(0)
-    sizes = {"cnn": {"width": 0.25}, "equi": {"group_order": 4, "n_hidden": 8}}[network]
-    problem = Problem(
-        control="close_loop",
-        images=close_loop_images(64, DEPTH_M),
-        actions=CloseLoopActions("pxyzr"),
-        total_updates=10,
-        seed=0,
-        device=torch.device("cpu"),
-    )
     options = {"batch_size": 16, "buffer_size": 500, "replay": "prioritized", "augmentation": "so2"}
-    settings = parse(SACConfig, {**options, **config}, "sac")
-    return settings.build(parse(NETWORKS[network], sizes, network), problem)
+    return tiny.build("sac", network, **{**options, **config})
 
 
 @pytest.fixture(scope="module")

@@ -1,3 +1,5 @@
+"""Spatial Q-learning on x, y and yaw, and in six degrees of freedom."""
+
 import copy
 import math
 
@@ -7,73 +9,95 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
-from ba_torchrl.actions import OpenLoopActions
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.spatial_q import SpatialQConfig
 from ba_torchrl.config import parse
 from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.errors import ConfigError
-from tests.specs import open_loop_images
+from tests.algorithms import tiny
+from tests.algorithms.tiny import SIX_DOF
 
 IMAGES = ["pixels", "in_hand"]
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}
-BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
-TINY = {"num_rotations": 4, "width": 0.125, "precision": "float32", "height_scale_m": 0.05}
 
 
-def build(network="asr", sequence="pxyr", *, sizes=None, seed=0, **config):
-    torch.manual_seed(seed)
-    problem = Problem(
-        control="open_loop",
-        images=open_loop_images(),
-        actions=OpenLoopActions(sequence, BOUNDS),
-        total_updates=10,
-        seed=seed,
-        device=torch.device("cpu"),
+def build(network="asr", sequence=None, *, seed=0, **config):
+    units = {"precision": "float32", "height_scale_m": 0.05, "voxel_scale": 10.0}
+    options = {"batch_size": 4, "buffer_size": 500, **config}
+    on = tiny.problem(network, sequence, seed=seed)
+    return tiny.build("spatial_q", network, sequence=sequence, sizes=units, on=on, **options)
+
+
+def collect(count, nearest_action=None, **env):
+    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **{**ENV, **env})
+    found = collect_demonstrations(
+        env, count, seed=0, only_successful=True, nearest_action=nearest_action
     )
-    settings = parse(SpatialQConfig, {"batch_size": 4, "buffer_size": 500, **config}, "spatial_q")
-    values = TINY if sizes is None else sizes
-    return settings.build(parse(NETWORKS[network], values, network), problem)
+    env.close()
+    return found
+
+
+def to_transitions(episodes):
+    return torch.cat([as_transitions(each, IMAGES, is_demonstration=True) for each in episodes])
 
 
 @pytest.fixture(scope="module")
 def transitions():
-    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
-    episodes = collect_demonstrations(env, 4, seed=0, only_successful=True)
-    env.close()
-    return torch.cat(
-        [as_transitions(episode, IMAGES, is_demonstration=True) for episode in episodes]
-    )
+    return to_transitions(collect(4))
 
 
-def online(transitions):
-    data = transitions.clone()
-    data["is_demonstration"] = torch.zeros_like(data["is_demonstration"])
-    return data
+@pytest.fixture(scope="module")
+def pose_episodes():
+    nearest = build("asr", SIX_DOF).nearest_action
+    return collect(4, nearest, action_sequence=SIX_DOF, in_hand_mode="proj")
+
+
+def demonstration_error(algorithm, data):
+    return float(algorithm.loss(data.clone())["demonstration_error"])
 
 
 @pytest.mark.parametrize("network", ["asr", "fcn", "rot_fcn", "equi_asr", "equi_fcn"])
 def test_every_network_learns_the_demonstrations(network, transitions):
     algorithm = build(network, learning_rate=1e-3, demonstration_weight=10.0)
     algorithm.extend(transitions)
-    before = float(algorithm.loss(transitions.clone())["demonstration_error"])
+    before = demonstration_error(algorithm, transitions)
     for _ in range(40):
         algorithm.update()
-    assert float(algorithm.loss(transitions.clone())["demonstration_error"]) < 0.9 * before
+    assert demonstration_error(algorithm, transitions) < 0.9 * before
 
 
-@pytest.mark.parametrize("demonstrations", ["none", "dqfd", "sdqfd", "adet"])
-@pytest.mark.parametrize("replay", ["symmetric", "prioritized", "uniform"])
-def test_every_loss_takes_steps_on_every_replay(demonstrations, replay, transitions):
-    algorithm = build("fcn", demonstrations=demonstrations, replay=replay)
-    algorithm.extend(transitions)
-    before = [parameter.clone() for parameter in algorithm.loss.parameters()]
-    scalars = algorithm.update()
-    assert all(math.isfinite(float(value)) for value in scalars.values())
-    after = list(algorithm.loss.parameters())
-    assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+@pytest.mark.parametrize(
+    ("network", "demonstrations", "augmentation"),
+    [
+        ("asr", "sdqfd", "none"),
+        ("asr", "dqfd", "se2"),
+        ("asr", "adet", "none"),
+        ("equi_deictic_asr", "sdqfd", "se2"),
+    ],
+)
+def test_networks_of_six_degrees_of_freedom_learn_the_demonstrations(
+    network, demonstrations, augmentation, pose_episodes
+):
+    pytest.importorskip("escnn")
+    options = {"demonstrations": demonstrations, "augmentation": augmentation}
+    algorithm = build(network, SIX_DOF, learning_rate=1e-3, demonstration_weight=10.0, **options)
+    algorithm.on_demonstrations(pose_episodes)
+    data = to_transitions(pose_episodes)
+    before = demonstration_error(algorithm, data)
+    for _ in range(20):
+        algorithm.update()
+    assert demonstration_error(algorithm, data) < 0.9 * before
+    action = algorithm.policy(data[:6].select(*IMAGES, "holding"))["action"]
+    assert action.shape == (6, 7)
+    assert torch.equal(algorithm.nearest_action(action), action)
+
+
+def test_the_actions_of_the_episodes_are_on_the_grid(pose_episodes):
+    actions = torch.cat([episode["action"] for episode in pose_episodes])
+    for steps in ((actions[:, 3] - 0.02) / (0.18 / 7), actions[:, 5:] / (math.pi / 8)):
+        torch.testing.assert_close(steps, steps.round(), atol=1e-4, rtol=0)
 
 
 def test_the_policy_acts_on_half_precision_heights(transitions):
@@ -137,50 +161,65 @@ def test_networks_and_tasks_of_the_other_control_are_refused():
     spatial.check(fcn, "open_loop")
 
 
-def test_demonstrations_are_executed_as_they_are_learnt():
+def test_demonstrations_are_executed_as_they_are_learnt(transitions):
     algorithm = build()
-    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **ENV)
-    episodes = collect_demonstrations(env, 3, seed=0, nearest_action=algorithm.nearest_action)
-    plain = collect_demonstrations(env, 3, seed=0)
-    env.close()
+    episodes = collect(3, algorithm.nearest_action)
     for episode in episodes:
         assert torch.equal(algorithm.nearest_action(episode["action"]), episode["action"])
-    moved = (algorithm.nearest_action(plain[0]["action"]) - plain[0]["action"]).abs()
+    moved = (algorithm.nearest_action(transitions["action"]) - transitions["action"]).abs()
     assert moved[:, 3].max() > 0.01  # the expert's own actions are off the grid
     algorithm.on_demonstrations(episodes)
     stored = algorithm.replay.storage.column("action")
     assert torch.equal(stored, torch.cat([episode["action"] for episode in episodes]))
 
 
+@pytest.mark.parametrize("sequence", ["pxyr", SIX_DOF])
 @pytest.mark.parametrize("yaw", [3.1, 1.5])
-def test_a_yaw_that_wraps_reverses_the_image_of_what_is_held(yaw):
-    algorithm = build()  # yaws at multiples of pi / 4
-    image = torch.rand(1, 24, 24).half().float()
+def test_a_yaw_that_wraps_reverses_the_image_of_what_is_held_and_negates_tilts(yaw, sequence):
+    algorithm = build(sequence=sequence)  # yaws at multiples of pi / 4
+    is_six_dof, tilt = sequence == SIX_DOF, math.pi / 8
+    image = torch.randint(24, (3 if is_six_dof else 1, 24, 24)) / 32.0
+    empty = torch.zeros_like(image)
     states = TensorDict(
         {
             "pixels": torch.zeros(4, 1, 32, 32),
-            "in_hand": torch.stack(
-                [torch.zeros_like(image), image, image, torch.zeros_like(image)]
-            ),
+            "in_hand": torch.stack([empty, image, image, empty]),
             "holding": torch.tensor([False, True, True, False])[:, None],
         },
         [4],
     )
     episode = states[:3].clone()
     # a pick, a place that does nothing, and one that releases
-    episode["action"] = torch.tensor(
-        [[0, 0.45, 0, yaw], [1, 0.4, 0.1, 0.8], [1, 0.4, 0.1, 0.8]], dtype=torch.float32
-    )
+    z, tilts = ([0.05], [[0.9 * tilt, -0.8 * tilt], [tilt, 0.0]]) if is_six_dof else ([], [[], []])
+    pick, place = [0, 0.45, 0, *z, yaw, *tilts[0]], [1, 0.4, 0.1, *z, 0.8, *tilts[1]]
+    episode["action"] = torch.tensor([pick, place, place], dtype=torch.float32)
     episode["next"] = states[1:].clone()
     episode["next", "reward"] = torch.zeros(3, 1)
     for key in ("done", "terminated", "truncated", "fault"):
         episode["next", key] = torch.zeros(3, 1, dtype=torch.bool)
     algorithm.on_demonstrations([episode])
     stored = algorithm.replay.storage[:3]
-    wraps = yaw > 3
-    expected = image.flip(-2, -1) if wraps else image
-    assert stored["action"][0, 3] == pytest.approx(0.0 if wraps else math.pi / 2)
+    wraps, sign = yaw > 3, -1 if yaw > 3 else 1
+    pick, place, _ = stored["action"][:, 4 if is_six_dof else 3 :].tolist()
+    swapped = [sign * tilt, -sign * tilt] if is_six_dof else []
+    assert pick == pytest.approx([0.0 if wraps else math.pi / 2, *swapped], abs=1e-6)
+    kept = [tilt, 0.0] if is_six_dof else []
+    assert place == pytest.approx([math.pi / 4, *kept], abs=1e-6)
+    expected = image
+    if wraps:  # the gripper's x and y axes; those of the three channels are yz, xz and xy
+        axes = [(0,), (0,), (0, 1)] if is_six_dof else [(0, 1)]
+        expected = torch.stack([each.flip(axis) for each, axis in zip(image, axes, strict=True)])
     for shown in (stored["next", "in_hand"][:2], stored["in_hand"][1:]):
         assert torch.equal(shown, expected.expand(2, -1, -1, -1))
     assert not stored["in_hand"][0].any()
     assert not stored["next", "in_hand"][2].any()
+
+
+def test_grids_outside_the_workspace_and_other_actions_are_refused():
+    sizes = {"max_z_m": 0.3}
+    with pytest.raises(ValueError, match=r"grid of z must increase within \[0.01, 0.25\]"):
+        tiny.build("spatial_q", "asr", sequence=SIX_DOF, sizes=sizes)
+    with pytest.raises(ValueError, match="has x, y, rz; use 'equi_asr'"):
+        build("equi_deictic_asr", "pxyr")
+    with pytest.raises(ValueError, match="x, y and rz, not z"):
+        build("asr", "pxyzr")

@@ -9,8 +9,7 @@ import torch
 from hydra import initialize_config_dir
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
+from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.sac import SAC
 from ba_torchrl.config import parse
 from ba_torchrl.data.augmentation.views import RandomViews
@@ -19,25 +18,11 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.sacfd import SoftUpdateByNetwork
 from ba_torchrl.training import hydra_schema
 from tests.algorithms import tiny
-from tests.specs import close_loop_images, open_loop_images
+from tests.specs import close_loop_images
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
-SMALL = {
-    "cnn": {"width": 0.1},
-    "equi": {"n_hidden": 4, "group_order": 4},
-    "ferm": {"width": 0.1, "features": 8},
-    **{
-        name: {"width": 0.05, "num_rotations": 4}
-        for name in ("asr", "equi_asr", "fcn", "equi_fcn", "rot_fcn")
-    },
-    **{
-        name: {"width": 0.05, "num_rotations": 4, "num_z": 8, "num_tilts": 3}
-        for name in ("6d_asr", "equi_deictic_asr")
-    },
-}
-"""Sizes of the networks; "6d_asr" is "asr" for actions in six degrees of freedom."""
-SIX_DOF = {"6d_asr", "equi_deictic_asr"}
+NETWORK_NAMES = [*tiny.SIZES, "6d_asr"]
+"""Networks; "6d_asr" is "asr" for actions in six degrees of freedom."""
 IMAGE, CROP = 71, 64
 
 
@@ -49,51 +34,28 @@ def method(name):
         return hydra_schema.preset("algorithm", name)
 
 
-def network_class(network):
-    return NETWORKS["asr" if network == "6d_asr" else network]
-
-
 PAIRS = [
     (preset, network)
     for preset in sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
-    for network in SMALL
-    if network_class(network).control in ALGORITHMS[method(preset)["name"]].controls
+    for network in NETWORK_NAMES
+    if NETWORKS[network.removeprefix("6d_")].control in ALGORITHMS[method(preset)["name"]].controls
     and (preset, network) != ("rlpd", "ferm")  # it builds no ensemble of critics
 ] + [("sacfd_per_so2", "cnn")]
 
 
 def build(preset, network, **changes):
-    values = {"batch_size": 4, "buffer_size": 60, **method(preset), **changes}
-    values |= {"batch_size": 4, "buffer_size": 60}
-    name = values.pop("name")
-    control = network_class(network).control
+    values = {**method(preset), **changes, "batch_size": 4, "buffer_size": 60}
+    sequence = tiny.SIX_DOF if network == "6d_asr" else None
+    network = network.removeprefix("6d_")
+    problem = tiny.problem(network, sequence)
     if values.get("view_transform") == "crop":
         values["crop_size"] = CROP
-    if control == "close_loop":
-        images = close_loop_images(IMAGE if values.get("crop_size") == CROP else CROP)
-        actions = CloseLoopActions("pxyzr")
-    else:
-        is_six_dof = network in SIX_DOF
-        images = open_loop_images(32, channels=3 if is_six_dof else 1)
-        actions = OpenLoopActions("pxyzrrr" if is_six_dof else "pxyr", BOUNDS)
-    torch.manual_seed(0)
-    problem = Problem(
-        control=control,
-        images=images,
-        actions=actions,
-        total_updates=10,
-        seed=0,
-        device=torch.device("cpu"),
-    )
-    return parse(ALGORITHMS[name], values, preset).build(
-        parse(network_class(network), SMALL[network], network), problem
-    )
+        problem = replace(problem, images=close_loop_images(IMAGE))
+    return tiny.build(values.pop("name"), network, sequence=sequence, on=problem, **values)
 
 
 def transitions(algorithm):
     """Eight random transitions, every second one a demonstration."""
-    if algorithm.problem.control == "open_loop":
-        return tiny.spatial_transitions(algorithm)
     return tiny.transitions(algorithm, 8)
 
 

@@ -14,9 +14,8 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.experiment import Experiment
 from tests.algorithms import tiny
+from tests.algorithms.tiny import make_experiment, transitions
 
 SAC = {
     "learning_rate": 0.003,
@@ -79,23 +78,11 @@ def build(name, **changes):
     return tiny.build(name, "cnn" if name == "sac" else "asr", **values)
 
 
-def transitions(algorithm):
-    """Random transitions, every second one a demonstration."""
-    is_spatial = algorithm.problem.control == "open_loop"
-    return (tiny.spatial_transitions if is_spatial else tiny.transitions)(algorithm, 24)
-
-
 @pytest.fixture(params=["sac", "spatial_q"])
 def algorithm(request):
     made = build(request.param)
     made.extend(transitions(made))
     return made
-
-
-@pytest.mark.parametrize("name", ["sac", "spatial_q"])
-def test_the_discount_is_that_of_the_value_estimator(name):
-    gamma = build(name).loss.value_estimator.gamma
-    assert float(gamma) == pytest.approx(KINDS[name]["gamma"])
 
 
 def test_a_target_is_the_reward_plus_the_discounted_value():
@@ -147,8 +134,9 @@ def test_the_terms_of_spatial_q_have_their_values():
 
 
 @pytest.mark.parametrize("name", ["sac", "spatial_q"])
-def test_the_loss_has_the_configured_importance_weights(name):
+def test_the_loss_has_the_configured_discount_and_importance_weights(name):
     loss, config = build(name, replay="prioritized").loss, KINDS[name]
+    assert float(loss.value_estimator.gamma) == pytest.approx(config["gamma"])
     assert loss.weighted_terms == config["importance_weighted"]
     assert loss.weight_norm == config["importance_norm"]
 
@@ -281,32 +269,14 @@ def test_epsilon_decreases_over_its_updates(policy_average):
 
 
 def test_collection_explores_and_evaluation_is_greedy(tmp_path):
-    config = ExperimentConfig.parse(
-        {
-            "task": "close_loop/block_reaching",
-            "env": {"obs_size": 64, "max_steps": 4},
-            "algorithm": {"name": "sac", "batch_size": 4},
-            "network": {"name": "cnn", "width": 0.25},
-            "num_envs": 2,
-            "parallel": False,
-            "demonstrations": 0,
-            "total_updates": 3,
-            "min_replay": 4,
-            "eval_every": 2,
-            "eval_episodes": 2,
-            "final_eval_episodes": 2,
-            "video_episodes": 1,
-            "log_every": 1,
-            "run_dir": str(tmp_path / "run"),
-        }
-    )
-    experiment = Experiment(config, progress=False)
+    changes = {"demonstrations": 0, "total_updates": 3, "min_replay": 4, "video_episodes": 1}
+    experiment = make_experiment(tmp_path, "cnn", {"name": "sac", "batch_size": 4}, **changes)
     found = []
     experiment.algorithm.policy.register_forward_hook(lambda *_: found.append(exploration_type()))
     experiment.run()
-    steps = int(read_scalars(tmp_path / "run")["train/env_steps"].values[-1]) // config.num_envs
+    steps = int(read_scalars(tmp_path / "run")["train/env_steps"].values[-1]) // 2
     assert found.count(ExplorationType.RANDOM) == steps == 4
-    # three evaluations and the video, of episodes with one to four steps
+    # three evaluations and the video
     assert found.count(ExplorationType.DETERMINISTIC) >= 4
 
 

@@ -16,48 +16,49 @@ SIZES = {
     "cnn": {"width": 0.25},
     "equi": {"group_order": 4, "n_hidden": 8},
     "ferm": {"width": 0.125, "features": 8},
-    "asr": {"num_rotations": 4, "width": 0.125},
+    **{
+        name: {"num_rotations": 4, "width": 0.125}
+        for name in ("fcn", "equi_fcn", "rot_fcn", "asr", "equi_asr", "equi_deictic_asr")
+    },
 }
+SIX_DOF = "pxyzrrr"
+BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
 FERM = {"view_transform": "shift", "contrastive_weight": 1.0}
 """SAC with optimisers of its own for one of the terms of the loss."""
 OPEN = {"task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects": 2}}
 """Changes of `run` for an open-loop task."""
 
 
-def problem():
-    """A close-loop problem of ten updates."""
-    return Problem(
-        control="close_loop",
-        images=close_loop_images(64),
-        actions=CloseLoopActions("pxyzr"),
-        total_updates=10,
-        seed=0,
-        device=torch.device("cpu"),
-    )
+def problem(network="cnn", sequence=None, **changes):
+    """A problem of ten updates that a network can learn."""
+    control = NETWORKS[network].control
+    if control == "close_loop":
+        images, actions = close_loop_images(64), CloseLoopActions("pxyzr")
+    else:
+        sequence = sequence or (SIX_DOF if network == "equi_deictic_asr" else "pxyr")
+        images = open_loop_images(channels=3 if sequence == SIX_DOF else 1)
+        actions = OpenLoopActions(sequence, BOUNDS)
+    values = {"total_updates": 10, "seed": 0, "device": torch.device("cpu"), **changes}
+    return Problem(**{"control": control, "images": images, "actions": actions, **values})
 
 
-def spatial_problem(sequence="pxyr", channels=1):
-    """An open-loop problem of ten updates, whose in-hand image has ``channels`` channels."""
-    return Problem(
-        control="open_loop",
-        images=open_loop_images(channels=channels),
-        actions=OpenLoopActions(sequence, ((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))),
-        total_updates=10,
-        seed=0,
-        device=torch.device("cpu"),
-    )
+def network_config(network, sequence=None, **sizes):
+    """The hyper-parameters of a small network."""
+    if sequence == SIX_DOF or network == "equi_deictic_asr":
+        sizes = {"num_z": 8, "num_tilts": 3, **sizes}
+    return parse(NETWORKS[network], {**SIZES[network], **sizes}, network)
 
 
-def build(algorithm, network="cnn", **settings):
-    """A learner for `problem` or, with a network of the open loop, `spatial_problem`."""
-    torch.manual_seed(0)
+def build(algorithm, network="cnn", *, sequence=None, sizes=None, on=None, **settings):
+    """A learner for `problem`, or for the problem ``on``."""
+    on = on or problem(network, sequence)
+    torch.manual_seed(on.seed)
     config = parse(ALGORITHMS[algorithm], settings, algorithm)
-    spec = parse(NETWORKS[network], SIZES[network], network)
-    return config.build(spec, problem() if spec.control == "close_loop" else spatial_problem())
+    return config.build(network_config(network, sequence, **(sizes or {})), on)
 
 
 def transitions(learner, count=24):
-    """Random transitions, every second one a demonstration."""
+    """Random transitions, every second one a demonstration; open-loop actions are on the grid."""
     generator = torch.Generator().manual_seed(1)
 
     def rand(*shape):
@@ -81,16 +82,11 @@ def transitions(learner, count=24):
         keys.IS_DEMONSTRATION: torch.arange(count)[:, None] % 2 == 0,
         keys.NEXT: following,
     }
-    return TensorDict(data, [count])
-
-
-def spatial_transitions(learner, count=8):
-    """As `transitions`, with actions of the learner's grid."""
-    data = transitions(learner, count)
-    generator = torch.Generator().manual_seed(2)
-    low, high = torch.tensor(learner.problem.actions.ranges).T
-    action = low + (high - low) * torch.rand(count, len(low), generator=generator)
-    data[keys.ACTION] = learner.nearest_action(action)
+    data = TensorDict(data, [count])
+    if learner.problem.control == "open_loop":
+        low, high = torch.tensor(learner.problem.actions.ranges).T
+        action = low + (high - low) * rand(len(low))
+        data[keys.ACTION] = learner.nearest_action(action)
     return data
 
 

@@ -6,14 +6,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
-from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
-from tests.specs import close_loop_images
-
-
-def build(network, critics=3, **sizes):
-    torch.manual_seed(0)
-    config = NETWORKS[network](precision="float32", **sizes)
-    return config.build(ActorCriticSpec(close_loop_images(64), "pxyzr", critics))
+from tests.modules.networks import actor_critic
 
 
 def perturb(module):
@@ -42,19 +35,19 @@ def test_a_batch_of_heads_is_a_loop_over_heads():
 
 
 def test_heads_start_different():
-    critic = build("cnn", width=0.25).critic
+    critic = actor_critic("cnn", critics=3).critic
     (values,) = critic(torch.rand(1, 32), torch.zeros(1, 5)).detach()
     assert values.shape == (3,)
     assert values.unique().numel() == 3
 
 
-@pytest.mark.parametrize("sizes", [{"network": "cnn", "width": 0.25}, {"network": "equi"}])
-def test_two_critics_without_an_ensemble_are_as_before(sizes):
-    assert not isinstance(build(critics=None, **sizes).critic, EnsembleCritic)
+@pytest.mark.parametrize("name", ["cnn", "equi"])
+def test_two_critics_without_an_ensemble_are_none(name):
+    assert not isinstance(actor_critic(name).critic, EnsembleCritic)
 
 
 def test_the_values_of_an_equivariant_ensemble_are_invariant():
-    networks = build("equi", critics=4, group_order=4, n_hidden=8)
+    networks = actor_critic("equi", critics=4)
     perturb(networks.critic.first_norm)
     perturb(networks.critic.second_norm)
     pixels, holding = torch.rand(2, 1, 64, 64), torch.tensor([[True], [False]])

@@ -2,7 +2,6 @@
 
 import os
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -27,21 +26,6 @@ GROUPS = {
     "C16": lambda: planar_rotations(16),
     "D4": lambda: planar_rotations_and_flips(4),
 }
-
-
-def threads_of_a_new_thread():
-    with ThreadPoolExecutor(1) as pool:
-        return pool.submit(torch.get_num_threads).result()
-
-
-@pytest.fixture(params=[1, 2], ids=["one-thread", "two-threads"])
-def threads(request):
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    found = torch.get_num_threads(), threads_of_a_new_thread()
-    torch.set_num_threads(before)
-    assert found == (request.param, request.param)
 
 
 def expanded(gspace, coefficients):

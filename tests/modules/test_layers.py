@@ -6,8 +6,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.modules import layers
-from tests.algorithms import test_spatial_q_pose as six_dof
-from tests.algorithms import test_wiring, tiny
+from tests.algorithms import tiny
 
 
 class NoFloat64(TorchDispatchMode):
@@ -35,32 +34,26 @@ def without_float64(monkeypatch):
     layers.constants.cache_clear()
 
 
-def check(learner, without_float64, transitions):
-    learner.extend(transitions)
+@pytest.mark.parametrize(
+    ("algorithm", "network", "sequence", "settings"),
+    [
+        ("sac", "cnn", None, {}),
+        ("sac", "equi", None, {}),
+        ("spatial_q", "asr", None, {"demonstrations": "sdqfd"}),
+        ("spatial_q", "asr", None, {"demonstrations": "adet"}),
+        ("spatial_q", "asr", tiny.SIX_DOF, {"demonstrations": "sdqfd"}),
+        ("spatial_q", "equi_deictic_asr", None, {"demonstrations": "sdqfd"}),
+    ],
+)
+def test_learners(algorithm, network, sequence, settings, without_float64):
+    learner = tiny.build(algorithm, network, sequence=sequence, batch_size=4, **settings)
+    learner.extend(tiny.transitions(learner))
     batch = learner.sample()
     expected = learn_and_act(learner, batch.clone())  # tables of rotations exist afterwards
     without_float64()
     with NoFloat64():
         action = learn_and_act(learner, batch.clone())
     torch.testing.assert_close(action, expected, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("network", ["cnn", "equi"])
-def test_close_loop(network, without_float64):
-    learner = tiny.build("sac", network, demonstration_weight=1.0)
-    check(learner, without_float64, tiny.transitions(learner))
-
-
-@pytest.mark.parametrize("demonstrations", ["sdqfd", "adet"])
-def test_open_loop(demonstrations, without_float64):
-    learner = test_wiring.build("spatial_q", demonstrations=demonstrations)
-    check(learner, without_float64, test_wiring.transitions(learner))
-
-
-@pytest.mark.parametrize("network", six_dof.BOTH)
-def test_six_degrees_of_freedom(network, without_float64):
-    learner = six_dof.build(network, demonstrations="sdqfd")
-    check(learner, without_float64, test_wiring.transitions(learner))
 
 
 def make_constant(calls):

@@ -19,14 +19,6 @@ from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
 
 
-@pytest.fixture(params=[1, 2], ids=["one-thread", "two-threads"])
-def threads(request):
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
-
-
 def check(x, grad=None):
     """Check values, layout and gradient; they must be equal."""
     for slope in (0.0, 0.1):
@@ -151,31 +143,23 @@ def test_threads_that_outlive_the_main_thread_work_on():
     assert done.stdout == "[2, 4]\n", done.stderr
 
 
+@pytest.mark.usefixtures("two_threads")
 def test_the_first_use_by_several_threads_keeps_their_number_of_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        for _ in range(20):
-            cpu_threads._threads.cache_clear()
-            barrier = Barrier(3)
-
-            def use(_, barrier=barrier):
-                barrier.wait()
-                in_parts(4, lambda part: part)
-                return torch.get_num_threads()
-
-            with ThreadPoolExecutor(3) as pool:
-                assert list(pool.map(use, range(3))) == [2, 2, 2]
-    finally:
-        torch.set_num_threads(before)
-
-
-def test_work_in_threads_does_not_start_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        assert in_parts(4, lambda _: torch.get_num_threads()) == [1, 1]
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
+    for _ in range(20):
         cpu_threads._threads.cache_clear()
+        barrier = Barrier(3)
+
+        def use(_, barrier=barrier):
+            barrier.wait()
+            in_parts(4, lambda part: part)
+            return torch.get_num_threads()
+
+        with ThreadPoolExecutor(3) as pool:
+            assert list(pool.map(use, range(3))) == [2, 2, 2]
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_work_in_threads_does_not_start_threads():
+    assert in_parts(4, lambda _: torch.get_num_threads()) == [1, 1]
+    assert torch.get_num_threads() == 2
+    cpu_threads._threads.cache_clear()

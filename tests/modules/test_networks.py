@@ -12,29 +12,11 @@ from pydantic import ValidationError
 from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.layers import compute_dtype
+from tests.modules.networks import ACTOR_CRITICS, count
+from tests.modules.networks import actor_critic as small
 from tests.specs import actor_critic_spec
 
 pytest.importorskip("escnn")
-
-ACTOR_CRITICS = [name for name in NETWORKS if NETWORKS[name].control == "close_loop"]
-
-SMALL_EQUIVARIANT = {"n_hidden": 8, "group_order": 4}
-SMALL = {
-    "cnn": {"width": 0.25},
-    "equi": SMALL_EQUIVARIANT,
-    "equi_strided": SMALL_EQUIVARIANT,
-}
-
-
-def small(name, size=64, sequence="pxyzr", **fields):
-    torch.manual_seed(0)
-    return NETWORKS[name](**{**SMALL.get(name, {}), **fields}).build(
-        actor_critic_spec(size, sequence)
-    )
-
-
-def count(module):
-    return sum(parameter.numel() for parameter in module.parameters())
 
 
 @pytest.mark.parametrize(
@@ -56,7 +38,7 @@ def test_parameter_counts_match_the_paper(name, fields, actor, critic):
 @pytest.mark.parametrize("sequence", ["pxyzr", "pxyz"])
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
 def test_any_batch_shape(name, sequence, leading):
-    networks = small(name, sequence=sequence, precision="float32")
+    networks = small(name, sequence=sequence)
     size = len(sequence)
     pixels = torch.rand(*leading, 1, 64, 64)
     holding = torch.rand(*leading, 1) > 0.5
@@ -75,7 +57,7 @@ def test_any_batch_shape(name, sequence, leading):
 
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
 def test_outputs_depend_on_holding_and_action(name):
-    networks = small(name, precision="float32")
+    networks = small(name)
     pixels = torch.rand(1, 64, 64)
     held, free = torch.tensor([True]), torch.tensor([False])
     assert not torch.allclose(networks.actor(pixels, held)[0], networks.actor(pixels, free)[0])
@@ -91,7 +73,7 @@ def test_outputs_depend_on_holding_and_action(name):
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
 def test_copies_and_pickles_are_small_and_equal(name):
     """Policies are copied for evaluation and sent to processes that may lack escnn."""
-    networks = small(name, precision="float32")
+    networks = small(name)
     pixels, holding = torch.rand(1, 64, 64), torch.tensor([True])
     data = pickle.dumps(networks.actor)
     assert b"escnn" not in data
@@ -102,7 +84,7 @@ def test_copies_and_pickles_are_small_and_equal(name):
 
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
 def test_log_std_is_clamped(name):
-    networks = small(name, precision="float32")
+    networks = small(name)
     with torch.no_grad():
         for parameter in networks.actor.parameters():
             parameter.mul_(30)
@@ -115,7 +97,7 @@ def test_log_std_is_clamped(name):
 
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
 def test_bfloat16_is_close_to_float32(name):
-    exact = small(name, precision="float32")
+    exact = small(name)
     rough = small(name, precision="bfloat16")
     for one, other in zip(rough, exact, strict=True):
         one.load_state_dict(other.state_dict())
@@ -163,24 +145,31 @@ def test_auto_precision_uses_the_instructions_that_are_fast_and_allowed(
     assert compute_dtype("auto", torch.device("meta")) is torch.float32
 
 
-def test_config_errors():
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [("cnn", {"widht": 2}), ("equi", {"precision": "float16"}), ("equi", {"group_order": 1})],
+)
+def test_unknown_fields_and_values_are_refused(name, fields):
     with pytest.raises(ValidationError):
-        NETWORKS["cnn"](widht=2)
-    with pytest.raises(ValidationError):
-        NETWORKS["equi"](precision="float16")
-    with pytest.raises(ValidationError):
-        NETWORKS["equi"](group_order=1)
-    with pytest.raises(ValueError, match="multiple of 8 at 128 px"):
-        NETWORKS["equi"](n_hidden=12).build(actor_critic_spec(128, "pxyzr"))
-    with pytest.raises(ValueError, match="multiple of 4 at 64 px"):
-        NETWORKS["equi"](n_hidden=6).build(actor_critic_spec(64, "pxyzr"))
-    with pytest.raises(ValueError, match="needs x and y"):
-        NETWORKS["equi"](n_hidden=8).build(actor_critic_spec(64, "pz"))
-    with pytest.raises(ValueError, match="group_order of at least 3"):
-        NETWORKS["equi"](group_order=2, reflections=True).build(actor_critic_spec())
-    for name in ACTOR_CRITICS:
-        with pytest.raises(ValueError, match=r"64 or 128 px, got 90; set obs_size"):
-            NETWORKS[name]().build(actor_critic_spec(90, "pxyzr"))
+        NETWORKS[name](**fields)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "spec", "message"),
+    [
+        ("equi", {"n_hidden": 12}, (128, "pxyzr"), "multiple of 8 at 128 px"),
+        ("equi", {"n_hidden": 6}, (64, "pxyzr"), "multiple of 4 at 64 px"),
+        ("equi", {"n_hidden": 8}, (64, "pz"), "needs x and y"),
+        ("equi", {"group_order": 2, "reflections": True}, (), "group_order of at least 3"),
+        *(
+            (name, {}, (90, "pxyzr"), r"64 or 128 px, got 90; set obs_size")
+            for name in ACTOR_CRITICS
+        ),
+    ],
+)
+def test_what_cannot_be_built_is_refused(name, fields, spec, message):
+    with pytest.raises(ValueError, match=message):
+        NETWORKS[name](**fields).build(actor_critic_spec(*spec))
 
 
 @pytest.mark.parametrize("sequence", ["", "pxx", "pxyq"])

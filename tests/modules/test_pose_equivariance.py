@@ -5,71 +5,25 @@ import torch
 
 pytest.importorskip("escnn")
 
-from ba_torchrl.modules.base import NETWORKS
-from tests.specs import spatial_spec
+from tests.modules.networks import pose, train, turned_pixels, values_of
+from tests.modules.networks import pose_batch as batch
 
 SIZE = 64
-COMPONENTS = ("x", "y", "z", "rz", "ry", "rx")
-FIELDS = {
-    "width": 0.125,
-    "precision": "float32",
-    "num_rotations": 8,
-    "num_z": 6,
-    "num_tilts": 3,
-    "height_scale_m": 0.05,
-    "voxel_scale": 10.0,
-}
 
 
-def build(name="equi_deictic_asr", half_rotation=False, **fields):
-    torch.manual_seed(0)
-    return NETWORKS[name](**FIELDS, **fields).build(
-        spatial_spec(SIZE, 24, 3, COMPONENTS, half_rotation)
-    )
-
-
-def batch(n=4, seed=0, yaws=8):
-    """Rough heightmaps with values at many levels, in-hand images, and one choice each."""
-    generator = torch.Generator().manual_seed(seed)
-    coarse = torch.rand(n, 1, 16, 16, generator=generator) * 0.15
-    pixels = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
-    holding = torch.arange(n)[:, None] % 2 == 0
-    in_hand = torch.randint(24, (n, 3, 24, 24), generator=generator) * holding[..., None, None]
-    limits = (SIZE, SIZE, yaws, 6, 3, 3)
-    chosen = torch.stack([torch.randint(k, (n,), generator=generator) for k in limits], dim=1)
-    return pixels, in_hand.float(), holding, chosen
-
-
-def train(network, steps=4):
-    """Take a few optimiser steps towards random targets, so that biases are not zero."""
-    optimizer = torch.optim.Adam(network.parameters(), 1e-3)
-    before = [parameter.detach().clone() for parameter in network.parameters()]
-    for step in range(steps):
-        *observation, chosen = batch(seed=step + 10)
-        values = values_of(network, observation, chosen)
-        loss = sum((q - torch.rand_like(q)).square().mean() for q in values)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert all(not torch.equal(p, q) for p, q in zip(network.parameters(), before, strict=True))
-
-
-def values_of(network, observation, chosen):
-    first, state = network.first(*observation)
-    return [first, *(network.later(n, state, chosen[:, : n + 1]) for n in range(1, 5))]
+def build(name="equi_deictic_asr", half=False, trained=False, **fields):
+    network = pose(name, half=half, height_scale_m=0.05, voxel_scale=10.0, **fields)
+    if trained:
+        train(network, batch)
+    return network
 
 
 def turned(observation, chosen, quarters, yaw_steps):
     """The scene after quarter turns by torch.rot90, and the choices that rotate with it."""
     pixels, in_hand, holding = observation
-    numbers = torch.arange(SIZE * SIZE).reshape(SIZE, SIZE)
-    position = torch.empty(SIZE * SIZE, dtype=torch.long)
-    position[torch.rot90(numbers, quarters).flatten()] = torch.arange(SIZE * SIZE)
-    pixel = position[chosen[:, 0] * SIZE + chosen[:, 1]]
-    moved = chosen.clone()
-    moved[:, 0], moved[:, 1] = pixel // SIZE, pixel % SIZE
+    moved = torch.cat([turned_pixels(chosen, SIZE, quarters), chosen[:, 2:]], dim=1)
     moved[:, 2] = (chosen[:, 2] + yaw_steps) % 8
-    return (torch.rot90(pixels, quarters, (-2, -1)), in_hand, holding), moved
+    return (torch.rot90(pixels, quarters, (-2, -1)), in_hand, holding, moved)
 
 
 def spread(values):
@@ -90,12 +44,10 @@ def assert_different(actual, expected):
 @pytest.mark.parametrize("trained", [False, True])
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_rotating_the_scene_turns_pixels_shifts_yaws_and_keeps_the_other_values(quarters, trained):
-    network = build()
-    if trained:
-        train(network)
+    network = build(trained=trained)
     *observation, chosen = batch()
     with torch.no_grad():
-        pixels, yaws, *others = values_of(network, observation, chosen)
+        pixels, yaws, *others = values_of(network, *observation, chosen)
         found = values_of(network, *turned(observation, chosen, quarters, 2 * quarters))
         assert_equal(found[0], torch.rot90(pixels, quarters, (-2, -1)))
         assert_equal(found[1], yaws.roll(2 * quarters, dims=1))
@@ -109,11 +61,9 @@ def test_rotating_the_scene_turns_pixels_shifts_yaws_and_keeps_the_other_values(
 
 @pytest.mark.parametrize("trained", [False, True])
 def test_values_of_a_flattened_scene_are_invariant_for_fixed_features_only(trained):
-    network = build(scene_head="flatten")
-    if trained:
-        train(network)
+    network = build(scene_head="flatten", trained=trained)
     *observation, chosen = batch()
-    scene, moved = turned(observation, chosen, 1, 2)
+    *scene, moved = turned(observation, chosen, 1, 2)
     with torch.no_grad():
         _, state = network.first(*observation)
         _, rotated = network.first(*scene)
@@ -145,18 +95,18 @@ def wrapped(observation, chosen):
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_yaws_of_half_a_turn(quarters, trained):
     """A yaw that leaves half a turn swaps the fingers: tilts and what is held turn over."""
-    network = build(half_rotation=True)
-    if trained:
-        train(network)
+    network = build(half=True, trained=trained)
     *observation, chosen = batch(n=6)
-    scene, moved = turned(observation, chosen, quarters, 0)
+    *scene, moved = turned(observation, chosen, quarters, 0)
     moved[:, 2] = chosen[:, 2] + 4 * quarters
     moved[:, 2] %= 16  # a full turn is the same pose
     swapped_scene, moved, is_swapped = wrapped(scene, moved)
     assert is_swapped.any()
     with torch.no_grad():
-        pixels, yaws, *others = values_of(network, observation, chosen)
-        found = values_of(network, scene, moved)[:2] + values_of(network, swapped_scene, moved)[2:]
+        pixels, yaws, *others = values_of(network, *observation, chosen)
+        found = (
+            values_of(network, *scene, moved)[:2] + values_of(network, *swapped_scene, moved)[2:]
+        )
         assert_equal(found[0], torch.rot90(pixels, quarters, (-2, -1)))
         assert_equal(found[1], yaws.roll(4 * quarters, dims=1))
         for actual, expected in zip(found[2:], others, strict=True):
@@ -166,38 +116,26 @@ def test_yaws_of_half_a_turn(quarters, trained):
 
 
 def test_one_order_of_the_fingers_alone_is_not_symmetric():
-    network = build(half_rotation=True, swap_fingers=False)
+    network = build(half=True, swap_fingers=False)
     *observation, chosen = batch()
-    scene, moved = turned(observation, chosen, 2, 0)
+    *scene, moved = turned(observation, chosen, 2, 0)
     moved[:, 2] = chosen[:, 2] + 8
     scene, moved, _ = wrapped(scene, moved)
     with torch.no_grad():
-        heights = values_of(network, observation, chosen)[2]
-        assert_different(values_of(network, scene, moved)[2], heights)
+        heights = values_of(network, *observation, chosen)[2]
+        assert_different(values_of(network, *scene, moved)[2], heights)
 
 
 def test_tilts_and_what_is_held_turn_over_with_the_fingers():
     """The symmetry does not hide either: each alone changes the values."""
-    network = build(half_rotation=True)
-    train(network)
+    network = build(half=True, trained=True)
     *observation, chosen = batch()
     chosen[:, 4] = 0
     tilted = chosen.clone()
     tilted[:, 4] = 2
     pixels, in_hand, holding = observation
     with torch.no_grad():
-        expected = values_of(network, observation, chosen)[4]
-        assert_different(values_of(network, observation, tilted)[4], expected)
+        expected = values_of(network, *observation, chosen)[4]
+        assert_different(values_of(network, *observation, tilted)[4], expected)
         other = (pixels, in_hand.flip(-2), holding)
-        assert_different(values_of(network, other, chosen)[4], expected)
-
-
-def test_the_plain_network_is_not_equivariant():
-    network = build("asr")
-    *observation, chosen = batch()
-    with torch.no_grad():
-        values = values_of(network, observation, chosen)
-        found = values_of(network, *turned(observation, chosen, 1, 2))
-    assert_different(found[1], values[1].roll(2, dims=1))
-    for actual, expected in zip(found[2:], values[2:], strict=True):
-        assert_different(actual, expected)
+        assert_different(values_of(network, *other, chosen)[4], expected)

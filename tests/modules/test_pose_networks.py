@@ -12,35 +12,16 @@ pytest.importorskip("escnn")
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView, crop
+from tests.modules.networks import COUNTS, POSE, count
+from tests.modules.networks import pose as build
+from tests.modules.networks import pose_batch as batch
 from tests.specs import spatial_spec
 
-COMPONENTS = ("x", "y", "z", "rz", "ry", "rx")
 BOTH = ["asr", "equi_deictic_asr"]
-SMALL = {"width": 0.125, "num_rotations": 8, "precision": "float32", "num_z": 5, "num_tilts": 3}
-COUNTS = {"rz": 8, "z": 5, "ry": 3, "rx": 3}
 SIZE = 64
 
 
-def build(name, size=SIZE, in_hand_size=24, half=True, **fields):
-    torch.manual_seed(0)
-    spec = spatial_spec(size, in_hand_size, 3, COMPONENTS, half)
-    return NETWORKS[name](**{**SMALL, **fields}).build(spec)
-
-
-def batch(size=SIZE, in_hand_size=24, n=3):
-    generator = torch.Generator().manual_seed(0)
-    pixels = torch.rand(n, 1, size // 4, size // 4, generator=generator).repeat_interleave(4, -1)
-    in_hand = torch.randint(24, (n, 3, in_hand_size, in_hand_size), generator=generator).float()
-    limits = (size, size, *COUNTS.values())
-    chosen = torch.stack([torch.randint(k, (n,), generator=generator) for k in limits], dim=1)
-    holding = torch.arange(n)[:, None] % 2 == 1
-    return 0.15 * pixels.repeat_interleave(4, -2), in_hand, holding, chosen
-
-
-def count(module):
-    return sum(parameter.numel() for parameter in module.parameters())
-
-
+PAPER = {"width": 1.0, "num_rotations": 16, "num_z": 36, "num_tilts": 7}
 # Weights and biases layer by layer, added up by hand.
 SCENE_MAP = (256 * 9 + 1) * 128 + (128 * 16 + 1) * 1024 + 1025 * 512
 SCENE_VECTOR = (256 + 1) * 1024 + 1025 * 512  # maximum and mean of 128 channels
@@ -55,8 +36,7 @@ def pose_head(channels, last_map, outputs, scene):
 
 @pytest.mark.parametrize(("size", "last_map", "millions"), [(24, 3, 4.9), (40, 5, 7.0)])
 def test_parameter_counts_of_the_plain_heads_match_the_reference(size, last_map, millions):
-    paper = {"width": 1.0, "num_rotations": 16, "num_z": 36, "num_tilts": 7}
-    heads = build("asr", 128, size, **paper).heads
+    heads = build("asr", 128, size, **PAPER).heads
     expected = [
         pose_head(channels, last_map, outputs, SCENE_MAP)
         for channels, outputs in ((4, 32), (4, 72), (6, 14), (6, 14))
@@ -73,8 +53,7 @@ def test_parameter_counts_of_the_plain_heads_match_the_reference(size, last_map,
 def test_parameter_counts_of_the_equivariant_heads(
     size, last_map, millions, scene_head, of_yaws, of_poses
 ):
-    paper = {"width": 1.0, "num_rotations": 16, "num_z": 36, "num_tilts": 7}
-    yaws, *poses = build("equi_deictic_asr", 128, size, **paper, scene_head=scene_head).heads
+    yaws, *poses = build("equi_deictic_asr", 128, size, **PAPER, scene_head=scene_head).heads
     assert {count(head) for head in poses} == {pose_head(6, last_map, 2, of_poses)}
     assert count(yaws.scene) == of_yaws
     reference = count(yaws) - of_yaws + FLATTENED_SCENE
@@ -94,10 +73,10 @@ def test_shapes(name, size, in_hand_size, half):
     assert network.limits["ry"] == network.limits["rx"] == (-math.pi / 8, math.pi / 8)
     *observation, chosen = batch(size, in_hand_size)
     first, state = network.first(*observation)
-    assert first.shape == (3, size, size)
+    assert first.shape == (4, size, size)
     for level, number in enumerate(COUNTS.values(), start=1):
         values = network.later(level, state, chosen[:, : level + 1])
-        assert values.shape == (3, number)
+        assert values.shape == (4, number)
         assert values.dtype == torch.float32
         assert torch.isfinite(values).all()
 
@@ -144,7 +123,7 @@ def test_every_candidate_pose_sees_the_scene_from_itself(half):
     pixels, *_, chosen = batch()
     for number, name in ((1, "z"), (2, "ry"), (3, "rx")):
         found = views[number](pixels, chosen[:, : number + 2])
-        for i in range(3):
+        for i in range(4):
             pose = pose_of(chosen[i], half) | dict.fromkeys(("ry", "rx")[number - 1 :], 0.0)
             poses = [pose | {name: grid(name, index, half)} for index in range(COUNTS[name])]
             poses += [swapped(pose) for pose in poses] if half else []
@@ -156,7 +135,7 @@ def test_every_candidate_pose_sees_the_scene_from_itself(half):
 def test_the_plain_levels_see_patches_and_projections_at_the_chosen_pose():
     views = build("asr").views
     pixels, *_, chosen = batch()
-    for i in range(3):
+    for i in range(4):
         heights = pixels[i, 0].numpy()
         center = tuple(chosen[i, :2].numpy() + 0.5)
         for number, yaw in ((0, 0.0), (1, grid("rz", int(chosen[i, 2]), True))):
@@ -173,7 +152,7 @@ def test_values_equal_those_of_the_concatenated_features_of_each_view(views, val
     """Features of the in-hand image and of the scene are computed once per sample."""
     torch.manual_seed(0)
     config = NETWORKS["asr"](width=0.25, precision="float32", voxel_scale=10.0)
-    spec = spatial_spec(SIZE, 24, 3, COMPONENTS)
+    spec = spatial_spec(SIZE, 24, 3, POSE)
     head = PoseValues(spec, config, 3, values_per_view, 24, SceneMapVector(8, SIZE, 0.25))
     with torch.no_grad():
         for parameter in head.parameters():

@@ -8,51 +8,16 @@ import torch
 from pydantic import ValidationError
 from torchrl.objectives import LossModule
 
-from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
-from tests.specs import spatial_spec
-
 pytest.importorskip("escnn")
 
-XY, XYR, POSE = ("x", "y"), ("x", "y", "rz"), ("x", "y", "z", "rz", "ry", "rx")
-NAMES = [
-    name
-    for name in NETWORKS
-    if NETWORKS[name].control == "open_loop" and name != "equi_deictic_asr"
-]
-FLATTENED = ["equi_asr/flatten", "equi_deictic_asr/pose/flatten"]
-EVERY = [*NAMES, "asr/pose", "equi_deictic_asr/pose", *FLATTENED]
-SMALL = {"width": 0.125, "num_rotations": 4, "precision": "float32"}
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
+from tests.modules.networks import SPATIAL, XY, XYR, batch, count, values_of
+from tests.modules.networks import spatial as build
+from tests.specs import spatial_spec
 
-
-def build(name, size=32, in_hand_size=24, channels=1, components=XYR, half=True, **fields):
-    torch.manual_seed(0)
-    name, *options = name.split("/")
-    if "pose" in options:
-        components, fields = POSE, {"num_z": 5, "num_tilts": 3, **fields}
-    if "flatten" in options:
-        fields = {"scene_head": "flatten", **fields}
-    spec = spatial_spec(size, in_hand_size, channels, components, half)
-    return NETWORKS[name](**{**SMALL, **fields}).build(spec)
-
-
-def batch(size=32, in_hand_size=24, channels=1, n=4, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return (
-        torch.rand(n, 1, size, size, generator=generator),
-        torch.rand(n, channels, in_hand_size, in_hand_size, generator=generator),
-        torch.arange(n)[:, None] % 3 == 1,
-        torch.cat(
-            [torch.randint(limit, (n, 2), generator=generator) for limit in (size, 4, 3)], dim=1
-        ),
-    )
-
-
-def values_of(network, pixels, in_hand, holding, chosen):
-    """The Q values of all levels."""
-    first, state = network.first(pixels, in_hand, holding)
-    later = range(1, len(network.levels))
-    return [first, *(network.later(n, state, chosen[:, : n + 1]) for n in later)]
+EVERY = [*SPATIAL, "asr/pose", "equi_deictic_asr/pose", "equi_asr/flatten"]
+EVERY += ["equi_deictic_asr/pose/flatten"]
 
 
 @pytest.mark.parametrize("name", ["equi_fcn", "equi_asr", "equi_deictic_asr/pose"])
@@ -71,10 +36,6 @@ def test_values_of_both_heads_are_those_of_the_samples_head(name, monkeypatch):
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
     assert any(slope.any() for slope in found[0][1:])
-
-
-def count(module):
-    return sum(parameter.numel() for parameter in module.parameters())
 
 
 # Weights layer by layer, added up by hand, with the biases behind them.
@@ -128,10 +89,10 @@ def test_equi_fcn_with_yaws_has_the_size_of_the_reference():
     assert count(network) == 47_125_954  # 47.1 million at C16
 
 
-@pytest.mark.parametrize("half", [True, False])
-@pytest.mark.parametrize("in_hand_size", [24, 40])
-@pytest.mark.parametrize("size", [32, 128])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("size", "in_hand_size", "half"), [(32, 24, True), (32, 40, False), (128, 24, False)]
+)
+@pytest.mark.parametrize("name", SPATIAL)
 def test_shapes_with_a_yaw(name, size, in_hand_size, half):
     network = build(name, size, in_hand_size, half=half)
     values = values_of(network, *batch(size, in_hand_size))
@@ -179,13 +140,8 @@ def test_values_depend_on_every_input_and_on_their_own_sample_only(name, channel
         for q, p in zip(values, other, strict=True):
             assert (q - p).abs().max() > 1e-3 * q.std()
         for i in range(4):
-            alone = values_of(
-                network,
-                pixels[i : i + 1],
-                in_hand[i : i + 1],
-                holding[i : i + 1],
-                chosen[i : i + 1],
-            )
+            inputs = (each[i : i + 1] for each in (pixels, in_hand, holding, chosen))
+            alone = values_of(network, *inputs)
             for q, p in zip(values, alone, strict=True):
                 torch.testing.assert_close(p[0], q[i], atol=1e-5, rtol=1e-4)
 
@@ -215,25 +171,20 @@ def test_a_batch_with_a_single_primitive_has_gradients(name, primitive):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_initial_pixel_values_of_narrow_networks_exceed_their_bias(seed):
-    """Otherwise many pixels share the maximum, and only the bias has a gradient."""
+@torch.no_grad()
+def test_initial_values_of_narrow_networks_differ(seed):
+    """Otherwise many pixels share the maximum, or the last layer of yaws has no gradient."""
+    pixels, in_hand, _, _ = inputs = batch()
     torch.manual_seed(seed)
-    spec = spatial_spec(32, 24, 1, XY)
-    network = NETWORKS["equi_fcn"](width=0.125, precision="float32").build(spec)
-    pixels, in_hand, _, _ = batch(n=2)
+    network = NETWORKS["equi_fcn"](width=0.125, precision="float32")
+    network = network.build(spatial_spec(32, 24, 1, XY))
     for holding in (False, True):
-        with torch.no_grad():
-            values, _ = network.first(pixels, in_hand, torch.full((2, 1), holding))
+        values, _ = network.first(pixels, in_hand, torch.full((4, 1), holding))
         best, second = values.flatten(1).topk(2).values.unbind(1)
         assert (best > second).all()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_initial_yaw_values_of_narrow_networks_differ(seed):
-    """Otherwise all inputs of the last layer are zero and have no gradient."""
     torch.manual_seed(seed)
     network = NETWORKS["equi_asr"](width=0.125, num_rotations=4, precision="float32")
-    _, yaws = values_of(network.build(spatial_spec(32, 24, 1, XYR)), *batch())
+    _, yaws = values_of(network.build(spatial_spec(32, 24, 1, XYR)), *inputs)
     assert (yaws.std(dim=1) > 1e-3 * yaws.abs().max()).all()
 
 
@@ -293,7 +244,7 @@ def test_values_of_bfloat16_networks_have_float32_resolution():
         assert one_to_two.unique().numel() > 500
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SPATIAL)
 def test_scaled_heights_give_the_same_values(name):
     metres, units = build(name), build(name, height_scale_m=0.05)
     pixels, in_hand, holding, chosen = batch()
@@ -352,7 +303,7 @@ def test_functional_calls_use_the_given_parameters(name):
     assert not torch.allclose(values(holder.net_params), start)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SPATIAL)
 def test_unsupported_images_and_actions_are_refused(name):
     with pytest.raises(ValueError, match="x, y and rz, not z; use"):
         build(name, components=("x", "y", "z", "rz"))

@@ -6,17 +6,14 @@ import torch.nn.functional as F
 
 pytest.importorskip("escnn")
 
-from ba_torchrl.modules.base import NETWORKS
-from tests.specs import actor_critic_spec
+from tests.modules.networks import actor_critic
 
-OPTIONS = {"depth_center_m": 0.2, "depth_scale_m": 0.1, "precision": "float32"}
+WIDTHS = {"equi": {"n_hidden": 16, "group_order": 8}, "cnn": {}, "ferm": {"width": 0.1}}
 
 
-def build(network, seed=0, size=64, **options):
-    torch.manual_seed(seed)
-    width = {"equi": {"n_hidden": 16}, "cnn": {"width": 0.25}, "ferm": {"width": 0.1}}[network]
-    config = NETWORKS[network](**{**OPTIONS, **width, **options})
-    return config.build(actor_critic_spec(size, "pxyzr"))
+def build(network, **options):
+    units = {"depth_center_m": 0.2, "depth_scale_m": 0.1}
+    return actor_critic(network, **{**units, **WIDTHS[network], **options})
 
 
 def scene(size=64, *, block=(10, 10), hand_m=0.3):
@@ -63,7 +60,7 @@ def test_a_block_always_changes_the_action_if_negative_values_pass():
     holding, changes = torch.tensor([[False]]), {0.0: [], 0.1: []}
     for slope, differences in changes.items():
         for seed in range(8):
-            actor = build("equi", seed, size=128, negative_slope=slope).actor
+            actor = build("equi", seed=seed, size=128, negative_slope=slope).actor
             with torch.no_grad():
                 here, _ = actor(scene(128, block=(30, 30)), holding)
                 there, _ = actor(scene(128, block=(80, 60)), holding)

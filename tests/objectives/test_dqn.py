@@ -1,3 +1,6 @@
+"""The losses on levels of choices, compared with loops over samples, levels and choices."""
+
+import itertools
 import math
 
 import pytest
@@ -6,139 +9,149 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import QValueActor
 
-from ba_torchrl.objectives.dqn import (
-    LevelDQNLoss,
-    large_margin,
-    strict_large_margin,
+from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
+from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
+from ba_torchrl.objectives.dqn import LevelDQNLoss, large_margin, strict_large_margin
+
+GAMMA = 0.9
+BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
+COUNTS = (3, 3, 4, 5, 3, 2)
+"""Rows, columns, yaws, z, ry, rx."""
+LEVELS = (
+    Level(("x", "y"), COUNTS[:2]),
+    *(Level((name,), (n,)) for name, n in zip(("rz", "z", "ry", "rx"), COUNTS[2:], strict=True)),
 )
+ACTIONS = SpatialActions(OpenLoopActions("pxyzrrr", BOUNDS), LEVELS)
+KINDS = ["dqfd", "sdqfd", "adet"]
 
-GAMMA = 0.95
-SIZES = (7, 3)
 
+class Tables(SpatialQNetwork):
+    """Values from tables over all choices so far, times the mean of the image."""
 
-class TwoLevels(nn.Module):
-    """Linear values; those of the second level depend on the choice at the first."""
-
-    in_keys = ("pixels", "holding")
+    levels = LEVELS
 
     def __init__(self):
         super().__init__()
-        generator = torch.Generator().manual_seed(3)
-        self.first = nn.Parameter(torch.randn(4, SIZES[0], generator=generator))
-        self.second = nn.Parameter(torch.randn(SIZES[0], 4, SIZES[1], generator=generator))
+        generator = torch.Generator().manual_seed(1)
+        self.tables = nn.ParameterList(
+            torch.randn(2, *COUNTS[: n + 2], generator=generator) for n in range(5)
+        )
 
-    def forward(self, pixels, holding, action):
-        choice = action.long()
-        later = torch.einsum("bi,bij->bj", pixels, self.second[choice[:, 0]])
-        return [(pixels @ self.first, choice[:, 0]), (later, choice[:, 1])]
+    def first(self, pixels, in_hand, holding):
+        state = holding[:, 0].long(), pixels.mean(dim=(1, 2, 3))
+        return self.tables[0][state[0]] * state[1][:, None, None], state
 
-    def greedy(self, pixels, holding):
-        best = (pixels @ self.first).argmax(dim=1)
-        later = torch.einsum("bi,bij->bj", pixels, self.second[best])
-        value, last = later.max(dim=1, keepdim=True)
-        return torch.cat([best[:, None], last], dim=1), value
+    def later(self, level, state, chosen):
+        primitive, scale = state
+        return self.tables[level][(primitive, *chosen.unbind(1))] * scale[:, None]
 
 
-def batch(size=12, experts="some", seed=0):
-    rng = torch.Generator().manual_seed(seed)
-    flags = {
-        "some": torch.rand(size, 1, generator=rng) < 0.5,
-        "all": torch.ones(size, 1, dtype=torch.bool),
-        "none": torch.zeros(size, 1, dtype=torch.bool),
-    }[experts]
-    ends = torch.rand(2, size, 1, generator=rng) < 0.3
-    state = {
-        "pixels": torch.randn(size, 4, generator=rng),
-        "holding": torch.zeros(size, 1, dtype=torch.bool),
-    }
+def batch(size=10, experts="some", seed=0):
+    """Random transitions, with the indices of their actions under "chosen"."""
+    generator = torch.Generator().manual_seed(seed)
+    flags = torch.rand(size, 1, generator=generator) < 0.5
+    flags = {"some": flags, "all": torch.ones_like(flags), "none": torch.zeros_like(flags)}[experts]
+    ends = torch.rand(2, size, 1, generator=generator) < 0.3
+    chosen = torch.stack([torch.randint(n, (size,), generator=generator) for n in COUNTS], dim=1)
+
+    def state():
+        return {
+            "pixels": torch.rand(size, 1, 3, 3, generator=generator) + 0.5,
+            "in_hand": torch.zeros(size, 1, 4, 4),
+            "holding": torch.rand(size, 1, generator=generator) < 0.5,
+        }
+
     following = {
-        "pixels": torch.randn(size, 4, generator=rng),
-        "holding": torch.zeros(size, 1, dtype=torch.bool),
-        "reward": torch.rand(size, 1, generator=rng),
+        "reward": torch.rand(size, 1, generator=generator),
         "terminated": ends[0],
         "truncated": ends[1] & ~ends[0],
         "done": ends[0] | ends[1],
     }
-    action = torch.stack([torch.randint(n, (size,), generator=rng) for n in SIZES], dim=1).float()
-    return TensorDict(
-        {**state, "action": action, "is_demonstration": flags, "next": following}, batch_size=[size]
+    data = TensorDict(
+        {**state(), "is_demonstration": flags, "next": {**state(), **following}}, batch_size=[size]
     )
+    data["action"] = ACTIONS.to_action(chosen, data["holding"])
+    return data.set("chosen", chosen)
 
 
 def make_loss(**settings):
-    loss = LevelDQNLoss(TwoLevels(), **settings).make_value_estimator(gamma=GAMMA)
+    values = SpatialValues(Tables(), ACTIONS)
+    loss = LevelDQNLoss(values, **{"demonstration_weight": 0.2, "margin": 0.3, **settings})
+    loss = loss.make_value_estimator(gamma=GAMMA)
     with torch.no_grad():  # a target that differs from the network
         for value in loss.target_value_network_params.values(True, True):
-            value.add_(0.3 * torch.randn(value.shape, generator=torch.Generator().manual_seed(5)))
+            value.add_(0.5 * torch.randn(value.shape, generator=torch.Generator().manual_seed(5)))
     return loss
 
 
-def huber(error):
-    return 0.5 * error**2 if abs(error) < 1 else abs(error) - 0.5
+def lookup(params, level, state, index, chosen):
+    """Return {choice: value} of a level, given the choices before it."""
+    table = params["network", "tables", str(level)].detach().double()
+    scale = float(state["pixels"][index].double().mean())
+    row = table[int(state["holding"][index])]
+    for choice in chosen:
+        row = row[choice]
+    sizes = COUNTS[:2] if level == 0 else (COUNTS[level + 1],)
+    return {choice: float(row[choice]) * scale for choice in itertools.product(*map(range, sizes))}
 
 
-def by_hand(
-    loss, data, kind, weight=0.1, margin=0.1, betas=(100.0, 1.0), td_weights=None, term_weights=None
-):
-    """The losses, computed by a loop over samples, levels and actions."""
-    online = {k: loss.value_network_params[k].detach().double() for k in ("first", "second")}
-    target = {k: loss.target_value_network_params[k].double() for k in ("first", "second")}
-    td, priorities, terms = 0.0, [], []
-    for i in range(len(data)):
-        x, following = data["pixels"][i].double(), data["next", "pixels"][i].double()
-        best = int((following @ target["first"]).argmax())
-        value = float((following @ target["second"][best]).max())
-        alive = 0.0 if data["next", "terminated"][i] else 1.0
-        y = float(data["next", "reward"][i]) + GAMMA * alive * value
-        choices = [int(a) for a in data["action"][i]]
-        q = [
-            (x @ online["first"]).tolist(),
-            (x @ online["second"][choices[0]]).tolist(),
-        ]
-        share = 1.0 if td_weights is None else td_weights[i]
-        errors = [values[choice] - y for values, choice in zip(q, choices, strict=True)]
-        td += share * sum(map(huber, errors)) / len(data)
-        priorities.append(sum(map(abs, errors)) / 2)
-        sample = 0.0
-        for level, (values, choice) in enumerate(zip(q, choices, strict=True)):
-            if not data["is_demonstration"][i]:
-                continue
-            if kind == "sdqfd":
-                gaps = [
-                    v - values[choice] + margin
-                    for a, v in enumerate(values)
-                    if a != choice and v > values[choice] - margin
-                ]
-                sample += sum(gaps) / len(gaps) if gaps else 0.0
-            elif kind == "dqfd":
-                raised = [v + (margin if a != choice else 0) for a, v in enumerate(values)]
-                sample += max(raised) - values[choice]
-            elif kind == "adet":
-                scaled = [betas[level] * v for v in values]
-                top = max(scaled)
-                log_sum = top + math.log(sum(math.exp(s - top) for s in scaled))
-                sample += log_sum - scaled[choice]
-        terms.append(sample if term_weights is None else term_weights[i] * sample)
-    experts = int(data["is_demonstration"].sum())
-    count = len(data) if kind == "sdqfd" else max(experts, 1)
-    return td, weight * sum(terms) / count, priorities
+def demonstration_term(kind, q, taken, level):
+    if kind == "sdqfd":
+        gaps = [v - q[taken] + 0.3 for a, v in q.items() if a != taken and v > q[taken] - 0.3]
+        return sum(gaps) / len(gaps) if gaps else 0.0
+    if kind == "dqfd":
+        return max(v + 0.3 * (a != taken) for a, v in q.items()) - q[taken]
+    beta = 100.0 if level == 0 else 1.0
+    top = max(q.values())
+    total = sum(math.exp(beta * (v - top)) for v in q.values())
+    return beta * (top - q[taken]) + math.log(total)
+
+
+def by_hand(loss, data, kind, td_weights=None, term_weights=None):
+    """The two losses and the priorities, by a loop over samples, levels and choices."""
+    ones = [1.0] * len(data)
+    td_weights, term_weights = td_weights or ones, term_weights or ones
+    td, term, priorities = 0.0, 0.0, []
+    for i, choices in enumerate(data["chosen"].tolist()):
+        greedy = ()
+        for level in range(5):  # the target's choices, each given those before
+            following = lookup(loss.target_value_network_params, level, data["next"], i, greedy)
+            best = max(following, key=following.get)
+            greedy += best
+        alive = not data["next", "terminated"][i]
+        y = float(data["next", "reward"][i]) + GAMMA * alive * following[best]
+        errors = []
+        for level in range(5):  # the stored choices, each given those before
+            before = choices[: level + 1] if level else []
+            q = lookup(loss.value_network_params, level, data, i, before)
+            taken = tuple(choices[:2]) if level == 0 else (choices[level + 1],)
+            errors.append(abs(q[taken] - y))
+            huber = 0.5 * errors[-1] ** 2 if errors[-1] < 1 else errors[-1] - 0.5
+            td += td_weights[i] * huber
+            if data["is_demonstration"][i] and kind != "none":
+                term += term_weights[i] * demonstration_term(kind, q, taken, level)
+        priorities.append(sum(errors) / 5)
+    count = len(data) if kind == "sdqfd" else max(int(data["is_demonstration"].sum()), 1)
+    return td / len(data), 0.2 * term / count, priorities
 
 
 @pytest.mark.parametrize("experts", ["some", "all", "none"])
-@pytest.mark.parametrize("kind", ["none", "dqfd", "sdqfd", "adet"])
+@pytest.mark.parametrize("kind", ["none", *KINDS])
 def test_the_losses_equal_a_loop_written_from_the_formulas(kind, experts):
-    data = batch(experts=experts)
-    loss = make_loss(demonstrations=kind)
+    data, loss = batch(experts=experts), make_loss(demonstrations=kind)
     td, demonstration, priorities = by_hand(loss, data, kind)
     out = loss(data)
     assert float(out["loss_qvalue"].detach()) == pytest.approx(td, rel=1e-5)
-    expected = 0.0 if kind == "none" else demonstration
-    assert float(out["loss_demonstration"].detach()) == pytest.approx(expected, rel=1e-4, abs=1e-7)
+    assert float(out["loss_demonstration"].detach()) == pytest.approx(demonstration, rel=1e-4)
     assert data["td_error"].squeeze(-1).tolist() == pytest.approx(priorities, rel=1e-5)
     assert not out["demonstration_error"].requires_grad
+    (out["loss_qvalue"] + out["loss_demonstration"]).backward()
+    assert all(parameter.grad.any() for parameter in loss.parameters())
+    assert not any(v.requires_grad for v in loss.target_value_network_params.values(True, True))
 
 
-@pytest.mark.parametrize("kind", ["dqfd", "sdqfd", "adet"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("norm", ["max", "mean"])
 @pytest.mark.parametrize("terms", ["none", "critic", "critic_and_policy", "all"])
 def test_importance_weights_multiply_the_chosen_terms(terms, norm, kind):
@@ -148,13 +161,8 @@ def test_importance_weights_multiply_the_chosen_terms(terms, norm, kind):
     divisor = max(drawn) if norm == "max" else sum(drawn) / len(drawn)
     weights = [weight / divisor for weight in drawn]
     loss = make_loss(demonstrations=kind, weighted_terms=terms, weight_norm=norm)
-    td, demonstration, _ = by_hand(
-        loss,
-        data,
-        kind,
-        td_weights=None if terms == "none" else weights,
-        term_weights=weights if terms == "all" else None,
-    )
+    chosen = None if terms == "none" else weights, weights if terms == "all" else None
+    td, demonstration, _ = by_hand(loss, data, kind, *chosen)
     out = loss(data)
     assert float(out["loss_qvalue"].detach()) == pytest.approx(td, rel=1e-5)
     assert float(out["loss_demonstration"].detach()) == pytest.approx(demonstration, rel=1e-5)
@@ -199,16 +207,6 @@ def test_the_margin_of_dqfd_has_gradients_for_the_worst_violation():
     assert q.grad[0].tolist() == pytest.approx([-1.0, 0.0, 1.0])
 
 
-def test_the_target_network_gets_no_gradient_and_the_network_does():
-    loss = make_loss()
-    out = loss(batch())
-    (out["loss_qvalue"] + out["loss_demonstration"]).backward()
-    for parameter in loss.parameters():
-        assert parameter.grad is not None
-        assert parameter.grad.any()
-    assert not any(v.requires_grad for v in loss.target_value_network_params.values(True, True))
-
-
 def test_only_plain_dqn_works_without_the_expert_flag():
     data = batch().exclude("is_demonstration")
     loss = make_loss(demonstrations="none")
@@ -231,7 +229,7 @@ def test_keys_can_be_renamed():
     assert "surprise" in data
 
 
-@pytest.mark.parametrize("demonstrations", ["none", "dqfd", "sdqfd", "adet"])
+@pytest.mark.parametrize("demonstrations", ["none", *KINDS])
 def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum(demonstrations):
     data, found = batch(experts="all"), {}
     for reduction in ("none", "mean", "sum"):
@@ -239,14 +237,14 @@ def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum(demonstra
         found[reduction] = loss(data.clone())
     for name in ("loss_qvalue", "loss_demonstration"):
         losses = found["none"][name]
-        assert losses.shape == (12,)
+        assert losses.shape == (10,)
         torch.testing.assert_close(found["mean"][name], losses.mean())
         torch.testing.assert_close(found["sum"][name], losses.sum())
     for name in ("demonstration_error", "td_error"):
         assert torch.equal(found["none"][name], found["mean"][name])
 
 
-@pytest.mark.parametrize("demonstrations", ["dqfd", "sdqfd", "adet"])
+@pytest.mark.parametrize("demonstrations", KINDS)
 def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstrations):
     data = batch()
     is_demonstration = data["is_demonstration"][:, 0]
@@ -267,10 +265,10 @@ def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstr
 @pytest.mark.parametrize("action_space", ["one_hot", "categorical"])
 def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
     torch.manual_seed(0)
-    network = nn.Linear(4, 5)
+    network = nn.Sequential(nn.Flatten(), nn.Linear(9, 5))
     actor = QValueActor(network, in_keys=["pixels"], action_space=action_space)
-    data = batch().exclude("holding", ("next", "holding"))
-    index = torch.randint(5, (12,))
+    data = batch().select("pixels", "is_demonstration", "next")
+    index = torch.randint(5, (10,))
     data["action"] = nn.functional.one_hot(index, 5) if action_space == "one_hot" else index
     loss = LevelDQNLoss(actor, demonstrations="sdqfd", margin=0.3).make_value_estimator(gamma=GAMMA)
     found = loss(data)

@@ -1,7 +1,8 @@
-"""The SACfD loss against plain arithmetic, and against TorchRL's contract."""
+"""The losses of SACfD and RLPD against plain arithmetic, and against TorchRL's contract."""
 
 import itertools
 import math
+import statistics
 
 import pytest
 import torch
@@ -9,11 +10,9 @@ from torch.distributions import Bernoulli, kl_divergence
 from torchrl.objectives import SoftUpdate, ValueEstimators
 
 from ba_torchrl.envs import keys
+from ba_torchrl.objectives.rlpd import RLPDLoss
 from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SoftUpdateByNetwork
-from tests.linear_sac import (
-    batch,
-    make,
-)
+from tests.linear_sac import batch, make
 
 
 def affine(row_weights, bias, x):
@@ -43,8 +42,12 @@ def by_hand(
     terms="critic_and_policy",
     norm="max",
     entropy_backup=True,
+    of_policy=min,
 ):
-    """The terms of the loss, computed with Python floats and loops."""
+    """The terms of the loss, computed with Python floats and loops.
+
+    ``of_policy`` is the value of the critics' values that the policy maximises.
+    """
 
     def parameters(name):
         tree = getattr(loss, name)
@@ -68,7 +71,8 @@ def by_hand(
 
     n = len(data)
     critic, policy_weights, others = importance(data, terms, norm)
-    qvalue = actor_term = alpha_term = entropy = value = behaviour = weighted_behaviour = 0.0
+    qvalue = actor_term = alpha_term = entropy = value = spread = 0.0
+    behaviour = weighted_behaviour = 0.0
     experts, priorities = 0, []
     for i in range(n):
         x, following = observation(data, i), observation(data[keys.NEXT], i)
@@ -79,12 +83,14 @@ def by_hand(
         y = float(data[keys.NEXT, keys.REWARD][i])
         if not data[keys.NEXT, keys.TERMINATED][i]:
             y += gamma * bootstrap
-        errors = [v - y for v in q(x, stored, "")]
+        values = q(x, stored, "")
+        errors = [v - y for v in values]
         qvalue += critic[i] * sum(e * e for e in errors) / n
-        value += sum(q(x, stored, "")) / 2 / n
-        priorities.append([sum(abs(e) for e in errors) / 2])
+        value += statistics.mean(values) / n
+        spread += statistics.stdev(values) / n
+        priorities.append([statistics.mean(map(abs, errors))])
         action, log_prob = policy(x)
-        actor_term += policy_weights[i] * (alpha * log_prob - min(q(x, action, ""))) / n
+        actor_term += policy_weights[i] * (alpha * log_prob - of_policy(q(x, action, ""))) / n
         alpha_term -= others[i] * math.log(alpha) * (log_prob + target_entropy) / n
         entropy -= log_prob / n
         if keys.IS_DEMONSTRATION in data and data[keys.IS_DEMONSTRATION][i]:
@@ -102,7 +108,13 @@ def by_hand(
         "entropy": entropy,
         "demonstration_error": behaviour,
         "q_value": value,
+        "q_std": spread,
     }, priorities
+
+
+def assert_terms(out, expected):
+    for name, value in out.items():
+        assert value.item() == pytest.approx(expected[name], rel=1e-6), name
 
 
 @pytest.mark.parametrize("weights", [(0.2, 0.8, 0.4, 0.1), None], ids=["weights", "uniform"])
@@ -115,9 +127,8 @@ def test_losses_equal_a_calculation_in_python(experts, weights, demonstration_we
     data = batch(experts, weights)
     expected, priorities = by_hand(loss, data, 0.9, 0.2, -1.5, demonstration_weight)
     out = loss(data)
-    assert set(out.keys()) == set(loss.out_keys) == set(expected)
-    for name, value in expected.items():
-        assert out[name].item() == pytest.approx(value, rel=1e-6), name
+    assert set(out.keys()) == set(loss.out_keys)
+    assert_terms(out, expected)
     assert data[keys.TD_ERROR].shape == (4, 1)
     expected_priorities = torch.tensor(priorities, dtype=torch.float64)
     torch.testing.assert_close(data[keys.TD_ERROR], expected_priorities, rtol=1e-6, atol=0)
@@ -129,32 +140,18 @@ def test_importance_weights_multiply_the_chosen_terms(terms, norm):
     loss = make(alpha_init=0.2, target_entropy=-1.5, weighted_terms=terms, weight_norm=norm)
     data = batch()
     expected, _ = by_hand(loss, data, 0.99, 0.2, -1.5, 1.0, terms, norm)
-    out = loss(data)
-    for name, value in expected.items():
-        assert out[name].item() == pytest.approx(value, rel=1e-6), name
+    assert_terms(loss(data), expected)
 
 
-def test_without_entropy_backup_the_target_is_the_return_alone():
-    data = batch()
-    losses = {}
+def test_defaults_are_those_of_the_appendix_and_the_entropy_can_be_left_out_of_the_target():
+    data, losses = batch(), []
     for backup in (True, False):
-        loss = make(alpha_init=0.2, target_entropy=-1.5, entropy_backup=backup)
-        expected, _ = by_hand(loss, data, 0.99, 0.2, -1.5, 1.0, entropy_backup=backup)
+        loss = make(entropy_backup=backup)
+        expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 1, entropy_backup=backup)
         out = loss(data)
-        for name, value in expected.items():
-            assert out[name].item() == pytest.approx(value, rel=1e-6), name
-        losses[backup] = out["loss_qvalue"].item()
-    assert losses[True] != pytest.approx(losses[False], rel=1e-3)
-
-
-def test_defaults_are_those_of_the_appendix():
-    loss = make()
-    assert float(loss.value_estimator.gamma) == pytest.approx(0.99)
-    assert float(loss.alpha) == pytest.approx(0.01)
-    assert float(loss.target_entropy) == -5
-    data = batch()
-    expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 1)
-    assert float(loss(data)["loss_qvalue"]) == pytest.approx(expected["loss_qvalue"], rel=1e-6)
+        assert_terms(out, expected)
+        losses.append(out["loss_qvalue"].item())
+    assert losses[0] != pytest.approx(losses[1], rel=1e-4)
 
 
 def test_steps_to_next_obs_raises_gamma():
@@ -200,27 +197,6 @@ def test_each_term_reaches_its_own_parameters_only():
         assert not out[name].requires_grad
 
 
-def test_soft_update_moves_the_targets():
-    loss = make()
-    updater = SoftUpdate(loss, tau=0.25)
-    pairs = [("encoder_network_params", "net", "weight"), ("qvalue_network_params", "net", "bias")]
-    with torch.no_grad():
-        for name, *path in pairs:
-            getattr(loss, name)[("module", *path)].add_(1.0)
-    before = [getattr(loss, f"target_{name}")[("module", *path)].clone() for name, *path in pairs]
-    updater.step()
-    for (name, *path), old in zip(pairs, before, strict=True):
-        source = getattr(loss, name)[("module", *path)]
-        target = getattr(loss, f"target_{name}")[("module", *path)]
-        torch.testing.assert_close(target, old + 0.25 * (source - old))
-        assert not torch.equal(target, old)
-    assert not any(n.startswith("target") for n, _ in loss.named_parameters())
-
-
-def loss_names(out):
-    return sorted(out.keys())
-
-
 def test_renamed_keys():
     data = batch()
     plain, renamed = make(), make()
@@ -248,7 +224,7 @@ def test_renamed_keys():
     )
     assert {"act", ("meta", "demo"), ("next", "r")} <= set(renamed.in_keys)
     out = renamed(other)
-    for name in loss_names(expected):
+    for name in plain.out_keys:
         torch.testing.assert_close(out[name], expected[name])
     assert other["prio"].shape == (4, 1)
     with pytest.raises(ValueError, match="not an accepted tensordict key"):
@@ -280,17 +256,19 @@ def test_coefficients_can_be_scheduled_and_saved():
     torch.testing.assert_close(other(data.clone())["loss_actor"], after["loss_actor"])
 
 
-def test_invalid_arguments_are_refused():
-    with pytest.raises(ValueError, match="alpha_init"):
-        make(alpha_init=0.0)
-    with pytest.raises(ValueError, match=r"demonstration_distance.*'mse', 'kl'.*'l1'"):
-        make(demonstration_distance="l1")
-    with pytest.raises(ValueError, match=r"weighted_terms .* 'actor'"):
-        make(weighted_terms="actor")
-    with pytest.raises(ValueError, match=r"weight_norm .* 'median'"):
-        make(weight_norm="median")
-    with pytest.raises(ValueError, match="reduction must be none, mean or sum, got 'max'"):
-        make(reduction="max")
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"alpha_init": 0.0}, "alpha_init"),
+        ({"demonstration_distance": "l1"}, r"demonstration_distance.*'mse', 'kl'.*'l1'"),
+        ({"weighted_terms": "actor"}, r"weighted_terms .* 'actor'"),
+        ({"weight_norm": "median"}, r"weight_norm .* 'median'"),
+        ({"reduction": "max"}, "reduction must be none, mean or sum, got 'max'"),
+    ],
+)
+def test_invalid_arguments_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        make(**settings)
     with pytest.raises(NotImplementedError):
         make().make_value_estimator(ValueEstimators.TDLambda)
 
@@ -435,15 +413,11 @@ def test_losses_and_priorities_are_means_over_the_views_of_the_observation(terms
 
 def test_one_view_of_either_kind():
     data, states, followings = with_views(batch())
-    one_state = data.clone()
-    one_state[keys.PIXELS], one_state[keys.HOLDING] = (
-        states[0][keys.PIXELS],
-        data[keys.HOLDING][:, 0],
-    )
-    assert torch.isfinite(make(target_views=TARGET_VIEWS)(one_state)["loss_qvalue"])
-    one_target = data.clone()
+    one_state, one_target = data.clone(), data.clone()
     for key in (keys.PIXELS, keys.HOLDING):
+        one_state[key] = states[0][key]
         one_target[keys.NEXT, key] = followings[0][keys.NEXT, key]
+    assert torch.isfinite(make(target_views=TARGET_VIEWS)(one_state)["loss_qvalue"])
     assert torch.isfinite(make(views=VIEWS)(one_target)["loss_qvalue"])
 
 
@@ -486,14 +460,11 @@ def with_positives(data):
     return data
 
 
-def features(loss, params, tree, i):
+def features(loss, params, tree):
     weight = getattr(loss, params)["module", "net", "weight"].tolist()
     bias = getattr(loss, params)["module", "net", "bias"].tolist()
-    x = [*tree[keys.PIXELS][i].tolist(), float(tree[keys.HOLDING][i])]
-    return [
-        math.tanh(sum(w * v for w, v in zip(row, x, strict=True)) + b)
-        for row, b in zip(weight, bias, strict=True)
-    ]
+    inputs = torch.cat([tree[keys.PIXELS], tree[keys.HOLDING].double()], dim=1).tolist()
+    return [[math.tanh(v) for v in affine(weight, bias, x)] for x in inputs]
 
 
 def contrastive(**settings):
@@ -503,10 +474,8 @@ def contrastive(**settings):
 
 def test_anchors_are_features_and_positives_those_of_the_target_encoder():
     loss, data = contrastive(), with_positives(batch())
-    anchors = [features(loss, "encoder_network_params", data, i) for i in range(4)]
-    positives = [
-        features(loss, "target_encoder_network_params", data[keys.POSITIVE], i) for i in range(4)
-    ]
+    anchors = features(loss, "encoder_network_params", data)
+    positives = features(loss, "target_encoder_network_params", data[keys.POSITIVE])
     expected = loop(anchors, loss.contrastive.weight.tolist(), positives)
     out = loss.contrastive_loss(data)
     assert list(out.keys()) == ["loss_contrastive"]
@@ -531,12 +500,14 @@ def test_its_gradient_reaches_the_encoder_and_the_similarity_only():
     assert reached == {*encoder, "contrastive.weight"}
 
 
-def test_the_encoders_target_has_a_rate_of_its_own():
+@pytest.mark.parametrize("encoder_tau", [0.25, 0.5])
+def test_targets_follow_and_the_encoders_can_have_a_rate_of_its_own(encoder_tau):
     loss = make()
-    updater = SoftUpdateByNetwork(loss, tau=0.25, taus={"encoder_network": 0.5})
-    assert isinstance(updater, SoftUpdate)
-    rates = {"encoder_network": 0.5, "qvalue_network": 0.25}
+    updater = SoftUpdate(loss, tau=0.25)
+    if encoder_tau != 0.25:
+        updater = SoftUpdateByNetwork(loss, tau=0.25, taus={"encoder_network": encoder_tau})
     before = {}
+    rates = {"encoder_network": encoder_tau, "qvalue_network": 0.25}
     with torch.no_grad():
         for name in rates:
             for value in getattr(loss, f"{name}_params").values(True, True):
@@ -547,3 +518,49 @@ def test_the_encoders_target_has_a_rate_of_its_own():
         online, target = getattr(loss, f"{name}_params"), getattr(loss, f"target_{name}_params")
         for key, old in before[name].items(True, True):
             torch.testing.assert_close(target[key], old + tau * (online[key].detach() - old))
+    assert not any(n.startswith("target") for n, _ in loss.named_parameters())
+
+
+# -- an ensemble of critics (RLPD) ---------------------------------------------------------------
+
+CRITICS = 4
+
+
+def rlpd(draws=0, **settings):
+    options = {"kind": RLPDLoss, "critics": CRITICS, "alpha_init": 0.2, "target_entropy": -1.5}
+    loss = make(**options, **settings)
+    loss.generator.manual_seed(draws)
+    return loss.make_value_estimator(gamma=0.9).double()
+
+
+@pytest.mark.parametrize("entropy_backup", [False, True])
+def test_the_policy_maximises_the_mean_of_the_ensemble(entropy_backup):
+    loss, data = rlpd(subset=CRITICS, entropy_backup=entropy_backup), batch(weights=None)
+    options = {"entropy_backup": entropy_backup, "of_policy": statistics.mean}
+    expected, _ = by_hand(loss, data, 0.9, 0.2, -1.5, 0, **options)
+    out = loss(data)
+    assert set(out.keys()) == set(loss.out_keys)
+    assert_terms(out, expected)
+
+
+def test_targets_are_from_random_subsets_of_the_given_size(monkeypatch):
+    loss, data = rlpd(subset=2, draws=3), batch(weights=None)
+
+    def target():
+        return tuple(loss._target(data)[:, 0].numpy().round(6).tolist())
+
+    drawn, expected = {target() for _ in range(60)}, set()
+    for pair in itertools.combinations(range(CRITICS), 2):
+        # pairs with the same lowest critic have the same target
+        lowest = lambda q, pair=pair: q[..., list(pair)].amin(dim=-1)  # noqa: E731
+        monkeypatch.setattr(loss, "_target_value", lowest)
+        expected.add(target())
+    assert drawn == expected
+    assert len(expected) >= 3
+
+
+def test_the_critics_alone_have_the_same_loss():
+    first, second, data = rlpd(draws=1), rlpd(draws=1), batch(weights=None)
+    critic = first.critic_loss(data)
+    assert "loss_actor" not in critic
+    torch.testing.assert_close(critic["loss_qvalue"], second(data)["loss_qvalue"])

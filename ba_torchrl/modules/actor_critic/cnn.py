@@ -76,20 +76,14 @@ def mlp(*sizes: int) -> nn.Sequential:
 def plain_trunk(
     config: ImageNetworkConfig, spec: ActorCriticSpec, widths: Sequence[int]
 ) -> ImageTrunk:
-    """Return a trunk of plain convolutions.
-
-    Args:
-        config: precision and the input's units.
-        spec: the images.
-        widths: of the stages of 128 px images.
-    """
+    """Return a trunk of plain convolutions with the widths of the stages of 128 px images."""
     stages = trunk_stages(spec.image_size, widths)
     inputs = [config.input_channels(spec.image_channels), *(width for width, _, _ in stages)]
     convs = [
         CastConv2d(channels, width, 3, padding=padding)
         for channels, (width, padding, _) in zip(inputs, stages, strict=False)
     ]
-    return config.image_trunk(convs, [pools for _, _, pools in stages])
+    return ImageTrunk(convs, [pools for _, _, pools in stages], config)
 
 
 @NETWORKS.register("cnn")
@@ -106,19 +100,16 @@ class CNNConfig(ImageNetworkConfig):
         """Return freshly initialised modules."""
         self.check_images(spec)
         features = scaled_width(_WIDTHS[-1], self.width)
+        trunk = self._trunk(spec)
+        loc, log_std = (nn.Linear(features, spec.action_size) for _ in range(2))
         networks = ActorCritic(
-            actor=self._actor(spec, features),
+            actor=PlainActor(trunk, nn.Identity(), loc, log_std),
             encoder=self._trunk(spec),
             critic=self._critic(spec, features),
         )
         for network in networks:
             network.apply(initialise_plain)
         return networks
-
-    def _actor(self, spec: ActorCriticSpec, features: int) -> PlainActor:
-        trunk = self._trunk(spec)
-        loc, log_std = (nn.Linear(features, spec.action_size) for _ in range(2))
-        return PlainActor(trunk, nn.Identity(), loc, log_std)
 
     def _critic(self, spec: ActorCriticSpec, features: int) -> nn.Module:
         hidden = scaled_width(_HIDDEN, self.width)

@@ -211,7 +211,7 @@ class EquivariantConfig(ImageNetworkConfig):
         pools = [  # a stride halves the image as a pool does
             pools and conv.stride == 1 for (_, _, pools), conv in zip(stages, convs, strict=True)
         ]
-        return self.image_trunk(convs, pools)
+        return ImageTrunk(convs, pools, self)
 
     def _convolution(
         self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool

@@ -84,8 +84,8 @@ def truncated_gaussian_policy(
 ) -> ProbabilisticActor:
     """Return the policy whose action is a Gaussian variable truncated to [-1, 1].
 
-    Its mode is tanh(loc). In contrast to the squashed Gaussian, the
-    likelihood of actions at the ends of the range is bounded.
+    Its mode is tanh(loc). In contrast to the squashed Gaussian, the likelihood of actions at the
+    ends of the range is bounded.
 
     Args:
         actor: from the observation to (loc, scale), each [..., A].

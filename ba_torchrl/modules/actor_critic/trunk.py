@@ -13,10 +13,7 @@ from torch import Tensor, nn
 from ba_torchrl.config import StrictModel
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
-from ba_torchrl.modules.layers import (
-    Precision,
-    compute_dtype,
-)
+from ba_torchrl.modules.layers import Precision, compute_dtype
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 SUPPORTED_IMAGE_SIZES = (64, 128)
@@ -41,14 +38,8 @@ def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int,
             f"this network takes images of {' or '.join(map(str, SUPPORTED_IMAGE_SIZES))} px, got "
             f"{image_size}; set obs_size, or crop_size where views are crops"
         )
-    stages = list(
-        zip(
-            widths,
-            (1, 1, 1, 1, 1, 0, 0),
-            (True, True, True, True, False, True, False),
-            strict=True,
-        )
-    )
+    paddings, pools = (1, 1, 1, 1, 1, 0, 0), (True, True, True, True, False, True, False)
+    stages = list(zip(widths, paddings, pools, strict=True))
     return stages if image_size == 128 else stages[1:]
 
 
@@ -87,11 +78,7 @@ class ImageNetworkConfig(StrictModel):
     negative_slope: float = Field(default=0.0, ge=0, lt=1)
 
     def input_channels(self, image_channels: int) -> int:
-        """Return the number of input channels of the first convolution.
-
-        Args:
-            image_channels: channels of the image.
-        """
+        """Return the number of input channels of the first convolution."""
         return image_channels + (1 if self.depth_reference == "camera" else 2)
 
     def check_images(self, spec: ActorCriticSpec) -> None:
@@ -107,11 +94,6 @@ class ImageNetworkConfig(StrictModel):
                     "network takes depth or height in one channel, nothing below zero: choose "
                     "another view_type"
                 )
-
-    def image_trunk(self, convs: Iterable[nn.Module], pools: Iterable[bool]) -> ImageTrunk:
-        """Return a trunk of convolutions, each followed by a 2x2 max pool where ``pools`` is
-        true."""
-        return ImageTrunk(convs, pools, self)
 
 
 class ImageTrunk(nn.Module):

@@ -7,7 +7,6 @@ The plain network chooses a pixel, then a yaw, then height and tilts if the acti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -37,7 +36,6 @@ from ba_torchrl.modules.spatial.views import (
     UprightView,
     centre_fit,
     is_six_dof,
-    patches,
 )
 
 View = Callable[[Tensor, Tensor], Tensor]
@@ -98,21 +96,6 @@ class ASR(SpatialQNetwork):
             )
         view = self.views[level - 1](state.pixels, chosen)
         return self.heads[level - 1](view, state.in_hand, state.scene, state.holding)
-
-
-@dataclass(frozen=True)
-class PatchView:
-    """Heights around the chosen pixel.
-
-    Args:
-        size: rows and columns of the patch.
-    """
-
-    size: int
-
-    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
-        """Return patches [B, 1, p, p], metres."""
-        return patches(pixels, chosen[:, :2], self.size)
 
 
 class ASRNetworkConfig(SpatialImageConfig):
@@ -187,13 +170,13 @@ class PlainYawValues(nn.Module):
         """Return values [B, yaws].
 
         Args:
-            patch: heights around the pixel [B, 1, p, p].
+            patch: heights around the pixel [B, 1, 1, p, p].
             in_hand: [B, C, h, w].
             scene: [B, scene_channels, H/16, W/16].
             holding: [B, 1], which selects the primitive.
         """
         hand = centre_fit(self.config.in_hand(in_hand), patch.shape[-1])
-        x = self.patch(torch.cat([self.config.heights(patch), hand], dim=1))
+        x = self.patch(torch.cat([self.config.heights(patch[:, 0]), hand], dim=1))
         if x.shape[-1] != self.map_size:
             size = (self.map_size, self.map_size)
             x = F.interpolate(x, size, mode="bilinear", align_corners=False)
@@ -216,7 +199,7 @@ class ASRConfig(ASRNetworkConfig, PoseGridConfig):
         levels, patch_size = self._planar_layout("asr", spec)
         positions = PlainPixelValues(spec, self, maps=1)
         yaws = PlainYawValues(spec, self, self.num_rotations, patch_size, positions.scene_channels)
-        return ASR(positions, [(PatchView(patch_size), yaws)], levels)
+        return ASR(positions, [(HeightView(patch_size), yaws)], levels)
 
     def _build_for_poses(self, spec: SpatialSpec) -> ASR:
         """Return the network of five levels; every later level has one view and all its values."""

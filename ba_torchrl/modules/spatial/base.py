@@ -157,11 +157,8 @@ class SpatialImageConfig(StrictModel):
         return self.images(images if self.voxel_scale == 1 else images / self.voxel_scale)
 
     def in_voxels(self, pixel_m: float) -> Self:
-        """Return a copy that scales heights like projections: their unit is a voxel.
-
-        Args:
-            pixel_m: edge of a pixel and a voxel.
-        """
+        """Return a copy that scales heights like projections, whose voxels have the edge
+        ``pixel_m``."""
         return self.model_copy(update={"height_scale_m": pixel_m * self.voxel_scale})
 
     def images(self, images: Tensor) -> Tensor:
@@ -185,11 +182,7 @@ def select_primitive(values: Tensor, holding: Tensor) -> Tensor:
 
 
 def has_yaw(name: str, spec: SpatialSpec) -> bool:
-    """Return whether the action has a yaw besides x and y.
-
-    Args:
-        name: of the network, for the error message.
-        spec: holds the action's components.
+    """Return whether the action has a yaw besides x and y, for the network with a name.
 
     Raises:
         ValueError: the action has other components.

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-from pydantic import Field
-
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.spatial.asr import ASR, ASRNetworkConfig, PatchView
+from ba_torchrl.modules.spatial.asr import ASR
 from ba_torchrl.modules.spatial.base import SpatialSpec
 from ba_torchrl.modules.spatial.equi_asr import (
     SCENE_COPIES,
-    EquivariantYawValues,
-    SceneHead,
+    EquivariantASRConfig,
     SceneVector,
 )
-from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
 from ba_torchrl.modules.spatial.pose_values import FingerSymmetricValues, PoseValues, SceneMapVector
 from ba_torchrl.modules.spatial.views import (
     BothFingerOrders,
@@ -25,11 +19,10 @@ from ba_torchrl.modules.spatial.views import (
     UprightView,
     is_six_dof,
 )
-from ba_torchrl.modules.steerable.layers import planar_rotations_and_flips, planar_yaws
 
 
 @NETWORKS.register("equi_deictic_asr")
-class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
+class EquiDeicticASRConfig(EquivariantASRConfig, PoseGridConfig):
     """Hyper-parameters of the network that sees the scene from every candidate pose.
 
     Pixels and yaws are chosen by the equivariant networks of 'equi_asr'. Each z, ry and rx is
@@ -38,21 +31,14 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
     With yaws of half a turn, a rotation that wraps the yaw swaps the fingers: the same
     pose has the opposite tilts, and the other end of what is held points forward. The values are
     therefore the mean over both orders of the fingers, each with its projections and the in-hand
-    image turned by half a turn; this doubles the cost of these levels.
+    image turned by half a turn; this doubles the cost of these levels. With the scene head
+    "flatten", z and the tilts see a convolution of the scene feature map.
 
     Args:
-        group_order: number of rotations of the dihedral group of the pixel values; the default is
-            that of the reference implementation.
-        scene_head: how the later levels read the scene feature map: "pool" keeps them invariant or
-            equivariant under rotations of the scene; "flatten", of the reference implementation,
-            keeps the positions of its features: yaws see the flattened map, and z and the tilts a
-            convolution of it.
         swap_fingers: take the mean over both orders of the fingers where yaws span half a turn; the
             paper describes one order.
     """
 
-    group_order: int = Field(default=4, ge=2)
-    scene_head: SceneHead = "pool"
     swap_fingers: bool = True
 
     def build(self, spec: SpatialSpec) -> ASR:
@@ -66,19 +52,15 @@ class EquiDeicticASRConfig(ASRNetworkConfig, PoseGridConfig):
         planar, patch_size = self._planar_layout(name, spec)
         levels = (*planar, *self.pose_levels())
         in_voxels = self.in_voxels(spec.pixel_m)
-        gspace = planar_rotations_and_flips(self.group_order)
-        positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
-        gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
+        positions, yaws = self._pixels_and_yaws(spec, in_voxels, patch_size)
         channels = positions.scene_channels
-        scene = partial(SceneVector, self.scene_head, channels, spec.image_size, self.width)
-        yaws = EquivariantYawValues(gspace, yaw_repr, spec, in_voxels, patch_size, scene)
         grid = self.pose_grid(self.num_rotations, spec.half_rotation)
         views = (
             UprightView(grid, spec.pixel_m, patch_size),
             TiltedView(grid._replace(rx_rad=(0.0,)), spec.pixel_m, patch_size),
             TiltedView(grid, spec.pixel_m, patch_size),
         )
-        later = [(PatchView(patch_size), yaws)]
+        later = [yaws]
         for view in views:
             scene = (
                 SceneMapVector(channels, spec.image_size, self.width, copies=SCENE_COPIES)

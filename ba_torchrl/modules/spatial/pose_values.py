@@ -154,14 +154,8 @@ class FingerSymmetricValues(nn.Module):
         self.in_hand = in_hand
 
     def forward(self, views: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
-        """Return values [B, K * values_per_view].
-
-        Args:
-            views: projections [B, 2 K, C, p, p], see `BothFingerOrders`.
-            in_hand: [B, C', h, w].
-            scene: feature map [B, C'', h', w'].
-            holding: [B, 1], which selects the primitive.
-        """
+        """Return values [B, K * values_per_view] of views [B, 2 K, C, p, p], see
+        `BothFingerOrders`; the other arguments are those of `PoseValues`."""
         views = torch.cat(views.chunk(2, dim=1))
         in_hand = torch.cat([in_hand, self.in_hand.reverse_axes(in_hand, "xy")])
         values = self.values(views, in_hand, scene, holding.repeat(2, 1))

@@ -69,13 +69,6 @@ def cell_table(
 ) -> Tensor:
     """Return the `rotated_cells` of every combination of angles, computed once per process.
 
-    Args:
-        yaws_rad: values of rz.
-        ry_rad: values of ry.
-        rx_rad: values of rx.
-        size: voxels along an edge.
-        device: of the result.
-
     Returns:
         int32 [yaws, ry, rx, size, size, size]: 43 MB for 16 x 7 x 7 rotations of 24 voxels, 200 MB
         for 40 voxels. With both orders of the fingers, a process holds twice this.
@@ -141,19 +134,11 @@ def project(patches: Tensor, pixel_m: float, z_m: Tensor, cells: Tensor) -> Tens
 
 
 def project_upright(patches: Tensor, pixel_m: float, z_m: Tensor, rz_rad: Tensor) -> Tensor:
-    """Return the projections of upright tools at several heights; the result equals `project`.
+    """Return the projections of tools without tilts, with yaws [B], which equal those of `project`.
 
-    Without tilts, the occupied voxels of a column are those below a height, before and after the
-    rotation and the median filter, so no voxels are needed.
-
-    Args:
-        patches: heights around the tool points [B, p, p], metres, in the axes of the scene.
-        pixel_m: edge of a pixel and a voxel.
-        z_m: heights of the tool points [B, K].
-        rz_rad: yaws of the tools [B].
-
-    Returns:
-        float32 [B, K, 3, p, p]: sums along the x, y and z axes.
+    The occupied voxels of a column are then those below a height, before and after the rotation and
+    the median filter, so no voxels are needed. The other arguments and the result are those of
+    `project`.
     """
     size = patches.shape[-1]
     below = column_counts(_turned(_rounded(patches), rz_rad), widened(z_m), pixel_m, size)

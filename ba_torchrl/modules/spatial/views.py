@@ -67,12 +67,8 @@ def patches(images: Tensor, pixels: Tensor, size: int, yaw_rad: Tensor | None = 
 
 
 def centre_fit(images: Tensor, size: int) -> Tensor:
-    """Return images [B, C, h, h] cropped, or padded with zeros, to ``size`` about their centre.
-
-    Args:
-        images: of a size that differs from ``size`` by an even number.
-        size: rows and columns of the result.
-    """
+    """Return images [B, C, h, h] cropped, or padded with zeros, to ``size`` about their centre;
+    the two sizes differ by an even number."""
     margin = (size - images.shape[-1]) // 2
     return F.pad(images, (margin,) * 4) if margin else images
 
@@ -133,12 +129,7 @@ class PoseGridConfig(StrictModel):
         return tuple(Level((name,), (count,)) for name, count in counts.items())
 
     def pose_grid(self, num_rotations: int, half_rotation: bool) -> PoseGrid:
-        """Return the values of z and the angles.
-
-        Args:
-            num_rotations: number of yaws.
-            half_rotation: whether the yaws span half a turn.
-        """
+        """Return the values of z and the angles; yaws span half a turn or a whole one."""
         turn = math.pi if half_rotation else 2 * math.pi
         values = {
             level.components[0]: _spaced(*self.limits[level.components[0]], level.shape[0])
@@ -228,11 +219,7 @@ class TiltedView:
 
 @dataclass(frozen=True)
 class BothFingerOrders:
-    """Projections at the candidate poses, then at the same poses with swapped fingers.
-
-    Args:
-        view: of the poses.
-    """
+    """Projections of a view at the candidate poses, then at the same poses with swapped fingers."""
 
     view: UprightView | TiltedView
 

@@ -54,9 +54,7 @@ class KernelBlock:
         return self._copies[key]
 
 
-_BLOCKS: dict[tuple, KernelBlock | None] = {}
-
-
+@cache
 def kernel_block(
     gspace: GSpace2D, in_repr: Representation, out_repr: Representation, kernel_size: int
 ) -> KernelBlock | None:
@@ -70,15 +68,6 @@ def kernel_block(
         out_repr: representation of the output field.
         kernel_size: pixels.
     """
-    key = (gspace, in_repr.name, out_repr.name, kernel_size)
-    if key not in _BLOCKS:
-        _BLOCKS[key] = _build_block(gspace, in_repr, out_repr, kernel_size)
-    return _BLOCKS[key]
-
-
-def _build_block(
-    gspace: GSpace2D, in_repr: Representation, out_repr: Representation, kernel_size: int
-) -> KernelBlock | None:
     from escnn.nn import FieldType, R2Conv
 
     types = FieldType(gspace, [in_repr]), FieldType(gspace, [out_repr])

@@ -60,9 +60,6 @@ def reuse_filters() -> Iterator[None]:
 def planar_rotations(order: int) -> GSpace2D:
     """Return escnn's space of planar images under the rotations of the cyclic group C_order.
 
-    Args:
-        order: number of rotations.
-
     Raises:
         ImportError: escnn is not installed; the message names the fix.
     """
@@ -70,10 +67,7 @@ def planar_rotations(order: int) -> GSpace2D:
 
 
 def planar_rotations_and_flips(order: int) -> GSpace2D:
-    """Return escnn's space of planar images under the dihedral group D_order.
-
-    Args:
-        order: number of rotations; with the reflections the group has twice as many elements.
+    """Return escnn's space of planar images under the dihedral group D_order of 2 order elements.
 
     Raises:
         ImportError: escnn is not installed; the message names the fix.
@@ -268,14 +262,7 @@ class SteerableConv2d(nn.Module):
 
 
 class SteerableLinear(SteerableConv2d):
-    """The steerable map between vectors of fields: a one-pixel steerable convolution.
-
-    Args:
-        gspace: images and their symmetry group.
-        in_types: input fields as (representation, multiplicity); each representation once.
-        out_types: output fields likewise.
-        bias: one bias per trivial irrep of the output.
-    """
+    """The steerable map between vectors of fields: a one-pixel `SteerableConv2d`."""
 
     def __init__(
         self, gspace: GSpace2D, in_types: FieldTypes, out_types: FieldTypes, *, bias: bool = True
