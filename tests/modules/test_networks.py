@@ -196,7 +196,6 @@ for name, spec in (("equi", actor_critic), ("equi_fcn", spatial), ("equi_asr", s
         NETWORKS[name]().build(spec)
     except MissingPackageError as error:
         assert "pip install --no-deps escnn==1.0.11" in str(error), error
-        assert "make setup" in str(error), error
     else:
         raise SystemExit(f"built {name} without escnn")
 """
