@@ -188,6 +188,8 @@ class Command:
                 settings = compose(name, overrides=overrides, return_hydra_config=True)
             except HydraException as error:
                 raise ConfigError(_explain(error, name, overrides)) from None
+            except ValueError as error:  # a preset that is neither a name nor a list
+                raise ConfigError(f"{error}; see --help") from None
             HydraConfig.instance().set_config(settings)
             with open_dict(settings):
                 del settings["hydra"]

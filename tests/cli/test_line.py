@@ -172,6 +172,7 @@ def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
     assert "trained policies       close_loop/block_picking" in out
 
 
+@pytest.mark.slow
 def test_speed_prints_rates(capsys, monkeypatch):
     words = ["close_loop/block_reaching", "env.obs_size=64", "steps=4", "num_envs=2", "updates=1"]
     monkeypatch.setattr("ba_torchrl.commands.speed.WARM_UP_UPDATES", 0)

@@ -105,7 +105,7 @@ class TestMakeLogger:
     @pytest.mark.parametrize("backend", ["tensorboard", "wandb"])
     def test_a_missing_package_is_an_error_with_the_fix(self, tmp_path, monkeypatch, backend):
         monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-        with pytest.raises(ImportError, match=rf"pip install 'ba-torchrl\[{backend}\]'"):
+        with pytest.raises(ImportError, match=rf"pip install .*{backend}"):
             ScalarLog(tmp_path, backend)
 
     def test_an_unknown_backend_is_refused(self, tmp_path):

@@ -1,4 +1,4 @@
-"""docs/tasks.md equals the output of `recipes/tasks.py` and lists the conditions of success."""
+"""docs/tasks.md equals the output of `ba-torchrl tasks` and lists the conditions of success."""
 
 from pathlib import Path
 
@@ -9,16 +9,18 @@ PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 
 
 def test_the_page_is_up_to_date():
-    assert PAGE.read_text(encoding="utf-8") == task_page(), "run `python recipes/tasks.py`"
+    assert PAGE.read_text(encoding="utf-8") == task_page(), (
+        "run `ba-torchrl tasks path=docs/tasks.md`"
+    )
 
 
 def test_a_section_has_description_conditions_and_parameters():
     page = task_page(["close_loop/object_grasping"])
     assert "### `close_loop/object_grasping`" in page
-    assert "- success: `is_grasped`, `is_lifted`" in page
-    assert "- `object_set`: 'random'. Name of the object set" in page
-    assert "- `max_attempts`: None. Episodes with the same heap" in page
-    assert "- `num_objects`: 5 (1, 2, 3," in page
+    assert "- success: is_grasped, is_lifted" in page
+    assert "- object_set: 'random'. Name of the object set" in page
+    assert "- max_attempts: None. Episodes with the same heap" in page
+    assert "- num_objects: 5 (1, 2, 3," in page
     assert "block_picking" not in page
 
 

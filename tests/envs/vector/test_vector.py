@@ -15,10 +15,10 @@ import ba_torchrl
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector.make import (
     SerialVectorEnv,
-    VectorEnv,
     available_cores,
     make_vector,
 )
+from ba_torchrl.envs.vector.parallel import VectorEnv
 
 FORK = WorkerOptions(start_method="fork")
 
