@@ -51,14 +51,13 @@ def main() -> int:
         print(json.dumps(check()))
         return 0
     rows = []
+    print(f"| python | versions | {' | '.join(SHOWN)} | checks | minutes |")
+    print(f"|{'---|' * (len(SHOWN) + 4)}")
     for python in options.pythons:
         for name in options.sets:
             print(f"== Python {python}, {name} versions", file=sys.stderr)
             rows.append(run(python, name, options.folder / f"{python}-{name}"))
-    print(f"| python | versions | {' | '.join(SHOWN)} | checks | minutes |")
-    print(f"|{'---|' * (len(SHOWN) + 4)}")
-    for row in rows:
-        print(f"| {' | '.join(row)} |")
+            print(f"| {' | '.join(rows[-1])} |", flush=True)
     return int(any("passed" not in row[-2] for row in rows))
 
 

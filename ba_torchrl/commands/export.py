@@ -1,7 +1,7 @@
 """Write the policy of a run into one file, with a card of its success.
 
+ba-torchrl export runs/my-run     # writes close_loop_block_picking.safetensors
 ba-torchrl export runs/my-run path=my-policy.safetensors
-ba-torchrl export runs/my-run                      # as the policy that the package ships
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pydantic import Field
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Text, check_writable_file, checked
 from ba_torchrl.commands import evaluate
-from ba_torchrl.training.policy import TENSORS, save_policy, shipped_file
+from ba_torchrl.training.policy import TENSORS, save_policy
 
 PolicyFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(TENSORS,)))]
 
@@ -24,7 +24,7 @@ class Settings(evaluate.Settings):
     """Settings of this command: those of the evaluation that the card reports, and the file."""
 
     path: PolicyFile | None = None
-    """File of the policy; the card is beside it. Null for the package's file of the task."""
+    """File of the policy; the card is beside it. Null for a file named after the task."""
     device: Text = "cpu"
     """Where the policy is computed."""
     episodes: int = Field(default=200, ge=1)
@@ -34,7 +34,7 @@ class Settings(evaluate.Settings):
 def main(settings: Settings) -> None:
     """Evaluate the policy, and write it with its card."""
     policy = evaluate.load(settings.policy, settings)
-    path = shipped_file(policy.task) if settings.path is None else Path(settings.path)
+    path = Path(settings.path or f"{policy.task.replace('/', '_')}{TENSORS}")
     check_writable_file(path)
     found = evaluate.play(policy, settings)
     seed = policy.test_seed if settings.seed is None else settings.seed

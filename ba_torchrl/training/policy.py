@@ -198,7 +198,7 @@ def save_policy(
     config = policy.config.resolved()
     for name in ("run_dir", "resume", "device", "demonstrations_path"):
         del config[name]
-    is_shipped = path == shipped_file(policy.task)
+    is_shipped = path.resolve() == shipped_file(policy.task)
     named = f"policy=trained task={policy.task}" if is_shipped else f"policy={path.name}"
     card = PolicyCard(
         task=policy.task,

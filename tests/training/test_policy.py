@@ -10,6 +10,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import policy as policies
 from ba_torchrl.training.checkpoint import load
 from ba_torchrl.training.experiment import Experiment
+from tests.recipes import recipe
 from tests.training.test_experiment import tiny
 
 
@@ -108,3 +109,17 @@ def policies_evaluation(env, policy):
     from ba_torchrl.training.evaluation import evaluate
 
     return evaluate(env, policy, 20, seed=policy.test_seed)
+
+
+def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = ("episodes=2", "num_envs=1", "parallel=false")
+    recipe("export", str(run), *options)
+    file = f"{ba_torchrl.load_policy(run).task.replace('/', '_')}.safetensors"
+    assert f"policy  {file}, 0." in capsys.readouterr().out
+    recipe("evaluate", file, *options)
+    out = capsys.readouterr().out
+    success = float(out.split("success_rate ")[1].split()[0])
+    assert f"  card      {success:.2f} (" in out  # the same episodes
+    recipe("play", f"policy={file}", "video=film.gif")
+    assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF")
