@@ -51,7 +51,7 @@ def main() -> int:
         print(json.dumps(check()))
         return 0
     rows = []
-    print(f"| python | versions | {' | '.join(SHOWN)} | checks | minutes |")
+    print(f"| python | versions | {' | '.join(SHOWN)} | checks | their minutes |")
     print(f"|{'---|' * (len(SHOWN) + 4)}")
     for python in options.pythons:
         for name in options.sets:
@@ -69,10 +69,10 @@ def run(python: str, name: str, folder: Path) -> list[str]:
         name: "lowest" or "newest".
         folder: of the environment.
     """
-    start = time.perf_counter()
     interpreter = folder / "bin/python"
     if not (folder / ".installed").exists():
         install(python, name, folder)
+    start = time.perf_counter()
     with tempfile.TemporaryDirectory() as empty:
         command = [str(interpreter), str(Path(__file__).resolve()), "--inside"]
         done = subprocess.run(command, cwd=empty, capture_output=True, text=True, check=False)
