@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -12,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from typing_extensions import Self
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, known_names
 
 Interval = tuple[float, float]
 
@@ -24,9 +23,8 @@ def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigEr
     for item in error.errors():
         field = ".".join(str(part) for part in item["loc"]) or "configuration"
         if item["type"] == "extra_forbidden":
-            close = difflib.get_close_matches(field.split(".")[-1], known, n=1)
-            hint = f" Did you mean {close[0]!r}?" if close else ""
-            lines.append(f"unknown parameter {field!r}.{hint} Known: {', '.join(known)}")
+            end = known_names(field.split(".")[-1], known)
+            lines.append(f"unknown parameter {field!r}.{end}")
         else:
             message = item["msg"].removeprefix("Value error, ")
             given = repr(item["input"])

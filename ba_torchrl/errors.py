@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 import shlex
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, requires
 
 
@@ -21,6 +23,12 @@ class UnknownNameError(ConfigError, KeyError):
 
 class MissingPackageError(ConfigError, ImportError):
     """An optional package that is not installed; the message says how to install it."""
+
+
+def known_names(name: str, known: Sequence[str]) -> str:
+    """Return the end of a message on an unknown name: the nearest known one, and all."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return (f" Did you mean {close[0]!r}?" if close else "") + f" Known: {', '.join(known)}"
 
 
 def install_command(*packages: str) -> str:

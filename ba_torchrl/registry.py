@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
-from ba_torchrl.errors import UnknownNameError
+from ba_torchrl.errors import UnknownNameError, known_names
 from ba_torchrl.plugins import load_entry_points
 
 T = TypeVar("T")
@@ -92,10 +91,8 @@ class Registry(Generic[T]):
         try:
             return self._entries[name]
         except KeyError:
-            close = difflib.get_close_matches(str(name), self._entries, n=1)
-            hint = f" Did you mean {close[0]!r}?" if close else ""
             raise UnknownNameError(
-                f"unknown {self.kind} {name!r}.{hint} Known: {', '.join(self)}. Entries from "
+                f"unknown {self.kind} {name!r}.{known_names(str(name), list(self))}. Entries from "
                 "outside the package are known once their module is imported (recipes: "
                 "plugins=[module]; worker processes: register_modules=[module])"
             ) from None

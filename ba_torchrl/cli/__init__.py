@@ -6,7 +6,6 @@ Each module of `ba_torchrl.commands` is a command, and its docstring is the comm
 from __future__ import annotations
 
 import ast
-import difflib
 import importlib
 import os
 import sys
@@ -16,7 +15,7 @@ from types import ModuleType
 
 from ba_torchrl import __version__
 from ba_torchrl._malloc import tune_malloc
-from ba_torchrl.errors import install_command
+from ba_torchrl.errors import install_command, known_names
 
 PROGRAM = "ba-torchrl"
 EXIT_CODE = 2
@@ -57,10 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.path.insert(0, os.getcwd())
         _import(first).COMMAND.run(rest)
     else:
-        close = difflib.get_close_matches(first, command_names(), n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        known = ", ".join(command_names())
-        sys.stderr.write(f"error: unknown command {first!r}.{hint} Known: {known}\n")
+        end = known_names(first, command_names())
+        sys.stderr.write(f"error: unknown command {first!r}.{end}\n")
         sys.exit(EXIT_CODE)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +26,7 @@ from ba_torchrl.cli import PROGRAM, config_dir
 from ba_torchrl.cli.errors import name_presets, plain_errors
 from ba_torchrl.cli.help import describe
 from ba_torchrl.config import parse
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, known_names
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
 
@@ -133,7 +132,7 @@ class Command:
         is_for_hydra = self.config is not None and any(each in _OF_HYDRA for each in options)
         known = ["--help", *(["--config-name", "--config-dir", *_OF_HYDRA] if self.config else [])]
         if not is_for_hydra and options:
-            raise ConfigError(f"unknown option {options[0]!r}.{_known(options[0], known)}")
+            raise ConfigError(f"unknown option {options[0]!r}.{known_names(options[0], known)}")
         if self.config is None and (found.config_name or found.config_dir):
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
         if found.config_dir is not None and not Path(found.config_dir).is_dir():
@@ -177,7 +176,7 @@ class Command:
         name = arguments.config_name or self.config or self._store_defaults()
         known = self.config_names(arguments.config_dir)
         if self.config is not None and name not in known:
-            raise ConfigError(f"unknown configuration {name!r}.{_known(name, known)}")
+            raise ConfigError(f"unknown configuration {name!r}.{known_names(name, known)}")
         if arguments.config_dir is not None:
             other = Path(arguments.config_dir).resolve()
             if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
@@ -243,7 +242,7 @@ def _explain(error: HydraException, config: str, overrides: Sequence[str]) -> st
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         group, _, name = error.missing_cfg_file.rpartition("/")
         known = [option for option in error.options or () if option != "schema"]
-        return f"unknown {group} {name!r}.{_known(name, known)}"
+        return f"unknown {group} {name!r}.{known_names(name, known)}"
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     is_preset = {each.input_line: _is_preset(each) for each in parsed}
     try:  # what the presets alone give
@@ -273,12 +272,6 @@ def _unknown_name(settings: DictConfig, path: str) -> str | None:
             return None
         if part not in node:
             known = [str(key) for key in node]
-            return f"unknown setting {'.'.join(parts[: index + 1])!r}.{_known(part, known)}"
+            return f"unknown setting {'.'.join(parts[: index + 1])!r}.{known_names(part, known)}"
         node = None if OmegaConf.is_missing(node, part) else node[part]
     return None
-
-
-def _known(name: str, known: Sequence[str]) -> str:
-    """Return the end of a message on an unknown name: the nearest one, and all."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return (f" Did you mean {close[0]!r}?" if close else "") + f" Known: {', '.join(known)}"

@@ -9,10 +9,10 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin
 
+from hydra.core.hydra_config import HydraConfig
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.cli import PROGRAM
 from ba_torchrl.config import EnvConfig, env_config_model
 from ba_torchrl.envs.observations import OBSERVATIONS
@@ -20,18 +20,9 @@ from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.collectors.base import COLLECTORS
-from ba_torchrl.training.grid.launchers.base import LAUNCHERS
 
 CHOICES = {"robot": ROBOTS, "robots": ROBOTS, "view_type": VIEWS, "observations": OBSERVATIONS}
 """Registries that fields of these names choose from."""
-_PRESETS = ("algorithm", "replay", "rotation", "network", "collector", "launcher", "benchmark")
-_REGISTRIES = {
-    "algorithm": ALGORITHMS,
-    "network": NETWORKS,
-    "collector": COLLECTORS,
-    "launcher": LAUNCHERS,
-}
 _INDENT = 6
 
 
@@ -53,11 +44,9 @@ def describe(
         lines += ["", f"--config-name: {' | '.join(names)}"]
         lines += ["--config-dir: a further folder of configurations"]
         lines += ["", "presets:"]
-        for group in _PRESETS:
-            if group in values or group in ("replay", "rotation"):
-                known = hydra_schema.preset_names(group)
-                if known:
-                    lines += _wrapped(f"  {group}=", " | ".join(known))
+        for group in HydraConfig.get().runtime.choices:
+            if "/" not in group:
+                lines += _wrapped(f"  {group}=", " | ".join(hydra_schema.preset_names(group)))
     parts = list(_parts(model, values))
     expanded = {prefix for _, _, _, prefix in parts}
     for title, model, own, prefix in parts:
@@ -81,7 +70,7 @@ def _parts(
         for name in {"seed", "expert"} - values["env"].keys():
             del own[name]
         yield f"env, the environment{f' of {task}' if known else ''}", model, own, "env."
-    for group, registry in _REGISTRIES.items():
+    for group, registry in hydra_schema.GROUPS.items():
         chosen = values.get(group) or {}
         if chosen.get("name") in registry:
             model = registry[chosen["name"]]

@@ -27,16 +27,14 @@ from ba_torchrl.training.policy import TrainedPolicy, shipped_policies, wilson_i
 FPS = 5
 
 
-class Settings(StrictModel):
-    """Settings of this command."""
+class EpisodeSettings(StrictModel):
+    """A policy and the episodes that it plays."""
 
     plugins: Plugins = Field(default_factory=list)
     """Modules outside the package, those that the run names among them: [my_tasks]."""
     policy: Text
-    """A run folder, one of the checkpoints in it, a .safetensors file, or "trained" for those that
-    the package ships."""
-    task: TaskId | None = None
-    """Of policy=trained; null for all of them."""
+    """A run folder, one of the checkpoints in it, a .safetensors file, or in evaluate "trained" for
+    those that the package ships."""
     which: Which = "best"
     """Of a run folder: the checkpoint with the best evaluation, or the latest."""
     device: Text = "auto"
@@ -45,12 +43,19 @@ class Settings(StrictModel):
     """Their number."""
     num_envs: NumEnvs = 5
     """Environments that step together."""
-    expert: bool = False
-    """Close loop: compare the policy's actions with the expert's, by component."""
     parallel: bool | None = None
     """Worker processes; null for processes where at least three can run at a time."""
     seed: Seed | None = None
     """Of the episodes; null for episodes that training did not use."""
+
+
+class Settings(EpisodeSettings):
+    """Settings of this command."""
+
+    task: TaskId | None = None
+    """Of policy=trained; null for all of them."""
+    expert: bool = False
+    """Close loop: compare the policy's actions with the expert's, by component."""
     video: VideoFile | None = None
     """A file such as evaluation.mp4 or evaluation.gif."""
     video_episodes: Count = 5
@@ -62,26 +67,21 @@ def main(settings: Settings) -> None:
     if settings.policy != "trained":
         if settings.task is not None:
             raise ConfigError("task: the policy names its task; leave it out")
-        _evaluate(load(settings.policy, settings), settings)
+        _evaluate(settings.policy, settings)
     elif settings.task is not None:
-        _evaluate(load(settings.task, settings), settings)
+        _evaluate(settings.task, settings)
     else:
         if settings.video is not None:
             raise ConfigError("video: name the task of the policy")
         for task in shipped_policies():
-            _evaluate(load(task, settings), settings)
-
-
-def load(source: str, settings: Settings) -> TrainedPolicy:
-    """Load a policy, and check that it can be compared with the expert if that is asked for."""
-    policy = load_policy(source, settings.which, settings.device)
-    if settings.expert:
-        check_comparable(policy.task)
-    return policy
+            _evaluate(task, settings)
 
 
 def play(
-    policy: TrainedPolicy, settings: Settings, episodes: list[TensorDict] | None = None
+    policy: TrainedPolicy,
+    settings: EpisodeSettings,
+    episodes: list[TensorDict] | None = None,
+    expert: bool = False,
 ) -> Evaluation:
     """Play greedy episodes in new environments.
 
@@ -89,6 +89,7 @@ def play(
         policy: acts.
         settings: of the episodes.
         episodes: which they are appended to.
+        expert: add the expert's actions to them.
     """
     seed = policy.test_seed if settings.seed is None else settings.seed
     env = make_vector_env(
@@ -97,7 +98,7 @@ def play(
         parallel=settings.parallel,
         register_modules=settings.plugins,
         seed=seed,
-        expert=settings.expert,
+        expert=expert,
     )
 
     def on_episode(episode: TensorDict) -> None:
@@ -112,9 +113,12 @@ def play(
         env.close()
 
 
-def _evaluate(policy: TrainedPolicy, settings: Settings) -> None:
+def _evaluate(source: str, settings: Settings) -> None:
+    policy = load_policy(source, settings.which, settings.device)
+    if settings.expert:
+        check_comparable(policy.task)
     episodes: list[TensorDict] = []
-    found = play(policy, settings, episodes)
+    found = play(policy, settings, episodes, settings.expert)
     low, high = wilson_interval(found.successes, found.episodes)
     print(
         f"success_rate {found.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "

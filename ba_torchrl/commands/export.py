@@ -12,6 +12,7 @@ from typing import Annotated
 
 from pydantic import Field
 
+from ba_torchrl import load_policy
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Text, check_writable_file, checked
 from ba_torchrl.commands import evaluate
@@ -20,7 +21,7 @@ from ba_torchrl.training.policy import TENSORS, save_policy
 PolicyFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(TENSORS,)))]
 
 
-class Settings(evaluate.Settings):
+class Settings(evaluate.EpisodeSettings):
     """Settings of this command: those of the evaluation that the card reports, and the file."""
 
     path: PolicyFile | None = None
@@ -33,7 +34,7 @@ class Settings(evaluate.Settings):
 
 def main(settings: Settings) -> None:
     """Evaluate the policy, and write it with its card."""
-    policy = evaluate.load(settings.policy, settings)
+    policy = load_policy(settings.policy, settings.which, settings.device)
     path = Path(settings.path or f"{policy.task.replace('/', '_')}{TENSORS}")
     check_writable_file(path)
     found = evaluate.play(policy, settings)

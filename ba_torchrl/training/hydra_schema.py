@@ -6,7 +6,6 @@ Any field can therefore be set on the command line, and no default is written tw
 from __future__ import annotations
 
 import contextlib
-import difflib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -20,7 +19,7 @@ from pydantic import BaseModel
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.config import EnvConfig
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, known_names
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.training.collectors.base import COLLECTORS
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
@@ -132,9 +131,7 @@ def preset(group: str, name: str) -> dict[str, Any]:
         if parts and parts[0] in preset_names(other):
             overrides.append(f"+{other}={parts.pop(0)}")
     if not first or parts:
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise ConfigError(f"unknown {group} {name!r}.{hint} Known: {', '.join(known)}")
+        raise ConfigError(f"unknown {group} {name!r}.{known_names(name, known)}")
     settings = compose(overrides=overrides)
     return OmegaConf.to_container(settings[group], resolve=True)
 
