@@ -273,5 +273,7 @@ def _unknown_name(settings: DictConfig, path: str) -> str | None:
         if part not in node:
             known = [str(key) for key in node]
             return f"unknown setting {'.'.join(parts[: index + 1])!r}.{known_names(part, known)}"
-        node = None if OmegaConf.is_missing(node, part) else node[part]
+        # the value itself is not read: it can be an interpolation of Hydra's settings
+        is_last = index == len(parts) - 1
+        node = None if is_last or OmegaConf.is_missing(node, part) else node[part]
     return None

@@ -47,6 +47,7 @@ def test_the_overview_lists_every_command_with_its_first_line(capsys):
         (["train", "algorithm=sacd"], "unknown algorithm 'sacd'. Did you mean 'sacfd'?"),
         (["train", "replay=pre"], "unknown replay 'pre'. Did you mean 'per'?"),
         (["train", "task=close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
+        (["train", "+seed=1", "run_dir=x"], "An item is already at 'seed'"),
         (["train", "env.workspace=[1,2"], "cannot read 'env.workspace=[1,2'"),
         (["train", "block_picking"], "'block_picking' sets nothing; settings are FIELD=VALUE"),
         (["evaluate"], "policy is missing; see --help"),
