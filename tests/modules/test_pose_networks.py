@@ -153,7 +153,7 @@ def test_values_equal_those_of_the_concatenated_features_of_each_view(views, val
     torch.manual_seed(0)
     config = NETWORKS["asr"](width=0.25, precision="float32", voxel_scale=10.0)
     spec = spatial_spec(SIZE, 24, 3, POSE)
-    head = PoseValues(spec, config, 3, values_per_view, 24, SceneMapVector(8, SIZE, 0.25))
+    head = PoseValues(spec, config, 3, values_per_view, 24, SceneMapVector(8, SIZE, config))
     with torch.no_grad():
         for parameter in head.parameters():
             parameter.add_(0.01 * torch.randn_like(parameter))

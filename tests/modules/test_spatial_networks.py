@@ -84,6 +84,15 @@ def test_parameter_counts_match_the_reference(name, components, in_hand_size, fi
     assert sum(map(count, parts.values())) == later
 
 
+def test_dense_width_changes_the_hidden_fully_connected_layers_alone():
+    fields = {"components": XYR, "width": 1.0, "num_rotations": 16}
+    network = build("equi_asr", 128, dense_width=0.25, **fields)
+    pixels = EQUI_PIXELS - GENERATOR + IN_HAND_CONVS + 9217 * 256 + 257 * (16 * 16 * 48 + 16)
+    hand = IN_HAND_CONVS + 9217 * 256 + 257 * 128
+    scene = 257 * 256 + 257 * 128
+    assert count(network) == pixels + YAW_CONVS + 257 * (16 * 16 * 32 + 16) + hand + scene
+
+
 def test_equi_fcn_with_yaws_has_the_size_of_the_reference():
     network = build("equi_fcn", 128, width=1.0, num_rotations=8)
     assert count(network) == 47_125_954  # 47.1 million at C16

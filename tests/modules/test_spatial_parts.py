@@ -83,13 +83,13 @@ def test_in_hand_encoders_refuse_unsupported_sizes():
     assert InHandMap(1, 24, 0.1).out_size == 8
     assert InHandMap(1, 40, 0.1).out_size == 16
     for size, last in ((24, 6), (40, 5), (32, 4), (20, 5)):
-        encoder = InHandVector(1, size, 0.25)
+        encoder = InHandVector(1, size, 0.25, 256)
         assert encoder.linear.in_features == 64 * last * last
         assert encoder(torch.rand(3, 1, size, size)).shape == (3, 256)
     with pytest.raises(ValueError, match="in_hand_size of at least 10"):
         InHandMap(1, 9, 0.1)
     with pytest.raises(ValueError, match="4 to 55"):
-        InHandVector(1, 56, 0.1)
+        InHandVector(1, 56, 0.1, 100)
 
 
 # -- the dynamic filter -----------------------------------------------------------------------

@@ -15,7 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.layers import initialise_plain
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
     Level,
@@ -157,7 +157,7 @@ class PlainYawValues(nn.Module):
         self.config = config
         self.patch = InHandMap(1 + spec.in_hand_channels, patch_size, config.width)
         self.map_size = min(self.patch.out_size, _LARGEST_MAP)
-        hidden = scaled_width(1024, config.width)
+        hidden = config.scaled_dense_width(1024)
         self.linear = nn.Linear(
             self.patch.out_channels * self.map_size**2
             + scene_channels * (spec.image_size // UNET_STRIDE) ** 2,
@@ -221,7 +221,7 @@ class ASRConfig(ASRNetworkConfig, PoseGridConfig):
                 view.channels,
                 level.shape[0],
                 patch_size,
-                SceneMapVector(positions.scene_channels, spec.image_size, self.width),
+                SceneMapVector(positions.scene_channels, spec.image_size, self),
             )
             for view, level in zip(views, levels[1:], strict=True)
         ]

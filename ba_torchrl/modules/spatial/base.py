@@ -18,7 +18,7 @@ from ba_torchrl.config import StrictModel
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import Control
-from ba_torchrl.modules.layers import Precision, compute_dtype
+from ba_torchrl.modules.layers import Precision, compute_dtype, scaled_width
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,8 @@ class SpatialImageConfig(StrictModel):
         height_scale_m: height that is scaled to one. The floor stays zero, like the padding.
         voxel_scale: number of voxels of a projection that is scaled to one.
         width: factor on every layer's width; 1 is the reference's size.
+        dense_width: factor on the widths of the hidden fully connected layers; None for `width`.
+            They hold most of the parameters of a narrow network.
     """
 
     control: ClassVar[Control] = "open_loop"
@@ -145,6 +147,11 @@ class SpatialImageConfig(StrictModel):
     height_scale_m: float = Field(default=1.0, gt=0)
     voxel_scale: float = Field(default=1.0, gt=0)
     width: float = Field(default=1.0, gt=0)
+    dense_width: float | None = Field(default=None, gt=0)
+
+    def scaled_dense_width(self, width: int) -> int:
+        """Return the width of a fully connected layer of ``width`` in the reference's size."""
+        return scaled_width(width, self.width if self.dense_width is None else self.dense_width)
 
     def heights(self, images: Tensor) -> Tensor:
         """Return heights [B, 1, H, W] divided by the scale, in the compute dtype."""

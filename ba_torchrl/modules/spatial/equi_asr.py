@@ -83,11 +83,13 @@ class SceneVector(nn.Sequential):
             change when the map rotates with the scene; "flatten" for the flattened map.
         channels: of the map, each invariant except for the positions.
         image_size: rows and columns of the heightmap.
-        width: factor on the layers' widths, 1024 and 512.
+        config: width of the layers.
     """
 
-    def __init__(self, head: SceneHead, channels: int, image_size: int, width: float) -> None:
-        wide, narrow = scaled_width(1024, width), scaled_width(512, width)
+    def __init__(
+        self, head: SceneHead, channels: int, image_size: int, config: SpatialImageConfig
+    ) -> None:
+        wide, narrow = config.scaled_dense_width(1024), config.scaled_dense_width(512)
         pixels = (image_size // UNET_STRIDE) ** 2
         inputs = 2 * channels if head == "pool" else SCENE_COPIES * channels * pixels
         super().__init__(nn.Linear(inputs, wide), nn.ReLU(), nn.Linear(wide, narrow))
@@ -154,8 +156,8 @@ class EquivariantYawValues(nn.Module):
         self.held = DynamicSteerableConv2d(gspace, gspace.regular_repr, fields, 1)
         self.values = SteerableLinear(gspace, types, [(out_repr, 2)])
 
-        narrow = scaled_width(512, config.width)
-        self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width)
+        narrow, wide = config.scaled_dense_width(512), config.scaled_dense_width(1024)
+        self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width, wide)
         self.hand_linear = nn.Linear(self.hand.out_features, narrow)
         self.scene = make_scene()
         self.apply(initialise_plain)
@@ -214,7 +216,7 @@ class EquivariantASRConfig(ASRNetworkConfig):
         positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
         gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
         channels = positions.scene_channels
-        scene = partial(SceneVector, self.scene_head, channels, spec.image_size, self.width)
+        scene = partial(SceneVector, self.scene_head, channels, spec.image_size, self)
         yaws = EquivariantYawValues(gspace, yaw_repr, spec, yaw_units, patch_size, scene)
         return positions, (HeightView(patch_size), yaws)
 

@@ -63,9 +63,9 @@ class EquiDeicticASRConfig(EquivariantASRConfig, PoseGridConfig):
         later = [yaws]
         for view in views:
             scene = (
-                SceneMapVector(channels, spec.image_size, self.width, copies=SCENE_COPIES)
+                SceneMapVector(channels, spec.image_size, self, copies=SCENE_COPIES)
                 if self.scene_head == "flatten"
-                else SceneVector("pool", channels, spec.image_size, self.width)
+                else SceneVector("pool", channels, spec.image_size, self)
             )
             values = PoseValues(spec, in_voxels, view.channels, 1, patch_size, scene)
             if self.swap_fingers and spec.half_rotation:

@@ -113,7 +113,8 @@ class EquivariantPixelValues(nn.Module):
         regular = gspace.regular_repr
         self._group_size = regular.size
         self.scene_channels = fields[-1]
-        self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width)
+        wide = config.scaled_dense_width(1024)
+        self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width, wide)
         self.hand.apply(initialise_plain)
         self.unet = equivariant_unet(gspace, fields)
         self.held = DynamicSteerableConv2d(gspace, regular, fields[0], 3)

@@ -48,13 +48,14 @@ class InHandVector(nn.Module):
     Args:
         channels: of the image.
         size: of the image, pixels.
-        width: factor on the layers' widths, 32, 64, 128, 256 and 1024.
+        width: factor on the convolutions' widths, 32, 64, 128 and 256.
+        out_features: width of the linear layer.
 
     Raises:
         ValueError: the image is too small or too large for two or three pools.
     """
 
-    def __init__(self, channels: int, size: int, width: float) -> None:
+    def __init__(self, channels: int, size: int, width: float, out_features: int) -> None:
         super().__init__()
         pools = 2 if size // 4 <= _LARGEST_LAST_MAP else 3
         last = size >> pools
@@ -66,8 +67,8 @@ class InHandVector(nn.Module):
             for a, b in zip([channels, *widths[:-1]], widths, strict=True)
         )
         self.pools = (pools == 3, True, True, False)
-        self.out_features = scaled_width(1024, width)
-        self.linear = nn.Linear(widths[-1] * last * last, self.out_features)
+        self.out_features = out_features
+        self.linear = nn.Linear(widths[-1] * last * last, out_features)
 
     def forward(self, images: Tensor) -> Tensor:
         """Return float32 features [B, out_features] of images [B, C, h, h]."""

@@ -33,21 +33,24 @@ class SceneMapVector(nn.Module):
     Args:
         channels: of the map.
         image_size: rows and columns of the heightmap.
-        width: factor on the layers' widths, 128, 1024 and 512.
+        config: widths of the layers, 128, 1024 and 512 in the reference's size.
         copies: number of copies of each channel that the convolution sees.
 
     Raises:
         ValueError: the image is smaller than 32 pixels.
     """
 
-    def __init__(self, channels: int, image_size: int, width: float, copies: int = 1) -> None:
+    def __init__(
+        self, channels: int, image_size: int, config: SpatialImageConfig, copies: int = 1
+    ) -> None:
         super().__init__()
         side = image_size // UNET_STRIDE // 2
         if side < 1:
             raise ValueError(
                 f"six degrees of freedom need an obs_size of at least 32, got {image_size}"
             )
-        inner, wide, self.out_features = (scaled_width(w, width) for w in (128, 1024, 512))
+        inner = scaled_width(128, config.width)
+        wide, self.out_features = (config.scaled_dense_width(w) for w in (1024, 512))
         self.copies = copies
         self.conv = CastConv2d(copies * channels, inner, 3, padding=1)
         self.first = nn.Linear(inner * side * side, wide)
@@ -100,7 +103,7 @@ class PoseValues(nn.Module):
         self.convs = nn.ModuleList(
             CastConv2d(a, b, 3, padding=1) for a, b in zip(inputs, widths, strict=True)
         )
-        wide, narrow = scaled_width(1024, config.width), scaled_width(512, config.width)
+        wide, narrow = config.scaled_dense_width(1024), config.scaled_dense_width(512)
         self.wide = nn.Linear(widths[-1] * last * last, wide)
         self.narrow = nn.Linear(wide, narrow)
         self.scene = scene
