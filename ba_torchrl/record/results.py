@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import platform
+import subprocess
 from collections.abc import Collection, Iterable, Mapping
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
@@ -188,13 +190,23 @@ def differences(
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that affect results."""
+    """Return the versions of Python and of the packages that affect results.
+
+    In a clone of the repository, ``commit`` is the package's, with a "+" if files are changed.
+    """
     found = {"python": platform.python_version(), "ba_torchrl": __version__}
     for name in PACKAGES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue  # escnn is optional
+    root = Path(__file__).parents[2]
+    if (root / ".git").exists():
+        command = ["git", "-C", str(root), "describe", "--always", "--exclude=*", "--dirty=+"]
+        with contextlib.suppress(OSError, subprocess.SubprocessError):  # git is not installed
+            found["commit"] = subprocess.run(
+                command, capture_output=True, text=True, check=True
+            ).stdout.strip()
     return found
 
 
