@@ -16,7 +16,7 @@ from ba_torchrl import load_policy
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Text, check_writable_file, checked
 from ba_torchrl.commands import evaluate
-from ba_torchrl.training.policy import TENSORS, save_policy
+from ba_torchrl.training.policy import TENSORS, round_weights, save_policy
 
 PolicyFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(TENSORS,)))]
 
@@ -37,6 +37,7 @@ def main(settings: Settings) -> None:
     policy = load_policy(settings.policy, settings.which, settings.device)
     path = Path(settings.path or f"{policy.task.replace('/', '_')}{TENSORS}")
     check_writable_file(path)
+    round_weights(policy)
     found = evaluate.play(policy, settings)
     seed = policy.test_seed if settings.seed is None else settings.seed
     card = save_policy(policy, path, successes=found.successes, episodes=found.episodes, seed=seed)

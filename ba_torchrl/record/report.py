@@ -58,7 +58,9 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     tables = [summarize(section) for section in sections]
-    pictures = [_plot(section, folder / f"{_file_name(section.title)}.png") for section in sections]
+    pictures = [
+        plot_section(section, folder / f"{_file_name(section.title)}.png") for section in sections
+    ]
     with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -97,7 +99,8 @@ def write_report(roots: Sequence[str | Path], folder: str | Path) -> Path:
 # -- parts -----------------------------------------------------------------------------------
 
 
-def _plot(section: Section, path: Path) -> Path:
+def plot_section(section: Section, path: Path) -> Path:
+    """Plot the curves of every method, a panel for each task, and return the PNG."""
     panels: dict[str, dict[str, Any]] = {task: {} for task in section.tasks}
     for group in section.groups:
         mean, error = group.rates.mean(0), standard_error(group.rates)

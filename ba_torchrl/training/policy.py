@@ -167,6 +167,13 @@ def load_policy(
     return TrainedPolicy(policy, config, card.updates, path, card)
 
 
+def round_weights(policy: TrainedPolicy) -> None:
+    """Round the weights to half precision, the format of files."""
+    for value in policy.policy.state_dict().values():
+        if value.is_floating_point():
+            value.copy_(value.half())
+
+
 def save_policy(
     policy: TrainedPolicy,
     path: str | Path,
@@ -175,10 +182,10 @@ def save_policy(
     episodes: int,
     seed: int,
 ) -> PolicyCard:
-    """Write a policy and its card.
+    """Write a policy and its card. Weights are stored in half precision.
 
     Args:
-        policy: from a run.
+        policy: from a run, after `round_weights`.
         path: ends in ``.safetensors``; the card is beside it.
         successes: of ``episodes`` greedy episodes.
         episodes: number of episodes that were played.
@@ -212,9 +219,15 @@ def save_policy(
         evaluate=f"ba-torchrl evaluate {named} episodes={episodes}",
         **run,
     )
-    tensors = policy.policy.state_dict()
+    tensors = {name: value.detach().cpu() for name, value in policy.policy.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_file({name: value.detach().cpu().clone() for name, value in tensors.items()}, path)
+    save_file(
+        {
+            name: value.half() if value.is_floating_point() else value.clone()
+            for name, value in tensors.items()
+        },
+        path,
+    )
     path.chmod(0o644)  # safetensors makes it readable for its owner alone
     write_text(path.with_suffix(CARD), card.model_dump_json(indent=2) + "\n")
     return card
