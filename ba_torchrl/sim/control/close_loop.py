@@ -402,12 +402,15 @@ def stop_swing(robot: Robot, max_steps: int) -> bool:
 
 
 def is_swinging(robot: Robot) -> bool:
-    """Whether the fingers are too fast, or past the closed or open position without a held body."""
+    """Whether the fingers are too fast, or past the closed or open position without a contact.
+
+    A contact can hold them there: that of a wide body, or of the rod of a drawer's handle.
+    """
     opening, rate = robot.finger_motion()
     if abs(rate) * robot.finger_open_position > MAX_OVERSPEED * robot.finger_speed:
         return True
     is_past_end = not -OPENING_TOLERANCE <= opening <= 1 + OPENING_TOLERANCE
-    return is_past_end and robot.held_body() is None
+    return is_past_end and not is_any_within(contacts(robot.client, robot.id))
 
 
 def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:
