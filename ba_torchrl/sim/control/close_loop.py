@@ -38,6 +38,8 @@ OPENING_TOLERANCE = 0.02
 """Tolerance within which a target opening counts as reached."""
 STALL_FRACTION = 0.1
 """Fingers that move at less than this fraction of their commanded speed are in contact."""
+MAX_OVERSPEED = 1.5
+"""Fingers that move at more than this multiple of their commanded speed swing."""
 
 
 @dataclass(frozen=True)
@@ -146,8 +148,13 @@ class CloseLoopController:
             self._move_held(path, held)
 
     def grip(self, opening: float) -> None:
-        """Open or close the fingers until they reach an opening or are stopped by a contact."""
-        if abs(opening - self._target_opening) < 1e-3:
+        """Open or close the fingers until they reach an opening or are stopped by a contact.
+
+        Fingers that have this opening as their target are moved only if they swing, as they do
+        when the body that they pressed on has slipped out.
+        """
+        were_swinging = stop_swing(self.robot, self.limits.max_gripper_steps)
+        if abs(opening - self._target_opening) < 1e-3 and not were_swinging:
             return
         self._target_opening = opening
         move_fingers(self.robot, opening, self.limits.max_gripper_steps)
@@ -373,6 +380,37 @@ def hand_contacts(robot: Robot, held: Body | None) -> list[Contact]:
     """Return the contacts of the hand and the held body with other bodies."""
     held_ids = () if held is None else (held.id,)
     return outer_contacts(robot.client, robot.id, *held_ids)
+
+
+def stop_swing(robot: Robot, max_steps: int) -> bool:
+    """Brake swinging fingers, and move them back between closed and open at their usual speed.
+
+    Fingers swing after a body that they pressed on has slipped out: the force of the motors
+    accelerates them to several times their usual speed, and they move past the closed position.
+    There `Robot.opening` is constant, so that `move_fingers` would take them for stopped by a
+    contact. Return whether they were swinging.
+    """
+    stride = robot.finger_speed * robot.world.physics.time_step_s / robot.finger_open_position
+    for step in range(max_steps):
+        if not is_swinging(robot):
+            return step > 0
+        opening, _ = robot.finger_motion()
+        back = min(max(opening, 0.0), 1.0) - opening
+        robot.command_opening(opening + min(max(back, -stride), stride))
+        robot.world.step()
+    return True
+
+
+def is_swinging(robot: Robot) -> bool:
+    """Whether the fingers are too fast, or past the closed or open position without a contact.
+
+    A contact can hold them there: that of a wide body, or of the rod of a drawer's handle.
+    """
+    opening, rate = robot.finger_motion()
+    if abs(rate) * robot.finger_open_position > MAX_OVERSPEED * robot.finger_speed:
+        return True
+    is_past_end = not -OPENING_TOLERANCE <= opening <= 1 + OPENING_TOLERANCE
+    return is_past_end and not is_any_within(contacts(robot.client, robot.id))
 
 
 def move_fingers(robot: Robot, opening: float, max_steps: int) -> None:

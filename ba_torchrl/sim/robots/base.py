@@ -262,11 +262,20 @@ class Robot(ABC):
 
     def opening(self) -> float:
         """Return the opening of the gripper, from 0 (closed) to 1 (fully open)."""
+        return min(max(self.finger_motion()[0], 0.0), 1.0)
+
+    def finger_motion(self) -> tuple[float, float]:
+        """Return the opening without limits, and its rate of change per second.
+
+        The opening is below 0 or above 1 for fingers that have moved past the closed or the fully
+        open position, where neither the joints nor contacts between the fingers stop them.
+        """
         states = pybullet.getJointStates(self.id, self.finger_joints, physicsClientId=self.client)
-        mean = (
-            sum(s * state[0] for s, state in zip(self.finger_open_signs, states, strict=True)) / 2
+        position, velocity = (
+            sum(s * state[i] for s, state in zip(self.finger_open_signs, states, strict=True)) / 2
+            for i in (0, 1)
         )
-        return min(max(mean / self.finger_open_position, 0.0), 1.0)
+        return position / self.finger_open_position, velocity / self.finger_open_position
 
     def set_opening(self, opening: float) -> None:
         """Set the opening of the fingers, with zero velocities, and command it."""

@@ -262,6 +262,25 @@ def test_a_frictionless_block_is_not_held(scene):
     assert block.position[2] < 0.1
 
 
+@pytest.mark.parametrize("opening", [0.0, 1.0])
+def test_fingers_that_swing_after_a_body_has_slipped_out_reach_their_opening(scene, opening):
+    """The motors close them at up to five times their speed, and past the closed position."""
+    robot = scene.robot
+    for steps in (3, 4, 5):
+        scene.reset()
+        block, motion = scene.put(), scene.motion
+        motion.move_to((0.45, 0.0, 0.025), 0.0)
+        motion.grip(0.0)
+        assert robot.held_body() is block
+        block.place((2.0, 2.0, 0.025))
+        scene.world.step(steps)
+        motion.grip(opening)
+        scene.world.step()
+        reached, rate = robot.finger_motion()
+        assert reached == pytest.approx(opening, abs=0.02)
+        assert abs(rate) < 1.0
+
+
 def test_an_empty_closed_gripper_holds_nothing(scene):
     scene.put()
     scene.motion.move_to((0.45, 0.12, 0.02), 0.5)
