@@ -54,10 +54,8 @@ APPROACH_TOLERANCE_M = 3e-3
 """Tolerance of the height at the end of the approach."""
 PRESS_TOLERANCE_M = 5e-3
 """Tolerance of the horizontal position of the press."""
-PRESS_TOLERANCE_RAD = 0.15
-"""Tolerance of the yaw of the press, at which the fingers are parallel to a wall."""
-WALL_TOLERANCE_M = 1.5e-3
-"""Largest displacement of a low hand towards a wall from the position of the press."""
+WALL_GAP_M = 3e-3
+"""Least gap between the closed hand and a wall for a descent beside it."""
 HAND_MARGIN_M = 0.01
 """Gap wanted between the closed hand and a wall. With more, the press would be farther from the
 centre of the block and tilt it."""
@@ -172,39 +170,48 @@ class CornerPicking(CloseLoopTask):
         return -self.robot.gripper.tip_height_m(0.0)
 
     def _press(self) -> GripperCommand:
-        """Move above the block with closed fingers, descend and press."""
+        """Move above the block with closed fingers, descend and press.
+
+        The hand descends while it moves and turns, wherever it is clear of the walls on a straight
+        way to the press.
+        """
         robot, limits = self.robot, self.action_limits
         (x, y, z), yaw = robot.tool_pose()
         target_yaw = nearest_equivalent_yaw(yaw, self.corner.yaw_rad, limits, math.pi / 2)
-        turn = wrap_angle(target_yaw - yaw)
         # the hand is wider than the block, so the press is off its centre, away from the wall
         top, wall_top = vertical_extent(self.block)[1], vertical_extent(self.walls)[1]
         gripper = robot.gripper
-        hand_half = gripper.closed_reach_m(wall_top - top - self._tips_below_m) + HAND_MARGIN_M
-        offset = min(hand_half - self.block_m / 2, self.block_m / 2 - gripper.half_width_m)
+        hand_half = gripper.closed_reach_m(wall_top - top - self._tips_below_m)
+        offset = min(
+            hand_half + HAND_MARGIN_M - self.block_m / 2, self.block_m / 2 - gripper.half_width_m
+        )
         px, py = self.corner.to_local(*self.block.position[:2])
-        if abs(math.cos(target_yaw - self.corner.yaw_rad)) > 0.7:
+        turn = target_yaw - self.corner.yaw_rad
+        if abs(math.cos(turn)) > 0.7:
             px += offset
         else:
             py += offset
         tool_x, tool_y = self.corner.to_local(x, y)
+        cos, sin = (abs(f(yaw - self.corner.yaw_rad)) for f in (math.cos, math.sin))
+        inner = (self.wall_m - self.base_m) / 2
+        wall_gap = min(
+            tool_x - hand_half * cos - gripper.half_width_m * sin - inner,
+            tool_y - hand_half * sin - gripper.half_width_m * cos - inner,
+        )
         low_z = top + self._tips_below_m + APPROACH_GAP_M
-        distance = max(abs(tool_x - px), abs(tool_y - py))
-        is_off_walls = min(tool_x - px, tool_y - py) > -WALL_TOLERANCE_M
-        is_clear = is_off_walls and abs(turn) < PRESS_TOLERANCE_RAD
         target = self.corner.to_world(px, py)
-        if robot.opening() < IS_CLOSED and distance < PRESS_TOLERANCE_M and is_clear:
-            gap = gap_m(self.world.client, robot.id, self.block.id)
-            if gap <= 2 * APPROACH_GAP_M:
-                return lift(-PRESS_M)
-            if gap <= limits.step_m:
-                return lift(APPROACH_GAP_M - gap)
-        if z < low_z - APPROACH_TOLERANCE_M / 2 and distance > PRESS_TOLERANCE_M:
-            return lift(low_z + APPROACH_TOLERANCE_M - z)  # a low hand would push the block back
-        if not is_clear or robot.opening() >= IS_CLOSED:
+        distance = max(abs(tool_x - px), abs(tool_y - py))
+        if robot.opening() >= IS_CLOSED or wall_gap < WALL_GAP_M:
             low_z = wall_top + self._tips_below_m + PASSING_CLEARANCE_M
             if z < low_z - 1e-3:
                 return lift(low_z - z, closing(robot))
+        elif z < low_z - APPROACH_TOLERANCE_M / 2 and distance > PRESS_TOLERANCE_M:
+            return lift(low_z + APPROACH_TOLERANCE_M - z)  # a low hand would push the block back
+        elif distance < PRESS_TOLERANCE_M:
+            gap = gap_m(self.world.client, robot.id, self.block.id)
+            if gap <= 2 * APPROACH_GAP_M:
+                return lift(-PRESS_M)
+            low_z = z + max(APPROACH_GAP_M - gap, low_z - z - limits.step_m)
         return move_toward(robot, (*target, low_z), target_yaw, closing(robot))
 
     def _drag(self) -> GripperCommand:
