@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.contacts import contacts, gap_m, vertical_force_n
 from ba_torchrl.sim.geometry import PlanarFrame
@@ -55,7 +55,10 @@ APPROACH_TOLERANCE_M = 3e-3
 PRESS_TOLERANCE_M = 5e-3
 """Tolerance of the horizontal position of the press."""
 WALL_GAP_M = 3e-3
-"""Least gap between the closed hand and a wall for a descent beside it."""
+"""Gap between the closed hand and a wall that allows a descent beside it. At a press on a small
+block the gap is smaller, and that of the press is allowed, less `WALL_TOLERANCE_M`."""
+WALL_TOLERANCE_M = 1.5e-3
+"""Largest displacement of a low hand towards a wall from the position of such a press."""
 HAND_MARGIN_M = 0.01
 """Gap wanted between the closed hand and a wall. With more, the press would be farther from the
 centre of the block and tilt it."""
@@ -192,16 +195,15 @@ class CornerPicking(CloseLoopTask):
         else:
             py += offset
         tool_x, tool_y = self.corner.to_local(x, y)
-        cos, sin = (abs(f(yaw - self.corner.yaw_rad)) for f in (math.cos, math.sin))
-        inner = (self.wall_m - self.base_m) / 2
-        wall_gap = min(
-            tool_x - hand_half * cos - gripper.half_width_m * sin - inner,
-            tool_y - hand_half * sin - gripper.half_width_m * cos - inner,
+        gap_now, press_gap = (
+            self._wall_gap_m(*xy, hand_half, wanted - self.corner.yaw_rad)
+            for *xy, wanted in ((tool_x, tool_y, yaw), (px, py, target_yaw))
         )
+        is_clear = gap_now >= min(WALL_GAP_M, press_gap - WALL_TOLERANCE_M)
         low_z = top + self._tips_below_m + APPROACH_GAP_M
         target = self.corner.to_world(px, py)
         distance = max(abs(tool_x - px), abs(tool_y - py))
-        if robot.opening() >= IS_CLOSED or wall_gap < WALL_GAP_M:
+        if robot.opening() >= IS_CLOSED or not is_clear:
             low_z = wall_top + self._tips_below_m + PASSING_CLEARANCE_M
             if z < low_z - 1e-3:
                 return lift(low_z - z, closing(robot))
@@ -213,6 +215,21 @@ class CornerPicking(CloseLoopTask):
                 return lift(-PRESS_M)
             low_z = z + max(APPROACH_GAP_M - gap, low_z - z - limits.step_m)
         return move_toward(robot, (*target, low_z), target_yaw, closing(robot))
+
+    def _wall_gap_m(self, x: float, y: float, hand_half_m: float, turn_rad: float) -> float:
+        """Return the gap between the closed hand and the nearer wall.
+
+        Args:
+            x: position of the tool in the corner's frame, as ``y``.
+            hand_half_m: reach of the closed hand along the direction in which it opens.
+            turn_rad: yaw of the tool in the corner's frame.
+        """
+        cos, sin = abs(math.cos(turn_rad)), abs(math.sin(turn_rad))
+        half_width = self.robot.gripper.half_width_m
+        inner = (self.wall_m - self.base_m) / 2
+        along = x - hand_half_m * cos - half_width * sin
+        across = y - hand_half_m * sin - half_width * cos
+        return min(along, across) - inner
 
     def _drag(self) -> GripperCommand:
         """Drag the block away from both walls, straight towards its target."""
