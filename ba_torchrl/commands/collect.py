@@ -24,7 +24,7 @@ from ba_torchrl.data.demos import (
     source_config,
 )
 from ba_torchrl.data.episodes import mean_length, success_rate
-from ba_torchrl.data.time_reversal import replay_scores
+from ba_torchrl.data.time_reversal import check_has_structure, replay_scores
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
@@ -71,6 +71,8 @@ def main(settings: Settings) -> None:
     actions = resolve_env(settings.task, settings.env).actions
     check_noise(settings.noise, settings.source, "noise")
     check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")
+    if settings.source == "deconstruction":
+        check_has_structure(settings.task)
     env = make_vector_env(
         settings.task,
         settings.num_envs,

@@ -8,6 +8,7 @@ ba-torchrl speed close_loop/block_picking env.obs_size=128 networks=[equi] devic
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -61,6 +62,7 @@ class Settings(StrictModel):
 
 def main(settings: Settings) -> None:
     """Print a table, row by row."""
+    learners = {task: list(learners_of(task, settings)) for task in settings.tasks}
     print(f"{'':52} {'per second':>10}")
     for task in settings.tasks:
         for name, workers in (
@@ -70,12 +72,9 @@ def main(settings: Settings) -> None:
         ):
             rate = steps_per_second(task, settings, **{"num_envs": settings.num_envs, **workers})
             print(f"{task:34} {name:17} {rate:10.1f} steps")
-        algorithm, usual = LEARNERS[TASKS[task].control]
-        for network in (settings.networks or [usual]) if settings.updates else ():
-            config = learner(task, algorithm, network, settings)
+        for config in learners[task]:
             rate = updates_per_second(config, settings)
-            name = f"{algorithm} {network}"
-            print(f"{task:34} {name:17} {rate:10.2f} updates, {compute_path(config)}")
+            print(f"{task:34} {config.label:17} {rate:10.2f} updates, {compute_path(config)}")
 
 
 def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: bool) -> float:
@@ -109,26 +108,27 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
         env.close()
 
 
-def learner(task: str, algorithm: str, network: str, settings: Settings) -> ExperimentConfig:
-    """Return the configuration of the learner that is measured on a task.
+def learners_of(task: str, settings: Settings) -> Iterator[ExperimentConfig]:
+    """Yield the configuration of each learner that is measured on a task.
 
     Args:
         task: id of the task.
-        algorithm: registered name.
-        network: preset.
         settings: of the measurement.
     """
-    return ExperimentConfig.parse(
-        {
-            "plugins": settings.plugins,
-            "task": task,
-            "env": settings.env,
-            "algorithm": {"name": algorithm},
-            "network": hydra_schema.preset("network", network),
-            "device": settings.device,
-            "seed": settings.seed,
-        }
-    )
+    algorithm, usual = LEARNERS[TASKS[task].control]
+    for network in (settings.networks or [usual]) if settings.updates else ():
+        yield ExperimentConfig.parse(
+            {
+                "plugins": settings.plugins,
+                "task": task,
+                "env": settings.env,
+                "algorithm": {"name": algorithm},
+                "network": hydra_schema.preset("network", network),
+                "label": f"{algorithm} {network}",
+                "device": settings.device,
+                "seed": settings.seed,
+            }
+        )
 
 
 def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:

@@ -60,4 +60,4 @@ def main(config: ExperimentConfig) -> None:
     print("    env.rollout(env.max_steps, policy)")
 
 
-COMMAND = Command(main, ExperimentConfig, config="train", parse=parse)
+COMMAND = Command(main, ExperimentConfig, config="train", variants="quickstart*", parse=parse)

@@ -56,6 +56,7 @@ REFUSED = [
     ("collect", "foo=1", "unknown setting 'foo'. Known: "),
     ("collect", "env.seed=5", "env: seed is set by the command; leave it out, and set seed"),
     ("collect", "env.expert=false", "leave it out, and set source"),
+    ("collect", "source=deconstruction", "deconstruction has no meaning for close_loop/block_pick"),
     ("collect", "path=run", "run exists already"),
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("play", "env.seed=5", "leave it out, and set seed"),
