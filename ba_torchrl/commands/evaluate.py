@@ -15,22 +15,20 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
 from tensordict import TensorDict
 
 from ba_torchrl import __version__, load_policy, make_vector_env
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
     Count,
-    NumEnvs,
     OutputFolder,
-    Plugins,
+    PluginSettings,
     Seed,
     TaskId,
     Text,
+    VectorSettings,
     VideoFile,
 )
-from ba_torchrl.config import StrictModel
 from ba_torchrl.data.files import write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
@@ -43,11 +41,9 @@ from ba_torchrl.training.policy import TrainedPolicy, shipped_policies, wilson_i
 FPS = 5
 
 
-class EpisodeSettings(StrictModel):
+class EpisodeSettings(VectorSettings, PluginSettings):
     """A policy and the episodes that it plays."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package, those that the run names among them: [my_tasks]."""
     policy: Text
     """A run folder, one of the checkpoints in it, a .safetensors file, or in evaluate "trained" for
     those that the package ships."""
@@ -57,10 +53,6 @@ class EpisodeSettings(StrictModel):
     """Where the policy is computed, whatever device it was trained on."""
     episodes: Count = 100
     """Their number."""
-    num_envs: NumEnvs = 5
-    """Environments that step together."""
-    parallel: bool | None = None
-    """Worker processes; null for processes where at least three can run at a time."""
     seed: Seed | None = None
     """Of the episodes; null for episodes that training did not use."""
 

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, NumEnvs, Plugins, Seed, TaskId, Text, without
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text
 from ba_torchrl.data import collect_demonstrations, expert_policy
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
@@ -29,11 +28,13 @@ LEARNERS = {"close_loop": ("sac", "equi_small"), "open_loop": ("spatial_q", "fcn
 """Algorithm and usual network by control."""
 
 
-class Settings(StrictModel):
+class Settings(EnvSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    set_by_command: ClassVar[dict[str, str]] = {
+        "seed": "set seed",
+        "expert": "know that the expert acts",
+    }
     tasks: list[TaskId] = Field(
         ["close_loop/block_picking", "open_loop/house_building_2"], min_length=1
     )
@@ -51,13 +52,6 @@ class Settings(StrictModel):
     """Updates of each learner; 0 for none."""
     device: Text = "auto"
     """Of the learners."""
-    seed: Seed = 0
-    """Of episodes and networks."""
-
-    @field_validator("env")
-    @classmethod
-    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
-        return without(env, seed="set seed", expert="know that the expert acts")
 
 
 def main(settings: Settings) -> None:
