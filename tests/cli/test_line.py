@@ -139,7 +139,7 @@ def test_a_package_that_is_missing_is_one_line(module, words, monkeypatch, capsy
     assert words in refused(["train"], capsys)
 
 
-def test_the_folder_alone_resumes_a_run(tmp_path):
+def test_the_folder_alone_resumes_a_run(tmp_path, caplog):
     config = tiny(tmp_path, total_updates=7)
     write_config(config)
     values = ExperimentConfig.parse(
@@ -150,9 +150,11 @@ def test_the_folder_alone_resumes_a_run(tmp_path):
     assert (found.total_updates, found.resume, found.threads) == (7, True, 1)
     everything = Arguments([*given.overrides, "total_updates=99"])
     assert train.parse(values, everything).total_updates == 99
+    assert caplog.text == ""
     (tmp_path / "other").mkdir()
     new = {**values, "run_dir": str(tmp_path / "other")}
     assert train.parse(new, given).total_updates == 99
+    assert f"there is no run in {new['run_dir']} to resume: a new one starts" in caplog.text
 
 
 def test_an_own_configuration_in_a_further_folder(tmp_path, capsys, monkeypatch):
