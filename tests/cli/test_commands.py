@@ -92,6 +92,7 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     def started(*_, **__):
         raise AssertionError("work started")
 
+    load_recipe(name)  # else modules that it imports would keep `started`
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ba_torchrl.envs.factory.make", started)
     monkeypatch.setattr("ba_torchrl.make", started)
