@@ -12,16 +12,21 @@ from tqdm import tqdm
 
 from ba_torchrl import list_tasks
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, OutputFolder, Plugins, PngFile, Seed, Structures, Tasks
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import (
+    Count,
+    OutputFolder,
+    PluginSettings,
+    PngFile,
+    Seed,
+    Structures,
+    Tasks,
+)
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
 
 
-class Settings(StrictModel):
+class Settings(PluginSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
     tasks: Tasks = None
     """Ids of tasks; null for all."""
     deconstructions: Structures = Field(["open_loop/house_building_4"])

@@ -14,11 +14,8 @@ tune_malloc()  # before torch allocates anything: halves the time of an update o
 from functools import partial  # noqa: E402
 from typing import Annotated  # noqa: E402
 
-from pydantic import Field  # noqa: E402
-
 from ba_torchrl.cli.command import Command  # noqa: E402
-from ba_torchrl.cli.types import Count, Plugins, Text, check_writable_file, checked  # noqa: E402
-from ba_torchrl.config import StrictModel  # noqa: E402
+from ba_torchrl.cli.types import Count, PluginSettings, Text, check_writable_file, checked  # noqa: E402
 from ba_torchrl.training.config import usable_device  # noqa: E402
 from profiling.comparison import columns_of_changes  # noqa: E402
 from profiling.speed_file import (  # noqa: E402
@@ -32,11 +29,9 @@ from profiling.table import COLUMNS, CompileMode, Precision, as_markdown, measur
 JsonFile = Annotated[Text, checked(partial(check_writable_file, suffixes=(".json",)))]
 
 
-class Settings(StrictModel):
+class Settings(PluginSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
     which: Text = "all"
     """simulation, learning, throughput, memory, or one of their measurements."""
     repeats: Count = 20

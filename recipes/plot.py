@@ -6,11 +6,9 @@ python recipes/plot.py runs=[runs/first,runs/second] path=curves.png
 import csv
 
 import numpy as np
-from pydantic import Field
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Folders, Plugins, PngFile
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import Folders, PluginSettings, PngFile
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
@@ -19,11 +17,9 @@ from ba_torchrl.training.checkpoint import read_config
 RATE, ERROR = "eval/success_rate", "eval/standard_error"
 
 
-class Settings(StrictModel):
+class Settings(PluginSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
     runs: Folders
     """Run folders."""
     path: PngFile = "curves.png"

@@ -19,24 +19,15 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from tqdm import tqdm
 
 from ba_torchrl import list_tasks, make
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import (
-    OutputFolder,
-    Plugins,
-    Seed,
-    TaskId,
-    Tasks,
-    check_writable_file,
-    without,
-)
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import EnvSettings, OutputFolder, TaskId, Tasks, check_writable_file
 from ba_torchrl.data.demos import expert_policy
 from ba_torchrl.data.files import write_text
 from ba_torchrl.envs import keys
@@ -106,15 +97,15 @@ class SoakFigures(BaseModel):
         return ", ".join(problem for problem, applies in criteria.items() if applies)
 
 
-class Settings(StrictModel):
+class Settings(EnvSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    set_by_command: ClassVar[dict[str, str]] = {
+        "seed": "set seed",
+        "expert": "set steps: every other episode is the expert's",
+    }
     tasks: Tasks = None
     """Ids of tasks; null for all."""
-    env: dict[str, Any] = Field(default_factory=dict)
-    """Parameters of the environments."""
     steps: int = Field(default=1000, ge=10)
     """Steps of a task."""
     long_tasks: list[TaskId] = Field(
@@ -128,17 +119,8 @@ class Settings(StrictModel):
     """A task of each kind, with more steps."""
     long_steps: int = Field(default=20_000, ge=10)
     """Steps of these."""
-    seed: Seed = 0
-    """Of the episodes."""
     folder: OutputFolder = "soak"
     """One file of figures per task, and the table."""
-
-    @field_validator("env")
-    @classmethod
-    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
-        return without(
-            env, seed="set seed", expert="set steps: every other episode is the expert's"
-        )
 
 
 def main(settings: Settings) -> None:

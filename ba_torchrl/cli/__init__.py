@@ -46,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: of the command line, without the program; those of this process if None.
     """
     first, *rest = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
+    if first in ("--help", "-h", "help") and rest:
+        first, rest = rest[0], ["--help", *rest[1:]]
     if first in ("--help", "-h", "help"):
         print(overview())  # noqa: T201
     elif first == "--version":
@@ -69,17 +71,18 @@ def config_dir() -> Path:
 
 
 def _import(command: str) -> ModuleType:
-    """Return the module of a command; end the process if a package of an extra is missing."""
+    """Return the module of a command; end the process if a package is missing."""
     try:
         return importlib.import_module(f"ba_torchrl.commands.{command}")
     except ModuleNotFoundError as error:
-        package = {"hydra": "hydra-core", "PIL": "pillow"}.get(error.name or "", error.name or "")
-        if package not in OF_TRAINING:
+        name = (error.name or "").split(".")[0]
+        package = {"hydra": "hydra-core", "PIL": "pillow"}.get(name, name)
+        if package in ("", "ba_torchrl"):
             raise
-        sys.stderr.write(
-            f"error: {PROGRAM} {command} needs the extra [train] of the package, of which "
-            f"{package!r} is missing: {install_command(*OF_TRAINING)}\n"
-        )
+        is_extra = package in OF_TRAINING
+        what = "the extra [train] of the package, of which" if is_extra else "a package:"
+        fix = install_command(*(OF_TRAINING if is_extra else [package]))
+        sys.stderr.write(f"error: {PROGRAM} {command} needs {what} {package!r} is missing: {fix}\n")
         sys.exit(EXIT_CODE)
 
 

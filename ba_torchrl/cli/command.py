@@ -67,6 +67,8 @@ class Command:
     """Field that words without "=" set."""
     config: str | None = None
     """Name of the configuration file that is used unless ``--config-name`` is given."""
+    variants: str = ""
+    """Pattern of the names of other configuration files that the package has for this command."""
     parse: Callable[[dict[str, Any], Arguments], Any] | None = None
     """Returns what ``main`` gets; by default an instance of ``settings``."""
 
@@ -85,7 +87,9 @@ class Command:
         words = sys.argv[1:] if words is None else words
         arguments = self.read(words)
         hydra_schema.register(arguments.overrides)
-        if arguments.is_for_hydra:
+        if arguments.is_for_hydra and not arguments.asks_for_help:
+            with self.composed(arguments):  # an unknown name ends it here
+                pass
             self._run_in_hydra(words)
             return
         logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
@@ -109,10 +113,9 @@ class Command:
         """
         if self.config is None:
             return []
-        folders = [config_dir(), *([] if further is None else [Path(further)])]
-        found = {path.stem for folder in folders for path in folder.glob("[!_]*.yaml")}
-        is_own = self.config.__eq__ if self.config == "benchmark" else "benchmark".__ne__
-        return sorted(filter(is_own, found))
+        files = [*config_dir().glob(f"{self.variants}.yaml")]
+        files += [] if further is None else Path(further).glob("[!_]*.yaml")
+        return sorted({self.config, *(file.stem for file in files)})
 
     def read(self, words: Sequence[str]) -> Arguments:
         """Return the parts of a command line.
@@ -120,7 +123,9 @@ class Command:
         Raises:
             ConfigError: an option is unknown, or a word sets nothing.
         """
-        parser = argparse.ArgumentParser(PROGRAM, add_help=False, exit_on_error=False)
+        parser = argparse.ArgumentParser(
+            PROGRAM, add_help=False, exit_on_error=False, allow_abbrev=False
+        )
         parser.add_argument("-h", "--help", action="store_true")
         parser.add_argument("-cn", "--config-name")
         parser.add_argument("-cd", "--config-dir")
@@ -129,7 +134,8 @@ class Command:
         except argparse.ArgumentError as error:
             raise ConfigError(str(error)) from None
         options = [word for word in rest if word.startswith("-")]
-        is_for_hydra = self.config is not None and any(each in _OF_HYDRA for each in options)
+        given = {option.split("=")[0] for option in options}
+        is_for_hydra = self.config is not None and bool(given & {*_OF_HYDRA})
         known = ["--help", *(["--config-name", "--config-dir", *_OF_HYDRA] if self.config else [])]
         if not is_for_hydra and options:
             raise ConfigError(f"unknown option {options[0]!r}.{known_names(options[0], known)}")
@@ -137,8 +143,12 @@ class Command:
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
         if found.config_dir is not None and not Path(found.config_dir).is_dir():
             raise ConfigError(f"there is no folder {found.config_dir}")
+        if is_for_hydra:  # words without "=" are values of its options
+            overrides = [word for word in rest if word[:1] != "-" and ("=" in word or "~" in word)]
+        else:
+            overrides = list(self._overrides(rest))
         return Arguments(
-            rest if is_for_hydra else list(self._overrides(rest)),
+            overrides,
             found.config_name,
             found.config_dir,
             found.help,
@@ -155,6 +165,8 @@ class Command:
         yield from (word for word in words if word not in bare)
         if not bare:
             return
+        if any(word.startswith(f"{self.positional}=") for word in words):
+            raise ConfigError(f"{self.positional} is given twice")
         if self.positional is None:
             raise ConfigError(f"{bare[0]!r} sets nothing; settings are FIELD=VALUE, see --help")
         quoted = ["'" + word.replace("'", "\\'") + "'" for word in bare]
@@ -184,6 +196,8 @@ class Command:
             overrides.append(f"hydra.searchpath=['file://{other}']")
         with initialize_config_dir(str(main_folder), version_base="1.3", job_name=self.name):
             try:
+                if arguments.is_for_hydra:
+                    overrides = list(_first_of_sweeps(overrides))
                 settings = compose(name, overrides=overrides, return_hydra_config=True)
             except HydraException as error:
                 raise ConfigError(_explain(error, name, overrides)) from None
@@ -232,6 +246,14 @@ class Command:
         sys.argv[1:] = words
         folder = str(config_dir())
         hydra.main(config_path=folder, config_name=self.config, version_base="1.3")(job)()
+
+
+def _first_of_sweeps(overrides: Sequence[str]) -> Iterator[str]:
+    """Yield overrides; of those with several values, as for ``--multirun``, the first one."""
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        is_sweep = override.is_sweep_override()
+        first = next(override.sweep_string_iterator()) if is_sweep else ""
+        yield f"{override.get_key_element()}={first}" if is_sweep else override.input_line
 
 
 def _explain(error: HydraException, config: str, overrides: Sequence[str]) -> str:

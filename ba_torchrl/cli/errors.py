@@ -86,7 +86,8 @@ def name_presets(message: str, settings: DictConfig) -> str:
             message += f"\n  {group}={choices[group]} sets it; this algorithm cannot have it"
     for group, preset in choices.items():
         chosen = settings.get(group)
-        if preset and isinstance(chosen, DictConfig) and "name" in chosen:
+        known = hydra_schema.GROUPS.get(group, {})
+        if preset and isinstance(chosen, DictConfig) and chosen.get("name") in known:
             message = message.replace(f"{group} {chosen.name!r}", f"{group} {preset!r}")
         start, listed, names = message.partition(f"tasks take {group}: ")
         if listed:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin
 
 from hydra.core.hydra_config import HydraConfig
+from omegaconf import MISSING
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -64,7 +65,7 @@ def _parts(
     yield "settings", settings, values, ""
     if "env" in values:
         task = values.get("task")
-        known = isinstance(task, str) and task in TASKS
+        known = isinstance(task, str) and task != MISSING
         model = env_config_model(TASKS[task].Parameters) if known else EnvConfig
         own = {**hydra_schema.defaults_of(model), **values["env"]}
         for name in {"seed", "expert"} - values["env"].keys():

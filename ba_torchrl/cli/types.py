@@ -8,11 +8,11 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from ba_torchrl.config import MAX_SEED
+from ba_torchrl.config import MAX_SEED, StrictModel
 from ba_torchrl.data.time_reversal import check_has_structure
 from ba_torchrl.envs.vector.make import MAX_ENVS
 from ba_torchrl.errors import ConfigError
@@ -124,6 +124,38 @@ VideoFile = Annotated[
 ]
 Structures = list[Annotated[str, checked(check_has_structure)]]
 """Ids of tasks whose structures can be deconstructed."""
+
+
+class PluginSettings(StrictModel):
+    """Settings of a command that uses tasks, robots or runs."""
+
+    plugins: Plugins = Field(default_factory=list)
+    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+
+
+class EnvSettings(PluginSettings):
+    """Settings of a command that makes environments."""
+
+    set_by_command: ClassVar[dict[str, str]] = {}
+    """By the name of each field of ``env`` that the command sets, what to do instead."""
+    env: dict[str, Any] = Field(default_factory=dict)
+    """Parameters of the environments."""
+    seed: Seed = 0
+    """Of the episodes."""
+
+    @field_validator("env")
+    @classmethod
+    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
+        return without(env, **cls.set_by_command)
+
+
+class VectorSettings(StrictModel):
+    """Settings of a vector of environments."""
+
+    num_envs: NumEnvs = 5
+    """Environments that step together."""
+    parallel: bool | None = None
+    """Worker processes; null for processes where at least three can run at a time."""
 
 
 def _short(path: str | Path) -> str:

@@ -7,14 +7,13 @@ ba-torchrl collect task=open_loop/house_building_4 source=deconstruction replays
 
 from __future__ import annotations
 
-from typing import Any
+from typing import ClassVar
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, NewPath, NumEnvs, Plugins, Seed, TaskId, without
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import Count, EnvSettings, NewPath, TaskId, VectorSettings
 from ba_torchrl.data.demo_files import save_demonstrations
 from ba_torchrl.data.demos import (
     Source,
@@ -24,21 +23,18 @@ from ba_torchrl.data.demos import (
     source_config,
 )
 from ba_torchrl.data.episodes import mean_length, success_rate
-from ba_torchrl.data.time_reversal import replay_scores
+from ba_torchrl.data.time_reversal import check_has_structure, replay_scores
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
 
 
-class Settings(StrictModel):
+class Settings(VectorSettings, EnvSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    set_by_command: ClassVar[dict[str, str]] = {"seed": "set seed", "expert": "set source"}
     task: TaskId = "close_loop/block_picking"
     """Id of the task."""
-    env: dict[str, Any] = Field(default_factory=dict)
-    """Parameters of the environment."""
     path: NewPath = "demos/${file_name:${task}}"
     """New folder of the demonstrations."""
     source: Source = "expert"
@@ -53,17 +49,6 @@ class Settings(StrictModel):
     """Probability of a random action in each step; the expert's is stored beside it."""
     turn_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random turn beside the expert's other components."""
-    num_envs: NumEnvs = 5
-    """Environments that step together."""
-    parallel: bool | None = None
-    """Worker processes; null for processes where at least three can run at a time."""
-    seed: Seed = 0
-    """Of the episodes."""
-
-    @field_validator("env")
-    @classmethod
-    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
-        return without(env, seed="set seed", expert="set source")
 
 
 def main(settings: Settings) -> None:
@@ -71,6 +56,8 @@ def main(settings: Settings) -> None:
     actions = resolve_env(settings.task, settings.env).actions
     check_noise(settings.noise, settings.source, "noise")
     check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")
+    if settings.source == "deconstruction":
+        check_has_structure(settings.task)
     env = make_vector_env(
         settings.task,
         settings.num_envs,

@@ -23,7 +23,7 @@ from ba_torchrl.envs.vector.torchrl_names import missing_names
 from ba_torchrl.errors import MissingPackageError, install_command
 from ba_torchrl.hardware import hardware
 from ba_torchrl.modules.layers import compute_dtype
-from ba_torchrl.modules.steerable.planar_escnn import ESCNN_FIX, import_escnn
+from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 from ba_torchrl.training.policy import shipped_policies
 
 NEEDED = (
@@ -58,9 +58,11 @@ class Doctor:
     def run(self, words: Sequence[str]) -> None:
         """Print the findings; the exit code is 1 if something that is needed is missing."""
         if words:
-            asks = words[0] in ("--help", "-h")
-            print(__doc__ if asks else "error: this command has no settings", file=sys.stderr)
-            sys.exit(0 if asks else EXIT_CODE)
+            if words[0] in ("--help", "-h"):
+                print(__doc__)
+                return
+            sys.stderr.write("error: doctor has no settings\n")
+            sys.exit(EXIT_CODE)
         main()
 
 
@@ -108,8 +110,8 @@ def _version(name: str) -> str | None:
 def _escnn() -> Finding:
     try:
         import_escnn()
-    except MissingPackageError:
-        return Finding("escnn", "not installed: no equivariant networks", ESCNN_FIX.split(": ")[1])
+    except MissingPackageError as error:
+        return Finding("escnn", "not usable: no equivariant networks", str(error).split(": ")[1])
     return Finding("escnn", _version("escnn") or "without version")
 
 

@@ -4,18 +4,32 @@ ba-torchrl evaluate runs/my-run episodes=100 video=my-run.mp4
 ba-torchrl evaluate runs/my-run which=latest
 ba-torchrl evaluate runs/my-run expert=true        # close loop: compare the actions
 ba-torchrl evaluate trained task=close_loop/block_picking
-ba-torchrl evaluate trained                        # all policies that the package ships
+ba-torchrl evaluate trained folder=runs/trained    # all that the package ships; resumable
 """
 
 from __future__ import annotations
 
-from pydantic import Field
+import hashlib
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
 from tensordict import TensorDict
 
-from ba_torchrl import load_policy, make_vector_env
+from ba_torchrl import __version__, load_policy, make_vector_env
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, NumEnvs, Plugins, Seed, TaskId, Text, VideoFile
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import (
+    Count,
+    OutputFolder,
+    PluginSettings,
+    Seed,
+    TaskId,
+    Text,
+    VectorSettings,
+    VideoFile,
+)
+from ba_torchrl.data.files import write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.video import write_video
@@ -27,11 +41,9 @@ from ba_torchrl.training.policy import TrainedPolicy, shipped_policies, wilson_i
 FPS = 5
 
 
-class EpisodeSettings(StrictModel):
+class EpisodeSettings(VectorSettings, PluginSettings):
     """A policy and the episodes that it plays."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package, those that the run names among them: [my_tasks]."""
     policy: Text
     """A run folder, one of the checkpoints in it, a .safetensors file, or in evaluate "trained" for
     those that the package ships."""
@@ -41,10 +53,6 @@ class EpisodeSettings(StrictModel):
     """Where the policy is computed, whatever device it was trained on."""
     episodes: Count = 100
     """Their number."""
-    num_envs: NumEnvs = 5
-    """Environments that step together."""
-    parallel: bool | None = None
-    """Worker processes; null for processes where at least three can run at a time."""
     seed: Seed | None = None
     """Of the episodes; null for episodes that training did not use."""
 
@@ -54,6 +62,8 @@ class Settings(EpisodeSettings):
 
     task: TaskId | None = None
     """Of policy=trained; null for all of them."""
+    folder: OutputFolder | None = None
+    """Of policy=trained: a JSON file per policy, whose episodes are not played again."""
     expert: bool = False
     """Close loop: compare the policy's actions with the expert's, by component."""
     video: VideoFile | None = None
@@ -67,7 +77,11 @@ def main(settings: Settings) -> None:
     if settings.policy != "trained":
         if settings.task is not None:
             raise ConfigError("task: the policy names its task; leave it out")
+        if settings.folder is not None:
+            raise ConfigError("folder: it is for policy=trained; leave it out")
         _evaluate(settings.policy, settings)
+    elif settings.folder is not None and (settings.expert or settings.video is not None):
+        raise ConfigError("folder: it keeps success and length; leave out expert and video")
     elif settings.task is not None:
         _evaluate(settings.task, settings)
     else:
@@ -117,8 +131,12 @@ def _evaluate(source: str, settings: Settings) -> None:
     policy = load_policy(source, settings.which, settings.device)
     if settings.expert:
         check_comparable(policy.task)
+    seed = policy.test_seed if settings.seed is None else settings.seed
     episodes: list[TensorDict] = []
-    found = play(policy, settings, episodes, settings.expert)
+    if settings.folder is None:
+        found = play(policy, settings, episodes, settings.expert)
+    else:
+        found = _kept(policy, settings, seed)
     low, high = wilson_interval(found.successes, found.episodes)
     print(
         f"success_rate {found.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "
@@ -133,7 +151,6 @@ def _evaluate(source: str, settings: Settings) -> None:
         )
     print(f"  policy    update {policy.updates}, {policy.source}")
     chosen = ", none of which training used" if settings.seed is None else ""
-    seed = policy.test_seed if settings.seed is None else settings.seed
     print(f"  episodes  seed {seed}{chosen}")
     resolved = policy.config.resolved_env
     if settings.expert:
@@ -141,6 +158,33 @@ def _evaluate(source: str, settings: Settings) -> None:
     if settings.video is not None:
         frames = record_episodes(resolved, policy, settings.video_episodes, seed)
         print(f"  video     {write_video(settings.video, frames, fps=FPS)}")
+
+
+def _kept(policy: TrainedPolicy, settings: Settings, seed: int) -> Evaluation:
+    """Return the evaluation that a file of the folder holds, or play it and write that file.
+
+    It is played again if the policy's file, the episodes or the version of the package are others.
+    """
+    file = Path(settings.folder) / f"{policy.task.replace('/', '_')}.json"
+    asked: dict[str, Any] = {
+        "task": policy.task,
+        "label": policy.config.label,
+        "policy": hashlib.sha256(policy.source.read_bytes()).hexdigest(),
+        "seed": seed,
+        "episodes": settings.episodes,
+        "num_envs": settings.num_envs,
+        "ba_torchrl": __version__,
+    }
+    try:
+        saved = dict(json.loads(file.read_text(encoding="utf-8")))
+        if asked.items() <= saved.items():
+            return Evaluation(**{field.name: saved[field.name] for field in fields(Evaluation)})
+    except (OSError, ValueError, TypeError, KeyError):
+        pass  # there is none, or it is damaged
+    found = play(policy, settings)
+    interval = wilson_interval(found.successes, found.episodes)
+    write_text(file, json.dumps({**asked, **asdict(found), "interval": interval}, indent=2) + "\n")
+    return found
 
 
 COMMAND = Command(main, Settings, positional="policy")

@@ -18,13 +18,13 @@ from ba_torchrl.cli.types import (
     Count,
     NumEnvs,
     OutputFile,
-    Plugins,
+    PluginSettings,
     Seed,
     Tasks,
+    VectorSettings,
     checked,
     without,
 )
-from ba_torchrl.config import StrictModel
 from ba_torchrl.data.demos import expert_scores
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.robots.base import ROBOTS
@@ -57,11 +57,9 @@ VARIANTS = {
 }
 
 
-class Settings(StrictModel):
+class Settings(VectorSettings, PluginSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
     tasks: Tasks = None
     """Ids of tasks; null for all."""
     robots: list[Annotated[str, checked(ROBOTS.__getitem__)]] = Field(["kuka"], min_length=1)
@@ -73,8 +71,6 @@ class Settings(StrictModel):
     """Episodes of each entry."""
     num_envs: NumEnvs = 2
     """Environments that step together."""
-    parallel: bool | None = None
-    """Worker processes; null for processes where at least three can run at a time."""
     seed: Seed = 0
     """Of the episodes."""
     path: OutputFile | None = None

@@ -40,7 +40,14 @@ def main(settings: Settings) -> None:
     round_weights(policy)
     found = evaluate.play(policy, settings)
     seed = policy.test_seed if settings.seed is None else settings.seed
-    card = save_policy(policy, path, successes=found.successes, episodes=found.episodes, seed=seed)
+    card = save_policy(
+        policy,
+        path,
+        successes=found.successes,
+        episodes=found.episodes,
+        seed=seed,
+        num_envs=settings.num_envs,
+    )
     low, high = card.interval
     print(
         f"success_rate {card.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "

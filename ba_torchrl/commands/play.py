@@ -9,15 +9,14 @@ ba-torchrl play close_loop/corner_picking video=null env.render=true   # needs a
 
 from __future__ import annotations
 
-from typing import Any
+from typing import ClassVar
 
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from ba_torchrl import load_policy
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, Plugins, Seed, TaskId, Text, VideoFile, without
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import Count, EnvSettings, TaskId, Text, VideoFile
 from ba_torchrl.data.demos import expert_policy
 from ba_torchrl.data.episodes import Policy
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
@@ -26,31 +25,21 @@ from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
 from ba_torchrl.training.evaluation import record_episodes
 
 
-class Settings(StrictModel):
+class Settings(EnvSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    set_by_command: ClassVar[dict[str, str]] = {"seed": "set seed", "expert": "set policy"}
     task: TaskId | None = None
     """Id of the task; a policy of a run knows its own."""
-    env: dict[str, Any] = Field(default_factory=dict)
-    """Parameters of the environment."""
     policy: Text = "expert"
     """expert, random, trained (the policy that the package ships), or a run folder, a checkpoint or
     a .safetensors file."""
     episodes: Count = 1
     """Their number."""
-    seed: Seed = 0
-    """Of the episodes."""
     video: VideoFile | None = "play.mp4"
     """A file such as play.mp4 or play.gif, or null."""
     fps: float = Field(default=5, ge=MIN_FPS, le=MAX_FPS)
     """Frames a second."""
-
-    @field_validator("env")
-    @classmethod
-    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
-        return without(env, seed="set seed", expert="set policy")
 
 
 def main(settings: Settings) -> None:

@@ -8,15 +8,15 @@ ba-torchrl speed close_loop/block_picking env.obs_size=128 networks=[equi] devic
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, NumEnvs, Plugins, Seed, TaskId, Text, without
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text
 from ba_torchrl.data import collect_demonstrations, expert_policy
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
@@ -28,11 +28,13 @@ LEARNERS = {"close_loop": ("sac", "equi_small"), "open_loop": ("spatial_q", "fcn
 """Algorithm and usual network by control."""
 
 
-class Settings(StrictModel):
+class Settings(EnvSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
+    set_by_command: ClassVar[dict[str, str]] = {
+        "seed": "set seed",
+        "expert": "know that the expert acts",
+    }
     tasks: list[TaskId] = Field(
         ["close_loop/block_picking", "open_loop/house_building_2"], min_length=1
     )
@@ -50,17 +52,11 @@ class Settings(StrictModel):
     """Updates of each learner; 0 for none."""
     device: Text = "auto"
     """Of the learners."""
-    seed: Seed = 0
-    """Of episodes and networks."""
-
-    @field_validator("env")
-    @classmethod
-    def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
-        return without(env, seed="set seed", expert="know that the expert acts")
 
 
 def main(settings: Settings) -> None:
     """Print a table, row by row."""
+    learners = {task: list(learners_of(task, settings)) for task in settings.tasks}
     print(f"{'':52} {'per second':>10}")
     for task in settings.tasks:
         for name, workers in (
@@ -70,12 +66,9 @@ def main(settings: Settings) -> None:
         ):
             rate = steps_per_second(task, settings, **{"num_envs": settings.num_envs, **workers})
             print(f"{task:34} {name:17} {rate:10.1f} steps")
-        algorithm, usual = LEARNERS[TASKS[task].control]
-        for network in (settings.networks or [usual]) if settings.updates else ():
-            config = learner(task, algorithm, network, settings)
+        for config in learners[task]:
             rate = updates_per_second(config, settings)
-            name = f"{algorithm} {network}"
-            print(f"{task:34} {name:17} {rate:10.2f} updates, {compute_path(config)}")
+            print(f"{task:34} {config.label:17} {rate:10.2f} updates, {compute_path(config)}")
 
 
 def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: bool) -> float:
@@ -109,26 +102,27 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
         env.close()
 
 
-def learner(task: str, algorithm: str, network: str, settings: Settings) -> ExperimentConfig:
-    """Return the configuration of the learner that is measured on a task.
+def learners_of(task: str, settings: Settings) -> Iterator[ExperimentConfig]:
+    """Yield the configuration of each learner that is measured on a task.
 
     Args:
         task: id of the task.
-        algorithm: registered name.
-        network: preset.
         settings: of the measurement.
     """
-    return ExperimentConfig.parse(
-        {
-            "plugins": settings.plugins,
-            "task": task,
-            "env": settings.env,
-            "algorithm": {"name": algorithm},
-            "network": hydra_schema.preset("network", network),
-            "device": settings.device,
-            "seed": settings.seed,
-        }
-    )
+    algorithm, usual = LEARNERS[TASKS[task].control]
+    for network in (settings.networks or [usual]) if settings.updates else ():
+        yield ExperimentConfig.parse(
+            {
+                "plugins": settings.plugins,
+                "task": task,
+                "env": settings.env,
+                "algorithm": {"name": algorithm},
+                "network": hydra_schema.preset("network", network),
+                "label": f"{algorithm} {network}",
+                "device": settings.device,
+                "seed": settings.seed,
+            }
+        )
 
 
 def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:

@@ -9,21 +9,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import Field
-
 from ba_torchrl import describe, list_tasks
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import OutputFile, Plugins, Tasks
-from ba_torchrl.config import StrictModel
+from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks
 from ba_torchrl.envs.description import summary
 from ba_torchrl.record.task_page import task_page, tasks_by_heading
 
 
-class Settings(StrictModel):
+class Settings(PluginSettings):
     """Settings of this command."""
 
-    plugins: Plugins = Field(default_factory=list)
-    """Modules outside the package that register tasks: [my_tasks]."""
     tasks: Tasks = None
     """Ids of tasks; null for all."""
     path: OutputFile | None = None

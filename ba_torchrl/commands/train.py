@@ -9,6 +9,7 @@ ba-torchrl train num_envs=8 collector=multi_async collector.workers=4
 
 from __future__ import annotations
 
+import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.interruption import RunStopped
 
+logger = logging.getLogger(__name__)
+
 
 def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
     """Return the run; that of an existing folder if the command line only resumes it.
@@ -30,6 +33,8 @@ def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
         arguments: what of them the command line gives.
     """
     is_resumed = values["resume"] is True and (Path(values["run_dir"]) / CONFIG_FILE).exists()
+    if values["resume"] is True and not is_resumed:
+        logger.warning("there is no run in %s to resume: a new one starts", values["run_dir"])
     if is_resumed and arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
         return read_config(values["run_dir"], **{name: values[name] for name in arguments.names})
     return ExperimentConfig.parse(values)
@@ -60,4 +65,4 @@ def main(config: ExperimentConfig) -> None:
     print("    env.rollout(env.max_steps, policy)")
 
 
-COMMAND = Command(main, ExperimentConfig, config="train", parse=parse)
+COMMAND = Command(main, ExperimentConfig, config="train", variants="quickstart*", parse=parse)

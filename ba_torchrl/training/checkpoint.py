@@ -103,6 +103,20 @@ def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
         saved = dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"cannot read {file}: {error}") from None
+    return parse_saved(saved, file, **changes)
+
+
+def parse_saved(saved: dict[str, Any], file: str | Path, **changes: Any) -> ExperimentConfig:
+    """Return the configuration that a file holds. Plugins that it names are not imported.
+
+    Args:
+        saved: the configuration.
+        file: that holds it.
+        changes: fields to override.
+
+    Raises:
+        ConfigError: it does not parse, or it names plugins that are neither imported nor installed.
+    """
     plugins = saved.get("plugins")
     if isinstance(plugins, list) and "plugins" not in changes:
         check_known(map(str, plugins), file)

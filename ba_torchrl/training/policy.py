@@ -5,6 +5,7 @@ A policy in a file is ``NAME.safetensors``, its parameters, and ``NAME.json``, i
 
 from __future__ import annotations
 
+import textwrap
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -19,11 +20,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import SeedUse
-from ba_torchrl.config import StrictModel
+from ba_torchrl.config import StrictModel, explain
 from ba_torchrl.data.files import write_text
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, known_names
 from ba_torchrl.record.results import RESULT_FILE, read_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.checkpoint import (
@@ -31,10 +32,13 @@ from ba_torchrl.training.checkpoint import (
     build_algorithm,
     find_checkpoint,
     load,
+    parse_saved,
 )
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
 
 TENSORS, CARD = ".safetensors", ".json"
+_OF_TRAINING = {"logger": "csv", "collector": {"name": "single"}, "demonstrations_path": None}
+"""Fields of a run that its policy does not need, with values that need no package or file."""
 
 
 class PolicyCard(StrictModel):
@@ -45,7 +49,7 @@ class PolicyCard(StrictModel):
     label: str
     """Name of the method, such as "sacfd equi"."""
     config: dict[str, Any]
-    """The configuration of the run, from which the networks are built."""
+    """The configuration of the run, from which the networks are built; without where it ran."""
     updates: int
     """Gradient updates of the policy."""
     success_rate: float
@@ -116,7 +120,7 @@ class TrainedPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``; the observation may be on another device than the policy."""
-        device = self.config.torch_device
+        device = next(self.parameters()).device
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
             found = self.policy(tensordict.select(*self.in_keys).to(device))[keys.ACTION]
         return tensordict.set(keys.ACTION, found.to(tensordict.device or found.device))
@@ -142,8 +146,10 @@ def load_policy(
         **policy.env_config)`` makes its environment.
 
     Raises:
-        ConfigError: there is no such policy, or its files are damaged.
+        ConfigError: there is no such policy, its files are damaged, or it names plugins that are
+            neither imported nor installed.
     """
+    changes = {**_OF_TRAINING, "device": device, **changes}
     if str(source) in TASKS:
         path = shipped_file(str(source))
         if not path.exists():
@@ -151,18 +157,23 @@ def load_policy(
             raise ConfigError(f"no trained policy of {source} is shipped; those that are: {known}")
     else:
         path = Path(source)
+        if not path.exists():
+            raise ConfigError(
+                f"{source} is neither a run folder, a file of a policy nor a task with a trained "
+                f"policy.{known_names(str(source), shipped_policies())}"
+            )
     if path.suffix != TENSORS:
         checkpoint = find_checkpoint(path, which)
-        config, algorithm = load(checkpoint, device=device, **changes)
+        config, algorithm = load(checkpoint, **changes)
         return TrainedPolicy(algorithm.policy, config, algorithm.updates, checkpoint)
     card = read_card(path)
-    where = {"run_dir": str(path.parent), "resume": False, "device": device}
-    config = ExperimentConfig.parse({**card.config, **where, **changes}, str(path))
+    changes = {"run_dir": str(path.parent), "resume": False, **changes}
+    config = parse_saved(card.config, path.with_suffix(CARD), **changes)
     policy = build_algorithm(config).policy
     try:
         policy.load_state_dict(load_file(path, device=str(config.torch_device)))
     except (OSError, RuntimeError, SafetensorError) as error:
-        reason = str(error).splitlines()[0]
+        reason = textwrap.shorten(str(error), 300)
         raise ConfigError(f"{path} does not hold the policy of its card: {reason}") from None
     return TrainedPolicy(policy, config, card.updates, path, card)
 
@@ -181,6 +192,7 @@ def save_policy(
     successes: int,
     episodes: int,
     seed: int,
+    num_envs: int,
 ) -> PolicyCard:
     """Write a policy and its card. Weights are stored in half precision.
 
@@ -190,6 +202,7 @@ def save_policy(
         successes: of ``episodes`` greedy episodes.
         episodes: number of episodes that were played.
         seed: of these episodes.
+        num_envs: number of environments that played them.
     """
     path = Path(path)
     run: dict[str, Any] = {}
@@ -203,7 +216,7 @@ def save_policy(
             "versions": result.versions,
         }
     config = policy.config.resolved()
-    for name in ("run_dir", "resume", "device", "demonstrations_path"):
+    for name in ("run_dir", "resume", "device", *_OF_TRAINING):
         del config[name]
     is_shipped = path.resolve() == shipped_file(policy.task)
     named = f"policy=trained task={policy.task}" if is_shipped else f"policy={path.name}"
@@ -216,7 +229,8 @@ def save_policy(
         interval=wilson_interval(successes, episodes),
         episodes=episodes,
         seed=seed,
-        evaluate=f"ba-torchrl evaluate {named} episodes={episodes}",
+        evaluate=f"ba-torchrl evaluate {named} {episodes=} {num_envs=}"
+        + (f" {seed=}" if seed != policy.test_seed else ""),
         **run,
     )
     tensors = {name: value.detach().cpu() for name, value in policy.policy.state_dict().items()}
@@ -242,8 +256,11 @@ def read_card(path: str | Path) -> PolicyCard:
     file = Path(path).with_suffix(CARD)
     try:
         return PolicyCard.model_validate_json(file.read_bytes())
-    except (OSError, ValidationError) as error:
-        raise ConfigError(f"cannot read {file}: {str(error).splitlines()[0]}") from None
+    except OSError as error:
+        raise ConfigError(f"cannot read {file}: {error.strerror}") from None
+    except ValidationError as error:
+        found = explain(error, PolicyCard.model_fields, "card")
+        raise ConfigError(f"this version cannot use {file}: {found}") from None
 
 
 def shipped_file(task: str) -> Path:

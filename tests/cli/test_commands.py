@@ -56,11 +56,12 @@ REFUSED = [
     ("collect", "foo=1", "unknown setting 'foo'. Known: "),
     ("collect", "env.seed=5", "env: seed is set by the command; leave it out, and set seed"),
     ("collect", "env.expert=false", "leave it out, and set source"),
+    ("collect", "source=deconstruction", "deconstruction has no meaning for close_loop/block_pick"),
     ("collect", "path=run", "run exists already"),
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("play", "env.seed=5", "leave it out, and set seed"),
     ("play", "env.expert=true", "leave it out, and set policy"),
-    ("experts", "env.num_objects=3", "unknown setting 'env'. Known: plugins, tasks, robots"),
+    ("experts", "env.num_objects=3", "unknown setting 'env'. Known: plugins, num_envs, "),
     ("experts", "variants.close_loop=null", "variants.close_loop: Input should be a valid dict"),
     ("experts", "variants.open_loop.x={seed: 3}", "variants: seed is set by the command"),
     ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
@@ -91,6 +92,7 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     def started(*_, **__):
         raise AssertionError("work started")
 
+    load_recipe(name)  # else modules that it imports would keep `started`
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ba_torchrl.envs.factory.make", started)
     monkeypatch.setattr("ba_torchrl.make", started)

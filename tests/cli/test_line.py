@@ -37,6 +37,11 @@ def test_the_overview_lists_every_command_with_its_first_line(capsys):
     [
         (["trian"], "unknown command 'trian'. Did you mean 'train'?"),
         (["train", "--confg-name", "x"], "unknown option '--confg-name'. Did you mean '--config"),
+        (["train", "--config", "x"], "unknown option '--config'. Did you mean '--config-"),
+        (["train", "--cfg", "job", "sed=1"], "unknown setting 'sed'. Did you mean 'seed'?"),
+        (["train", "-m", "sed=1,2"], "unknown setting 'sed'. Did you mean 'seed'?"),
+        (["train", "--cfg=job", "--config-name", "quikstart"], "Did you mean 'quickstart'?"),
+        (["train", "--help", "task=close_loop/block_pickng"], "Did you mean 'close_loop/block_p"),
         (["train", "--config-name", "quikstart"], "Did you mean 'quickstart'?"),
         (["train", "--config-name"], "expected one argument"),
         (["train", "--config-dir", "nowhere"], "there is no folder nowhere"),
@@ -45,6 +50,7 @@ def test_the_overview_lists_every_command_with_its_first_line(capsys):
         (["train", "algorithm=dqn", "algorithm.magrin=1"], "unknown setting 'algorithm.magrin'"),
         (["train", "network.wdith=1", "network=cnn"], "Did you mean 'width'?"),
         (["train", "algorithm=sacd"], "unknown algorithm 'sacd'. Did you mean 'sacfd'?"),
+        (["train", "algorithm.name=sacd", "run_dir=x"], "unknown algorithm 'sacd'. Did you mean"),
         (["train", "replay=pre"], "unknown replay 'pre'. Did you mean 'per'?"),
         (["train", "task=close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
         (["train", "+seed=1", "run_dir=x"], "An item is already at 'seed'"),
@@ -52,10 +58,18 @@ def test_the_overview_lists_every_command_with_its_first_line(capsys):
         (["train", "block_picking"], "'block_picking' sets nothing; settings are FIELD=VALUE"),
         (["evaluate"], "policy is missing; see --help"),
         (["evaluate", "a", "b"], "one policy is expected, got a b"),
+        (["evaluate", "a", "policy=b"], "policy is given twice"),
+        (["evaluate", "close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
+        (["doctor", "now"], "doctor has no settings"),
         (["evaluate", "trained", "task=open_loop/covid_tets"], "unknown task 'open_loop/covid_"),
         (["play"], "task is missing"),
         (["play", "--config-name", "x"], "play has no configuration files"),
         (["benchmark", "benchmark=close_loop_4"], "Did you mean 'close_loop_4d'?"),
+        (
+            ["benchmark", "--config-name", "train"],
+            "unknown configuration 'train'. Known: benchmark",
+        ),
+        (["speed", "networks=[equo]"], "unknown network 'equo'. Did you mean 'equi'?"),
     ],
 )
 def test_a_mistake_is_one_line_with_the_nearest_name(words, message, capsys):
@@ -102,7 +116,7 @@ def test_the_help_describes_every_setting(name, capsys):
 
 
 def test_the_help_shows_the_fields_of_the_chosen_presets_and_their_choices(capsys):
-    cli.main(["train", "--help", "algorithm=dqn", "task=open_loop/bin_packing"])
+    cli.main(["--help", "train", "algorithm=dqn", "task=open_loop/bin_packing"])
     out = capsys.readouterr().out
     assert "algorithm.epsilon_" in out
     assert "env.robot=kuka   {kuka, panda, ur5, ur5_robotiq}" in out
@@ -110,16 +124,22 @@ def test_the_help_shows_the_fields_of_the_chosen_presets_and_their_choices(capsy
     assert "network=asr | cnn | " in out
 
 
-def test_a_package_of_the_extra_that_is_missing_is_one_line(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("hydra", "needs the extra [train] of the package, of which 'hydra-core' is missing: pip"),
+        ("pybullet.x", "needs a package: 'pybullet' is missing: pip install "),
+    ],
+)
+def test_a_package_that_is_missing_is_one_line(module, words, monkeypatch, capsys):
     def missing(name):
-        raise ModuleNotFoundError("No module named 'hydra'", name="hydra")
+        raise ModuleNotFoundError(f"No module named {module!r}", name=module)
 
     monkeypatch.setattr(cli.importlib, "import_module", missing)
-    line = refused(["train"], capsys)
-    assert "'hydra-core' is missing: pip install" in line
+    assert words in refused(["train"], capsys)
 
 
-def test_the_folder_alone_resumes_a_run(tmp_path):
+def test_the_folder_alone_resumes_a_run(tmp_path, caplog):
     config = tiny(tmp_path, total_updates=7)
     write_config(config)
     values = ExperimentConfig.parse(
@@ -130,9 +150,11 @@ def test_the_folder_alone_resumes_a_run(tmp_path):
     assert (found.total_updates, found.resume, found.threads) == (7, True, 1)
     everything = Arguments([*given.overrides, "total_updates=99"])
     assert train.parse(values, everything).total_updates == 99
+    assert caplog.text == ""
     (tmp_path / "other").mkdir()
     new = {**values, "run_dir": str(tmp_path / "other")}
     assert train.parse(new, given).total_updates == 99
+    assert f"there is no run in {new['run_dir']} to resume: a new one starts" in caplog.text
 
 
 def test_an_own_configuration_in_a_further_folder(tmp_path, capsys, monkeypatch):
@@ -140,6 +162,9 @@ def test_an_own_configuration_in_a_further_folder(tmp_path, capsys, monkeypatch)
     (tmp_path / "mine.yaml").write_text("defaults: [train, _self_]\nseed: 7\n")
     cli.main(["train", "--config-dir", ".", "--config-name", "mine", "--help"])
     assert "  seed=7" in capsys.readouterr().out
+    (tmp_path / "my_grid.yaml").write_text("defaults: [benchmark, _self_]\nseeds: 9\n")
+    cli.main(["benchmark", "--config-dir", ".", "--config-name", "my_grid", "--help"])
+    assert "  seeds=9" in capsys.readouterr().out
 
 
 def test_hydras_own_options_work(capsys, monkeypatch):

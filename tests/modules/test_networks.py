@@ -198,6 +198,14 @@ for name, spec in (("equi", actor_critic), ("equi_fcn", spatial), ("equi_asr", s
         assert "pip install --no-deps escnn==1.0.11" in str(error), error
     else:
         raise SystemExit(f"built {name} without escnn")
+del sys.modules["escnn"]
+sys.modules["joblib"] = None  # which escnn imports
+try:
+    NETWORKS["equi"]().build(actor_critic)
+except MissingPackageError as error:
+    assert "equivariant networks need joblib: pip install " in str(error), error
+else:
+    raise SystemExit("built equi without joblib")
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr

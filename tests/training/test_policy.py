@@ -1,12 +1,15 @@
 """Trained policies: from a run, in a file with its card, and shipped."""
 
 import json
+import sys
 
 import pytest
 import torch
 
 import ba_torchrl
+from ba_torchrl.commands import evaluate
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.training import evaluation
 from ba_torchrl.training import policy as policies
 from ba_torchrl.training.checkpoint import load
 from ba_torchrl.training.experiment import Experiment
@@ -53,7 +56,7 @@ def test_a_file_acts_like_the_run(run, tmp_path):
     for weight, before in zip(policy.policy.state_dict().values(), trained, strict=True):
         torch.testing.assert_close(weight, before, rtol=2**-11, atol=2**-25)
     path = tmp_path / "p.safetensors"
-    card = policies.save_policy(policy, path, successes=3, episodes=4, seed=9)
+    card = policies.save_policy(policy, path, successes=3, episodes=4, seed=9, num_envs=2)
     again = ba_torchrl.load_policy(path)
     state = observed(policy)
     torch.testing.assert_close(
@@ -61,7 +64,10 @@ def test_a_file_acts_like_the_run(run, tmp_path):
     )
     assert again.card == card
     assert (card.success_rate, card.episodes, card.seed) == (0.75, 4, 9)
-    assert card.evaluate == "ba-torchrl evaluate policy=p.safetensors episodes=4"
+    command = "ba-torchrl evaluate policy=p.safetensors episodes=4 num_envs=2"
+    assert card.evaluate == f"{command} seed=9"
+    own = {"successes": 3, "episodes": 4, "num_envs": 2, "seed": policy.test_seed}
+    assert policies.save_policy(policy, tmp_path / "p.safetensors", **own).evaluate == command
     assert card.env_steps >= 0
     assert again.env_config == policy.env_config
     assert str(run) not in path.with_suffix(".json").read_text()
@@ -82,16 +88,37 @@ def test_what_is_no_policy_is_named(run, tmp_path):
         ba_torchrl.load_policy("open_loop/covid_test")
     with pytest.raises(ConfigError, match="neither a run folder"):
         ba_torchrl.load_policy(tmp_path / "none")
+    with pytest.raises(ConfigError, match="Did you mean 'close_loop/block_picking'"):
+        ba_torchrl.load_policy("close_loop/block_pickng")
     path = tmp_path / "p.safetensors"
+    path.touch()
     with pytest.raises(ConfigError, match=r"cannot read .*p.json"):
         ba_torchrl.load_policy(path)
-    policies.save_policy(ba_torchrl.load_policy(run), path, successes=1, episodes=1, seed=0)
+    counts = {"successes": 1, "episodes": 1, "seed": 0, "num_envs": 1}
+    policies.save_policy(ba_torchrl.load_policy(run), path, **counts)
+    card = path.with_suffix(".json")
+    saved = json.loads(card.read_text())
+
+    def loaded(**changes):
+        card.write_text(json.dumps({**saved, **changes}))
+        return ba_torchrl.load_policy(path)
+
+    for elsewhere in (
+        {"logger": "wandb"},
+        {"collector": {"name": "ray"}},
+        {"demonstrations_path": "nowhere"},
+    ):
+        loaded(config={**saved["config"], **elsewhere})
+    with pytest.raises(ConfigError, match=r"uses the plugins \[antigravity\].*runs their code"):
+        loaded(config={**saved["config"], "plugins": ["antigravity"]})
+    assert "antigravity" not in sys.modules
+    with pytest.raises(ConfigError, match=r"(?s)this version cannot use .*p.json.*unknown .*'new'"):
+        loaded(config={**saved["config"], "new": 1})
+    with pytest.raises(ConfigError, match=r"(?s)this version cannot use .*p.json.*format: "):
+        loaded(format=2)
+    loaded()
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ConfigError, match="does not hold the policy of its card"):
-        ba_torchrl.load_policy(path)
-    card = path.with_suffix(".json")
-    card.write_text(json.dumps({**json.loads(card.read_text()), "format": 2}))
-    with pytest.raises(ConfigError, match="cannot read"):
         ba_torchrl.load_policy(path)
 
 
@@ -112,16 +139,10 @@ def test_a_shipped_policy_reaches_the_goal(task):
     assert policy.card.episodes >= 100
     env = ba_torchrl.make_vector_env(task, 5, parallel=False, **policy.env_config)
     try:
-        found = policies_evaluation(env, policy)
+        found = evaluation.evaluate(env, policy, 20, seed=policy.test_seed)
     finally:
         env.close()
     assert found.success_rate >= policy.card.interval[0] - 0.2
-
-
-def policies_evaluation(env, policy):
-    from ba_torchrl.training.evaluation import evaluate
-
-    return evaluate(env, policy, 20, seed=policy.test_seed)
 
 
 def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsys, monkeypatch):
@@ -136,3 +157,29 @@ def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsy
     assert f"  card      {success:.2f} (" in out  # the same episodes
     recipe("play", f"policy={file}", "video=film.gif")
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF")
+
+
+def test_results_of_the_shipped_policies_are_kept(tmp_path, capsys, monkeypatch):
+    played = []
+
+    def play(policy, settings):
+        played.append(settings.episodes)
+        return evaluation.Evaluation(settings.episodes, 0.5, 0.1, 7.0)
+
+    monkeypatch.setattr(evaluate, "play", play)
+    words = ("trained", f"folder={tmp_path}", "episodes=20")
+    recipe("evaluate", *words)
+    first = capsys.readouterr().out
+    recipe("evaluate", *words)
+    assert capsys.readouterr().out == first
+    assert "success_rate 0.50 (95 % interval 0.30 to 0.70) over 20 episodes" in first
+    (file,) = tmp_path.glob("close_loop_block_picking.json")
+    assert json.loads(file.read_text())["interval"] == pytest.approx((0.299, 0.701), abs=1e-3)
+    file.write_text(file.read_text()[:-9])
+    recipe("evaluate", *words)
+    recipe("evaluate", *words, "seed=3")
+    recipe("evaluate", "trained", "task=close_loop/block_picking", *words[1:], "num_envs=2")
+    assert played == [20, 20, 20, 20]
+    with pytest.raises(SystemExit):
+        recipe("evaluate", "nothere", *words[1:])
+    assert "folder: it is for policy=trained" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import shutil
 import warnings
@@ -30,6 +31,8 @@ __all__ = [
     "make_vector",
     "processes_save_time",
 ]
+
+logger = logging.getLogger(__name__)
 
 MakeEnv = Callable[[], EnvBase]
 
@@ -151,6 +154,10 @@ class PlainVectorEnv(SeededVector, ParallelEnv):
     def get_positions(self) -> list[Position]:
         """Raise a `WorkerError`: a run that is resumed plays other episodes."""
         raise WorkerError("TorchRL's ParallelEnv does not tell the episodes of its workers")
+
+    def continue_from(self, positions: Sequence[Position]) -> None:
+        """Start new episodes: those of ``positions`` cannot be given to the workers."""
+        logger.warning("TorchRL's ParallelEnv cannot continue episodes; others are played")
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any

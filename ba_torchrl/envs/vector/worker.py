@@ -35,7 +35,8 @@ _POLL_INTERVAL_S = 30e-6
 
 
 class EnvironmentRaisedError(WorkerError):
-    """The environment of a worker raised an exception, in contrast to a process that ended."""
+    """The environment of a worker raised an exception, or the process ended by an exception before
+    it could make the environment; in contrast to a process that was ended."""
 
 
 class Worker:
@@ -140,7 +141,7 @@ class Worker:
 
         Raises:
             WorkerError: the worker has ended, or sends nothing for ``timeout_s`` seconds.
-            EnvironmentRaisedError: the environment raised.
+            EnvironmentRaisedError: the environment raised, or what it needs cannot be imported.
         """
         try:
             if not self.pipe.poll(timeout_s):
@@ -148,7 +149,14 @@ class Worker:
                 raise WorkerError(f"it did not answer {self.command!r} within {limit_s:g} s")
             message = self.pipe.recv()
         except (EOFError, OSError):
-            raise WorkerError(self._exit_reason()) from None
+            reason = self._exit_reason()
+            # `_run_worker` sends every exception: this one was raised before, by an import
+            if not self.is_ready and (self.process.exitcode or 0) > 0:
+                raise EnvironmentRaisedError(
+                    f"{reason} before it made the environment. It cannot import what it needs, see "
+                    'its traceback above, or the script lacks `if __name__ == "__main__":`'
+                ) from None
+            raise WorkerError(reason) from None
         if isinstance(message, tuple) and message[0] == _FAILED:
             raise EnvironmentRaisedError(f"it raised\n{message[1]}")
         return message

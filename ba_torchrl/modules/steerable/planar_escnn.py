@@ -13,7 +13,7 @@ import warnings
 from types import ModuleType
 from typing import Any
 
-from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.errors import MissingPackageError, install_command
 
 ESCNN_FIX = "equivariant networks need escnn: pip install --no-deps escnn==1.0.11"
 _NAMES = ("lie_learn", "representations", "SO3", "wigner_d")
@@ -35,7 +35,11 @@ def import_escnn(name: str = "escnn") -> ModuleType:
             importlib.import_module("escnn")
             return importlib.import_module(name)
     except ImportError as error:
-        raise MissingPackageError(ESCNN_FIX) from error
+        other = (error.name or "").split(".")[0]  # a package that escnn imports
+        fix = ESCNN_FIX
+        if other not in ("", "escnn"):
+            fix = f"equivariant networks need {other}: {install_command(other)}"
+        raise MissingPackageError(fix) from error
 
 
 def _replace_lie_learn() -> None:

@@ -2,7 +2,9 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 from functools import partial
+from types import ModuleType
 
 import pytest
 import torch
@@ -155,6 +157,15 @@ class TestFailures:
         with pytest.raises(RuntimeError, match=r"(?s)could not be started.*no simulator today"):
             env.start()
         assert multiprocessing.active_children() == []
+
+    def test_to_import_are_not_retried(self, monkeypatch):
+        module = ModuleType("only_in_this_process")
+        exec("def make():\n    import fake_env\n    return fake_env.FakeEnv()", vars(module))
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        env = VectorEnv(1, module.make, workers=WorkerOptions(start_method="spawn"))
+        with pytest.raises(RuntimeError, match=r"worker 0 could not be started.*cannot import"):
+            env.start()
+        assert env.restarts == 0
 
     def test_to_rebuild_are_retried_then_raise(self, make_fakes, tmp_path):
         env = make_fakes(2, folder=tmp_path, max_restarts=1)

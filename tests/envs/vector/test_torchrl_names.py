@@ -44,6 +44,7 @@ def test_without_them_the_vector_is_a_plain_one_with_the_same_episodes(started, 
         first, second = started.reset(), plain.reset()
         torch.testing.assert_close(first["pixels"], second["pixels"], rtol=0, atol=0)
         assert not torch.equal(second["pixels"][0], second["pixels"][1])
+        plain.continue_from(started.get_positions())  # of a run that is resumed
         torch.testing.assert_close(
             started.reset(seed=5)["pixels"], plain.reset(seed=5)["pixels"], rtol=0, atol=0
         )
