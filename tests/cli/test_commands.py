@@ -94,8 +94,10 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
 
     load_recipe(name)  # else modules that it imports would keep `started`
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ba_torchrl.envs.factory.make", started)
+    # in this order: each looks up what the next one replaces
+    monkeypatch.setattr("ba_torchrl.envs.description.make", started)
     monkeypatch.setattr("ba_torchrl.make", started)
+    monkeypatch.setattr("ba_torchrl.envs.factory.make", started)
     monkeypatch.setattr("ba_torchrl.training.experiment.Experiment.run", started)
     monkeypatch.setattr("ba_torchrl.training.grid.launchers.local.run_all", started)
     (tmp_path / "file").write_text("a file")
