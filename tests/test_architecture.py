@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from docs import architecture, layout
+from docs import architecture, layout, results
 from docs.sources import Definition
 
 ROOT = Path(__file__).parents[1]
@@ -12,6 +12,11 @@ PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 def test_the_picture_is_drawn_from_the_imports():
     assert architecture.page_with_picture(PAGE) == PAGE, "run `python -m docs.architecture`"
+
+
+def test_the_page_of_results_has_the_present_results():
+    page = results.PAGE.read_text(encoding="utf-8")
+    assert results.page_with_results(page) == page, "run `python -m docs.results`"
 
 
 def test_imports_that_follow_from_others_are_left_out():

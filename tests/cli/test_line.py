@@ -195,7 +195,7 @@ def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
     assert "no-such-package        missing\n" in out
     assert "pip install no-such-package" in out
     assert "workers are not replaced" in out
-    assert "trained policies       close_loop/block_picking" in out
+    assert "trained policies       close_loop/block_in_bowl, close_loop/block_picking" in out
 
 
 @pytest.mark.slow
