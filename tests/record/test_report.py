@@ -12,7 +12,7 @@ import pytest
 
 from ba_torchrl.record.plots import plot_panels
 from ba_torchrl.record.report import write_report
-from ba_torchrl.record.results import RunResult, differences, read_result, write_result
+from ba_torchrl.record.results import RunResult, differences, read_result, versions, write_result
 from ba_torchrl.record.summary import interval, load_sections, standard_error, summarize
 
 imageio = pytest.importorskip("imageio.v3")
@@ -62,6 +62,14 @@ def write_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equ
     }
     write_result(folder, RunResult(**{**values, **changes}))
     return folder
+
+
+def test_versions_name_the_commit_in_a_clone():
+    command = ["git", "-C", str(ROOT), "rev-parse", "HEAD"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    if found.returncode or not (ROOT / ".git").exists():
+        pytest.skip("this is no clone")
+    assert found.stdout.startswith(versions()["commit"].rstrip("+"))
 
 
 def test_figures_over_seeds(tmp_path):

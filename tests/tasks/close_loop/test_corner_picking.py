@@ -136,3 +136,20 @@ def test_the_expert_drags_a_rotated_block_out_of_the_corner(env):
         state = env._step(env.full_action_spec.zero())
         solved += bool(play(env, state)["success"])
     assert solved >= 9
+
+
+def test_the_expert_descends_while_it_moves_and_turns_to_the_press(env):
+    scene, task = env.scene, env.scene.task
+    env.reset()
+    task.put_corner((0.45, 0.0), 0.0)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.2), 0.0)
+    far = task.expert_command()
+    x, y = 0.45 + far.dx_m, far.dy_m
+    scene.controller.move_to((x + 0.008, y + 0.008, 0.2), 0.2)
+    scene.controller.move_to((x + 0.008, y + 0.008, 0.075), 0.2)  # below the top of the walls
+    near = task.expert_command()
+    assert near.dz_m < -0.005
+    assert near.dx_m < -0.005
+    assert near.dy_m < -0.005
+    assert near.dyaw_rad == pytest.approx(-0.2, abs=0.02)
