@@ -16,7 +16,7 @@ REQUIREMENTS := requirements.txt requirements-no-deps.txt pyproject.toml
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup train test test-slow test-versions lint
+.PHONY: help setup train test test-slow test-versions lint docs
 
 help:
 	@echo "make setup      create $(VENV) with everything this project uses"
@@ -24,6 +24,7 @@ help:
 	@echo "make test       the tests (minutes)"
 	@echo "make test-slow  the tests that take longer"
 	@echo "make test-versions  the lowest and newest versions, in fresh environments (gigabytes)"
+	@echo "make docs       the site, in docs/_build/html"
 	@echo "make lint       check style; list long files, deep classes and lines to read"
 	@echo
 	@echo "ARGS='...' is passed on: make train ARGS='seed=1', make test ARGS='-k vector'."
@@ -49,6 +50,9 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m docs.layout
+
+docs: $(STAMP)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -b html docs docs/_build/html $(ARGS)
 
 # The stamp comes last, so an interrupted set-up is taken up again. One recipe, so that -j
 # cannot reorder it: torch goes first, or a requirement would pull in another build of it.

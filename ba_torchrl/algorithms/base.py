@@ -63,7 +63,7 @@ __all__ = [
 ALGORITHMS: Registry[type[LearnerConfig]] = Registry("algorithm", "ba_torchrl.algorithms")
 
 LossFunction = Callable[[TensorDictBase], TensorDictBase]
-"""Losses, whose names begin with "loss_", and diagnostics of a batch."""
+"""Losses, whose names begin with ``loss_``, and diagnostics of a batch."""
 
 
 class SeedUse(IntEnum):
@@ -536,7 +536,7 @@ class Learner(ABC):
         target network.
 
         Args:
-            stages: losses, whose names begin with "loss_", and diagnostics. An iterator computes
+            stages: losses, whose names begin with ``loss_``, and diagnostics. An iterator computes
                 each stage after the step on the one before.
 
         Returns:

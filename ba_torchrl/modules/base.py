@@ -64,19 +64,16 @@ class ActorCriticSpec:
 
 
 class ActorCritic(NamedTuple):
-    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, including none.
-
-    Fields:
-        actor: (images [..., C, H, W] each, holding [..., 1]) -> (loc [..., A], scale [..., A]) of
-            the Gaussian before it is squashed.
-        encoder: (images, holding) -> features [..., F], shared by the two critics.
-        critic: (features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the
-            specification asks for K critics.
-    """
+    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, including none."""
 
     actor: nn.Module
+    """(images [..., C, H, W] each, holding [..., 1]) -> (loc [..., A], scale [..., A]) of the
+    Gaussian before it is squashed."""
     encoder: nn.Module
+    """(images, holding) -> features [..., F], shared by the two critics."""
     critic: nn.Module
+    """(features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the specification
+    asks for K critics."""
 
 
 class NetworkConfig(Protocol):

@@ -170,7 +170,7 @@ class Task(ABC):
         """Return the conditions of `evaluate` after a check of names and types.
 
         Raises:
-            TypeError: there are none, or they are not bools whose names begin with "is_".
+            TypeError: there are none, or they are not bools whose names begin with ``is_``.
         """
         conditions = self.evaluate()
         are_named = all(name.startswith("is_") and name != "is_success" for name in conditions)

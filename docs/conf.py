@@ -1,0 +1,133 @@
+"""Settings of the site, and the pages that each build makes from the classes.
+
+make docs
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from sphinx.application import Sphinx
+
+from ba_torchrl import __version__, list_tasks
+from ba_torchrl.algorithms.base import ALGORITHMS
+from ba_torchrl.config import EnvConfig
+from ba_torchrl.envs.description import describe, summary
+from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.record.task_page import tasks_by_heading
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.policy import read_card, shipped_file, shipped_policies
+
+project, author, release = "BA-TorchRL", "The BA-TorchRL authors", __version__
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinxcontrib.mermaid",
+]
+myst_enable_extensions = ["dollarmath", "amsmath"]
+myst_heading_anchors = 3
+myst_fence_as_directive = ["mermaid"]
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+html_theme = "furo"
+html_title = "BA-TorchRL"
+exclude_patterns = ["_build", "results/**", "tasks.md"]
+
+FOLDER = Path(__file__).parent
+GENERATED = FOLDER / "generated"
+"""Pages of `write_pages`, which are not tracked."""
+
+
+def setup(app: Sphinx) -> None:
+    """Make the generated pages before Sphinx looks for its sources."""
+    app.connect("config-inited", lambda *_: write_pages())
+
+
+def write_pages() -> None:
+    """Write one page per task, an index of them, and the fields of all configurations."""
+    shutil.rmtree(GENERATED, ignore_errors=True)
+    (GENERATED / "tasks").mkdir(parents=True)
+    groups = tasks_by_heading(list_tasks())
+    for task in list_tasks():
+        page = GENERATED / "tasks" / f"{_slug(task)}.md"
+        page.write_text(task_page(task), encoding="utf-8")
+    lines = ["# Tasks", ""]
+    for heading, tasks in groups.items():
+        lines += [f"## {heading}", "", "| | task | goal |", "|---|---|---|"]
+        for task in tasks:
+            picture = f"![](../gallery/{_slug(task)}.png)"
+            lines.append(f"| {picture} | [`{task}`](tasks/{_slug(task)}.md) | {summary(task)} |")
+        pages = (f"tasks/{_slug(task)}" for task in tasks)
+        lines += ["", "```{toctree}", ":hidden:", *pages, "```", ""]
+    (GENERATED / "tasks.md").write_text("\n".join(lines), encoding="utf-8")
+    (GENERATED / "fields.md").write_text(fields_page(), encoding="utf-8")
+
+
+def task_page(task: str) -> str:
+    """Return the page of a task: picture, film, description, expert and trained policy."""
+    found, slug = describe(task), _slug(task)
+    film = FOLDER / "gallery" / f"{slug}.gif"
+    picture = film if film.exists() else film.with_suffix(".png")
+    lines = [f"# {task}", "", f"![{task}](../../gallery/{picture.name})", "", found.text, ""]
+    lines += ["| | |", "|---|---|"]
+    lines += [f"| {name} | {_cell(value)} |" for name, value in found.rows().items()]
+    if task in shipped_policies():
+        card = read_card(shipped_file(task))
+        low, high = card.interval
+        lines += [
+            f"| trained policy | {card.success_rate:.2f} ({low:.2f} to {high:.2f}) over "
+            f"{card.episodes} episodes, {card.label} |",
+            f"| check it | `{card.evaluate}` |",
+            f"| watch it | `ba-torchrl play {task} policy=trained path=film.gif` |",
+        ]
+    lines += [f"| watch the expert | `ba-torchrl play {task} path=film.gif` |"]
+    lines += ["", "```python", "import ba_torchrl", "", f'env = ba_torchrl.make("{task}")', "```"]
+    return "\n".join(lines) + "\n"
+
+
+def fields_page() -> str:
+    """Return the page of the fields of the command line's and the library's configurations."""
+    lines = [
+        "# Configuration fields",
+        "",
+        "Paths are those of the command line: `env.obs_size=64`.",
+    ]
+    sections: Mapping[str, Iterable[tuple[str, type[BaseModel]]]] = {
+        "Training": [("`ba-torchrl train`", ExperimentConfig)],
+        "Environments": [("`env`, the keywords of `ba_torchrl.make`", EnvConfig)],
+        "Algorithms": [(f"`algorithm={name}`", ALGORITHMS[name]) for name in ALGORITHMS],
+        "Networks": [(f"`network={name}`", NETWORKS[name]) for name in NETWORKS],
+    }
+    for heading, models in sections.items():
+        lines += ["", f"## {heading}"]
+        for title, model in models:
+            lines += ["", f"### {title}", "", "| field | default | meaning |", "|---|---|---|"]
+            lines += _rows(model)
+    return "\n".join(lines) + "\n"
+
+
+def _rows(model: type[BaseModel]) -> Iterable[str]:
+    """Yield a row of a table for each field."""
+    for name, field in model.model_fields.items():
+        default: Any = (
+            "required"
+            if field.is_required()
+            else f"`{field.get_default(call_default_factory=True)!r}`"
+        )
+        yield f"| `{name}` | {_cell(default)} | {_cell(field.description or '')} |"
+
+
+def _slug(task: str) -> str:
+    return task.replace("/", "_")
+
+
+def _cell(text: str) -> str:
+    """Return a text without line breaks and column marks."""
+    return " ".join(text.split()).replace("|", "\\|")
