@@ -16,7 +16,7 @@ from ba_torchrl.cli.command import Command
 from ba_torchrl.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHORTER = {"agent.learn(10_000)": "agent.learn(120)", "buffer_size=10_000": "buffer_size=200"}
 """Parts of the pages' Python that take minutes, and what runs instead."""
 
