@@ -40,7 +40,7 @@ def amx_is_used() -> bool:
 def bfloat16_is_fast() -> bool:
     """Return whether the processor multiplies bfloat16 faster than float32.
 
-    Intel's AVX512-BF16 without AMX does not (docs/performance.md, bfloat16).
+    Intel's AVX512-BF16 without AMX does not (docs/findings.md).
     """
     if amx_is_used():
         return True

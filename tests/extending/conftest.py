@@ -10,11 +10,12 @@ import pytest
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 
 HERE = Path(__file__).parent
 MODULES = sorted(path.stem for path in (HERE / "mine").glob("*.py"))
-REGISTRIES = (TASKS, OBSERVATIONS, NETWORKS, ALGORITHMS)
+REGISTRIES = (TASKS, ROBOTS, OBSERVATIONS, NETWORKS, ALGORITHMS)
 
 
 @pytest.fixture(scope="module", autouse=True)

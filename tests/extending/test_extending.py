@@ -1,15 +1,18 @@
 """The exercises of docs/architecture.md, "How to add", done outside the package and played.
 
-Each file of ``mine/`` is one addition. None of them edits a file of the package.
+Each file of ``mine/`` is one addition. None of them edits a file of the package. docs/plugins.md
+shows some of them.
 """
 
 from contextlib import ExitStack, closing
+from pathlib import Path
 
 import pytest
 import torch
 
 import ba_torchrl
 from ba_torchrl import testing
+from ba_torchrl.data.demos import expert_scores
 from ba_torchrl.data.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -20,6 +23,7 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from tests.tasks.episodes import slow
 
+PAGE = Path(__file__).parents[2] / "docs" / "plugins.md"
 NEW_TASKS = (
     "mine/bridge",
     "mine/stack_on_random_plateau",
@@ -100,6 +104,19 @@ def test_a_parameter_of_the_task_alone(started):
     env, _ = started("mine/tall_block", tolerance_m=0.5)
     assert env.scene.task.settings.parameters.tolerance_m == 0.5
     assert env.scene.task.evaluate()["is_over_corner"]
+
+
+def test_an_expert_grasps_with_longer_fingers():
+    scores = expert_scores(
+        "close_loop/block_picking", 5, seed=0, num_envs=1, parallel=False, robot="mine/long_jaw"
+    )
+    assert scores.success_rate == 1
+
+
+@pytest.mark.parametrize("name", ["tall_block", "plateau", "long_jaw"])
+def test_the_page_of_plugins_shows_the_file(name):
+    code = (Path(__file__).parent / "mine" / f"{name}.py").read_text()
+    assert f"```python\n{code}```" in PAGE.read_text()
 
 
 def two_views(env=(), **other):

@@ -321,7 +321,7 @@ def saves_time(
     """Return whether the convolution is estimated to be faster than with the expanded filter.
 
     A map, a change of basis and a product of small matrices take as long as the numbers of products
-    of a large convolution below, on a CPU with AVX-512 (docs/performance.md).
+    of a large convolution below, on a CPU with AVX-512 (docs/findings.md).
 
     Args:
         kernels: the kernels.
