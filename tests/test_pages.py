@@ -25,13 +25,21 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
-def scripts() -> list[tuple[str, str]]:
-    """A block that imports the package starts a script; one that does not continues it."""
+def scripts() -> list[tuple[str, str, str]]:
+    """Return the name of each script, its source, and the modules that its page shows.
+
+    A block that begins with a docstring is a module, `my_tasks`. One that imports the package
+    starts a script; one that does not continues it.
+    """
     found = []
     for page in PAGES:
-        for block in blocks(page, "python"):
+        python = blocks(page, "python")
+        modules = "".join(block for block in python if block.startswith('"""'))
+        for block in python:
+            if block.startswith('"""'):
+                continue
             if "import ba_torchrl" in block or "from ba_torchrl" in block:
-                found.append([f"{page.name} {len(found)}", ""])
+                found.append([f"{page.name} {len(found)}", "", modules])
             found[-1][1] += block
     return [tuple(script) for script in found]
 
@@ -45,15 +53,20 @@ def command_lines() -> list[tuple[str, str]]:
         lines += re.findall(r"`(ba-torchrl [^`\n]+)`", page.read_text())
         found |= {(page.name, line.split("  #")[0].strip()) for line in lines}
     return sorted(
-        (page, line) for page, line in found if line.startswith("ba-torchrl ") and "..." not in line
+        (page, line)
+        for page, line in found
+        if line.startswith("ba-torchrl ") and not re.search(r"\.\.\.|=NAME|\[my_", line)
     )
 
 
-@pytest.mark.parametrize(("name", "script"), scripts(), ids=[name for name, _ in scripts()])
-def test_python_of_a_page_runs(name, script, tmp_path):
+@pytest.mark.parametrize(
+    ("script", "modules"), [s[1:] for s in scripts()], ids=[s[0] for s in scripts()]
+)
+def test_python_of_a_page_runs(script, modules, tmp_path):
     for long, short in SHORTER.items():
         script = script.replace(long, short)
     (tmp_path / "script.py").write_text(script)
+    (tmp_path / "my_tasks.py").write_text(modules)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     run = subprocess.run(
         [sys.executable, "script.py"], cwd=tmp_path, env=environment, capture_output=True, text=True
