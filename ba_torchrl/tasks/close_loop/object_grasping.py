@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
+import numpy as np
+
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.clutter.base import ClutterTask
+from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M
 from ba_torchrl.tasks.clutter.push_planner import NEAR_M, Push, PushPlanner
 from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.manipulation.primitives import (
@@ -42,6 +45,9 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     lift_height_m: ClassVar[float] = 0.15
     """Least height of the tool at success, metres."""
+    travel_weight: ClassVar[float] = 8.0
+    """Weight of the number of actions to a grasp in its cost. A policy that imitates the expert has to
+    predict which object is grasped: it is a near one."""
     risk_allowed: ClassVar[float] = 1.0
     """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
     first."""
@@ -68,7 +74,12 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
         grasp = planner.plan(  # the slip score is an additional cost
-            self.pool.active, tool, limits, heights, penalty=lambda grasps: grasps[:, 5]
+            self.pool.active,
+            tool,
+            limits,
+            heights,
+            penalty=lambda grasps: grasps[:, 5],
+            travel_weight=self.travel_weight,
         )
         if grasp is None or grasp.risk > self.risk_allowed:
             push = PushPlanner(planner, self.terrain).plan(self.pool.active, tool, limits, heights)
@@ -76,21 +87,29 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
                 return self._push(push, over_z)
         if grasp is None or robot.opening() < IS_OPEN:
             return lift(limits.step_m, OPEN)
-        return self._grasp(grasp, over_z)
+        return self._grasp(grasp, heights)
 
-    def _grasp(self, grasp: TopDownGrasp, over_z: float) -> GripperCommand:
-        """Move above the object with open fingers, descend, and close the fingers at the end."""
+    def _grasp(self, grasp: TopDownGrasp, heights: np.ndarray) -> GripperCommand:
+        """Move to the object with open fingers, and close them at the end.
+
+        The hand descends while it moves and turns, as far as what is below its way permits.
+        """
         robot, limits = self.robot, self.action_limits
-        (x, y, z), yaw = robot.tool_pose()
+        tool = (x, y, z), yaw = robot.tool_pose()
         gx, gy, gz = grasp.position
         offset = max(abs(gx - x), abs(gy - y))
         turn = abs(wrap_angle(grasp.yaw_rad - yaw))
         if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
             opening = CLOSED if z - gz <= limits.step_m else OPEN
             return move_toward(robot, grasp.position, grasp.yaw_rad, opening)
-        if z < over_z - 1e-3:
-            return lift(over_z - z, OPEN)
-        return move_toward(robot, (gx, gy, over_z), grasp.yaw_rad, OPEN)
+        ceiling = self.settings.workspace.z[1]
+        touching_z, next_z = (
+            min(self.planner.height_on_way(tool, grasp, limits, heights, gap_m), ceiling)
+            for gap_m in (0.0, CLEARANCE_M)
+        )
+        if touching_z > z + limits.step_m:
+            return lift(next_z - z, OPEN)
+        return move_toward(robot, (gx, gy, next_z), grasp.yaw_rad, OPEN)
 
     def _push(self, push: Push, over_z: float) -> GripperCommand:
         """Descend beside an object with closed fingers, then push it."""

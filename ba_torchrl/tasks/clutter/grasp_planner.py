@@ -49,6 +49,8 @@ YAWS = 16
 """Yaws per half turn that are compared."""
 SAMPLES = 256
 """Number of sampled points of a surface."""
+SAMPLES_PER_ACTION = 6
+"""Poses per action at which the way to a grasp is compared with the height image."""
 PIXEL_M = 0.003
 """Width of a pixel of the height image."""
 BORDER_M = 0.06
@@ -106,12 +108,14 @@ class GraspPlanner:
         limits: ActionLimits,
         heights: np.ndarray,
         penalty: Callable[[np.ndarray], np.ndarray] | None = None,
+        travel_weight: float = 1.0,
     ) -> TopDownGrasp | None:
         """Return the grasp of any of the bodies with the lowest cost; None without a grasp.
 
         Args:
             heights: height image of `heights`.
             penalty: returns the additional costs [N] of grasps [N, 6]: x, y, z, yaw, risk, slip.
+            travel_weight: weight of the number of actions to the grasp in the cost.
         """
         (x, y, z), yaw = tool
         yaws = np.arange(YAWS) * np.pi / YAWS if limits.turn_rad else np.array([yaw])
@@ -143,14 +147,53 @@ class GraspPlanner:
                     distance / limits.step_m, turn / limits.turn_rad if limits.turn_rad else 0
                 )
                 travel += max(z - gz, 0.0) / limits.step_m
-                if distance > 0.015 or turn > 0.3:
-                    travel += max(0.1 - z, 0.0) / limits.step_m  # the tool moves up first
-                cost = travel + 12 * risk + added_cost
+                cost = travel_weight * travel + 12 * risk + added_cost
                 if best is None or cost < best.cost:
                     best = TopDownGrasp(
                         body, (gx, gy, gz), target_yaw, risk=float(risk), cost=float(cost)
                     )
         return best
+
+    def height_on_way(
+        self,
+        tool: YawPose,
+        grasp: TopDownGrasp,
+        limits: ActionLimits,
+        heights: np.ndarray,
+        clearance_m: float,
+    ) -> float:
+        """Return the least height of the tool after the next action on its way to a grasp.
+
+        The open gripper moves towards the grasp along each axis, and turns, as fast as the limits
+        allow. With the returned height, and at most one further step up in each later action, it
+        stays above the height image.
+
+        Args:
+            heights: height image of `heights`.
+            clearance_m: gap between the gripper and what is below it.
+        """
+        (x, y, z), yaw = tool
+        gx, gy, gz = grasp.position
+        turn = wrap_angle(grasp.yaw_rad - yaw)
+        actions = max(abs(gx - x), abs(gy - y)) / limits.step_m
+        if limits.turn_rad:
+            actions = max(actions, abs(turn) / limits.turn_rad)
+        least = gz
+        for t in np.linspace(0.0, actions, math.ceil(actions * SAMPLES_PER_ACTION) + 1)[1:].tolist():
+            move, rotation = t * limits.step_m, t * limits.turn_rad
+            free = _free_height(
+                x + min(max(gx - x, -move), move),
+                y + min(max(gy - y, -move), move),
+                yaw + min(max(turn, -rotation), rotation),
+                heights,
+                np.array(self.corner),
+                self.gripper.half_width_m,
+                self._jaws,
+            )
+            free = max(free + clearance_m, gz)
+            # linear in the first action
+            least = max(least, z + (free - z) / t if t < 1 else free - (t - 1) * limits.step_m)
+        return least
 
     def risk_alone(self, samples: np.ndarray, tool: YawPose) -> float:
         """Return the least risk of a grasp, at the present yaw, of a body without obstacles.
@@ -211,6 +254,19 @@ def _height(heights, corner, x, y):  # noqa: ANN001, ANN202 -- compiled
     if i < 0 or j < 0 or i >= heights.shape[0] or j >= heights.shape[1]:
         return 1.0
     return heights[i, j]
+
+
+@njit()
+def _free_height(x, y, yaw, heights, corner, half_width, jaws):  # noqa: ANN001, ANN202
+    """Return the height of the tool at which the open gripper touches the height image."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    free = -1.0
+    for m in range(jaws.outline_u.shape[0]):
+        for fu in (-jaws.outline_u[m], jaws.outline_u[m]):
+            for w in (-half_width, 0.0, half_width):
+                h = _height(heights, corner, x + cos * fu - sin * w, y + sin * fu + cos * w)
+                free = max(free, h - jaws.outline_z[m])
+    return free
 
 
 @njit()
