@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ba_torchrl.cli.command import Arguments
+from ba_torchrl.commands import report
 from ba_torchrl.errors import MissingPackageError
 from ba_torchrl.record.plots import plot_panels
 from ba_torchrl.record.report import write_report
@@ -24,6 +26,7 @@ from ba_torchrl.record.results import (
     write_result,
 )
 from ba_torchrl.record.summary import differing_settings, estimate, load_sections, summarize
+from ba_torchrl.training import hydra_schema
 
 imageio = pytest.importorskip("imageio.v3")
 
@@ -329,6 +332,28 @@ def texts(path):
     return [html.unescape(text) for text in re.findall(r"<!-- (.*?) -->", path.read_text())]
 
 
+def test_runs_are_compared_with_the_benchmark_of_the_package(tmp_path):
+    hydra_schema.register()
+    text = (ROOT / "configs/benchmark/cpu_six_dof.yaml").read_text()
+    updates = int(re.search(r"^total_updates: (\d+)", text, flags=re.MULTILINE)[1])
+    with report.COMMAND.composed(Arguments()):
+        planned = hydra_schema.preset("algorithm", "dagger")
+        folder = write_run(tmp_path / "a", (0, 1), label="dagger asr", task="ramp/block_stacking")
+        run = read_result(folder).model_copy(update={"benchmark": "cpu_six_dof"})
+        grid = report._planned("cpu_six_dof")[run.task, run.label]
+        assert (grid.total_updates, grid.algorithm["name"]) == (updates, planned["name"])
+
+        def changes(**values):
+            config = {**grid.resolved(), "seed": 3, "threads": 7, **values}
+            return report.changes(run.model_copy(update={"config": config}))
+
+        assert changes() == {}
+        assert changes(total_updates=updates + 1) == {"total_updates": (updates + 1, updates)}
+        (listed,) = report.changes(run.model_copy(update={"label": "sac cnn"}))
+        assert listed == "tasks, algorithms and networks"
+        assert report.changes(run.model_copy(update={"benchmark": "mine"})) == {}
+
+
 @pytest.mark.usefixtures("rliable")
 def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):
     runs = tmp_path / "runs"
@@ -498,12 +523,14 @@ def test_the_recipe_reports_several_folders(tmp_path):
     for name in ("one", "two"):
         write_run(tmp_path / name / "run", (0.2, 0.7, 0.9), benchmark=name)
     command = [sys.executable, "recipes/report.py", f"{tmp_path}/one", f"{tmp_path}/two"]
+    command.append("axis=env_steps")
     done = subprocess.run(
         [*command, f"folder={tmp_path}/out"], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "## one" in done.stdout
     assert f"{tmp_path}/out/report.html" in done.stdout
+    assert "environment steps" in texts(tmp_path / "out/one.svg")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     tables = {"table.csv", "table.md", "table.tex", "seeds.csv", "curves.csv"}
     figures = {"one", "one.svg", "one.pdf", "two", "two.svg", "two.pdf"}
