@@ -219,8 +219,8 @@ def _bootstrap(rates: np.ndarray) -> np.ndarray:
     """Return the interval of the interquartile mean, [seeds, tasks, n] -> [2, n]."""
     try:
         from rliable.library import get_interval_estimates
-    except ImportError as error:
-        fix = install_command("rliable", "pandas")
+    except (ImportError, TypeError) as error:  # the latter from arch, if pandas is version 3
+        fix = install_command("rliable", "pandas<3")
         raise MissingPackageError(
             f"intervals over several seeds need the extra [report]: {fix}"
         ) from error

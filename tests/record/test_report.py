@@ -542,7 +542,7 @@ def test_labels_are_apart_and_within_the_picture(tmp_path, count):
     names = [f"an algorithm on its network {i}" for i in range(count)]
     x = np.arange(5)
     path = tmp_path / "p.png"
-    plot_panels({"task": dict.fromkeys(names, (x, x / 4))}, [path], names=names)
+    plot_panels({"task": dict.fromkeys(names, (x, x / 8))}, [path], names=names)
     picture = imageio.imread(path)[..., :3] / 255
     for edge in (picture[:, :2], picture[:, -2:], picture[:2], picture[-2:]):
         assert (edge > 0.99).all()
