@@ -29,10 +29,6 @@ _MOST_MARKERS = 25
 _LABEL_PT = 7
 _LABEL_WIDTH = 24
 """Characters in a line of a label beside a panel."""
-_REPEATABLE = {
-    ".svg": {"metadata": {"Date": None}},
-    ".pdf": {"metadata": {"CreationDate": None}},
-}
 
 
 def plot_learning_curve(
@@ -96,12 +92,10 @@ def plot_panels(
     """
     if not panels:
         raise ValueError("there is no panel to draw")
-    columns = min((4, 3), key=lambda n: -len(panels) % n)
-    columns = min(columns, len(panels))
+    columns = min(min((4, 3), key=lambda n: -len(panels) % n), len(panels))
     rows = math.ceil(len(panels) / columns)
     labels = {name: textwrap.wrap(name, _LABEL_WIDTH) for name in names}
-    line_in = 1.3 * _LABEL_PT / 72
-    gap_in = line_in * max(map(len, labels.values()), default=1)
+    gap_in = 1.3 * _LABEL_PT / 72 * max(map(len, labels.values()), default=1)
     height_in = max(1.8, gap_in * max(map(len, panels.values())))
     longest = max((len(line) for lines in labels.values() for line in lines), default=0)
     figure = _figure((columns * (2.5 + 0.6 * _LABEL_PT / 72 * longest), rows * (height_in + 0.7)))
@@ -110,16 +104,15 @@ def plot_panels(
         ends = []
         for name, curve in curves.items():
             line = _draw(axes, list(names).index(name), name, curve)
-            ends.append((*line.get_xydata()[-1], line, "\n".join(labels[name])))
+            label = "\n".join(labels[name])
+            ends += [(x, y, line, label) for x, y in line.get_xydata()[-1:]]
         _label(axes, ends, gap_in / height_in)
         axes.set_title(title, fontsize=10)
         axes.set_xlim(left=0)
         _style_axes(axes, (0.0, 1.0))
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
-    for column in range(columns):
-        lowest = (len(panels) - 1 - column) // columns
-        grid[lowest, column].set_xlabel(xlabel)
+    figure.supxlabel(xlabel, fontsize=10)
     figure.supylabel(ylabel, fontsize=10)
     for path in paths:
         _save(figure, path)
@@ -137,18 +130,12 @@ def _label(axes: Axes, ends: Sequence[tuple[float, float, Line2D, str]], gap: fl
     steps = gap * np.arange(len(ends))
     heights = np.maximum.accumulate([end[1] for end in ends] - steps) + steps
     heights = np.minimum(heights, 1 - steps[::-1])
-    beside = axes.get_yaxis_transform()  # x in widths of the panel
     for (x, y, line, label), height in zip(ends, heights, strict=True):
-        look = {"color": line.get_color(), "clip_on": False}
-        axes.plot(1.05, height, marker=line.get_marker(), markersize=3.5, transform=beside, **look)
-        axes.annotate(
-            "",
-            (x, y),
-            (1.05, height),
-            textcoords=beside,
-            arrowprops={"arrowstyle": "-", "color": line.get_color(), "lw": 0.5, "shrinkA": 0},
-            annotation_clip=False,
-        )
+        color, beside = line.get_color(), axes.get_yaxis_transform()  # x in widths of the panel
+        mark = {"marker": line.get_marker(), "color": color, "markersize": 3.5}
+        axes.plot(1.05, height, **mark, transform=beside, clip_on=False)
+        leader = {"arrowstyle": "-", "color": color, "lw": 0.5, "shrinkA": 0}
+        axes.annotate("", (x, y), (1.05, height), textcoords=beside, arrowprops=leader)
         axes.text(1.09, height, label, transform=beside, va="center", fontsize=_LABEL_PT)
 
 
@@ -175,7 +162,7 @@ def _save(figure: Figure, path: str | Path) -> Path:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context({"svg.hashsalt": path.stem}):  # the same file for the same curves
-        figure.savefig(path, **_REPEATABLE.get(path.suffix, {}))
+        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
     return path
 
 

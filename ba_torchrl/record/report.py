@@ -10,7 +10,7 @@ import csv
 import math
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from ba_torchrl.record.summary import (
     GOOD_RATE,
     Axis,
     Changes,
+    Run,
     Section,
     differing_settings,
     load_sections,
@@ -76,8 +77,10 @@ def write_report(
     left_out = [f"{_relative(path, folder)}: {why_unfinished(path)}" for path in unfinished]
     parts = [_part(section, folder, axis) for section in sections]
     _write_csv(folder / "table.csv", (row for part in parts for row in part["table"]))
-    _write_csv(folder / "seeds.csv", (row for section in sections for row in _seeds(section)))
-    _write_csv(folder / "curves.csv", (row for section in sections for row in _points(section)))
+    runs = [named for section in sections for named in _by_seed(section)]
+    _write_csv(folder / "seeds.csv", ({**names, **_final(run)} for run, names in runs))
+    points = ({**names, **p.model_dump()} for run, names in runs for p in run.result.curve)
+    _write_csv(folder / "curves.csv", points)
     texts = [_DEFINITIONS, *map(_markdown, parts)]
     if left_out:
         texts.append("\n".join(["## Not finished", "", *(f"- {run}" for run in left_out)]))
@@ -86,16 +89,10 @@ def write_report(
     (folder / "table.tex").write_text(tables + "\n", encoding="utf-8")
     template = files("ba_torchrl.record").joinpath("report.html").read_text(encoding="utf-8")
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
+    texts = {"definitions": _DEFINITIONS, "unfinished": left_out, "made": now()}
+    headers = {"header": _HEADER, "settings_header": _SETTINGS_HEADER}
     path = folder / "report.html"
-    text = page.render(
-        made=now(),
-        definitions=_DEFINITIONS,
-        header=_HEADER,
-        settings_header=_SETTINGS_HEADER,
-        sections=parts,
-        unfinished=left_out,
-    )
-    path.write_text(text, encoding="utf-8")
+    path.write_text(page.render(sections=parts, **texts, **headers), encoding="utf-8")
     return path
 
 
@@ -131,15 +128,11 @@ def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
         "title": section.title,
         "name": name,
         "note": _note(section),
-        "warning": _warning(section),
-        "changes": _changes(section),
+        "warnings": _warnings(section),
         "panels": panels,
         "table": table,
         "rows": [_cells(row) for row in table],
-        "settings": [
-            (setting, value, ", ".join(methods))
-            for setting, value, methods in differing_settings(section)
-        ],
+        "settings": differing_settings(section),
         "videos": _videos(section, folder),
         "machines": _machines(section),
     }
@@ -147,95 +140,71 @@ def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
 
 def _note(section: Section) -> str:
     """Return which policies the numbers are of, and where the curves start."""
-    runs = [run.result for group in section.groups for run in group.runs]
+    runs = [run.result for run, _ in _by_seed(section)]
     policies = " or ".join(sorted({run.final.policy for run in runs}))
-    text = f"The table has the {policies} policy of each run, on episodes that selected none."
-    first = sorted({run.curve[0].updates for run in runs})
-    if first[0]:
+    text = f"The table has the {policies} policy of each run, on episodes that did not select it."
+    first = sorted({point.updates for run in runs for point in run.curve[:1]})
+    if first and first[0]:
         after = " to ".join(str(updates) for updates in dict.fromkeys((first[0], first[-1])))
         text += f" Curves start at the first evaluation, after {after} updates."
     return text
 
 
-def _warning(section: Section) -> str:
-    """Return what the number of seeds leaves unknown, "" if there are enough."""
-    least = min(len(group.runs) for group in section.groups)
-    if least >= ENOUGH_SEEDS:
-        return ""
-    text = f"Fewer than {ENOUGH_SEEDS} seeds: methods cannot be ranked by these numbers."
-    if least == 1:
-        text += " The interval of a single run does not contain the spread over seeds."
-    return text
-
-
-def _changes(section: Section) -> list[str]:
-    """Return the settings in which the runs differ from their benchmark, one a line."""
-    return [
-        f"{name}: {', '.join(f'{there} instead of {planned}' for there, planned in sorted(pairs))}"
+def _warnings(section: Section) -> list[str]:
+    """Return what is not the benchmark's, and what the number of seeds leaves unknown."""
+    found = [
+        f"{name} is {there} instead of {planned}"
         for name, pairs in sorted(section.changes.items())
+        for there, planned in sorted(pairs)
     ]
+    texts = [f"Not the values of the benchmark: {'; '.join(found)}."] if found else []
+    least = min(len(group.runs) for group in section.groups)
+    if least < ENOUGH_SEEDS:
+        text = f"Fewer than {ENOUGH_SEEDS} seeds: methods cannot be ranked by these numbers."
+        single = " The interval of a single run does not contain the spread over seeds."
+        texts.append(text + (single if least == 1 else ""))
+    return texts
 
 
 def _cells(row: dict[str, Any]) -> list[tuple[str, Any]]:
     """Return the cells of a row: text, and the value by which rows are sorted."""
-    has_interval = not math.isnan(row["low"])
+    interval = "–" if math.isnan(row["low"]) else f"{row['low']:.3f} to {row['high']:.3f}"
+    numbers = [(row[column], form) for column, form in _NUMBERS.values()]
     return [
         *((str(row[name]), row[name]) for name in ("task", "method", "seeds")),
         (f"{row['success_iqm']:.3f}", row["success_iqm"]),
-        (f"{row['low']:.3f} to {row['high']:.3f}" if has_interval else "–", row["low"]),
-        *(
-            ("–" if math.isnan(row[column]) else format(row[column], form), row[column])
-            for column, form in _NUMBERS.values()
-        ),
+        (interval, row["low"]),
+        *(("–" if math.isnan(value) else format(value, form), value) for value, form in numbers),
     ]
 
 
 def _write_csv(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     rows = list(rows)
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
 
-def _seeds(section: Section) -> Iterable[dict[str, Any]]:
-    """Yield the final evaluation of each run."""
+def _by_seed(section: Section) -> Iterator[tuple[Run, dict[str, Any]]]:
+    """Yield each run with the columns that name it."""
     for group in section.groups:
         for run in group.runs:
-            result = run.result
-            yield {
-                "benchmark": section.title,
-                "task": group.task,
-                "method": group.method,
-                "seed": result.seed,
-                **result.final.model_dump(),
-                "hours": result.seconds / 3600,
-                "commit": result.versions.get("commit", ""),
-                "cpu": result.hardware.get("cpu"),
-                "gpu": result.hardware.get("gpu"),
-                "folder": run.folder,
-            }
+            names = (section.title, group.task, group.method, run.result.seed)
+            yield run, dict(zip(("benchmark", "task", "method", "seed"), names, strict=True))
 
 
-def _points(section: Section) -> Iterable[dict[str, Any]]:
-    """Yield the points of the curve of each run."""
-    for group in section.groups:
-        for run in group.runs:
-            for point in run.result.curve:
-                yield {
-                    "benchmark": section.title,
-                    "task": group.task,
-                    "method": group.method,
-                    "seed": run.result.seed,
-                    **point.model_dump(),
-                }
+def _final(run: Run) -> dict[str, Any]:
+    """Return the columns of a run's final evaluation, and where it ran."""
+    result = run.result
+    where = {name: result.hardware.get(name) for name in ("cpu", "gpu")}
+    where |= {"commit": result.versions.get("commit"), "folder": run.folder}
+    return {**result.final.model_dump(), "hours": result.seconds / 3600, **where}
 
 
 def _markdown(part: dict[str, Any]) -> str:
     lines = [f"## {part['title']}", "", part["note"]]
-    lines += ["", f"**{part['warning']}**"] if part["warning"] else []
-    if part["changes"]:
-        lines += ["", "Not the values of the benchmark:", "", *(f"- {c}" for c in part["changes"])]
+    lines += [line for text in part["warnings"] for line in ("", f"**{text}**")]
     lines += ["", *_pipes(_HEADER, ([text for text, _ in row] for row in part["rows"]))]
     if part["settings"]:
         lines += ["", "Settings in which methods differ:", ""]
@@ -256,7 +225,7 @@ def _latex(part: dict[str, Any]) -> str:
     )
     body = [r"\toprule", head, r"\midrule", *rows, r"\bottomrule"]
     begin = rf"\begin{{tabular}}{{ll{'r' * (len(_HEADER) - 2)}}}"
-    notes = [f"% {text}" for text in (part["title"], _DEFINITIONS, part["note"], part["warning"])]
+    notes = [f"% {text}" for text in (part["title"], _DEFINITIONS, part["note"], *part["warnings"])]
     return "\n".join([*notes, begin, *body, r"\end{tabular}"])
 
 
@@ -268,18 +237,13 @@ def _escape(text: str) -> str:
 def _machines(section: Section) -> list[str]:
     """Return the different machines, package versions and commits of the runs."""
     found = set()
-    for group in section.groups:
-        for run in group.runs:
-            hardware, versions = run.result.hardware, run.result.versions
-            where = f"{hardware.get('cpu')}, {hardware.get('cores')} cores"
-            if hardware.get("gpu"):
-                where += f", {hardware['gpu']}"
-            packages = ", ".join(
-                f"{name} {versions[name]}"
-                for name in ("ba_torchrl", "commit", "torch")
-                if name in versions
-            )
-            found.add(f"{where}, {hardware.get('threads')} threads; {packages}")
+    for run, _ in _by_seed(section):
+        hardware, versions = run.result.hardware, run.result.versions
+        where = f"{hardware.get('cpu')}, {hardware.get('cores')} cores"
+        where += f", {hardware['gpu']}" if hardware.get("gpu") else ""
+        names = [name for name in ("ba_torchrl", "commit", "torch") if name in versions]
+        packages = ", ".join(f"{name} {versions[name]}" for name in names)
+        found.add(f"{where}, {hardware.get('threads')} threads; {packages}")
     return sorted(found)
 
 

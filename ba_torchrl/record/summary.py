@@ -235,7 +235,7 @@ def _bootstrap(rates: np.ndarray) -> np.ndarray:
     return found[""]
 
 
-def differing_settings(section: Section) -> list[tuple[str, str, list[str]]]:
+def differing_settings(section: Section) -> list[tuple[str, str, str]]:
     """Return the settings in which methods differ on a task: name, value, and its methods."""
     names = set()
     for task in section.tasks:
@@ -247,7 +247,7 @@ def differing_settings(section: Section) -> list[tuple[str, str, list[str]]]:
         for name in names:
             value = str(settings.get(name, "–"))
             found.setdefault((name, value), set()).add(group.method)
-    return [(*key, sorted(found[key])) for key in sorted(found)]
+    return [(*key, ", ".join(sorted(found[key]))) for key in sorted(found)]
 
 
 def summarize(section: Section) -> list[dict[str, Any]]:
