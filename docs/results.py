@@ -15,9 +15,15 @@ from collections.abc import Iterator
 
 from ba_torchrl.envs.description import describe
 from ba_torchrl.record.report import plot_section
-from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, read_result, run_folders
+from ba_torchrl.record.results import (
+    CONFIG_FILE,
+    RESULT_FILE,
+    read_result,
+    run_folders,
+    wilson_interval,
+)
 from ba_torchrl.record.summary import Group, Run, Section, load_sections
-from ba_torchrl.training.policy import read_card, shipped_file, wilson_interval
+from ba_torchrl.training.policy import read_card, shipped_file
 from docs.sources import ROOT
 
 PAGE = ROOT / "docs" / "results.md"
@@ -82,11 +88,11 @@ def _section(section: Section) -> Iterator[str]:
     yield f"## {HEADINGS[name]}\n"
     yield f"`ba-torchrl benchmark benchmark={name} threads=1 jobs=2`; {'; '.join(machines)};"
     yield f"{days[0]} to {days[-1]}.\n"
-    yield f"![Success over updates](results/{name}.png)\n"
+    yield f"![Success over updates](results/{name}.svg)\n"
     yield f"| {' | '.join(HEADER)} |"
     yield "|" + "---|" * len(HEADER)
     before = ""
-    for group in sorted(section.groups, key=lambda group: (group.task, group.method)):
+    for group in section.groups:
         for run in group.runs:
             yield f"| {' | '.join(_cells(group, run, is_first=group.task != before))} |"
             before = group.task
@@ -133,7 +139,7 @@ def main() -> None:
     if sys.argv[1:]:
         print(f"{copy(sys.argv[1:])} runs copied")
     for section in sections():
-        plot_section(section, FOLDER / f"{section.title}.png")
+        plot_section(section, [FOLDER / f"{section.title}.svg"])
     PAGE.write_text(page_with_results(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
 

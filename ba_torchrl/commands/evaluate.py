@@ -32,11 +32,12 @@ from ba_torchrl.cli.types import (
 from ba_torchrl.data.files import write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
+from ba_torchrl.record.results import wilson_interval
 from ba_torchrl.record.video import write_video
 from ba_torchrl.training.agreement import agreement_table, check_comparable
 from ba_torchrl.training.checkpoint import Which
 from ba_torchrl.training.evaluation import Evaluation, evaluate, record_episodes
-from ba_torchrl.training.policy import TrainedPolicy, shipped_policies, wilson_interval
+from ba_torchrl.training.policy import TrainedPolicy, shipped_policies
 
 FPS = 5
 

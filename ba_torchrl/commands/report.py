@@ -1,19 +1,29 @@
-"""Report the results of runs: curves with standard errors, tables, and a page with videos.
+"""Report the results of runs: a folder with a page, curves, tables, values by seed and videos.
 
 ba-torchrl report runs/
-ba-torchrl report runs=[runs/close_loop_3d,runs/close_loop_4d] folder=report
+ba-torchrl report runs=[runs/close_loop_3d,runs/close_loop_4d] folder=report axis=env_steps
 """
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
+from typing import Any
 
+from hydra import compose
+from omegaconf import OmegaConf
+
+from ba_torchrl import config as configuration
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, OutputFolder, check_writable_folder
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.report import write_report
-from ba_torchrl.record.results import run_folders
+from ba_torchrl.record.results import NON_LEARNING_FIELDS, RunResult, differences, run_folders
+from ba_torchrl.record.summary import Axis
+from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.grid.plan import BenchmarkConfig, expand
 
 
 class Settings(StrictModel):
@@ -23,6 +33,8 @@ class Settings(StrictModel):
     """A folder or a list of folders; the report holds all finished runs below them."""
     folder: OutputFolder | None = None
     """Of the report; null for "report" in the first of the other folders."""
+    axis: Axis = "updates"
+    """Of the curves: gradient updates, or steps of all environments."""
 
 
 def main(settings: Settings) -> None:
@@ -31,10 +43,35 @@ def main(settings: Settings) -> None:
     if not run_folders(settings.runs)[0]:
         raise ConfigError(f"no finished run below {', '.join(settings.runs)}")
     check_writable_folder(folder)
-    page = write_report(settings.runs, folder)
-    print((page.parent / "table.md").read_text(encoding="utf-8"))
+    page = write_report(settings.runs, folder, axis=settings.axis, changes=changes)
+    print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
-    print(f"  tables  {page.parent / 'table.csv'}, {page.parent / 'table.md'}")
+    print(f"  tables  {folder / 'table.csv'}, table.md, table.tex; by seed seeds.csv, curves.csv")
+
+
+def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:
+    """Return the settings in which a run differs from the package's benchmark of its name."""
+    if run.benchmark not in hydra_schema.preset_names("benchmark"):
+        return {}
+    planned = _planned(run.benchmark).get((run.task, run.label))
+    if planned is None:
+        return {"tasks, algorithms and networks": (f"{run.task} with {run.label}", "those listed")}
+    try:  # settings that are newer than the run have their defaults
+        found = ExperimentConfig.parse({**run.config, "device": "cpu"}).resolved()
+    except ConfigError:
+        found = run.config
+    return differences(found, planned.resolved(), {*NON_LEARNING_FIELDS, "seed"})
+
+
+@functools.cache
+def _planned(benchmark: str) -> dict[tuple[str, str], ExperimentConfig]:
+    """Return the runs of one of the package's benchmarks by task and label."""
+    overrides = [f"benchmark={benchmark}", f"name={benchmark}", "seeds=[0]"]
+    values = OmegaConf.to_container(compose("benchmark", overrides), resolve=True)
+    grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields}
+    common = {name: values[name] for name in values if name in ExperimentConfig.model_fields}
+    config = configuration.parse(BenchmarkConfig, grid, "benchmark")
+    return {(run.task, run.label): run for run in expand(config, common, hydra_schema.preset)}
 
 
 COMMAND = Command(main, Settings, positional="runs")

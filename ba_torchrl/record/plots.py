@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,11 +24,11 @@ if TYPE_CHECKING:
 # Distinguishable by colour-blind readers (Okabe and Ito), in order of decreasing contrast.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")
-_MANY_POINTS = 25
-LEAST_WIDTH_IN = 5.0
-"""Least width of a figure, for the legend."""
-MOST_LEGEND_ROWS = 5
-"""Largest number of rows of a legend below the panels; a longer one is at their right."""
+_MARKERS = "osD^vPX*<>"
+_MOST_MARKERS = 25
+_LABEL_PT = 7
+_LABEL_WIDTH = 24
+"""Characters in a line of a label beside a panel."""
 
 
 def plot_learning_curve(
@@ -68,22 +69,21 @@ def plot_learning_curve(
 
 def plot_panels(
     panels: Mapping[str, Mapping[str, Curve]],
-    path: str | Path,
+    paths: Sequence[str | Path],
     *,
     names: Sequence[str],
     xlabel: str = "updates",
     ylabel: str = "success rate",
-    ylim: tuple[float, float] | None = (0.0, 1.0),
-    columns: int | None = None,
-) -> Path:
-    """Plot curves into a grid of panels, as in the paper's figures 18 to 22, and return the PNG.
+) -> None:
+    """Plot rates into a grid of panels, as in the paper's figures 18 to 22.
+
+    The labels of the curves are at the right of each panel, beside their last points.
 
     Args:
         panels: curves as for `plot_learning_curve`, by title.
-        names: names of all curves, in the order of colours; a name has the same colour in all
-            panels.
-        columns: largest number of panels in a row; None for three to five, with the fewest empty
-            cells.
+        paths: of the figure in several formats, such as ``.svg`` and ``.pdf``.
+        names: names of all curves, in the order of colours and markers; a name has the same ones in
+            all panels.
 
     Raises:
         ImportError: matplotlib is missing.
@@ -92,41 +92,51 @@ def plot_panels(
     """
     if not panels:
         raise ValueError("there is no panel to draw")
-    columns = columns or min((5, 4, 3), key=lambda n: -len(panels) % n)
-    columns = min(columns, len(panels))
+    columns = min(min((4, 3), key=lambda n: -len(panels) % n), len(panels))
     rows = math.ceil(len(panels) / columns)
-    width_in = max(3.1 * columns + 0.6, LEAST_WIDTH_IN)
-    entry_in = 0.6 + 0.09 * max(map(len, names), default=0)
-    entries = max(int(width_in / entry_in), 1)  # in a row of the legend
-    legend_rows = math.ceil(len(names) / entries)
-    place, height_in = "outside lower center", 2.6 * rows + 0.6 + 0.25 * legend_rows
-    if legend_rows > MOST_LEGEND_ROWS:
-        place, width_in, entries = "outside right upper", width_in + entry_in + 0.4, 1
-        height_in = max(2.6 * rows + 0.6, 0.25 * len(names) + 0.3)
-    figure = _figure((width_in, height_in))
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=ylim is not None)
-    shown: dict[str, Line2D] = {}
+    labels = {name: textwrap.wrap(name, _LABEL_WIDTH) for name in names}
+    gap_in = 1.3 * _LABEL_PT / 72 * max(map(len, labels.values()), default=1)
+    height_in = max(1.8, gap_in * max(map(len, panels.values())))
+    longest = max((len(line) for lines in labels.values() for line in lines), default=0)
+    figure = _figure((columns * (2.5 + 0.6 * _LABEL_PT / 72 * longest), rows * (height_in + 0.7)))
+    grid = figure.subplots(rows, columns, squeeze=False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
+        ends = []
         for name, curve in curves.items():
-            shown[name] = _draw(axes, list(names).index(name), name, curve)
+            line = _draw(axes, list(names).index(name), name, curve)
+            label = "\n".join(labels[name])
+            ends += [(x, y, line, label) for x, y in line.get_xydata()[-1:]]
+        _label(axes, ends, gap_in / height_in)
         axes.set_title(title, fontsize=10)
-        _style_axes(axes, ylim)
+        axes.set_xlim(left=0)
+        _style_axes(axes, (0.0, 1.0))
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
-    for column in range(columns):
-        lowest = (len(panels) - 1 - column) // columns
-        grid[lowest, column].set_xlabel(xlabel)
-    for axes in grid[:, 0]:
-        axes.set_ylabel(ylabel)
-    labels = [name for name in names if name in shown]
-    figure.legend(
-        [shown[name] for name in labels],
-        labels,
-        loc=place,
-        ncols=min(entries, max(len(labels), 1)),
-        frameon=False,
-    )
-    return _save(figure, path)
+    figure.supxlabel(xlabel, fontsize=10)
+    figure.supylabel(ylabel, fontsize=10)
+    for path in paths:
+        _save(figure, path)
+
+
+def _label(axes: Axes, ends: Sequence[tuple[float, float, Line2D, str]], gap: float) -> None:
+    """Write the names of curves at the right of a panel, without overlap.
+
+    Args:
+        axes: the panel, with limits of 0 and 1.
+        ends: last point, line and label of each curve.
+        gap: least distance of two labels in the height of the panel.
+    """
+    ends = sorted(ends, key=lambda end: end[1])
+    steps = gap * np.arange(len(ends))
+    heights = np.maximum.accumulate([end[1] for end in ends] - steps) + steps
+    heights = np.minimum(heights, 1 - steps[::-1])
+    for (x, y, line, label), height in zip(ends, heights, strict=True):
+        color, beside = line.get_color(), axes.get_yaxis_transform()  # x in widths of the panel
+        mark = {"marker": line.get_marker(), "color": color, "markersize": 3.5}
+        axes.plot(1.05, height, **mark, transform=beside, clip_on=False)
+        leader = {"arrowstyle": "-", "color": color, "lw": 0.5, "shrinkA": 0}
+        axes.annotate("", (x, y), (1.05, height), textcoords=beside, arrowprops=leader)
+        axes.text(1.09, height, label, transform=beside, va="center", fontsize=_LABEL_PT)
 
 
 def _figure(size_in: tuple[float, float]) -> Figure:
@@ -148,8 +158,11 @@ def _style_axes(axes: Axes, ylim: tuple[float, float] | None) -> None:
 
 def _save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
+    from matplotlib import rc_context
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    with rc_context({"svg.hashsalt": path.stem}):  # the same file for the same curves
+        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
     return path
 
 
@@ -163,9 +176,15 @@ def _draw(axes: Axes, number: int, name: str, curve: Curve) -> Line2D:
     x, y, *band = parts
     color = _COLORS[number % len(_COLORS)]
     style = _STYLES[number // len(_COLORS) % len(_STYLES)]
-    marker = "o" if x.size <= _MANY_POINTS else None
     (line,) = axes.plot(
-        x, y, color=color, linestyle=style, marker=marker, markersize=3.5, label=name
+        x,
+        y,
+        color=color,
+        linestyle=style,
+        marker=_MARKERS[number % len(_MARKERS)],
+        markersize=3.5,
+        markevery=math.ceil(x.size / _MOST_MARKERS),
+        label=name,
     )
     if band:
         axes.fill_between(x, *band, color=color, alpha=0.2, linewidth=0)

@@ -25,7 +25,7 @@ from ba_torchrl.data.files import write_text
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, known_names
-from ba_torchrl.record.results import RESULT_FILE, read_result
+from ba_torchrl.record.results import RESULT_FILE, read_result, wilson_interval
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.checkpoint import (
     Which,
@@ -271,11 +271,3 @@ def shipped_file(task: str) -> Path:
 def shipped_policies() -> list[str]:
     """Return the tasks of which the package ships a policy."""
     return [task for task in TASKS if shipped_file(task).exists()]
-
-
-def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a success rate."""
-    from scipy.stats import binomtest  # which takes a second to import
-
-    found = binomtest(successes, episodes).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)

@@ -1,6 +1,8 @@
 import csv
 import html
+import json
 import re
+import shutil
 import statistics
 import subprocess
 import sys
@@ -10,17 +12,33 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ba_torchrl.cli.command import Arguments
+from ba_torchrl.commands import report
+from ba_torchrl.errors import MissingPackageError
 from ba_torchrl.record.plots import plot_panels
 from ba_torchrl.record.report import write_report
-from ba_torchrl.record.results import RunResult, differences, read_result, versions, write_result
-from ba_torchrl.record.summary import interval, load_sections, standard_error, summarize
+from ba_torchrl.record.results import (
+    RunResult,
+    differences,
+    read_result,
+    versions,
+    wilson_interval,
+    write_result,
+)
+from ba_torchrl.record.summary import differing_settings, estimate, load_sections, summarize
+from ba_torchrl.training import hydra_schema
 
 imageio = pytest.importorskip("imageio.v3")
 
 ROOT = Path(__file__).parents[2]
 REACH, PICK = "close_loop/block_reaching", "close_loop/block_picking"
 UPDATES = (100, 200, 300)
-BLUE, ORANGE = (0, 114, 178), (213, 94, 0)
+BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
+
+
+@pytest.fixture
+def rliable():
+    return pytest.importorskip("rliable")
 
 
 def write_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equi", **changes):
@@ -54,7 +72,7 @@ def write_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equ
             "mean_length": 6.0 + seed,
         },
         "config": config,
-        "versions": {"torch": "2.13.0", "ba_torchrl": "0.1.0"},
+        "versions": {"torch": "2.13.0", "ba_torchrl": "0.1.0", "commit": "abc"},
         "hardware": {"cpu": "Some CPU", "cores": 2, "memory_gb": 8.0, "gpu": None, "threads": 2},
         "seconds": 1800.0 + 360 * seed,
         "finished": "2000-01-01T00:00:00+00:00",
@@ -72,37 +90,74 @@ def test_versions_name_the_commit_in_a_clone():
     assert found.stdout.startswith(versions()["commit"].rstrip("+"))
 
 
+@pytest.mark.usefixtures("rliable")
 def test_figures_over_seeds(tmp_path):
-    curves = {0: (0.1, 0.8, 0.9), 1: (0.3, 0.9, 1.0), 2: (0.2, 0.6, 0.7)}
+    curves = {0: (0.1, 0.8, 0.9), 1: (0.3, 0.9, 1.0), 2: (0.2, 0.6, 0.7), 3: (0.2, 0.7, 0.9)}
     for seed, rates in curves.items():
         write_run(tmp_path / f"seed{seed}", rates, seed=seed)
     (section,), unfinished = load_sections([tmp_path])
     assert unfinished == []
     (row,) = summarize(section)
-    final = [0.9, 1.0, 0.7]
-    assert (row["task"], row["method"], row["seeds"]) == (REACH, "sacfd equi", 3)
-    assert row["success"] == pytest.approx(statistics.mean(final))
-    assert row["standard_error"] == pytest.approx(statistics.stdev(final) / 3**0.5)
+    assert (row["task"], row["method"], row["seeds"]) == (REACH, "sacfd equi", 4)
+    assert row["success_iqm"] == pytest.approx(0.9)  # without 0.7 and 1.0
+    assert row["success_mean"] == pytest.approx(0.875)
     assert row["curve_mean"] == pytest.approx(statistics.mean(sum(curves.values(), ())))
-    # the mean curve is 0.2, 0.77, 0.87: at the last point it is beyond 0.8 for the first time
+    # the curve is 0.2, 0.75, 0.9: at the last point it is beyond 0.8 for the first time
+    assert section.groups[0].estimate.value[:3] == pytest.approx([0.2, 0.75, 0.9])
     assert row["updates_to_80"] == 300
-    assert row["env_steps_to_80"] == pytest.approx(1501)
-    assert row["mean_length"] == pytest.approx(7.0)
-    assert row["hours"] == pytest.approx(0.6)
-    assert 0.7 - 1e-9 <= row["low"] < row["success"] < row["high"] <= 1.0 + 1e-9
+    assert row["env_steps_to_80"] == pytest.approx(1501.5)
+    assert row["mean_length"] == pytest.approx(7.5)
+    assert row["hours"] == pytest.approx(0.65)
+    assert 0.7 - 1e-9 <= row["low"] < row["success_iqm"] < row["high"] <= 1.0 + 1e-9
 
 
-def test_standard_error_and_interval_against_plain_arithmetic():
-    values = np.array([[0.0, 0.5], [1.0, 0.5]])
-    assert standard_error(values).tolist() == [0.5, 0.0]
-    assert np.isnan(standard_error(values[:1])).all()
-    assert np.isnan(interval(np.array([0.3]))).all()
-    # of two values the mean of a resample is one of them or half-way, 1:2:1
-    assert interval(np.array([0.0, 1.0])) == (0.0, 1.0)
-    assert interval(np.array([0.4, 0.4])) == (0.4, 0.4)
-    many = np.random.default_rng(0).normal(2.0, 1.0, 400)
-    low, high = interval(many)
-    assert high - low == pytest.approx(2 * 1.96 * many.std(ddof=1) / 20, rel=0.1)
+@pytest.mark.usefixtures("rliable")
+def test_the_interval_is_that_of_resampled_seeds_of_each_task():
+    rates = np.array([[[0.1], [0.7]], [[0.3], [0.9]]])  # two seeds of two tasks
+    before = np.random.get_state()[1].tolist()  # noqa: NPY002
+    found = estimate(rates, np.full((2, 2, 1), 10))
+    # Half of the larger rate of the first task and the smaller one of the second: 0.4 and 0.6 in
+    # 3 of 16 resamples each. Without strata 0.1 and 0.9 are in the interval.
+    assert (found.value, found.low, found.high) == (
+        pytest.approx([0.5]),
+        pytest.approx([0.4]),
+        pytest.approx([0.6]),
+    )
+    assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
+
+
+@pytest.mark.parametrize("seeds", [1, 2, 3, 4, 5, 8, 11])
+def test_the_interquartile_mean_is_that_of_rliable(rliable, seeds):
+    from rliable.metrics import aggregate_iqm
+
+    rates = np.random.default_rng(seeds).uniform(size=(seeds, 3, 2))
+    found = estimate(rates, np.ones_like(rates)).value
+    assert found == pytest.approx([aggregate_iqm(rates[..., point]) for point in range(2)])
+
+
+def test_equal_rates_have_the_interval_of_their_episodes():
+    episodes = np.full((2, 1, 2), 50)
+    equal = np.broadcast_to([[[0.0, 0.9]]], (2, 1, 2))
+    one = estimate(equal[:1], episodes[:1])
+    assert (one.low[1], one.high[1]) == wilson_interval(45, 50)
+    two = estimate(equal, episodes)
+    assert (two.low[0], two.high[0]) == wilson_interval(0, 100)
+    assert two.high[0] > 0.01
+    tasks = estimate(np.array([[[0.2], [0.8]]]), np.full((1, 2, 1), 50))  # of a single seed
+    assert tasks.value == pytest.approx([0.5])
+    assert np.isnan([tasks.low, tasks.high]).all()
+
+
+def test_without_rliable_seeds_are_refused_and_a_single_run_is_not(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rliable.library", None)
+    write_run(tmp_path / "a", (0.1, 0.2, 0.3))
+    (section,), _ = load_sections([tmp_path])
+    (row,) = summarize(section)
+    assert (row["low"], row["high"]) == wilson_interval(3, 10)
+    write_run(tmp_path / "b", (0.1, 0.2, 0.4), seed=1)
+    (section,), _ = load_sections([tmp_path])
+    with pytest.raises(MissingPackageError, match=r"\[report\]: pip install .*rliable"):
+        summarize(section)
 
 
 def test_a_rate_that_is_never_reached_gives_nan(tmp_path):
@@ -111,17 +166,20 @@ def test_a_rate_that_is_never_reached_gives_nan(tmp_path):
     assert np.isnan(summarize(section)[0]["updates_to_80"])
 
 
+@pytest.mark.usefixtures("rliable")
 def test_the_last_point_of_a_run_that_ended_early_stands_for_later_ones(tmp_path):
     for seed, rates in enumerate([(0.1, 0.5, 0.7), (0.9, 0.9)]):
         write_run(tmp_path / f"seed{seed}", rates, seed=seed)
     (section,), _ = load_sections([tmp_path])
     (group,) = section.groups
-    assert group.updates.tolist() == list(UPDATES)
-    assert group.rates.tolist() == [[0.1, 0.5, 0.7], [0.9, 0.9, 0.9]]
-    # the mean is 0.8 at the last point, where the seeds have 1500 and 1001 steps
+    assert group.axis("updates").tolist() == list(UPDATES)
+    assert group.axis("env_steps").tolist() == [500, 1000, 1500]
+    assert group.estimate.value == pytest.approx([0.5, 0.7, 0.8, 0.8])
+    # at the last point the seeds have 1500 and 1001 steps
     assert group.reaches(0.8) == (300.0, 1250.5)
 
 
+@pytest.mark.usefixtures("rliable")
 def test_the_row_of_all_tasks_has_methods_that_ran_on_all_of_them(tmp_path):
     for seed, (limits, pick) in enumerate([(1.0, 0.5), (0.8, 0.1)]):
         rates = (0.0, 0.0)
@@ -137,10 +195,47 @@ def test_the_row_of_all_tasks_has_methods_that_ran_on_all_of_them(tmp_path):
         ("all tasks", "sacfd equi"),
     ]
     together = rows[-1]
-    # 0.75 and 0.45 by seed
-    assert together["success"] == pytest.approx(0.6)
-    assert together["standard_error"] == pytest.approx(0.15)
+    assert together["success_iqm"] == pytest.approx(0.65)  # of 0.5 and 0.8
+    assert together["success_mean"] == pytest.approx(0.6)
+    # half of the larger rate of one task and the smaller one of the other
+    assert (together["low"], together["high"]) == (pytest.approx(0.45), pytest.approx(0.75))
     assert together["seeds"] == 2
+    assert list(together) == list(rows[0])
+
+
+def test_the_settings_in_which_methods_differ_are_listed(tmp_path):
+    for task, steps in ((REACH, 50), (PICK, 100)):
+        for label in ("sac cnn", "sac equi"):
+            env = {"obs_size": 64, "max_steps": steps}
+            config = {"network": {"name": label.split()[1]}, "tau": 0.01, "env": env}
+            folder = tmp_path / f"{label}{steps}"
+            write_run(folder, (0, 0, 1), label=label, task=task, config=config)
+    write_run(tmp_path / "c", (0, 0, 1), label="sac ferm", config={"network": {"name": "ferm"}})
+    (section,), _ = load_sections([tmp_path])
+    found = differing_settings(section)
+    assert [row for row in found if not row[0].startswith("env")] == [
+        ("network.name", "cnn", "sac cnn"),
+        ("network.name", "equi", "sac equi"),
+        ("network.name", "ferm", "sac ferm"),
+        ("tau", "0.01", "sac cnn, sac equi"),
+        ("tau", "–", "sac ferm"),
+    ]
+
+
+def test_runs_with_other_values_do_not_have_the_name_of_the_benchmark(tmp_path):
+    for seed in range(2):
+        write_run(tmp_path / f"a{seed}", (0, 0, 1), seed=seed)
+    write_run(tmp_path / "b", (0, 0, 1), label="sac cnn")
+
+    def changes(run):
+        return {"tau": (0.5, 0.1)} if run.label == "sac cnn" else {}
+
+    same, changed = load_sections([tmp_path], changes)[0]
+    assert (same.title, len(same.groups[0].runs)) == ("close_loop_4d", 2)
+    assert (changed.title, changed.changes) == ("close_loop_4d, changed", {"tau": {("0.5", "0.1")}})
+    page = write_report([tmp_path], tmp_path / "report", changes=changes).read_text()
+    assert "tau is 0.5 instead of 0.1" in page
+    assert "tau is 0.5 instead of 0.1" in (tmp_path / "report/table.md").read_text()
 
 
 def test_runs_with_other_settings_are_not_averaged(tmp_path):
@@ -208,18 +303,58 @@ class Page(HTMLParser):
         self.sources.append(attributes.get("src", ""))
         if tag == "tr":
             self.rows.append([])
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "input", "br"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if self.open and self.open[-1] in ("td", "th"):
+        if self.open[-1:] == ["td"] or self.open[-2:] == ["th", "button"]:
             self.rows[-1].append(data)
 
 
-def test_a_report_has_curves_tables_and_a_page(tmp_path):
+def lines(path):
+    """Return the points of the curves of an SVG by colour, [n, 2] in points from the top left."""
+    found = {}
+    for d, style in re.findall(
+        r'<path d="([^"]*)" clip-path="[^"]*" style="([^"]*)"', path.read_text()
+    ):
+        color = re.search(r"stroke: (#\w+)", style)
+        if color and "stroke-width: 1.5;" in style:
+            numbers = [float(word) for word in re.findall(r"[\d.]+", d)]
+            found.setdefault(color[1], []).append(np.reshape(numbers, (-1, 2)))
+    return found
+
+
+def texts(path):
+    """Return the words of an SVG, which are drawn as shapes, with a comment each."""
+    return [html.unescape(text) for text in re.findall(r"<!-- (.*?) -->", path.read_text())]
+
+
+def test_runs_are_compared_with_the_benchmark_of_the_package(tmp_path):
+    hydra_schema.register()
+    text = (ROOT / "configs/benchmark/cpu_six_dof.yaml").read_text()
+    updates = int(re.search(r"^total_updates: (\d+)", text, flags=re.MULTILINE)[1])
+    with report.COMMAND.composed(Arguments()):
+        folder = write_run(tmp_path / "a", (0, 1), label="dagger asr", task="ramp/block_stacking")
+        run = read_result(folder).model_copy(update={"benchmark": "cpu_six_dof"})
+        grid = report._planned("cpu_six_dof")[run.task, run.label]
+        assert (grid.total_updates, grid.algorithm["name"]) == (updates, "dagger")
+
+        def changes(**values):
+            config = {**grid.resolved(), "seed": 3, "threads": 7, **values}
+            return report.changes(run.model_copy(update={"config": config}))
+
+        assert changes() == {}
+        assert changes(total_updates=updates + 1) == {"total_updates": (updates + 1, updates)}
+        (listed,) = report.changes(run.model_copy(update={"label": "sac cnn"}))
+        assert listed == "tasks, algorithms and networks"
+        assert report.changes(run.model_copy(update={"benchmark": "mine"})) == {}
+
+
+@pytest.mark.usefixtures("rliable")
+def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):
     runs = tmp_path / "runs"
     for task in (REACH, PICK):
         for seed in range(2):
@@ -243,108 +378,172 @@ def test_a_report_has_curves_tables_and_a_page(tmp_path):
     (runs / "stopped" / "config.json").write_text("{}")
 
     path = write_report([runs], tmp_path / "report")
-    page = Page(path)
+    shutil.rmtree(runs)  # all that the page shows is in its folder
+    page, folder = Page(path), path.parent
     assert page.open == []
-    (picture,) = (source for source in page.sources if source.startswith("data:image/png;base64,"))
-    assert len(picture) > 10_000
-    assert "../runs/equiblock_picking0/evaluation.mp4" in page.sources
-    assert (path.parent / "../runs/equiblock_picking0/evaluation.mp4").exists()
-    assert "../runs/equiblock_picking1/evaluation.mp4" not in page.sources
-    assert 'href="../runs/equiblock_picking1/evaluation.mp4"' in page.text
-    assert "each run's last policy" in html.unescape(page.text)
+    video = "videos/close_loop_4d/close_loop_block_picking_sacfd_equi_seed0.mp4"
+    assert [source for source in page.sources if source] == [
+        "close_loop_4d/close_loop_block_picking.svg",
+        "close_loop_4d/close_loop_block_reaching.svg",
+        video,
+    ]
+    linked = re.findall(r'href="([^"]*)"', page.text)
+    assert video.replace("seed0", "seed1") in linked
+    assert {"close_loop_4d.pdf", "table.csv", "table.tex", "seeds.csv", "curves.csv"} < {*linked}
+    assert all((folder / each).stat().st_size for each in [*filter(None, page.sources), *linked])
+    assert "the last policy of each run" in html.unescape(page.text)
+    assert "after 100 updates" in page.text
     assert not re.findall(r'(?:src|href)="(?:https?:)?//', page.text)
     assert "sacfd &lt;cnn&gt;" in page.text
     assert "it broke" in page.text
     assert "stopped: interrupted" in page.text
     rows = {(row[0], row[1]): row for row in page.rows[1:]}
     assert len(rows) == 6
-    assert rows[REACH, "sacfd equi"][2:4] == ["2", "0.900 ± 0.000"]
-    assert rows[REACH, "sacfd equi"][6] == "300"
-    assert rows["all tasks", "sacfd equi"][3] == "0.900 ± 0.000"
+    assert rows[REACH, "sacfd equi"][2:5] == ["2", "0.900", "0.699 to 0.972"]
+    assert rows[REACH, "sacfd equi"][7] == "300"
+    assert rows["all tasks", "sacfd equi"][3] == "0.900"
 
-    with (path.parent / "table.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert len(table) == 6
-    assert {float(row["success"]) for row in table} == {0.9, 0.4}
-    text = (path.parent / "table.md").read_text()
-    assert f"| {PICK} | sacfd equi | 2 | 0.900 ± 0.000 | 0.900 to 0.900 |" in text
-    assert "Some CPU, 2 cores, 2 threads; ba_torchrl 0.1.0, torch 2.13.0" in text
+    def table(name):
+        with (folder / name).open() as file:
+            return list(csv.DictReader(file))
+
+    assert len(table("table.csv")) == 6
+    assert {float(row["success_iqm"]) for row in table("table.csv")} == {0.9, 0.4}
+    assert [(row["seed"], row["success_rate"]) for row in table("seeds.csv")[:2]] == [
+        ("0", "0.4"),
+        ("1", "0.4"),
+    ]
+    of_seed = [row for row in table("curves.csv") if row["seed"] == "1" and row["task"] == REACH]
+    assert [(row["method"], row["updates"], row["env_steps"]) for row in of_seed[:2]] == [
+        ("sacfd <cnn>", "100", "501"),
+        ("sacfd <cnn>", "200", "1001"),
+    ]
+    text = (folder / "table.md").read_text()
+    assert f"| {PICK} | sacfd equi | 2 | 0.900 | 0.699 to 0.972 |" in text
+    assert "Some CPU, 2 cores, 2 threads; ba_torchrl 0.1.0, commit abc, torch 2.13.0" in text
     assert "it broke" in text
+    latex = (folder / "table.tex").read_text()
+    name = PICK.replace("_", r"\_")
+    assert rf"{name} & sacfd equi & 2 & 0.900 & 0.699 to 0.972 &" in latex
 
-    image = imageio.imread(path.parent / "close_loop_4d.png")[..., :3].astype(int)
     # methods in alphabetical order: "sacfd <cnn>" first
-    for color in (BLUE, ORANGE):
-        shade = 0.2 * np.array(color) + 0.8 * 255
-        assert (np.abs(image - color).max(-1) <= 12).sum() > 500
-        assert (np.abs(image - shade).max(-1) <= 3).sum() > 1000
+    both = folder / "close_loop_4d.svg"
+    assert {color: len(found) for color, found in lines(both).items()} == {BLUE: 2, ORANGE: 2}
+    assert texts(both).count("sacfd <cnn>") == 2
+    one = lines(folder / "close_loop_4d/close_loop_block_picking.svg")
+    assert [len(found) for found in one.values()] == [1, 1]
+    assert (folder / "close_loop_4d.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_one_seed_has_no_shading_and_the_report_states_it(tmp_path):
-    write_run(tmp_path / "runs/a", (0.2, 0.7, 0.9))
+@pytest.mark.parametrize(
+    ("seeds", "part"), [(1, "The interval of a single run"), (2, "Fewer than 5 seeds"), (5, None)]
+)
+def test_few_seeds_are_a_warning(tmp_path, seeds, part):
+    for seed in range(seeds):
+        write_run(tmp_path / f"runs/{seed}", (0.2, 0.7, 0.9), seed=seed)
     path = write_report([tmp_path / "runs"], tmp_path / "report")
-    image = imageio.imread(path.parent / "close_loop_4d.png")[..., :3].astype(int)
-    shade = 0.2 * np.array(BLUE) + 0.8 * 255
-    assert (np.abs(image - BLUE).max(-1) <= 12).sum() > 500
-    assert (np.abs(image - shade).max(-1) <= 3).sum() < 500
-    for name in ("report.html", "table.md"):
+    for name in ("report.html", "table.md", "table.tex"):
         text = (path.parent / name).read_text()
-        assert "neither shading nor interval" in text
-        assert "±" in text
-    assert "| 1 | 0.900 | – |" in (path.parent / "table.md").read_text()
-    write_run(tmp_path / "runs/b", (0.2, 0.7, 0.9), seed=1)
-    path = write_report([tmp_path / "runs"], tmp_path / "report")
-    assert "neither shading" not in (path.parent / "table.md").read_text()
+        assert ("Fewer than 5 seeds" in text) is (seeds < 5)
+        assert part is None or part in text
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed")
+def test_the_table_sorts_and_filters(tmp_path):
+    for rate, label in ((0.9, "sac cnn"), (0.1, "sac equi"), (1.0, "dagger cnn")):
+        write_run(tmp_path / label, (0, 0, rate), label=label)
+    write_run(tmp_path / "other", (0, 0, 0.5), task=PICK, label="sac cnn")
+    path = write_report([tmp_path], tmp_path / "report")
+
+    script = """
+        const found = [], field = document.querySelector("input");
+        const shown = () => found.push([...document.querySelectorAll("tbody tr:not([hidden])")].map(
+            (row) => `${row.cells[3].textContent} ${row.cells[1].textContent}`));
+        for (const column of [3, 3, 1, 7, 7]) {
+            document.querySelectorAll("th button")[column].click();
+            shown();
+        }
+        field.value = "CNN reach";
+        field.dispatchEvent(new Event("input"));
+        shown();
+        document.documentElement.innerHTML = `<pre>${JSON.stringify(found)}</pre>`;
+    """
+    copy = path.with_name("copy.html")
+    copy.write_text(path.read_text().replace("</body>", f"<script>{script}</script></body>"))
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
+    done = subprocess.run([*command, copy.as_uri()], capture_output=True, text=True, check=True)
+    rising, falling, methods, updates, updates_falling, filtered = json.loads(
+        re.search("<pre>(.*)</pre>", done.stdout)[1]
+    )
+    assert rising == [
+        "0.100 sac equi",
+        "0.500 sac cnn",
+        "0.700 sac cnn",
+        "0.900 sac cnn",
+        "1.000 dagger cnn",
+    ]
+    assert falling == rising[::-1]
+    assert [row.split()[1] for row in methods] == ["dagger", "sac", "sac", "sac", "sac"]
+    for rows in (updates, updates_falling):  # those that do not reach 80 % are last
+        assert {*rows[:2]} == {"0.900 sac cnn", "1.000 dagger cnn"}
+    assert {*filtered} == {"0.900 sac cnn", "1.000 dagger cnn"}
 
 
 def test_panels_share_colours_and_keep_their_names(tmp_path):
-    x = np.arange(0, 5000, 500)
+    x = np.arange(500, 5000, 500)
     rising = 1 - np.exp(-x / 900)
     curves = {
         "a": {"first": (x, rising), "second": (x, 0.5 * rising)},
         "b": {"second": (x, rising)},
     }
-    path = plot_panels(curves, tmp_path / "p.png", names=["first", "second"])
-    image = imageio.imread(path)[..., :3].astype(int)
-    middle = int(0.55 * image.shape[1])  # between the panels, right of the label
-    above_legend = image[: int(0.8 * image.shape[0])]
-
-    def count(part, color):
-        return int((np.abs(part - color).max(-1) <= 12).sum())
-
-    assert count(above_legend[:, :middle], BLUE) > 300
-    assert count(above_legend[:, middle:], BLUE) == 0
-    assert count(above_legend[:, middle:], ORANGE) > 300
+    path = tmp_path / "p.svg"
+    plot_panels(curves, [path, tmp_path / "p.pdf"], names=["first", "second"])
+    found = lines(path)
+    assert {color: len(curves) for color, curves in found.items()} == {BLUE: 1, ORANGE: 2}
+    width = float(re.search(r'viewBox="0 0 ([\d.]+)', path.read_text())[1])
+    assert [each[0, 0] > width / 2 for each in found[BLUE] + found[ORANGE]] == [False, False, True]
+    first, _ = found[ORANGE][0][:, 0], found[ORANGE][1]  # x of 500 to 4500
+    ticks = re.findall(
+        r'<use xlink:href="#\w+" x="([\d.]+)" y="[\d.]+" style="stroke: #000', path.read_text()
+    )
+    assert float(ticks[0]) == pytest.approx(first[0] - (first[1] - first[0]), abs=0.5)  # at 0
+    assert texts(path).count("first") == 1
+    assert texts(path).count("second") == 2
+    again = tmp_path / "again"
+    plot_panels(curves, [again / "p.svg"], names=["first", "second"])
+    assert (again / "p.svg").read_bytes() == path.read_bytes()
     with pytest.raises(ValueError, match="no panel"):
-        plot_panels({}, tmp_path / "p.png", names=[])
+        plot_panels({}, [path], names=[])
     with pytest.raises(ValueError, match="third"):
-        plot_panels({"a": {"third": (x, x)}}, tmp_path / "p.png", names=["first"])
+        plot_panels({"a": {"third": (x, x)}}, [path], names=["first"])
 
 
 def test_the_recipe_reports_several_folders(tmp_path):
     for name in ("one", "two"):
         write_run(tmp_path / name / "run", (0.2, 0.7, 0.9), benchmark=name)
     command = [sys.executable, "recipes/report.py", f"{tmp_path}/one", f"{tmp_path}/two"]
+    command.append("axis=env_steps")
     done = subprocess.run(
         [*command, f"folder={tmp_path}/out"], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "## one" in done.stdout
     assert f"{tmp_path}/out/report.html" in done.stdout
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "one.png",
-        "two.png",
-        "report.html",
-        "table.csv",
-        "table.md",
-    }
+    assert "environment steps" in texts(tmp_path / "out/one.svg")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    tables = {"table.csv", "table.md", "table.tex", "seeds.csv", "curves.csv"}
+    figures = {"one", "one.svg", "one.pdf", "two", "two.svg", "two.pdf"}
+    assert names == {"report.html", *tables, *figures}
 
 
-@pytest.mark.parametrize("count", [2, 5, 8, 13])
-def test_long_legends_stay_within_the_picture(tmp_path, count):
+@pytest.mark.parametrize("count", [2, 8, 30])
+def test_labels_are_apart_and_within_the_picture(tmp_path, count):
     names = [f"an algorithm on its network {i}" for i in range(count)]
     x = np.arange(5)
-    path = plot_panels({"task": dict.fromkeys(names, (x, x / 5))}, tmp_path / "p.png", names=names)
+    path = tmp_path / "p.png"
+    plot_panels({"task": dict.fromkeys(names, (x, x / 8))}, [path], names=names)
     picture = imageio.imread(path)[..., :3] / 255
-    assert (picture[:, :2] > 0.99).all()
-    assert (picture[:, -2:] > 0.99).all()
-    assert (picture[-2:] > 0.99).all()
+    for edge in (picture[:, :2], picture[:, -2:], picture[:2], picture[-2:]):
+        assert (edge > 0.99).all()
+    labels = (picture[:, int(0.75 * picture.shape[1]) :] < 0.5).all(-1).any(1)
+    assert np.diff(labels.astype(int)).clip(0).sum() >= 2 * count  # two lines each

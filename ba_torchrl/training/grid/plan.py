@@ -106,7 +106,19 @@ class Status:
 def plan(
     config: BenchmarkConfig, common: Mapping[str, Any], preset: Preset
 ) -> list[ExperimentConfig]:
-    """Return every run of a grid, checked: all tasks and methods with the first seed come first.
+    """Return every run of a grid, after one environment and learner of each kind was made.
+
+    Args, order and errors are those of `expand`.
+    """
+    runs = expand(config, common, preset)
+    _check_parts(runs)
+    return runs
+
+
+def expand(
+    config: BenchmarkConfig, common: Mapping[str, Any], preset: Preset
+) -> list[ExperimentConfig]:
+    """Return every run of a grid: all tasks and methods with the first seed come first.
 
     Args:
         config: the grid.
@@ -164,7 +176,6 @@ def plan(
             raise ConfigError(f"{task} with {algorithm} {network}: {error}") from None
     if not runs:
         raise ConfigError("the grid is empty: `skip` leaves everything out")
-    _check_parts(runs)
     return runs
 
 
