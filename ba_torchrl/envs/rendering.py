@@ -66,9 +66,11 @@ DISPLAY_POINT = RelativePoint(-0.3, 0.3, 0.15)
 DISPLAY_YAW_RAD = 0.7
 ARM_HEIGHTS_M = (0.0, 0.15, 0.25)
 """Heights of the tool at which an image shows the whole arm."""
-FRAME_DISTANCE_M = 0.07
+LINK_RADIUS_M = 0.09
+"""Largest distance of a link's surface from the line through its joints, about."""
+FRAME_DISTANCE_M = 0.09
 """Distance between positions of the tool in successive frames of an interpolated motion."""
-FRAME_ROTATION_RAD = 0.5
+FRAME_ROTATION_RAD = 0.6
 """Largest displacement of a joint between these frames."""
 
 
@@ -154,8 +156,6 @@ class ArmDisplay:
             joints: of the arm at the grasp or the release.
             top_down: whether the arm approaches vertically even with a tilted tool.
         """
-        if self._scene is None:
-            return
         robot, limits = self._scene.robot, self._scene.controller.limits
         ends = [robot.measured_joints(), list(joints)]
         start = robot.tool_frame().position
@@ -168,43 +168,47 @@ class ArmDisplay:
         if between is not None:
             ends.insert(1, between)
             points.insert(1, before)
-        self._path = []
+        self._path = ends[:1]
         for (a, b), (p, q) in zip(
             itertools.pairwise(ends), itertools.pairwise(points), strict=True
         ):
             self._path += _interpolated(np.array(a), np.array(b), math.dist(p, q))
         del self._path[-1]
-        for joints in self._path:
+        for joints in self._path[1:]:
             self._move(joints)
             yield self._scene.world
 
     def extent_m(self) -> np.ndarray:
         """Return points [N, 3] that enclose the arm in all its poses above the workspace.
 
-        They are the corners of the boxes around its links, with the tool pointing down at the
-        corners of the workspace.
+        They are the corners of cubes around its links, with the tool pointing down at the corners
+        of the workspace.
         """
         if self._extent_m is None:
             robot, workspace = self._scene.robot, self._scene.task.settings.workspace
-            joints, boxes = robot.measured_joints(), []
+            joints, links = robot.measured_joints(), []
             for position in itertools.product(workspace.x, workspace.y, ARM_HEIGHTS_M):
                 solution = robot.inverse_kinematics(position, downward(DISPLAY_YAW_RAD), joints)
                 if solution is not None:
                     robot.teleport(solution)
-                    boxes += robot.link_boxes_m()
+                    links += robot.link_positions()
             self._move(joints)
-            corners = [
-                point for box in boxes for point in itertools.product(*zip(*box, strict=True))
-            ]
-            self._extent_m = np.array(corners).clip([-np.inf, -np.inf, 0.0], np.inf)
+            cube = np.array([*itertools.product((-LINK_RADIUS_M, LINK_RADIUS_M), repeat=3)])
+            points = (np.array(links)[:, None] + cube).reshape(-1, 3)
+            self._extent_m = points.clip([-np.inf, -np.inf, 0.0], np.inf)  # above the floor
         return self._extent_m
 
     def retreat(self) -> Iterator[World]:
-        """Yield the world while the arm moves back on the path of the last `approach`, if any."""
+        """Yield the world while the arm moves back on the path of the last `approach`, if any.
+
+        At the end, the arm is in the pose of `posed`.
+        """
         path, self._path = self._path, []
-        for joints in reversed(path):
+        for joints in reversed(path[1:]):
             self._move(joints)
             yield self._scene.world
+        if path:
+            self._move(path[0])
 
     def _move(self, joints: Sequence[float]) -> None:
         """Set the arm joints, and the pose of the held body in the tool frame."""

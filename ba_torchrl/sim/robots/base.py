@@ -253,15 +253,13 @@ class Robot(ABC):
         self._reset_joints(self.arm_joints, *zip(*(state[:2] for state in states), strict=True))
         return is_any_within(points, 0.0)
 
-    def link_boxes_m(self) -> list[tuple[Vector, Vector]]:
-        """Return the lower and the upper corner of the box around each link, parallel to the axes.
-
-        This detects all collisions anew.
-        """
-        self.world.detect_collisions()
+    def link_positions(self) -> list[Vector]:
+        """Return the origins of the base and of the links, metres."""
         client = {"physicsClientId": self.client}
-        links = range(-1, pybullet.getNumJoints(self.id, **client))
-        return [pybullet.getAABB(self.id, link, **client) for link in links]
+        links = range(pybullet.getNumJoints(self.id, **client))
+        states = pybullet.getLinkStates(self.id, links, computeForwardKinematics=1, **client)
+        base, _ = pybullet.getBasePositionAndOrientation(self.id, **client)
+        return [base, *(state[4] for state in states)]
 
     # -- gripper -----------------------------------------------------------------------------
 
