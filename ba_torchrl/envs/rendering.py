@@ -67,7 +67,7 @@ DISPLAY_YAW_RAD = 0.7
 ARM_HEIGHTS_M = (0.0, 0.15, 0.25)
 """Heights of the tool at which an image shows the whole arm."""
 LINK_RADIUS_M = 0.09
-"""Largest distance of a link's surface from the line through its joints, about."""
+"""Half the edge of the cube around the origin of each link that is in such an image."""
 FRAME_DISTANCE_M = 0.09
 """Distance between positions of the tool in successive frames of an interpolated motion."""
 FRAME_ROTATION_RAD = 0.6
@@ -149,8 +149,8 @@ class ArmDisplay:
     def approach(self, joints: Sequence[float], *, top_down: bool) -> Iterator[World]:
         """Yield the world while the arm moves from the pose of `posed` to a grasp or a release.
 
-        The joints are interpolated to the start of the approach, then to its end, without both
-        ends of the motion. A held body moves with the hand.
+        The joints are interpolated to the start of the approach, then to its end. Both ends of the
+        motion are left out. A held body moves with the hand.
 
         Args:
             joints: of the arm at the grasp or the release.
@@ -181,8 +181,8 @@ class ArmDisplay:
     def extent_m(self) -> np.ndarray:
         """Return points [N, 3] that enclose the arm in all its poses above the workspace.
 
-        They are the corners of cubes around its links, with the tool pointing down at the corners
-        of the workspace.
+        They are the corners of cubes around its links, with the tool pointing down above the
+        corners of the workspace at `ARM_HEIGHTS_M`.
         """
         if self._extent_m is None:
             robot, workspace = self._scene.robot, self._scene.task.settings.workspace
