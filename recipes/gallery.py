@@ -1,7 +1,7 @@
 """Draw the tasks: an episode of each expert, and one picture of all tasks.
 
 python recipes/gallery.py                       # pictures in runs/gallery
-python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png  # those of the README
+python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png overwrite=true
 python recipes/gallery.py tasks=[close_loop/block_picking] folder=pictures overview=null
 """
 
@@ -20,6 +20,7 @@ from ba_torchrl.cli.types import (
     Seed,
     Structures,
     Tasks,
+    check_untracked,
 )
 from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
 
@@ -39,18 +40,28 @@ class Settings(PluginSettings):
     """Of the pictures."""
     overview: PngFile | None = "runs/gallery/all_tasks.png"
     """Picture of all tasks, or null."""
+    overwrite: bool = False
+    """Also write over files that git tracks."""
 
 
 def main(settings: Settings) -> None:
     """Play one episode per task and write its pictures."""
-    strips = {}
-    for task in tqdm(settings.tasks or list_tasks(), unit="task"):
+    folder, strips = Path(settings.folder), {}
+    files = {
+        task: folder / f"{task.replace('/', '_')}.png" for task in settings.tasks or list_tasks()
+    }
+    apart = {
+        task: folder / f"{task.replace('/', '_')}_deconstruction.png"
+        for task in settings.deconstructions
+    }
+    if not settings.overwrite:
+        overview = [settings.overview] if settings.overview else []
+        check_untracked([*files.values(), *apart.values(), *overview])
+    for task, path in tqdm(files.items(), unit="task"):
         strips[task] = expert_strip(task, settings.seed, settings.pictures)
-        path = Path(settings.folder) / f"{task.replace('/', '_')}.png"
         tqdm.write(str(strip_figure(task, strips[task], path)))
-    for task in settings.deconstructions:
+    for task, path in apart.items():
         strip = expert_strip(task, settings.seed, settings.pictures, deconstruct=True)
-        path = Path(settings.folder) / f"{task.replace('/', '_')}_deconstruction.png"
         print(strip_figure(f"{task}, deconstruction", strip, path))
     if settings.overview is not None:
         print(overview_figure(strips, settings.overview))

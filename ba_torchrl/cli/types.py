@@ -5,8 +5,9 @@ from __future__ import annotations
 import errno
 import functools
 import os
+import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -98,6 +99,22 @@ def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
         raise ConfigError(f"cannot write to {path}: it is a folder; name a file")
     if os.path.exists(path) and not os.access(path, os.W_OK):
         raise ConfigError(f"cannot write to {path}: {os.strerror(errno.EACCES)}")
+
+
+def check_untracked(paths: Iterable[str | Path]) -> None:
+    """Check that git tracks none of the files, so that a command can write over them.
+
+    Raises:
+        ConfigError: it tracks one.
+    """
+    for path in map(Path, paths):
+        command = ["git", "-C", str(path.parent), "ls-files", "--", f":(literal){path.name}"]
+        try:
+            found = subprocess.run(command, capture_output=True, check=False).stdout
+        except FileNotFoundError:
+            return  # git is not installed
+        if path.exists() and found:
+            raise ConfigError(f"git tracks {path}; choose another path, or set overwrite=true")
 
 
 Count = Annotated[int, Field(ge=1)]

@@ -39,8 +39,6 @@ from ba_torchrl.training.checkpoint import Which
 from ba_torchrl.training.evaluation import Evaluation, evaluate, record_episodes
 from ba_torchrl.training.policy import TrainedPolicy, shipped_policies
 
-FPS = 5
-
 
 class EpisodeSettings(VectorSettings, PluginSettings):
     """A policy and the episodes that it plays."""
@@ -158,7 +156,7 @@ def _evaluate(source: str, settings: Settings) -> None:
         print(f"\n{agreement_table(episodes, resolved.actions.sequence)}")
     if settings.video is not None:
         frames = record_episodes(resolved, policy, settings.video_episodes, seed)
-        print(f"  video     {write_video(settings.video, frames, fps=FPS)}")
+        print(f"  video     {write_video(settings.video, frames, fps=resolved.video_fps)}")
 
 
 def _kept(policy: TrainedPolicy, settings: Settings, seed: int) -> Evaluation:

@@ -9,7 +9,7 @@ ba-torchrl play close_loop/corner_picking video=null env.render=true   # needs a
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field
@@ -38,8 +38,9 @@ class Settings(EnvSettings):
     """Their number."""
     video: VideoFile | None = "play.mp4"
     """A file such as play.mp4 or play.gif, or null."""
-    fps: float = Field(default=5, ge=MIN_FPS, le=MAX_FPS)
-    """Frames a second."""
+    fps: Annotated[float, Field(ge=MIN_FPS, le=MAX_FPS)] | None = None
+    """Frames a second; null for 5 in close loop and 10 in open loop, where frames between the poses
+    of a step show the arm move, by interpolation."""
 
 
 def main(settings: Settings) -> None:
@@ -49,7 +50,8 @@ def main(settings: Settings) -> None:
     frames = record_episodes(resolved, policy, settings.episodes, settings.seed)
     print(f"{settings.episodes} episodes of {resolved.task_id}, {len(frames)} pictures")
     if settings.video is not None:
-        print(f"  video  {write_video(settings.video, frames, fps=settings.fps)}")
+        fps = settings.fps or resolved.video_fps
+        print(f"  video  {write_video(settings.video, frames, fps=fps)}")
 
 
 def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:

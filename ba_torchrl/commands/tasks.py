@@ -2,7 +2,7 @@
 
 ba-torchrl tasks
 ba-torchrl tasks close_loop/block_picking
-ba-torchrl tasks path=docs/tasks.md
+ba-torchrl tasks path=docs/tasks.md overwrite=true
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ba_torchrl import describe, list_tasks
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks
+from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks, check_untracked
 from ba_torchrl.envs.description import summary
 from ba_torchrl.record.task_page import task_page, tasks_by_heading
 
@@ -23,12 +23,16 @@ class Settings(PluginSettings):
     """Ids of tasks; null for all."""
     path: OutputFile | None = None
     """Write the page of the tasks, in Markdown, to this file."""
+    overwrite: bool = False
+    """Also write over a file that git tracks."""
 
 
 def main(settings: Settings) -> None:
     """Print or write what is known of the tasks."""
     if settings.path is not None:
         path = Path(settings.path)
+        if not settings.overwrite:
+            check_untracked([path])
         path.write_text(task_page(settings.tasks), encoding="utf-8")
         print(path)
     elif settings.tasks is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,7 +20,7 @@ from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_observation
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import enabled_observations, merge_entries
-from ba_torchrl.envs.rendering import RelativePoint, scene_viewpoint
+from ba_torchrl.envs.rendering import WORKSPACE_VIEW, Direction, RelativePoint, scene_viewpoint
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
 from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
@@ -81,6 +81,10 @@ class ManipulationEnv(CopiesWithState, EnvBase):
     """Settings of the physics engine for ``physics_mode="fast"``."""
     hand_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.28)
     """A point of the hand that `render` shows besides the workspace."""
+    video_fps: ClassVar[int] = 5
+    """Frames of a video per second."""
+    video_caption: ClassVar[str] = ""
+    """Text in every frame of a video."""
 
     @abstractmethod
     def _make_controller(self, robot: Robot, task: Task) -> Controller:
@@ -163,11 +167,22 @@ class ManipulationEnv(CopiesWithState, EnvBase):
 
     def render(self, width: int = 480, height: int = 360) -> np.ndarray:
         """Return an RGB image of the scene, [height, width, 3] uint8."""
-        world = self._rendered_world(self.scene)
-        terrain = self.scene.task.terrain
-        viewpoint = scene_viewpoint(world, terrain, self.hand_point.above(terrain), width / height)
-        floor = self.config.floor_color or DEFAULT_FLOOR_RGB
-        return render_rgb(world, viewpoint, width, height, floor_rgb=floor)
+        hand_m = np.array(self.hand_point.above(self.scene.task.terrain))
+        return self._draw(self._rendered_world(self.scene), hand_m, width, height)
+
+    def video_images(
+        self, width: int, height: int, *, at_contact: bool = False
+    ) -> Iterator[np.ndarray]:
+        """Yield the images of a video, [height, width, 3] uint8, from the last call until now.
+
+        They have no effect on the simulation. The first call follows `reset`, the others each step.
+
+        Args:
+            width: number of columns.
+            height: number of rows.
+            at_contact: the call is that of `on_contact`.
+        """
+        yield self.render(width, height)
 
     def get_state(self) -> EnvState:
         """Return the full state, for `set_state`.
@@ -323,6 +338,20 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         except PlacementError as error:
             raise ConfigError(f"{self.task_id}: {error}") from None
         self._condition_names = tuple(largest.task.conditions())
+
+    def _draw(
+        self,
+        world: World,
+        arm_m: np.ndarray,
+        width: int,
+        height: int,
+        direction: Direction = WORKSPACE_VIEW,
+    ) -> np.ndarray:
+        """Return an image of the workspace and of points of the arm; see `scene_viewpoint`."""
+        terrain = self.scene.task.terrain
+        viewpoint = scene_viewpoint(world, terrain, arm_m, width / height, direction)
+        floor = self.config.floor_color or DEFAULT_FLOOR_RGB
+        return render_rgb(world, viewpoint, width, height, floor_rgb=floor)
 
     def _build_scene(self, scale: float, *, window: bool | None = None) -> Scene:
         return build_scene(

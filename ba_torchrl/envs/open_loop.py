@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
@@ -16,7 +18,7 @@ from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.envs.episodes import SETTLE_STEPS
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
-from ba_torchrl.envs.rendering import ArmDisplay, RelativePoint
+from ba_torchrl.envs.rendering import ARM_VIEW, DISPLAY_POINT, DISPLAY_YAW_RAD, ArmDisplay
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
 from ba_torchrl.errors import ConfigError
@@ -28,9 +30,6 @@ from ba_torchrl.sim.world import Physics, World
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.workspace import ActionLimits
 
-DISPLAY_POINT = RelativePoint(-0.3, 0.3, 0.15)
-"""Position of the tool in images between actions."""
-DISPLAY_YAW_RAD = 0.7
 HOME_TOLERANCE_RAD = 1e-6
 
 
@@ -49,6 +48,8 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
     default_action_sequence = "pxyr"
     default_half_rotation = True
     hand_point = DISPLAY_POINT._replace(height_m=0.23)
+    video_fps = 10
+    video_caption = "arm motion between poses: interpolated"
     # a stack of four creeps by 0.15 mm in two seconds; without a residual, by 0.11 mm
     physics = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-5)
 
@@ -166,6 +167,24 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         return self._display.posed(
             scene, self._episodes.scale(), position, downward(DISPLAY_YAW_RAD)
         )
+
+    def video_images(
+        self, width: int, height: int, *, at_contact: bool = False
+    ) -> Iterator[np.ndarray]:
+        """Yield the images of a video, which show the whole arm; see `ManipulationEnv`.
+
+        The simulation teleports the arm. These images show it move, by interpolation of its joints,
+        to the grasp or the release of the action and back.
+        """
+        scene, display = self.scene, self._display
+        if at_contact:
+            motion = display.approach(scene.robot.joints, top_down=self.config.top_down_approach)
+            last = scene.world
+        else:
+            last, motion = self._rendered_world(scene), display.retreat()
+        arm_m = display.extent_m()
+        for world in itertools.chain(motion, [last]):
+            yield self._draw(world, arm_m, width, height, ARM_VIEW)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all worlds of this environment."""

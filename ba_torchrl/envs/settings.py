@@ -25,6 +25,8 @@ class Control(Protocol):
     """Default `action_sequence`."""
     default_half_rotation: ClassVar[bool]
     """Default `half_rotation`."""
+    video_fps: ClassVar[int]
+    """Frames of a video per second."""
 
     @classmethod
     def make_actions(cls, config: EnvConfig) -> CloseLoopActions | OpenLoopActions:
@@ -63,6 +65,11 @@ class ResolvedEnv:
     def task_class(self) -> type[Task]:
         """The class of the task."""
         return TASKS[self.task_id]
+
+    @property
+    def video_fps(self) -> int:
+        """Frames of a video per second."""
+        return CONTROLS[self.task_class.control].video_fps
 
     @property
     def robot_class(self) -> type[Robot]:

@@ -17,19 +17,29 @@ _PALETTE_STRIDE = 4
 """Distance of the pixels from which the colours of a GIF are chosen."""
 
 
+_CAPTION_SIZE = 13
+_CAPTION_MARGIN = 6
+_CAPTION_RGB = (70, 70, 70)
+
+
 class FrameRecorder:
     """Renders an environment into a list of frames.
 
     An open-loop step gives two frames: the grasp or the release, recorded during the step, and the
-    scene after the step, recorded by `record`.
+    scene after the step, recorded by `record`. With ``motion``, frames between them show the arm
+    move, with a caption that says so, and all frames show the whole arm.
 
     Args:
         width: number of columns of a frame.
         height: number of rows of a frame.
+        motion: show the interpolated motion of the arm in open loop.
     """
 
-    def __init__(self, env: ManipulationEnv, width: int = 400, height: int = 400) -> None:
+    def __init__(
+        self, env: ManipulationEnv, width: int = 400, height: int = 400, *, motion: bool = False
+    ) -> None:
         self.env = env
+        self.motion = motion
         self.size = (width, height)
         self.frames: list[np.ndarray] = []
         """[height, width, 3] uint8 each, in the order of time."""
@@ -38,12 +48,19 @@ class FrameRecorder:
         env.on_contact = self._record_contact
 
     def record(self) -> None:
-        """Append an image of the current scene."""
-        self.frames.append(self.env.render(*self.size))
+        """Append an image of the current scene, with ``motion`` after those that lead to it."""
+        self._record()
 
     def _record_contact(self) -> None:
-        self.contacts.append(len(self.frames))
-        self.record()
+        self._record(at_contact=True)
+        self.contacts.append(len(self.frames) - 1)
+
+    def _record(self, *, at_contact: bool = False) -> None:
+        if not self.motion:
+            self.frames.append(self.env.render(*self.size))
+            return
+        for image in self.env.video_images(*self.size, at_contact=at_contact):
+            self.frames.append(_with_caption(image, self.env.video_caption))
 
 
 def check_video(path: str | Path, fps: float) -> None:
@@ -122,6 +139,18 @@ def _with_common_colors(pictures: list[np.ndarray]) -> list[np.ndarray]:
         )
         for picture in pictures
     ]
+
+
+def _with_caption(picture: np.ndarray, text: str) -> np.ndarray:
+    """Return an image with a text in its lower left corner."""
+    if not text:
+        return picture
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray(picture)
+    position = (_CAPTION_MARGIN, picture.shape[0] - _CAPTION_MARGIN)
+    ImageDraw.Draw(image).text(position, text, _CAPTION_RGB, anchor="ls", font_size=_CAPTION_SIZE)
+    return np.asarray(image)
 
 
 def _even(picture: np.ndarray) -> np.ndarray:

@@ -97,7 +97,7 @@ def record_episodes(
     seed: int,
     hold_frames: int = 4,
 ) -> list[np.ndarray]:
-    """Play greedy episodes and render every step, as a `FrameRecorder` does.
+    """Play greedy episodes and render every step, as a `FrameRecorder` with ``motion`` does.
 
     Args:
         resolved: the environment.
@@ -110,7 +110,7 @@ def record_episodes(
         Images [H, W, 3] uint8 in the order of time.
     """
     env = make(resolved, seed=seed)
-    recorder = FrameRecorder(env)
+    recorder = FrameRecorder(env, motion=True)
     act = env.rand_action if policy is None else policy
     try:
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():

@@ -22,8 +22,6 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation, record_episodes
 from ba_torchrl.training.resume import Progress
 
-VIDEO_FPS = 5
-
 
 @dataclass(frozen=True)
 class Result:
@@ -64,7 +62,7 @@ def record_video(config: ExperimentConfig, policy: Policy) -> Path | None:
         return None
     seed = config.derived_seed(SeedUse.REPORT)
     frames = record_episodes(config.resolved_env, policy, config.video_episodes, seed)
-    return write_video(config.folder / "evaluation.mp4", frames, fps=VIDEO_FPS)
+    return write_video(config.folder / "evaluation.mp4", frames, fps=config.resolved_env.video_fps)
 
 
 def write_record(

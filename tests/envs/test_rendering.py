@@ -1,5 +1,6 @@
 """`ManipulationEnv.render`: the workspace fills the image and shows the arm and the held object."""
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -9,11 +10,12 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.rendering import scene_viewpoint
+from ba_torchrl.envs import base, keys
+from ba_torchrl.envs.rendering import ARM_VIEW, scene_viewpoint
+from ba_torchrl.record.video import FrameRecorder
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.shapes import Box
-from ba_torchrl.sim.vision.rgb import FOV_DEG, render_rgb
+from ba_torchrl.sim.vision.rgb import FOV_DEG, _render, render_rgb
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.workspace import Workspace
 
@@ -149,27 +151,164 @@ def test_images_of_a_grasp_and_a_release_show_the_hand_at_the_object(make):
     assert all(red.sum() > 200 for _, red in seen)
 
 
-@pytest.mark.parametrize("fast_mode", [True, False])
-def test_rendering_changes_no_observation_and_no_pose(make, fast_mode):
+@pytest.mark.parametrize(
+    ("task", "settings"),
+    [
+        ("open_loop/house_building_1", {}),
+        ("open_loop/house_building_1", {"fast_mode": False}),
+        (STACKING, {"robot": "panda", "num_objects": 2}),
+        (STACKING, {"robot": "ur5", "num_objects": 2}),
+        (STACKING, {"robot": "ur5_robotiq", "num_objects": 2}),
+        ("ramp/house_building_2", {}),
+        ("bump/house_building_4", {"max_steps": 2}),
+    ],
+)
+def test_videos_and_images_change_no_step(make, task, settings):
     results = []
-    for render in (False, True):
-        env = make("open_loop/house_building_1", fast_mode=fast_mode)
-        if render:
-            env.on_contact = lambda env=env: env.render(32, 24)
+    for motion in (None, False, True):
+        env = make(task, **settings)
+        recorder = FrameRecorder(env, 32, 24, motion=motion)
+        if motion is None:
+            env.on_contact = None
         state, seen = env.reset(), []
         while not state[keys.DONE]:
-            if render:
-                env.render(32, 24)
+            if motion is not None:
+                recorder.record()
             state = follow_expert(env, state)
-            poses = [body.pose for body in env.scene.world.bodies]
-            seen.append((state[keys.PIXELS], state[keys.IN_HAND], poses))
+            entries = {key: value.clone() for key, value in state.items()}
+            world = env.scene.world
+            physics = [
+                (
+                    pybullet.getBasePositionAndOrientation(body, physicsClientId=world.client),
+                    pybullet.getBaseVelocity(body, physicsClientId=world.client),
+                    pybullet.getJointStates(
+                        body,
+                        range(pybullet.getNumJoints(body, physicsClientId=world.client)),
+                        physicsClientId=world.client,
+                    ),
+                )
+                for body in range(pybullet.getNumBodies(physicsClientId=world.client))
+            ]
+            seen.append((entries, physics))
         results.append(seen)
-    plain, rendered = results
-    assert len(plain) == len(rendered)
-    for (a, b, poses), (c, d, others) in zip(plain, rendered, strict=True):
-        assert torch.equal(a, c)
-        assert torch.equal(b, d)
-        assert poses == others
+    assert len(results[0]) >= 2
+    for seen in results[1:]:
+        for (entries, physics), (others, other_physics) in zip(results[0], seen, strict=True):
+            assert entries.keys() == others.keys()
+            assert all(torch.equal(value, others[key]) for key, value in entries.items())
+            assert physics == other_physics
+
+
+class Motion:
+    """Poses of the arm in the frames of a video of an expert's episode, which are not drawn."""
+
+    def __init__(self, monkeypatch, env):
+        self.tools, self.held, self.links, self.viewpoints = [], [], [], []
+        self.env = env
+        monkeypatch.setattr(base, "render_rgb", self._draw)
+        self.recorder = FrameRecorder(env, 40, 40, motion=True)
+        state = env.reset()
+        self.recorder.record()
+        while not state[keys.DONE]:
+            state = follow_expert(env, state)
+            self.recorder.record()
+        self.contacts = self.recorder.contacts
+
+    def _draw(self, world, viewpoint, width, height, **_):
+        display = self.env._display
+        is_display = world is display._scene.world
+        scene = display._scene if is_display else self.env.scene
+        tool = scene.robot.tool_frame()
+        self.tools.append(tool.position)
+        held = display._held[0] if is_display and display._held is not None else None
+        self.held.append(None if held is None else math.dist(held.position, tool.position))
+        view = np.reshape(viewpoint.view_matrix(), (4, 4)).T
+        projection = pybullet.computeProjectionMatrixFOV(FOV_DEG, width / height, 0.05, 10)
+        links = np.pad(scene.robot.link_positions(), ((0, 0), (0, 1)), constant_values=1.0)
+        image = links @ (np.reshape(projection, (4, 4)).T @ view).T
+        self.links.append(image[:, :2] / image[:, 3:])
+        self.viewpoints.append(np.hstack(viewpoint))
+        return np.zeros((height, width, 3), np.uint8)
+
+
+FILMED = ["open_loop/house_building_3", "ramp/house_building_2", "bump/house_building_4"]
+
+
+@pytest.mark.parametrize("robot", ["kuka", "panda", "ur5", "ur5_robotiq"])
+@pytest.mark.parametrize("task", FILMED)
+def test_the_arm_of_a_video_moves_between_poses_and_is_in_every_frame(
+    make, monkeypatch, task, robot
+):
+    motion = Motion(monkeypatch, make(task, robot=robot))
+    steps = [math.dist(*pair) for pair in itertools.pairwise(motion.tools)]
+    assert max(steps) < 0.14  # also where one joint moves further than the tool
+    assert len(motion.contacts) >= 2
+    for contact, after in itertools.pairwise([*motion.contacts, len(steps)]):
+        between = steps[contact:after]
+        assert len(between) > 2
+        assert sum(between) > 0.1
+    held = [distance for distance in motion.held if distance is not None]
+    assert len(held) > 8
+    assert max(held) < 0.05
+    assert np.abs(motion.links).max() < 0.9  # the sides of the image are at 1
+    assert np.ptp(motion.viewpoints, axis=0).max() < 1e-6
+
+
+@pytest.mark.parametrize("robot", ["kuka", "panda", "ur5", "ur5_robotiq"])
+@pytest.mark.parametrize("size_m", [0.3, 0.4])
+def test_the_whole_arm_is_in_the_image_at_every_corner_of_the_workspace(make, robot, size_m):
+    half = size_m / 2
+    env = make(robot=robot, workspace=((0.45 - half, 0.45 + half), (-half, half), (0.0, 0.4)))
+    env.reset()
+    (image,) = env.video_images(120, 120)
+    assert image.shape == (120, 120, 3)
+    display = env._display
+    seen = []
+    for x, y, z in itertools.product(env.workspace.x, env.workspace.y, (0.01, 0.15, 0.25)):
+        joints = display._scene.robot.inverse_kinematics((x, y, z), downward(0.0))
+        if joints is None:
+            continue
+        display._move(joints)
+        viewpoint = scene_viewpoint(
+            display._scene.world, env.scene.task.terrain, display.extent_m(), 1.0, ARM_VIEW
+        )
+        view = viewpoint.view_matrix()
+        projection = pybullet.computeProjectionMatrixFOV(FOV_DEG, 1.0, 0.05, 10)
+        _, _, owner = _render(display._scene.world, 120, 120, view, projection)
+        is_arm = owner == display._scene.robot.id
+        seen.append(is_arm.sum())
+        assert not is_arm[[0, -1]].any()
+        assert not is_arm[:, [0, -1]].any()
+    assert len(seen) >= 8
+    assert min(seen) > 400
+
+
+def test_frames_of_a_video_differ_and_say_that_motion_is_interpolated(make):
+    env = make(num_objects=2)
+    recorder = FrameRecorder(env, 200, 200, motion=True)
+    state = env.reset()
+    recorder.record()
+    while not state[keys.DONE]:
+        state = follow_expert(env, state)
+        recorder.record()
+    frames = np.stack(recorder.frames).astype(int)
+    assert np.abs(np.diff(frames, axis=0)).reshape(len(frames) - 1, -1).max(1).min() > 50
+    (last,) = env.video_images(200, 200)
+    differs = (frames[-1] != last).any(-1)
+    assert differs[180:].sum() > 100
+    assert not differs[:180].any()
+    assert "interpolated" in env.video_caption
+
+
+def test_a_video_in_close_loop_is_its_images(make):
+    env = make("close_loop/block_reaching")
+    recorder = FrameRecorder(env, 80, 80, motion=True)
+    state = env.reset()
+    recorder.record()
+    np.testing.assert_array_equal(recorder.frames, [env.render(80, 80)])
+    follow_expert(env, state)
+    recorder.record()
+    assert len(recorder.frames) == 2
 
 
 def test_objects_of_every_scale_are_drawn_at_their_size(make):

@@ -1,3 +1,5 @@
+import subprocess
+
 import imageio.v3 as imageio
 import numpy as np
 import pytest
@@ -142,3 +144,31 @@ def test_the_gallery_leaves_the_pictures_of_the_repository_alone(monkeypatch, tm
     written = [path.relative_to(tmp_path) for path in tmp_path.rglob("*.png")]
     assert len(written) == 3
     assert {str(path.parent) for path in written} == {"runs/gallery"}
+
+
+def test_files_that_git_tracks_are_overwritten_only_on_request(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    strip = Strip([np.zeros((8, 8, 3), np.uint8)] * 2, np.zeros((8, 8), np.float32))
+    played = []
+    monkeypatch.setattr(
+        "ba_torchrl.record.gallery.expert_strip", lambda *_, **__: played.append(1) or strip
+    )
+    tracked = [tmp_path / name for name in ("close_loop_block_reaching.png", "[tasks].md")]
+    for path in tracked:
+        path.write_text("old")
+    subprocess.run(["git", "init", "-q"], check=True)
+    subprocess.run(["git", "add", "."], check=True)
+    draw = ("gallery", f"tasks=[{TASK}]", "deconstructions=[]", "folder=.", "overview=all.png")
+    page = ("tasks", f"tasks=[{TASK}]", "path='[tasks].md'")
+    for words, path in zip((draw, page), tracked, strict=True):
+        with pytest.raises(SystemExit):
+            recipe(*words)
+        assert f"git tracks {path.name}" in capsys.readouterr().err
+        assert path.read_text() == "old"
+    assert not played
+    for words, path in zip((draw, page), tracked, strict=True):
+        recipe(*words, "overwrite=true")
+        assert path.read_bytes() != b"old"
+    recipe(*draw[:3], "folder=new", "overview=all.png")  # which git does not track
+    recipe(*draw[:3], "folder=new", "overview=all.png")
+    assert len(played) == 3

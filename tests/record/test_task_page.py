@@ -10,7 +10,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "tasks.md"
 
 def test_the_page_is_up_to_date():
     assert PAGE.read_text(encoding="utf-8") == task_page(), (
-        "run `ba-torchrl tasks path=docs/tasks.md`"
+        "run `ba-torchrl tasks path=docs/tasks.md overwrite=true`"
     )
 
 

@@ -253,6 +253,14 @@ class Robot(ABC):
         self._reset_joints(self.arm_joints, *zip(*(state[:2] for state in states), strict=True))
         return is_any_within(points, 0.0)
 
+    def link_positions(self) -> list[Vector]:
+        """Return the origins of the base and of the links, metres."""
+        client = {"physicsClientId": self.client}
+        links = range(pybullet.getNumJoints(self.id, **client))
+        states = pybullet.getLinkStates(self.id, links, computeForwardKinematics=1, **client)
+        base, _ = pybullet.getBasePositionAndOrientation(self.id, **client)
+        return [base, *(state[4] for state in states)]
+
     # -- gripper -----------------------------------------------------------------------------
 
     @property
