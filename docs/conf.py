@@ -85,9 +85,9 @@ def task_page(task: str) -> str:
             f"| trained policy | {card.success_rate:.2f} ({low:.2f} to {high:.2f}) over "
             f"{card.episodes} episodes, {card.label} |",
             f"| check it | `{card.evaluate}` |",
-            f"| watch it | `ba-torchrl play {task} policy=trained path=film.gif` |",
+            f"| watch it | `ba-torchrl play {task} policy=trained video=film.gif` |",
         ]
-    lines += [f"| watch the expert | `ba-torchrl play {task} path=film.gif` |"]
+    lines += [f"| watch the expert | `ba-torchrl play {task} video=film.gif` |"]
     lines += ["", "```python", "import ba_torchrl", "", f'env = ba_torchrl.make("{task}")', "```"]
     return "\n".join(lines) + "\n"
 

@@ -22,7 +22,8 @@ SHORTER = {"agent.learn(10_000)": "agent.learn(120)", "buffer_size=10_000": "buf
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    fences = re.findall(r"^```(.*)\n((?s:.*?))^```", page.read_text(), re.MULTILINE)
+    return [text for info, text in fences if info == language]
 
 
 def scripts() -> list[tuple[str, str, str]]:

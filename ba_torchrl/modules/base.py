@@ -64,7 +64,7 @@ class ActorCriticSpec:
 
 
 class ActorCritic(NamedTuple):
-    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, including none."""
+    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, even none."""
 
     actor: nn.Module
     """(images [..., C, H, W] each, holding [..., 1]) -> (loc [..., A], scale [..., A]) of the
@@ -72,8 +72,8 @@ class ActorCritic(NamedTuple):
     encoder: nn.Module
     """(images, holding) -> features [..., F], shared by the two critics."""
     critic: nn.Module
-    """(features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the specification
-    asks for K critics."""
+    """(features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the
+    specification asks for K critics."""
 
 
 class NetworkConfig(Protocol):
