@@ -27,6 +27,11 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
 )
 
+RISKY = 1e3
+"""Cost of a grasp whose risk is not allowed, more than that of any other."""
+TURN_OFFSET_M = 0.02
+"""Largest horizontal offset, along each axis, of a gripper that turns to a grasp. The image is
+centred on the gripper, so a policy sees the object whose orientation matters in its centre."""
 WALL_PIXELS = 25
 """Width of the border of the planner's height image that shows the walls of the tray."""
 
@@ -46,8 +51,8 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
     lift_height_m: ClassVar[float] = 0.15
     """Least height of the tool at success, metres."""
     travel_weight: ClassVar[float] = 8.0
-    """Weight of the number of actions to a grasp in its cost. A policy that imitates the expert has to
-    predict which object is grasped: it is a near one."""
+    """Weight of the number of actions to a grasp in its cost. A policy that imitates the expert has
+    to predict which object is grasped: it is a near one."""
     risk_allowed: ClassVar[float] = 1.0
     """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
     first."""
@@ -73,12 +78,12 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         # above all objects; the upper parts of the walls are never crossed
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
-        grasp = planner.plan(  # the slip score is an additional cost
+        grasp = planner.plan(  # the slip score is an additional cost; risky grasps come last
             self.pool.active,
             tool,
             limits,
             heights,
-            penalty=lambda grasps: grasps[:, 5],
+            penalty=lambda grasps: grasps[:, 5] + RISKY * (grasps[:, 4] > self.risk_allowed),
             travel_weight=self.travel_weight,
         )
         if grasp is None or grasp.risk > self.risk_allowed:
@@ -90,7 +95,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         return self._grasp(grasp, heights)
 
     def _grasp(self, grasp: TopDownGrasp, heights: np.ndarray) -> GripperCommand:
-        """Move to the object with open fingers, and close them at the end.
+        """Move to the object with open fingers, turn near it, and close them at the end.
 
         The hand descends while it moves and turns, as far as what is below its way permits.
         """
@@ -102,6 +107,8 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
             opening = CLOSED if z - gz <= limits.step_m else OPEN
             return move_toward(robot, grasp.position, grasp.yaw_rad, opening)
+        if offset > TURN_OFFSET_M:
+            grasp = grasp._replace(yaw_rad=yaw)
         ceiling = self.settings.workspace.z[1]
         touching_z, next_z = (
             min(self.planner.height_on_way(tool, grasp, limits, heights, gap_m), ceiling)

@@ -179,7 +179,8 @@ class GraspPlanner:
         if limits.turn_rad:
             actions = max(actions, abs(turn) / limits.turn_rad)
         least = gz
-        for t in np.linspace(0.0, actions, math.ceil(actions * SAMPLES_PER_ACTION) + 1)[1:].tolist():
+        count = math.ceil(actions * SAMPLES_PER_ACTION)
+        for t in np.linspace(0.0, actions, count + 1)[1:].tolist():
             move, rotation = t * limits.step_m, t * limits.turn_rad
             free = _free_height(
                 x + min(max(gx - x, -move), move),
