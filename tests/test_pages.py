@@ -17,6 +17,7 @@ from ba_torchrl.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+DEMONSTRATIONS = "demos/pulling"
 SHORTER = {"agent.learn(10_000)": "agent.learn(120)", "buffer_size=10_000": "buffer_size=200"}
 """Parts of the pages' Python that take minutes, and what runs instead."""
 
@@ -29,7 +30,7 @@ def blocks(page: Path, language: str) -> list[str]:
 def scripts() -> list[tuple[str, str, str]]:
     """Return the name of each script, its source, and the modules that its page shows.
 
-    A block that begins with a docstring is a module, `my_tasks`. One that imports the package
+    A block that begins with a docstring is a module, `my_tasks`. One that imports something
     starts a script; one that does not continues it.
     """
     found = []
@@ -39,7 +40,7 @@ def scripts() -> list[tuple[str, str, str]]:
         for block in python:
             if block.startswith('"""'):
                 continue
-            if "import ba_torchrl" in block or "from ba_torchrl" in block:
+            if re.match(r"(?s).*^(import|from) ", block, re.MULTILINE):
                 found.append([f"{page.name} {len(found)}", "", modules])
             found[-1][1] += block
     return [tuple(script) for script in found]
@@ -69,10 +70,14 @@ def test_python_of_a_page_runs(script, modules, tmp_path):
     (tmp_path / "script.py").write_text(script)
     (tmp_path / "my_tasks.py").write_text(modules)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    run = subprocess.run(
-        [sys.executable, "script.py"], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    assert run.returncode == 0, run.stderr
+    collect = "-m ba_torchrl collect task=close_loop/block_pulling episodes=1 num_envs=1"
+    steps = [["script.py"]]
+    if DEMONSTRATIONS in script:
+        steps.insert(0, f"{collect} parallel=false path={DEMONSTRATIONS}".split())
+    for words in steps:
+        command = [sys.executable, *words]
+        run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
 
 
 @pytest.mark.parametrize(
