@@ -28,7 +28,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
 )
 
 RISKY = 1e3
-"""Cost of a grasp whose risk is not allowed, more than that of any other."""
+"""Cost of a risk, more than that of any way to a grasp."""
 TURN_OFFSET_M = 0.02
 """Largest horizontal offset, along each axis, of a gripper that turns to a grasp. The image is
 centred on the gripper, so a policy sees the object whose orientation matters in its centre."""
@@ -50,9 +50,11 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     lift_height_m: ClassVar[float] = 0.15
     """Least height of the tool at success, metres."""
-    travel_weight: ClassVar[float] = 8.0
+    travel_weight: ClassVar[float] = 3.0
     """Weight of the number of actions to a grasp in its cost. A policy that imitates the expert has
     to predict which object is grasped: it is a near one."""
+    risk_preferred: ClassVar[float] = 0.5
+    """Largest risk score of a grasp that is chosen for being near."""
     risk_allowed: ClassVar[float] = 1.0
     """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
     first."""
@@ -78,12 +80,12 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         # above all objects; the upper parts of the walls are never crossed
         over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
         over_z = min(over_z + 0.02, self.settings.workspace.z[1])
-        grasp = planner.plan(  # the slip score is an additional cost; risky grasps come last
+        grasp = planner.plan(
             self.pool.active,
             tool,
             limits,
             heights,
-            penalty=lambda grasps: grasps[:, 5] + RISKY * (grasps[:, 4] > self.risk_allowed),
+            penalty=self._penalty,
             travel_weight=self.travel_weight,
         )
         if grasp is None or grasp.risk > self.risk_allowed:
@@ -93,6 +95,17 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         if grasp is None or robot.opening() < IS_OPEN:
             return lift(limits.step_m, OPEN)
         return self._grasp(grasp, heights)
+
+    def _penalty(self, grasps: np.ndarray) -> np.ndarray:
+        """Return the additional costs [N] of grasps [N, 6]: slip, and much for a risk.
+
+        If a near grasp could outweigh its risk, the expert would repeat it after each failure. A
+        gripper that cannot turn has few grasps; it pushes objects until one is good.
+        """
+        slip, risk = grasps[:, 5], grasps[:, 4]
+        if not self.action_limits.turn_rad:
+            return slip
+        return slip + RISKY * ((risk > self.risk_preferred) + 1.0 * (risk > self.risk_allowed))
 
     def _grasp(self, grasp: TopDownGrasp, heights: np.ndarray) -> GripperCommand:
         """Move to the object with open fingers, turn near it, and close them at the end.

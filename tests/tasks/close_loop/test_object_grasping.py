@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from ba_torchrl.sim.geometry import downward
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
 from tests.tasks.episodes import check_lift, play
 
@@ -53,6 +54,26 @@ def test_success_requires_a_grasp_and_a_height(make):
     brick.place((0.45, 0.0, FLOOR_Z_M + 0.02))
     env.scene.world.settle()
     check_lift(env, (0.45, 0.0, 0.02), low_m=0.14, high_m=0.16)
+
+
+def test_the_expert_descends_while_it_moves_and_turns_near_the_object_only(make):
+    env = make(num_objects=1, object_set="household")
+    task, limits = env.scene.task, env.scene.task.action_limits
+    brick = next(body for body in task.pool.bodies if body.name == "brick")
+    task.pool.deactivate(task.objects[0])
+    task.pool.activate(brick)
+    brick.place((0.55, 0.1, FLOOR_Z_M + 0.02), 0.6)
+    env.scene.world.settle()
+    task.robot.teleport(task.robot.inverse_kinematics((0.45, 0.0, 0.2), downward(0.0)))
+    far = task.expert_command()
+    assert far.dx_m > 0.05
+    assert far.dz_m < -limits.step_m
+    assert far.dyaw_rad == 0
+    x, y, z = brick.position[0] - 0.01, brick.position[1], 0.2
+    task.robot.teleport(task.robot.inverse_kinematics((x, y, z), downward(0.0)))
+    near = task.expert_command()
+    assert near.dz_m < -limits.step_m
+    assert abs(near.dyaw_rad) > 0.3
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.clutter import grasp_planner
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M, DEEPEST_M, PIXEL_M, GraspPlanner
 from ba_torchrl.tasks.clutter.push_planner import PushPlanner
+from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 WORKSPACE = Workspace((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))
@@ -180,3 +181,25 @@ def test_a_push_without_contact_of_hand_and_wall_is_preferred():
     over_the_wall, beside_it = gaps
     assert over_the_wall < 0
     assert beside_it > 0
+
+
+def test_the_way_to_a_grasp_passes_over_what_is_below_it():
+    """A wall of 0.1 m crosses the way; the tips are 1 cm below the tool."""
+    planner = GraspPlanner([], SimpleNamespace(), WORKSPACE, JAW)
+    heights = planner._empty_image.copy()
+    start, goal = (0.35, 0.0, 0.2), (0.55, 0.0, 0.02)
+    grasp = TopDownGrasp(None, goal, 0.0)
+    free = planner.height_on_way((start, 0.0), grasp, REACH, heights, CLEARANCE_M)
+    assert free == pytest.approx(goal[2])
+    near, far = (int((x - planner.corner[0]) / PIXEL_M) for x in (0.49, 0.51))
+    heights[near:far] = 0.1
+    # the tips, up to 5.5 cm ahead of the tool, reach the wall at x = 0.435, in the second action
+    passing_z = 0.1 + 0.01 + CLEARANCE_M
+    found = planner.height_on_way((start, 0.0), grasp, REACH, heights, CLEARANCE_M)
+    assert passing_z - REACH.step_m <= found <= passing_z
+    low = planner.height_on_way(((*start[:2], 0.02), 0.0), grasp, REACH, heights, 0.0)
+    assert low == pytest.approx(found - CLEARANCE_M)
+    # linear in the first action: above the wall when the tips reach it
+    beside = (0.425, 0.0, 0.06)
+    found = planner.height_on_way((beside, 0.0), grasp, REACH, heights, 0.0)
+    assert found > 0.11
