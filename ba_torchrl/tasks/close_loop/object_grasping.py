@@ -77,9 +77,6 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
             return lift(limits.step_m)
         heights = planner.heights()
         tool = robot.tool_pose()
-        # above all objects; the upper parts of the walls are never crossed
-        over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
-        over_z = min(over_z + 0.02, self.settings.workspace.z[1])
         grasp = planner.plan(
             self.pool.active,
             tool,
@@ -91,7 +88,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         if grasp is None or grasp.risk > self.risk_allowed:
             push = PushPlanner(planner, self.terrain).plan(self.pool.active, tool, limits, heights)
             if push is not None:
-                return self._push(push, over_z)
+                return self._push(push, heights)
         if grasp is None or robot.opening() < IS_OPEN:
             return lift(limits.step_m, OPEN)
         return self._grasp(grasp, heights)
@@ -131,7 +128,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
             return lift(next_z - z, OPEN)
         return move_toward(robot, (gx, gy, next_z), grasp.yaw_rad, OPEN)
 
-    def _push(self, push: Push, over_z: float) -> GripperCommand:
+    def _push(self, push: Push, heights: np.ndarray) -> GripperCommand:
         """Descend beside an object with closed fingers, then push it."""
         robot = self.robot
         (x, y, z), yaw = robot.tool_pose()
@@ -142,6 +139,9 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
             return move_toward(robot, push.end, yaw, CLOSED)
         if is_closed and offset <= ALIGNED_M:
             return move_toward(robot, push.start, yaw, CLOSED)
+        # above all objects; the upper parts of the walls are never crossed
+        over_z = float(heights[WALL_PIXELS:-WALL_PIXELS, WALL_PIXELS:-WALL_PIXELS].max())
+        over_z = min(over_z + 0.02, self.settings.workspace.z[1])
         if z < over_z - 1e-3:
             return lift(over_z - z, closing(robot))
         return move_toward(robot, (sx, sy, over_z), yaw, closing(robot))

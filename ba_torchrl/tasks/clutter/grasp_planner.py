@@ -178,7 +178,7 @@ class GraspPlanner:
         actions = max(abs(gx - x), abs(gy - y)) / limits.step_m
         if limits.turn_rad:
             actions = max(actions, abs(turn) / limits.turn_rad)
-        least = gz
+        least, corner = gz, np.array(self.corner)
         count = math.ceil(actions * SAMPLES_PER_ACTION)
         for t in np.linspace(0.0, actions, count + 1)[1:].tolist():
             move, rotation = t * limits.step_m, t * limits.turn_rad
@@ -187,7 +187,7 @@ class GraspPlanner:
                 y + min(max(gy - y, -move), move),
                 yaw + min(max(turn, -rotation), rotation),
                 heights,
-                np.array(self.corner),
+                corner,
                 self.gripper.half_width_m,
                 self._jaws,
             )
