@@ -26,3 +26,25 @@ else:
 def test_planar_groups_work_and_rotations_in_space_name_what_they_need():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+BESIDE_SCIKIT_LEARN = """
+import sys
+from types import ModuleType
+import numpy as np
+from ba_torchrl.modules.steerable.planar_escnn import import_escnn
+assert "escnn" not in sys.modules
+def refuse(*_, **__):
+    raise TypeError("np.matrix is not supported")
+for name in ("sklearn", "sklearn.utils", "sklearn.utils.extmath"):
+    sys.modules[name] = ModuleType(name)
+sys.modules["sklearn.utils.extmath"].randomized_svd = refuse
+kernel = import_escnn("escnn.group._numerical").null(np.matrix([[2.0, 0.0], [0.0, 0.0]]), False)
+assert np.allclose(np.abs(kernel), [[0.0], [1.0]]), kernel
+"""
+
+
+def test_kernels_are_found_beside_scikit_learn():
+    command = [sys.executable, "-c", BESIDE_SCIKIT_LEARN]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

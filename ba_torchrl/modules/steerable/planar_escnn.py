@@ -33,13 +33,17 @@ def import_escnn(name: str = "escnn") -> ModuleType:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*py3nj")
             importlib.import_module("escnn")
-            return importlib.import_module(name)
+            module = importlib.import_module(name)
     except ImportError as error:
         other = (error.name or "").split(".")[0]  # a package that escnn imports
         fix = ESCNN_FIX
         if other not in ("", "escnn"):
             fix = f"equivariant networks need {other}: {install_command(other)}"
         raise MissingPackageError(fix) from error
+    # scikit-learn's singular value decomposition refuses the matrices that escnn gives it; where
+    # scikit-learn is not installed, escnn takes SciPy's.
+    importlib.import_module("escnn.group._numerical").randomized_svd = None
+    return module
 
 
 def _replace_lie_learn() -> None:
