@@ -13,10 +13,10 @@ from typing import Any
 from pydantic import BaseModel
 from sphinx.application import Sphinx
 
-from ba_torchrl import __version__, list_tasks
+from ba_torchrl import __version__, list_robots, list_tasks
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.config import EnvConfig
-from ba_torchrl.envs.description import describe, summary
+from ba_torchrl.envs.description import describe, expert_scores, summary
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.training.config import ExperimentConfig
@@ -58,12 +58,17 @@ def write_pages() -> None:
     for task in list_tasks():
         page = GENERATED / "tasks" / f"{_slug(task)}.md"
         page.write_text(task_page(task), encoding="utf-8")
-    lines = ["# Tasks", ""]
+    scores, robots = expert_scores(), list_robots()
+    lines = ["# Tasks", "", "Below the names of robots: success rate of the task's expert.", ""]
     for heading, tasks in groups.items():
-        lines += [f"## {heading}", "", "| | task | goal |", "|---|---|---|"]
+        columns = ["", "task", "goal", *robots]
+        lines += [f"## {heading}", "", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
         for task in tasks:
-            picture = f"![](../gallery/{_slug(task)}.png)"
-            lines.append(f"| {picture} | [`{task}`](tasks/{_slug(task)}.md) | {summary(task)} |")
+            found = (scores[task].get(robot) for robot in robots)
+            rates = ("–" if score is None else f"{score.success_rate:.3f}" for score in found)
+            page, picture = f"tasks/{_slug(task)}.md", f"![](../gallery/{_slug(task)}.png)"
+            cells = [picture, f"[`{task}`]({page})", summary(task), *rates]
+            lines.append(f"| {' | '.join(cells)} |")
         pages = (f"tasks/{_slug(task)}" for task in tasks)
         lines += ["", "```{toctree}", ":hidden:", *pages, "```", ""]
     (GENERATED / "tasks.md").write_text("\n".join(lines), encoding="utf-8")

@@ -22,19 +22,14 @@ from ba_torchrl.record.results import (
     run_folders,
     wilson_interval,
 )
-from ba_torchrl.record.summary import Group, Run, Section, load_sections
+from ba_torchrl.record.summary import OTHER_RUNS, Group, Run, Section, load_sections
+from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.training.policy import read_card, shipped_file
 from docs.sources import ROOT
 
 PAGE = ROOT / "docs" / "results.md"
 FOLDER = ROOT / "docs" / "results"
 BEGIN, END = "<!-- results: begin -->\n", "<!-- results: end -->\n"
-HEADINGS = {
-    "cpu_close_loop": "Close loop",
-    "cpu_open_loop": "Open loop",
-    "cpu_six_dof": "Six degrees of freedom",
-}
-"""Benchmarks on the page, in this order."""
 HEADER = (
     "task",
     "",
@@ -68,9 +63,8 @@ def copy(roots: list[str]) -> int:
 
 
 def sections() -> list[Section]:
-    """Return the runs of each benchmark in docs/results, in the order of the page."""
-    found = {section.title: section for section in load_sections([FOLDER])[0]}
-    return [found[name] for name in HEADINGS if name in found]
+    """Return the runs of each benchmark in docs/results, in the order of their names."""
+    return [each for each in load_sections([FOLDER])[0] if each.title != OTHER_RUNS]
 
 
 def page_with_results(text: str) -> str:
@@ -85,7 +79,7 @@ def _section(section: Section) -> Iterator[str]:
     runs = [run.result for group in section.groups for run in group.runs]
     machines = sorted({f"{run.hardware['cpu']}, {run.hardware['threads']} thread" for run in runs})
     days = sorted({run.finished[:10] for run in runs})
-    yield f"## {HEADINGS[name]}\n"
+    yield f"## {', '.join(tasks_by_heading(section.tasks))} (`{name}`)\n"
     yield f"`ba-torchrl benchmark benchmark={name} threads=1 jobs=2`; {'; '.join(machines)};"
     yield f"{days[0]} to {days[-1]}.\n"
     yield f"![Success over updates](results/{name}.svg)\n"
@@ -101,7 +95,7 @@ def _section(section: Section) -> Iterator[str]:
 def _cells(group: Group, run: Run, *, is_first: bool) -> list[str]:
     """Return the row of a run; the first one of a task has its picture."""
     result, task = run.result, group.task
-    final, score = result.final, describe(task).expert
+    final, score = result.final, describe(task).experts.get(result.config["env"]["robot"])
     low, high = wilson_interval(round(final.success_rate * final.episodes), final.episodes)
     success = f"{final.success_rate:.2f} ({low:.2f} to {high:.2f})"
     return [

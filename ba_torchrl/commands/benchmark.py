@@ -19,14 +19,13 @@ from typing import Any
 
 from pydantic import Field
 
-from ba_torchrl import config as configuration
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig, choose
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
-from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, status
+from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, split, status
 
 
 class Settings(BenchmarkConfig):
@@ -54,12 +53,10 @@ def parse(values: dict[str, Any], arguments: Arguments) -> Task:
         values: of all settings: those of `Settings`, and fields of `ExperimentConfig`.
         arguments: the command line.
     """
-    values = dict(values)
-    grid = {name: values.pop(name) for name in Settings.model_fields if name in values}
-    settings = configuration.parse(Settings, grid, "benchmark")
+    settings, common = split(values, Settings)
     if not settings.dry_run:
         check_writable_folder(settings.folder)
-    runs = plan(settings, values, hydra_schema.preset)
+    runs = plan(settings, common, hydra_schema.preset)
     if settings.only is not None and settings.only >= len(runs):
         raise ConfigError(f"only: must be a number from 0 to {len(runs) - 1}, got {settings.only}")
     return Task(settings, runs, arguments.overrides)

@@ -13,9 +13,9 @@ from typing import Any
 from hydra import compose
 from omegaconf import OmegaConf
 
-from ba_torchrl import config as configuration
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, OutputFolder, check_writable_folder
+from ba_torchrl.commands import benchmark as benchmark_command
 from ba_torchrl.config import StrictModel
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.report import write_report
@@ -23,7 +23,7 @@ from ba_torchrl.record.results import NON_LEARNING_FIELDS, RunResult, difference
 from ba_torchrl.record.summary import Axis
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.grid.plan import BenchmarkConfig, expand
+from ba_torchrl.training.grid.plan import expand, split
 
 
 class Settings(StrictModel):
@@ -68,10 +68,8 @@ def _planned(benchmark: str) -> dict[tuple[str, str], ExperimentConfig]:
     """Return the runs of one of the package's benchmarks by task and label."""
     overrides = [f"benchmark={benchmark}", f"name={benchmark}", "seeds=[0]"]
     values = OmegaConf.to_container(compose("benchmark", overrides), resolve=True)
-    grid = {name: values.pop(name) for name in BenchmarkConfig.model_fields}
-    common = {name: values[name] for name in values if name in ExperimentConfig.model_fields}
-    config = configuration.parse(BenchmarkConfig, grid, "benchmark")
-    return {(run.task, run.label): run for run in expand(config, common, hydra_schema.preset)}
+    grid, common = split(values, benchmark_command.Settings)
+    return {(run.task, run.label): run for run in expand(grid, common, hydra_schema.preset)}
 
 
 COMMAND = Command(main, Settings, positional="runs")

@@ -13,24 +13,21 @@ from ba_torchrl.envs.factory import make
 from ba_torchrl.tasks.base import TASKS
 
 EXPERT_SCORES = "expert_scores.json"
-"""File of `ba_torchrl.tasks`: the first column of the tables of ``ba-torchrl experts``."""
+"""File of `ba_torchrl.tasks`: by task and robot, what ``ba-torchrl experts`` measured."""
 
 
 @dataclass(frozen=True)
 class ExpertScore:
-    """Score of a task's expert over random episodes."""
+    """Score of a task's expert with a robot over random episodes."""
 
-    robot: str
     episodes: int
     success_rate: float
-    mean_length: float
-    """Steps of the successful episodes."""
+    mean_length: float | None = None
+    """Steps of the successful episodes; None where they were not noted."""
 
     def __str__(self) -> str:
-        return (
-            f"{self.success_rate:.3f} in {self.mean_length:.1f} steps "
-            f"({self.robot}, {self.episodes} episodes)"
-        )
+        steps = "" if self.mean_length is None else f" in {self.mean_length:.1f} steps"
+        return f"{self.success_rate:.3f}{steps} ({self.episodes} episodes)"
 
 
 @dataclass(frozen=True)
@@ -61,8 +58,8 @@ class TaskDescription:
     """Allowed scales."""
     parameters: dict[str, tuple[Any, str]]
     """Default and meaning of each parameter that only this task has, by name."""
-    expert: ExpertScore | None
-    """Score of the expert, if it was measured."""
+    experts: dict[str, ExpertScore]
+    """Score of the expert by robot, as far as it was measured."""
 
     def rows(self) -> dict[str, str]:
         """Return everything except id and text, as text by heading."""
@@ -85,8 +82,9 @@ class TaskDescription:
             rows["num_objects"] = f"{self.num_objects} ({allowed})"
         for name, (default, meaning) in self.parameters.items():
             rows[name] = f"{default!r}" + (f". {meaning}" if meaning else "")
-        if self.expert is not None:
-            rows["expert"] = str(self.expert)
+        if self.experts:
+            scores = (f"{robot} {score}" for robot, score in self.experts.items())
+            rows["expert"] = ", ".join(scores)
         return rows
 
     def __str__(self) -> str:
@@ -132,7 +130,7 @@ def describe(task: str) -> TaskDescription:
             name: (field.default, " ".join((field.description or "").split()))
             for name, field in cls.Parameters.model_fields.items()
         },
-        expert=_expert_scores().get(task),
+        experts=expert_scores().get(task, {}),
     )
 
 
@@ -144,7 +142,10 @@ def summary(task: str) -> str:
 
 
 @cache
-def _expert_scores() -> dict[str, ExpertScore]:
-    """Return the measured scores of the package's experts by task."""
+def expert_scores() -> dict[str, dict[str, ExpertScore]]:
+    """Return the measured scores of the package's experts by task and robot."""
     text = files("ba_torchrl.tasks").joinpath(EXPERT_SCORES).read_text(encoding="utf-8")
-    return {task: ExpertScore(**values) for task, values in json.loads(text).items()}
+    return {
+        task: {robot: ExpertScore(**values) for robot, values in robots.items()}
+        for task, robots in json.loads(text).items()
+    }

@@ -91,7 +91,7 @@ class RunResult(StrictModel):
     """The benchmark that the run belongs to."""
     seed: int
     curve: list[CurvePoint]
-    """Evaluations in the order of updates."""
+    """Evaluations in the order of updates, the first of the untrained policy."""
     final: FinalEvaluation
     config: dict[str, Any]
     """The run's configuration, defaults included."""

@@ -76,15 +76,18 @@ class Group:
     def curves(self) -> list[list[CurvePoint]]:
         """Curves of all seeds, of the same length.
 
-        The last point of a run that ended at `stop_at_success` stands for all later ones.
+        The last point of a run that ended at `stop_at_success` stands for all later ones. The
+        untrained policy is left out if a run lacks its evaluation.
         """
         curves = [run.result.curve for run in self.runs]
+        if any(curve and curve[0].updates for curve in curves):
+            curves = [[point for point in curve if point.updates] for curve in curves]
         length = max(map(len, curves))
         return [curve + curve[-1:] * (length - len(curve)) for curve in curves]
 
     def axis(self, name: Axis) -> np.ndarray:
         """Return updates or environment steps at the points of the longest run's curve, [n]."""
-        longest = max((run.result.curve for run in self.runs), key=len)
+        longest = max(self.curves, key=lambda curve: curve[-1].updates if curve else 0)
         return np.array([getattr(point, name) for point in longest])
 
     @cached_property
@@ -287,7 +290,7 @@ def _row(title: str, group: Group) -> dict[str, Any]:
     """Return the row of a task and a method."""
     results = [run.result for run in group.runs]
     updates, steps = group.reaches(GOOD_RATE)
-    curves = [point.success_rate for curve in group.curves for point in curve]
+    curves = [point.success_rate for curve in group.curves for point in curve if point.updates]
     return {
         "benchmark": title,
         "task": group.task,

@@ -114,8 +114,8 @@ class ExperimentConfig(WorkerOptions):
     min_replay: int = Field(default=100, ge=1)
     """Transitions in the replay before the first update; reference implementation."""
     eval_every: int = Field(default=500, ge=1)
-    """Updates between evaluations of the greedy policy; a checkpoint follows each, and the best and
-    the latest ones are kept."""
+    """Updates between evaluations of the greedy policy, the first of which is of the untrained one;
+    a checkpoint follows each later one, and the best and the latest ones are kept."""
     eval_episodes: int = Field(default=100, ge=1)
     """Episodes of each of these evaluations; reference implementation."""
     stop_at_success: float | None = Field(default=None, gt=0, le=1)
@@ -227,7 +227,10 @@ class ExperimentConfig(WorkerOptions):
         control = config.resolved_env.task_class.control
         config.algorithm_config.check(config.network_config, control)
         if config.pretrain_updates > config.total_updates:
-            raise ConfigError("pretrain_updates is part of total_updates and cannot exceed it")
+            raise ConfigError(
+                f"pretrain_updates ({config.pretrain_updates}) is part of total_updates "
+                f"({config.total_updates}) and cannot exceed it"
+            )
         if config.pretrain_updates and not config.demonstrations:
             raise ConfigError("pretrain_updates needs demonstrations")
         if not config.algorithm_config.collects and not config.demonstrations:

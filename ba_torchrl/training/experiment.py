@@ -90,6 +90,7 @@ class Experiment:
             try:
                 if not (self.config.resume and self._resume()):
                     self._demonstrate()
+                self._evaluate_if_due()  # untrained, or the run was stopped during an evaluation
                 self._learn()
                 return self._finish()
             except Interruption:
@@ -128,10 +129,9 @@ class Experiment:
         self._started -= progress.seconds
         self._bar.update(updates)
         last = progress.curve[-1] if progress.curve else None
-        if last and last.updates == updates and not self.checkpoints.has(updates):
+        if last and 0 < last.updates == updates and not self.checkpoints.has(updates):
             self.checkpoints.save(updates, last.success_rate)  # interrupted between the two
         logger.info("the run in %s continues after update %d", self.config.folder, updates)
-        self._evaluate_if_due()  # the run was stopped during an evaluation
         return True
 
     def _demonstrate(self) -> None:
@@ -195,7 +195,8 @@ class Experiment:
         """Whether all updates are taken, or the last evaluations reach `stop_at_success`."""
         if self.algorithm.updates == self.config.total_updates:
             return True
-        target, last = self.config.stop_at_success, self._progress.curve[-2:]
+        target = self.config.stop_at_success
+        last = [point for point in self._progress.curve[-2:] if point.updates]
         if target is None or len(last) < 2:
             return False
         return all(point.success_rate >= target for point in last)
@@ -299,9 +300,9 @@ class Experiment:
         )
 
     def _evaluate_if_due(self) -> None:
-        """Evaluate at every multiple of ``eval_every``, except at the end of the run."""
+        """Evaluate at 0 and every multiple of ``eval_every``, except at the end of the run."""
         updates, curve = self.algorithm.updates, self._progress.curve
-        is_new = updates > (curve[-1].updates if curve else 0)
+        is_new = not curve or updates > curve[-1].updates
         if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
             start = time.perf_counter()
             self._evaluate_and_save()
@@ -310,9 +311,9 @@ class Experiment:
             self._log_end(seconds)
 
     def _log_end(self, seconds_per_evaluation: float) -> None:
-        """Log the expected duration of the rest of the run after its first two evaluations."""
+        """Log the expected duration of the rest of the run after two evaluations in training."""
         config, updates = self.config, self.algorithm.updates
-        if self._seconds_per_update is None or len(self._progress.curve) > 2:
+        if self._seconds_per_update is None or len(self._progress.curve) > 3:
             return
         remaining = config.total_updates - updates
         last = config.final_eval_episodes / config.eval_episodes
@@ -348,10 +349,14 @@ class Experiment:
         return True
 
     def _evaluate_and_save(self) -> None:
-        """Add a point to the learning curve; save the state and a checkpoint with its rate."""
+        """Add a point to the learning curve; save the state and, of a trained policy, a checkpoint.
+
+        The untrained policy has the episodes of the first trained one.
+        """
         updates, progress = self.algorithm.updates, self._progress
         # A run must not end because the same episodes succeed twice.
-        part = 0 if self.config.stop_at_success is None else len(progress.curve)
+        trained = [point for point in progress.curve if point.updates]
+        part = 0 if self.config.stop_at_success is None else len(trained)
         evaluation = self._evaluate(self.config.eval_episodes, SeedUse.EVALUATION, part)
         progress.curve.append(
             CurvePoint(
@@ -364,7 +369,8 @@ class Experiment:
         self.log.write(updates, evaluation.scalars("eval"))
         self._bar.set_postfix(success=f"{evaluation.success_rate:.2f}")
         self._save()
-        self.checkpoints.save(updates, evaluation.success_rate)
+        if updates:
+            self.checkpoints.save(updates, evaluation.success_rate)
 
     def _evaluate(self, episodes: int, use: SeedUse, part: int = 0) -> Evaluation:
         seed = self.config.derived_seed(use, part)

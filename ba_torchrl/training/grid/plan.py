@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import torch
 from pydantic import Field
 
 from ba_torchrl.algorithms.base import Problem
-from ba_torchrl.config import StrictModel
+from ba_torchrl.config import StrictModel, parse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.record.results import (
@@ -90,6 +90,24 @@ class BenchmarkConfig(StrictModel):
             )
             for rule in (entry.items() for entry in self.skip)
         )
+
+
+Grid = TypeVar("Grid", bound=BenchmarkConfig)
+
+
+def split(values: Mapping[str, Any], model: type[Grid]) -> tuple[Grid, dict[str, Any]]:
+    """Return the grid that composed settings describe, and the fields that its runs share.
+
+    Args:
+        values: fields of ``model`` and of `ExperimentConfig`.
+        model: of the grid.
+
+    Raises:
+        ConfigError: a field of the grid has a wrong type or is out of range.
+    """
+    own = {name: value for name, value in values.items() if name in model.model_fields}
+    common = {name: value for name, value in values.items() if name not in own}
+    return parse(model, own, "benchmark"), common
 
 
 @dataclass(frozen=True)
