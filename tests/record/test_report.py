@@ -41,7 +41,9 @@ def rliable():
     return pytest.importorskip("rliable")
 
 
-def write_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equi", **changes):
+def write_run(
+    folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equi", updates=UPDATES, **changes
+):
     """Write the files of a finished run; ``rates`` are the success rates of the curve."""
     folder.mkdir(parents=True)
     config = {"task": task, "seed": seed, "env": {"obs_size": 64}, "run_dir": str(folder)}
@@ -61,7 +63,7 @@ def write_run(folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equ
                 "standard_error": 0.1,
                 "mean_length": 7.0,
             }
-            for updates, rate in zip(UPDATES, rates, strict=False)
+            for updates, rate in zip(updates, rates, strict=False)
         ],
         "final": {
             "policy": "last",
@@ -88,6 +90,23 @@ def test_versions_name_the_commit_in_a_clone():
     if found.returncode or not (ROOT / ".git").exists():
         pytest.skip("this is no clone")
     assert found.stdout.startswith(versions()["commit"].rstrip("+"))
+
+
+def test_curves_begin_with_the_untrained_policy_if_all_runs_have_its_evaluation(tmp_path):
+    write_run(tmp_path / "new" / "seed0", (0.2, 0.5, 0.9), updates=(0, 100, 200))
+    (section,), _ = load_sections([tmp_path])
+    assert section.groups[0].axis("updates").tolist() == [0, 100, 200]
+    assert summarize(section)[0]["curve_mean"] == pytest.approx(0.7)  # of trained policies
+    write_report([tmp_path], tmp_path / "report")
+    assert "Curves start" not in (tmp_path / "report" / "table.md").read_text()
+    write_run(tmp_path / "old" / "seed1", (0.5, 0.9, 0.9), seed=1, updates=(100, 200, 300))
+    (section,), _ = load_sections([tmp_path])
+    (group,) = section.groups
+    assert group.axis("updates").tolist() == [100, 200, 300]
+    assert group.estimate.value.tolist() == [0.5, 0.9, 0.9, 0.9]
+    write_report([tmp_path], tmp_path / "report")
+    text = (tmp_path / "report" / "table.md").read_text()
+    assert "Curves start at the first evaluation, after 100 updates." in text
 
 
 @pytest.mark.usefixtures("rliable")

@@ -65,7 +65,7 @@ def test_a_run_writes_its_files(tmp_path):
     assert result.video.stat().st_size > 1000
     assert json.loads((folder / "config.json").read_text())["task"] == TINY["task"]
     scalars = read_scalars(folder)
-    assert scalars["eval/success_rate"].steps.tolist() == [3, 6]
+    assert scalars["eval/success_rate"].steps.tolist() == [0, 3, 6]
     assert scalars["final/success_rate"].steps.tolist() == [6]
     assert result.updates == 6
     assert scalars["train/loss_qvalue"].steps.tolist() == [1, 2, 3, 4, 5, 6]
@@ -150,7 +150,7 @@ def test_the_best_checkpoint_is_kept(tmp_path):
 
 def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
     experiment = Experiment(tiny(tmp_path, report="best", video_episodes=0), progress=False)
-    rates = iter([0.9, 0.4, 0.7])
+    rates = iter([1.0, 0.9, 0.4, 0.7])  # the first is of the untrained policy
     seeds = []
 
     def fake(env, policy, episodes, seed, on_episode):
@@ -164,9 +164,9 @@ def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
     assert result.updates == 3
     assert result.evaluation.success_rate == 0.7
     assert result.checkpoint.name.endswith("3")
-    assert torch.equal(weights[2], weights[0])
-    assert not torch.equal(weights[1], weights[0])
-    assert seeds[0] == seeds[1] != seeds[2]
+    assert torch.equal(weights[3], weights[1])
+    assert not torch.equal(weights[2], weights[1])
+    assert seeds[0] == seeds[1] == seeds[2] != seeds[3]
 
 
 def test_a_folder_without_a_run_is_an_error(tmp_path):

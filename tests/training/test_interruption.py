@@ -157,13 +157,13 @@ def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undi
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
-@pytest.mark.parametrize("evaluation", [pytest.param(1, marks=SLOW), 2])
+@pytest.mark.parametrize("evaluation", [1, pytest.param(2, marks=SLOW), 3])
 def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evaluation):
     experiment = Experiment(config_for(tmp_path), progress=False)
     at_call(experiment, experiment, "_evaluate", evaluation, terminate)
     with pytest.raises(RunStopped):
         experiment.run()
-    assert resumable_updates(tmp_path) == 8 * evaluation
+    assert resumable_updates(tmp_path) == 8 * (evaluation - 1)
     assert len(experiment._progress.curve) == evaluation - 1
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
@@ -171,13 +171,13 @@ def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evalua
 def test_a_run_stopped_while_its_best_policy_is_evaluated_keeps_the_last_state(tmp_path):
     whole = run(config_for(tmp_path / "whole", report="best"))
     experiment = Experiment(config_for(tmp_path / "run", report="best"), progress=False)
-    at_call(experiment, experiment, "_evaluate", 4, terminate)  # after those at 8, 16 and 21
+    at_call(experiment, experiment, "_evaluate", 5, terminate)  # after those at 0, 8, 16 and 21
     saved = []
     save = experiment._state.save
     experiment._state.save = lambda updates: (saved.append(updates), save(updates))
     with pytest.raises(RunStopped, match="state saved"):
         experiment.run()
-    assert saved == [8, 16, 21]
+    assert saved == [0, 8, 16, 21]
     assert_same(run(config_for(tmp_path / "run", report="best", resume=True)), whole)
 
 

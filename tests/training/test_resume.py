@@ -117,13 +117,13 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path, changes)
     assert result.updates == whole.updates == 9
     assert experiment.algorithm.optimizers.state_dict()["scheduler"]["last_epoch"] == 9
     a, b = (read_result(run.record.parent) for run in (result, whole))
-    assert [point.updates for point in a.curve] == [3, 6, 9]
+    assert [point.updates for point in a.curve] == [0, 3, 6, 9]
     # two updates on demonstrations, then one for each step of both environments
-    assert [point.env_steps for point in a.curve] == [2, 8, 14]
-    assert [point.env_steps for point in b.curve] == [2, 8, 14]
+    assert [point.env_steps for point in a.curve] == [0, 2, 8, 14]
+    assert [point.env_steps for point in b.curve] == [0, 2, 8, 14]
     assert a.resumed_at == [3]
     assert b.resumed_at == []
-    assert a.curve[0].seconds < a.curve[1].seconds < a.curve[2].seconds < a.seconds
+    assert a.curve[1].seconds < a.curve[2].seconds < a.curve[3].seconds < a.seconds
     scalars = read_scalars(config.folder)
     first = 3 if changes else 1
     assert scalars["train/loss_qvalue"].steps.tolist() == list(range(first, 10))
@@ -192,12 +192,13 @@ def test_a_crash_while_saving_keeps_the_last_state(tmp_path):
     with pytest.raises(Interrupted):
         experiment.run()
     # a kill leaves the unfinished state lying about, which an exception does not
-    state = next((config.folder / "resume").iterdir())
+    states = sorted((config.folder / "resume").iterdir())
+    state = states[-1]
     shutil.copytree(state, state.with_name(f".{state.name}.stage-0123"))
     assert resumable_updates(config.folder) == 3
     again = resumed(config)
-    assert [point.updates for point in again._progress.curve] == [3]
-    assert [path.name for path in (config.folder / "resume").iterdir()] == [state.name]
+    assert [point.updates for point in again._progress.curve] == [0, 3]
+    assert sorted((config.folder / "resume").iterdir()) == states
 
 
 def test_a_checkpoint_missing_after_an_interruption_is_written(tmp_path):
@@ -218,12 +219,15 @@ def test_an_interruption_after_the_last_evaluation_repeats_no_update(tmp_path, m
     experiment.algorithm.update = None
     assert experiment.run().updates == 9
     result = read_result(config.folder)
-    assert [point.updates for point in result.curve] == [3, 6, 9]
+    assert [point.updates for point in result.curve] == [0, 3, 6, 9]
     assert result.resumed_at == [9]
 
 
-def test_a_run_interrupted_before_its_first_evaluation_starts_again(tmp_path, caplog):
-    interrupt(config_for(tmp_path), after=2)
+def test_a_run_interrupted_before_its_first_state_starts_again(tmp_path, caplog, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(experiments, "evaluate", raise_interrupted)
+        with pytest.raises(Interrupted):
+            run(config_for(tmp_path))
     result = run(config_for(tmp_path, resume=True))
     assert "has no saved state yet" in caplog.text
     assert result.updates == 9

@@ -10,7 +10,8 @@ from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
 from tests.training.test_experiment import TINY
 
-RATES = [0.9, 0.5, 1.0, 0.9, 1.0, 1.0]
+UNTRAINED = 1.0
+RATES = [UNTRAINED, 0.9, 0.5, 1.0, 0.9, 1.0, 1.0]
 
 
 class Interrupted(BaseException):
@@ -43,15 +44,17 @@ def test_a_run_ends_after_two_successful_evaluations_in_a_row(tmp_path, seeds, c
     assert result.updates == 8
     assert "the run ends at update 8" in caplog.text
     record = read_result(config.folder)
-    assert [point.updates for point in record.curve] == [2, 4, 6, 8]
+    assert [point.updates for point in record.curve] == [0, 2, 4, 6, 8]
     assert record.final.updates == 8
-    assert len(set(seeds)) == len(seeds) == 5
+    assert record.curve[0].success_rate == UNTRAINED
+    assert seeds[0] == seeds[1]
+    assert len(set(seeds[1:])) == len(seeds[1:]) == 5
 
 
 def test_without_a_rate_all_updates_are_taken_and_the_episodes_are_the_same(tmp_path, seeds):
     config = config_for(tmp_path, stop_at_success=None)
     assert Experiment(config, progress=False).run().updates == 12
-    assert seeds == [config.derived_seed(SeedUse.EVALUATION)] * 6 + [
+    assert seeds == [config.derived_seed(SeedUse.EVALUATION)] * 7 + [
         config.derived_seed(SeedUse.REPORT)
     ]
 

@@ -280,7 +280,7 @@ def test_a_killed_run_is_resumed_in_a_new_process(tmp_path):
     assert run_all([run], progress=False) == {}
     result = read_result(run.folder)
     assert result.resumed_at == [updates]
-    assert [point.updates for point in result.curve] == list(range(15, 91, 15))
+    assert [point.updates for point in result.curve] == list(range(0, 91, 15))
     assert not state.exists()
 
 

@@ -180,7 +180,7 @@ def test_ray_repeats_the_run_of_a_failed_node_from_its_last_state(tmp_path):
     assert len(removed) == 1
     assert {status(run).state for run in runs} == {"done"}
     results = [read_result(run.folder) for run in runs]
-    assert [len(result.curve) for result in results] == [12] * 4
+    assert [len(result.curve) for result in results] == [13] * 4
     resumed = [result.resumed_at for result in results if result.resumed_at]
     assert len(resumed) == 1
 
