@@ -77,6 +77,10 @@ def slots() -> list[tuple[float, float]]:
     return [(x, y) for y in (-width / 4, width / 4) for x in (-length / 3, 0.0, length / 3)]
 
 
+ORDERS = ((0, 1, 2, 3, 4, 5), (2, 1, 0, 5, 4, 3), (3, 4, 5, 0, 1, 2), (5, 4, 3, 2, 1, 0))
+"""The slots by rows, from each of the four corners."""
+
+
 @TASKS.register("open_loop/bottle_arrangement")
 class BottleArrangement(PackingTask):
     """Objects: six bottles of eight kinds, 5 cm wide and 13 to 14.4 cm high, and a tray.
@@ -247,12 +251,29 @@ class BottleArrangement(PackingTask):
         )
 
     def _free_site(self, held: Body | None) -> tuple[float, float]:
-        """Return the first free slot, or the site in the tray with the largest gap."""
+        """Return the next free slot, or the site in the tray with the largest gap.
+
+        Rows are filled from the corner farthest from the bottles outside, so that the next slot
+        does not depend on which of the two ends of the symmetric tray is its front.
+        """
         tray = self.container_outline()
         sites = [tray.frame.to_world(x * self.unit, y * self.unit) for x, y in slots()]
-        for site in sites:
-            if self._neighbor_gap_m(site, held) >= NEIGHBOR_GAP_M:
-                return site
+        are_filled = [self._neighbor_gap_m(site, held) < NEIGHBOR_GAP_M for site in sites]
+        if not all(are_filled):
+            outside = [
+                body.position[:2]
+                for body in self.objects
+                if body is not held and not self.stands_in_tray(body)
+            ]
+
+            def preference(order: Sequence[int]) -> tuple[list[bool], float]:
+                filled = [are_filled[slot] for slot in order]
+                first = sites[order[filled.index(False)]]
+                away = min((math.dist(first, point) for point in outside), default=0.0)
+                return filled, away
+
+            order = max(ORDERS, key=preference)
+            return next(sites[slot] for slot in order if not are_filled[slot])
         inside, half = self._inside(), BOTTLE_M * self.unit / 2 + NEIGHBOR_GAP_M
         along, across = inside.half_x - half, inside.half_y - half
         sites += [
