@@ -19,7 +19,7 @@ from ba_torchrl.tasks.manipulation.clearance import half_gap_m, outline_clearanc
 from ba_torchrl.tasks.manipulation.commands import no_op, pick_command
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
 from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
-from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
+from ba_torchrl.tasks.packing.base import FILLING_ORDERS, RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
@@ -75,10 +75,6 @@ def slots() -> list[tuple[float, float]]:
     """Return the positions of the slots in the tray's frame, at the appendix's size."""
     length, width, _ = TRAY_M
     return [(x, y) for y in (-width / 4, width / 4) for x in (-length / 3, 0.0, length / 3)]
-
-
-ORDERS = ((0, 1, 2, 3, 4, 5), (2, 1, 0, 5, 4, 3), (3, 4, 5, 0, 1, 2), (5, 4, 3, 2, 1, 0))
-"""The slots by rows, from each of the four corners."""
 
 
 @TASKS.register("open_loop/bottle_arrangement")
@@ -272,7 +268,7 @@ class BottleArrangement(PackingTask):
                 away = min((math.dist(first, point) for point in outside), default=0.0)
                 return filled, away
 
-            order = max(ORDERS, key=preference)
+            order = max(FILLING_ORDERS, key=preference)
             return next(sites[slot] for slot in order if not are_filled[slot])
         inside, half = self._inside(), BOTTLE_M * self.unit / 2 + NEIGHBOR_GAP_M
         along, across = inside.half_x - half, inside.half_y - half
