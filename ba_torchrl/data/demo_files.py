@@ -81,20 +81,22 @@ def save_demonstrations(
     publish(scratch, path)
 
 
-def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> list[TensorDict]:
-    """Read episodes that were collected from the same task with the same parameters.
+def load_demonstrations(
+    path: str | Path, *, task: str | None = None, env: dict[str, Any] | None = None
+) -> list[TensorDict]:
+    """Read the episodes of a folder of `ba-torchrl collect`, a TensorDict [T] each.
 
     Args:
         path: folder that `save_demonstrations` wrote.
-        task: id of the task.
-        env: fields of `EnvConfig` of the environments.
+        task: id of the task that they must be of; None for any task with any parameters.
+        env: fields of `EnvConfig` that they must have been collected with.
 
     Raises:
         ConfigError: there are none at ``path``, their files are damaged, or task or parameters
             differ; the message names every difference.
     """
     path = Path(path)
-    check_demonstrations(path, task=task, env=env)
+    check_demonstrations(path, task=task, env=env or {})
     state = read_state(path)
     try:
         lengths = state.pop(_LENGTHS).tolist()
@@ -107,13 +109,13 @@ def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> 
 
 
 def check_demonstrations(
-    path: str | Path, *, task: str, env: dict[str, Any], least: int = 1
+    path: str | Path, *, task: str | None, env: dict[str, Any], least: int = 1
 ) -> None:
     """Check that there are demonstrations of the same task and parameters at ``path``.
 
     Args:
         path: folder that `save_demonstrations` wrote.
-        task: id of the task.
+        task: id of the task; None for any task with any parameters.
         env: fields of `EnvConfig` of the environments.
         least: number of episodes that are needed.
 
@@ -134,6 +136,8 @@ def check_demonstrations(
         raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
     if metadata["episodes"] < least:
         raise ConfigError(f"{path} holds {metadata['episodes']} episodes, {least} are needed")
+    if task is None:
+        return
     # A field that is missing in the file was added later and has its default value.
     found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
     wanted = {"task": task, **_env_values(task, env)}

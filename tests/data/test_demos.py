@@ -48,6 +48,7 @@ def test_demonstrations_of_both_sources_can_be_loaded(collected, tmp_path):
     source, episodes = collected
     path = tmp_path / "demos"
     save_demonstrations(path, episodes, task=TASK, env=ENV, seed=0, source=source)
+    assert len(load_demonstrations(path)) == len(episodes)  # of any task
     loaded = load_demonstrations(path, task=TASK, env=ENV)
     for episode, original in zip(loaded, episodes, strict=True):
         for key in original.keys(True, True):
