@@ -1,4 +1,4 @@
-"""The exercises of docs/architecture.md, "How to add", done outside the package and played.
+"""What docs/plugins.md describes, done outside the package and played.
 
 Each file of ``mine/`` is one addition. None of them edits a file of the package. docs/plugins.md
 shows some of them.
