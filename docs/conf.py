@@ -67,7 +67,8 @@ def write_pages() -> None:
             found = (scores[task].get(robot) for robot in robots)
             rates = ("–" if score is None else f"{score.success_rate:.3f}" for score in found)
             page, picture = f"tasks/{_slug(task)}.md", f"![](../gallery/{_slug(task)}.png)"
-            cells = [picture, f"[`{task}`]({page})", summary(task), *rates]
+            goal = summary(task)
+            cells = [picture, f"[`{task}`]({page})", goal[:1].upper() + goal[1:], *rates]
             lines.append(f"| {' | '.join(cells)} |")
         pages = (f"tasks/{_slug(task)}" for task in tasks)
         lines += ["", "```{toctree}", ":hidden:", *pages, "```", ""]
@@ -81,7 +82,7 @@ def task_page(task: str) -> str:
     film = FOLDER / "gallery" / f"{slug}.gif"
     picture = film if film.exists() else film.with_suffix(".png")
     lines = [f"# {task}", "", f"![{task}](../../gallery/{picture.name})", "", found.text, ""]
-    lines += ["| | |", "|---|---|"]
+    lines += ["| | allowed values in brackets |", "|---|---|"]
     lines += [f"| {name} | {_cell(value)} |" for name, value in found.rows().items()]
     if task in shipped_policies():
         card = read_card(shipped_file(task))

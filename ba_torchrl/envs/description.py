@@ -62,7 +62,7 @@ class TaskDescription:
     """Score of the expert by robot, as far as it was measured."""
 
     def rows(self) -> dict[str, str]:
-        """Return everything except id and text, as text by heading."""
+        """Return everything except id and text, as text by heading; in brackets what is allowed."""
         rows = {
             "success": ", ".join(self.conditions),
             "randomised": "; ".join(self.randomised),
@@ -73,12 +73,13 @@ class TaskDescription:
                 f"{name} {low:g} to {high:g}" for name, (low, high) in self.actions.items()
             ),
             "max_steps": f"{self.max_steps}",
-            "scale": "{:g} to {:g} (limits {:g} to {:g})".format(
-                *self.object_scale_range, *self.object_scale_limits
-            ),
+            "scale": f"{_span(self.object_scale_range)} ({_span(self.object_scale_limits)})",
         }
         if len(self.numbers_of_objects) > 1:
-            allowed = ", ".join(map(str, self.numbers_of_objects))
+            least, *others = self.numbers_of_objects
+            is_whole = others[-1] - least == len(others)
+            numbers = ", ".join(map(str, self.numbers_of_objects))
+            allowed = _span((least, others[-1])) if is_whole else numbers
             rows["num_objects"] = f"{self.num_objects} ({allowed})"
         for name, (default, meaning) in self.parameters.items():
             rows[name] = f"{default!r}" + (f". {meaning}" if meaning else "")
@@ -90,6 +91,12 @@ class TaskDescription:
     def __str__(self) -> str:
         rows = (f"  {name + ':':14}{value}" for name, value in self.rows().items())
         return "\n".join([self.task, "", self.text, "", *rows])
+
+
+def _span(limits: tuple[float, float]) -> str:
+    """Return a range as text, a single value if both ends are the same."""
+    low, high = limits
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def describe(task: str) -> TaskDescription:

@@ -21,7 +21,7 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
         "",
         "Written by `ba-torchrl tasks path=...` from the sources. Success is the conjunction of",
         "the conditions in a valid scene at rest. `env.conditions` and Gymnasium's `info` hold",
-        "them after every step.",
+        "them after every step. Allowed values are in brackets.",
     ]
     for heading, ids in tasks_by_heading(tasks).items():
         lines += ["", f"## {heading}"]

@@ -96,7 +96,7 @@ def task_on(task_id: str, level: type[OpenLoopTask], attributes: dict[str, Any])
     size_cm = (f"{100 * size:g}" for size in attributes.get("platform_m", ()))
     description = f"""{name.replace("_", " ").title()} {DESCRIPTIONS[terrain].format(*size_cm)}
     The episode ends early when a piece that must stay upright lies on its side, or a piece leaves
-    the workspace. Appendix C.
+    the workspace. Paper, appendix C.
     """
     own = {"__module__": __name__, "__doc__": description}
     name = f"{terrain.title()}{level.__name__}"

@@ -20,7 +20,7 @@ def test_a_section_has_description_conditions_and_parameters():
     assert "- success: is_grasped, is_lifted" in page
     assert "- object_set: 'random'. Name of the object set" in page
     assert "- max_attempts: None. Episodes with the same heap" in page
-    assert "- num_objects: 5 (1, 2, 3," in page
+    assert "- num_objects: 5 (1 to 15)" in page
     assert "block_picking" not in page
 
 

@@ -19,7 +19,7 @@ class BlockPicking(CloseLoopTask):
     """Objects: a cubic block of 5 cm.
 
     Goal: the block is held and the tool is higher than 15 cm. The episode ends early when the block
-    leaves the workspace. Appendix A.2.
+    leaves the workspace. Paper, appendix A.2.
     """
 
     scale_limits = (0.6, 1.4)

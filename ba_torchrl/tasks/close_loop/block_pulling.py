@@ -30,7 +30,8 @@ PRESS_M = 5e-3
 class BlockPulling(CloseLoopTask):
     """Objects: two blocks of 8 x 8 x 5 cm.
 
-    Goal: the blocks touch. The episode ends early when a block leaves the workspace. Appendix A.2.
+    Goal: the blocks touch. The episode ends early when a block leaves the workspace.
+    Paper, appendix A.2.
     """
 
     scale_limits = (0.6, 1.1)

@@ -21,7 +21,7 @@ class BlockPushing(CloseLoopTask):
     """Objects: a cubic block of 5 cm and a square goal area of 9 cm, a recess of 2 cm in the image.
 
     Goal: the centre of the block is within 5 cm of that of the goal area. The episode ends early
-    when the block leaves the workspace. Appendix A.2.
+    when the block leaves the workspace. Paper, appendix A.2.
     """
 
     scale_limits = (0.5, 1.6)

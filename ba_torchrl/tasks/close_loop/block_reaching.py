@@ -19,7 +19,7 @@ class BlockReaching(CloseLoopTask):
     """Objects: a cubic block of 5 cm.
 
     Goal: the tool point is within 3 cm of the centre of the block. The episode ends early when the
-    block leaves the workspace. Appendix A.2.
+    block leaves the workspace. Paper, appendix A.2.
     """
 
     scale_limits = (0.5, 1.6)

@@ -13,7 +13,7 @@ class BlockStacking(CloseLoopStructureTask):
     """Objects: two to four cubes of 5 cm, two by default.
 
     Goal: the cubes form a stack, released. The episode ends early when a cube leaves the workspace.
-    Appendix A.2.
+    Paper, appendix A.2.
     """
 
     num_objects = 2

@@ -70,7 +70,7 @@ class CornerPicking(CloseLoopTask):
 
     Goal: the block is held and the tool is higher than 15 cm. A finger does not fit between block
     and walls. The base has almost no friction, so that closed fingers that press on the block can
-    drag it out. The episode ends early when the block leaves the workspace. Appendix A.2.
+    drag it out. The episode ends early when the block leaves the workspace. Paper, appendix A.2.
     """
 
     base_m: ClassVar[float] = 0.2

@@ -76,7 +76,8 @@ OVERSHOOT_M = 0.01
 class DrawerOpening(CloseLoopTask):
     """Objects: a cabinet of 22 x 23 x 11 cm with one drawer, at a random pose beside the workspace.
 
-    Goal: the drawer is open by more than 15 cm. Nothing ends the episode early. Appendix A.2.
+    Goal: the drawer is open by more than 15 cm. Nothing ends the episode early.
+    Paper, appendix A.2.
     """
 
     scale_limits = (0.85, 1.4)

@@ -41,7 +41,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
     """Objects: 1 to 15 random objects in a tray, five by default.
 
     Goal: an object is held and the tool is higher than 15 cm. The episode ends early when an object
-    leaves the workspace. Appendix A.2.
+    leaves the workspace. Paper, appendix A.2.
     """
 
     num_objects = 5

@@ -96,7 +96,7 @@ class BinPacking(PackingTask):
     """Objects: one to ten of seven shapes, 4 x 4 x 2 to 8 x 4 x 4 cm, eight by default, and a bin.
 
     Goal: all objects lie in the bin of 17.6 x 14.4 x 8 cm, their centres below its rim, released.
-    The episode ends early when an object leaves the workspace. Appendix A.1.
+    The episode ends early when an object leaves the workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.78, 0.86)

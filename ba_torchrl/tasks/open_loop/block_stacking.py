@@ -19,7 +19,7 @@ class BlockStacking(StructureTask):
     """Objects: two to eight cubes or cylinders of 3 cm, four by default.
 
     Goal: the blocks form a stack, released. The episode ends early when a cylinder tips over or a
-    block leaves the workspace. Appendix A.1.
+    block leaves the workspace. Paper, appendix A.1.
     """
 
     class Parameters(TaskParameters):

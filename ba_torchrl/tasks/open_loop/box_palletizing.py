@@ -98,7 +98,7 @@ class BoxPalletizing(PackingTask):
     Goal: each slot of each layer on the pallet of 23.2 x 19.2 x 3 cm has its box, released. A box
     is stacked if it lies in a slot and all layers below it are full. The boxes arrive one at a
     time, when all earlier ones are stacked and none is held. The episode ends early when a box
-    leaves the workspace. Appendix A.1.
+    leaves the workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.75, 1.0)

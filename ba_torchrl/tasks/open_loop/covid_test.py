@@ -205,7 +205,7 @@ class CovidTest(OpenLoopTask):
     pose in the test area, from which it must be collected before the next test. The episode ends
     early on a violation of this order, which is a second tube or swab in the test area, or a tube
     and a swab there before the last tube is collected, or when an object leaves the workspace.
-    Appendix A.1.
+    Paper, appendix A.1.
     """
 
     scale_limits = (0.5, 0.66)

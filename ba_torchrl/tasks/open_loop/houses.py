@@ -16,7 +16,7 @@ class HouseBuilding1(StructureTask):
     """Objects: one to five cubes of 3 cm, three by default, and a triangle of 3 cm.
 
     Goal: the cubes form a stack with the triangle on top, released. The episode ends early when the
-    triangle tips over or a piece leaves the workspace. Appendix A.1.
+    triangle tips over or a piece leaves the workspace. Paper, appendix A.1.
     """
 
     num_objects = 4
@@ -33,7 +33,7 @@ class HouseBuilding2(StructureTask):
     """Objects: two cubes of 3 cm and a roof of 3 x 12 x 3 cm.
 
     Goal: the roof lies on both cubes, released. The episode ends early when the roof tips over or a
-    piece leaves the workspace. Appendix A.1.
+    piece leaves the workspace. Paper, appendix A.1.
     """
 
     num_objects = 3
@@ -52,7 +52,7 @@ class HouseBuilding3(StructureTask):
 
     Goal: the cuboid lies on both cubes and the roof on the cuboid, both centred over the cubes,
     released. The episode ends early when the roof tips over or a piece leaves the workspace.
-    Appendix A.1.
+    Paper, appendix A.1.
     """
 
     scale_limits = (0.55, 0.9)
@@ -78,7 +78,7 @@ class HouseBuilding4(StructureTask):
 
     Goal: two cubes support the cuboid, which supports the other two cubes, which support the roof,
     released. The episode ends early when the roof tips over or a piece leaves the workspace.
-    Appendix A.1.
+    Paper, appendix A.1.
     """
 
     scale_limits = (0.55, 0.66)
@@ -106,7 +106,7 @@ class ImproviseHouseBuilding2(StructureTask):
     """Objects: two random shapes, 2.5 to 3 cm high, and a roof of 3 x 12 x 3 cm.
 
     Goal: the roof lies on both shapes, released. The episode ends early when a shape or the roof
-    tips over or leaves the workspace. Appendix A.1.
+    tips over or leaves the workspace. Paper, appendix A.1.
     """
 
     num_objects = 3
@@ -127,7 +127,7 @@ class ImproviseHouseBuilding3(StructureTask):
 
     Goal: the cuboid lies on both shapes and the roof on the cuboid, both centred over the shapes,
     released. The episode ends early when a shape or the roof tips over, or a piece leaves the
-    workspace. Appendix A.1.
+    workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.55, 0.9)
