@@ -143,7 +143,8 @@ def _note(section: Section) -> str:
     runs = [run.result for run, _ in _by_seed(section)]
     policies = " or ".join(sorted({run.final.policy for run in runs}))
     text = f"The table has the {policies} policy of each run, on episodes that did not select it."
-    first = sorted({int(group.axis("updates")[0]) for group in section.groups} - {0})
+    starts = (int(update) for group in section.groups for update in group.axis("updates")[:1])
+    first = sorted({*starts} - {0})
     if first:
         after = " to ".join(str(updates) for updates in dict.fromkeys((first[0], first[-1])))
         text += f" Curves start at the first evaluation, after {after} updates."

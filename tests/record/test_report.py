@@ -92,6 +92,12 @@ def test_versions_name_the_commit_in_a_clone():
     assert found.stdout.startswith(versions()["commit"].rstrip("+"))
 
 
+def test_a_run_without_a_curve_is_reported(tmp_path):
+    folder = write_run(tmp_path / "a", (), final=0.5)
+    write_report([folder], tmp_path / "report")
+    assert "0.500" in (tmp_path / "report" / "table.md").read_text()
+
+
 def test_curves_begin_with_the_untrained_policy_if_all_runs_have_its_evaluation(tmp_path):
     write_run(tmp_path / "new" / "seed0", (0.2, 0.5, 0.9), updates=(0, 100, 200))
     (section,), _ = load_sections([tmp_path])
