@@ -337,8 +337,14 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         general[keys.STEP_COUNT] = Unbounded((1,), device="cpu", dtype=torch.int64)
         if self.config.expert:
             general[keys.EXPERT_ACTION] = action.clone()
-        extras = (extra.specs(largest) for extra in self._observations)
-        self.observation_spec = Composite(merge_entries([seen, *extras, general]), device="cpu")
+        extras = merge_entries([extra.specs(largest) for extra in self._observations])
+        self.vectors = {
+            key: spec.shape[0]
+            for key, spec in extras.items()
+            if len(spec.shape) == 1 and spec.dtype.is_floating_point
+        }
+        """Length of each vector of floats that is observed, by key."""
+        self.observation_spec = Composite(merge_entries([seen, extras, general]), device="cpu")
         self.action_spec = action
         # unbounded, since TorchRL's transforms of rewards take no other specification
         self.reward_spec = Unbounded((1,), device="cpu", dtype=torch.float32)
