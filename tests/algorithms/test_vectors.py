@@ -32,7 +32,7 @@ def build(network="cnn", vectors=tuple(SIZES), algorithm="sac", observed=SIZES, 
         ("cnn", ("proprio",), "iql", {}),
         ("cnn", ("proprio",), "bc", {}),
         ("ferm", ("proprio", "joint_positions"), "sac", tiny.FERM),
-        ("equi", ("proprio",), "sac", {}),
+        ("equi", ("proprio",), "sac", {"encoder_tau": 0.5}),
         ("equi", ("proprio",), "rlpd", {}),
     ],
 )

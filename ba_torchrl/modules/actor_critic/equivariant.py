@@ -7,6 +7,7 @@ sign. Reflecting the scene's y axis reverses the columns of the image, dy and th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -154,34 +155,34 @@ class EquivariantEncoder(nn.Module):
 
 def steerable_linear(gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes) -> nn.Module:
     """Return a steerable map between vectors of fields, whose inputs may repeat representations."""
-    sizes = [rep.size * count for rep, count in inputs]
-    places = torch.arange(sum(sizes), device="cpu").split(sizes)
     merged: dict[str, tuple[Representation, int]] = {}
-    order: dict[str, list[Tensor]] = {}
-    for (rep, count), place in zip(inputs, places, strict=True):
+    for rep, count in inputs:
         merged[rep.name] = rep, count + merged.get(rep.name, (rep, 0))[1]
-        order.setdefault(rep.name, []).append(place)
     linear = SteerableLinear(gspace, list(merged.values()), outputs)
     if len(merged) == len(inputs):
         return linear
-    indices = torch.cat([place for each in order.values() for place in each])
-    return nn.Sequential(Reordered(indices), linear)
+    names = [rep.name for rep, _ in inputs]
+    order = [i for name in merged for i, other in enumerate(names) if other == name]
+    return nn.Sequential(Reordered([rep.size * count for rep, count in inputs], order), linear)
 
 
 class Reordered(nn.Module):
-    """A permutation of the last dimension.
+    """A permutation of the parts of the last dimension.
 
     Args:
-        order: index of the input of each output.
+        sizes: of the parts.
+        order: number of the part that is at each place.
     """
 
-    def __init__(self, order: Tensor) -> None:
+    def __init__(self, sizes: Sequence[int], order: Sequence[int]) -> None:
         super().__init__()
-        self.register_buffer("order", order, persistent=False)
+        self.sizes = list(sizes)
+        self.order = list(order)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return x [..., N] in the new order."""
-        return x[..., self.order]
+        """Return x [..., N] with its parts in the new order."""
+        parts = x.split(self.sizes, dim=-1)
+        return torch.cat([parts[i] for i in self.order], dim=-1)
 
 
 class EquivariantActor(nn.Module):
