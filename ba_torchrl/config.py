@@ -192,7 +192,11 @@ class EnvConfig(StrictModel):
     point_cloud: int = Field(default=0, ge=0, le=1_000_000)
     """Number of points of the scene's surfaces that are added to every observation."""
     observations: tuple[str, ...] = ()
-    """Further observations by their registered names; see `ba_torchrl.envs.observations`."""
+    """Further observations by their registered names: "proprio", "joints", "wrist_rgb",
+    "segmentation", "instruction"; see `ba_torchrl.envs.observations`."""
+    camera_size: int | None = Field(default=None, ge=16, le=1024)
+    """Rows and columns of the cameras' images: `rgb`, "wrist_rgb", "segmentation". None stands for
+    `obs_size`."""
     floor_color: Rgb | None = None
     """Colour of the floor in RGB images, components from 0 to 1; by default light, and a blue
     chequer in PyBullet's window and in `rgb`."""
@@ -281,6 +285,11 @@ class EnvConfig(StrictModel):
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
         return self
 
+    @property
+    def camera_pixels(self) -> int:
+        """Rows and columns of the cameras' images."""
+        return self.camera_size or self.obs_size
+
     def check_control(self, task_id: str, control: str) -> None:
         """Check that the parameters that differ from their defaults apply to a control.
 
@@ -328,6 +337,7 @@ class EnvKeywords(TypedDict, total=False):
     rgb: bool
     point_cloud: int
     observations: tuple[str, ...]
+    camera_size: int | None
     floor_color: Rgb | None
     workspace_color: Rgb | None
     physics_mode: Literal["fast", "slow", "custom"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
 from typing import Any, ClassVar, Literal
@@ -40,7 +40,7 @@ from ba_torchrl.data.transitions import WITH_TARGET, Imitation, as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.modules.base import NETWORKS, Control, NetworkConfig
+from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
 from ba_torchrl.modules.layers import compute_dtype
 from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
@@ -112,6 +112,10 @@ class Problem:
     """Gradient updates of the run, the length of schedules."""
     seed: int
     device: torch.device
+    vectors: Mapping[str, int] = field(default_factory=dict)
+    """Length of each vector that the environment observes, by key."""
+    center_m: tuple[float, float] = (0.0, 0.0)
+    """x and y of the workspace's centre."""
     pretrain_updates: int = 0
     """The first of `total_updates`, before the first collection."""
 
@@ -283,7 +287,15 @@ class Learner(ABC):
             )
         self.images = {key: problem.images[key] for key in network.image_keys}
         """Declarations of the networks' input images, which the replay stores."""
-        self.observation_keys = [*self.images, keys.HOLDING]
+        names = getattr(network, "vector_keys", ())
+        if missing := [key for key in names if key not in problem.vectors]:
+            raise ConfigError(
+                f"network.vector_keys: the environment does not observe {', '.join(missing)}; it "
+                f"observes {', '.join(problem.vectors) or 'no vectors'}. env.observations adds some"
+            )
+        self.vectors = {key: problem.vectors[key] for key in names}
+        """Lengths of the networks' input vectors, which the replay stores."""
+        self.observation_keys = [*self.images, keys.HOLDING, *self.vectors]
         self.codecs = make_codecs(self.images)
         self.host_tasks = HostTasks(problem.device)
         networks = self.make_networks(network)
@@ -312,6 +324,21 @@ class Learner(ABC):
             clamp=config.gradient_clamp,
             clamped=self.network_parameters(),
         )
+
+    @property
+    def network_spec(self) -> ActorCriticSpec:
+        """What actor-critic networks see and compute."""
+        return ActorCriticSpec(
+            self.seen_images,
+            self.problem.actions.sequence,
+            vectors=self.vectors,
+            center_m=self.problem.center_m,
+        )
+
+    @property
+    def seen_images(self) -> Mapping[str, ImageSpec]:
+        """Declarations of the images that the networks see; by default those of the replay."""
+        return self.images
 
     # -- parts -------------------------------------------------------------------------------
 
@@ -436,7 +463,11 @@ class Learner(ABC):
             KeyError: an entry is missing.
         """
         return as_transitions(
-            data, self.images, is_demonstration=is_demonstration, imitates=self.config.imitates
+            data,
+            self.images,
+            self.vectors,
+            is_demonstration=is_demonstration,
+            imitates=self.config.imitates,
         )
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:

@@ -23,7 +23,7 @@ from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_sp
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
-from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
+from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialPolicy, spatial_policy
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
 
@@ -88,8 +88,7 @@ class BC(Learner):
     def make_networks(self, network: NetworkConfig) -> nn.Module:
         """Return the actor of an actor-critic network, or a spatial Q network."""
         if self.problem.control == "close_loop":
-            spec = ActorCriticSpec(self.images, self.problem.actions.sequence)
-            return network.build(spec).actor.to(self.problem.device)
+            return network.build(self.network_spec).actor.to(self.problem.device)
         values = make_spatial_values(network, self.problem, self.images)
         self.actions = values.actions
         return values

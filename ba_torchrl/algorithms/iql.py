@@ -8,6 +8,7 @@ the demonstrations alone; with fewer, the remaining updates are online.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar, Literal, NamedTuple
 
 from pydantic import Field
@@ -21,7 +22,7 @@ from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from ba_torchrl.modules.actor_critic.gaussian_policy import truncated_gaussian_policy
-from ba_torchrl.modules.base import ActorCriticSpec, NetworkConfig
+from ba_torchrl.modules.base import NetworkConfig
 
 
 @ALGORITHMS.register("iql")
@@ -74,15 +75,14 @@ class IQL(Learner):
 
     def make_networks(self, network: NetworkConfig) -> IQLNetworks:
         """Return actor, critics and state value."""
-        actions = self.problem.actions
-        spec = ActorCriticSpec(self.images, actions.sequence, critics=1)
+        spec = replace(self.network_spec, critics=1)
         # four networks, since those of an actor and its encoder may share parameters
         first, second, third, fourth = (network.build(spec) for _ in range(4))
         device = self.problem.device
         return IQLNetworks(
             fourth.actor.to(device),
             [ActionValue(each.encoder, each.critic).to(device) for each in (first, second)],
-            StateValue(third.encoder, third.critic, actions.size).to(device),
+            StateValue(third.encoder, third.critic, spec.action_size).to(device),
         )
 
     def make_policy(self, networks: IQLNetworks) -> ProbabilisticActor:

@@ -37,8 +37,9 @@ from ba_torchrl.data.episodes import EpisodeAssembler
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
-from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, NetworkConfig
 from ba_torchrl.objectives.imitation import ActionDistance
 from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SACfDLoss, SoftUpdateByNetwork
 
@@ -181,11 +182,6 @@ class SAC(Learner):
             return self.images
         return cropped_images(self.images, self.config.crop_size)
 
-    @property
-    def network_spec(self) -> ActorCriticSpec:
-        """What the networks see and compute."""
-        return ActorCriticSpec(self.seen_images, self.problem.actions.sequence)
-
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and critic."""
         networks = network.build(self.network_spec)
@@ -255,8 +251,9 @@ class SAC(Learner):
         if not self.config.contrastive_weight:
             return None
         device = self.problem.device
-        images = (torch.zeros(image.shape, device=device) for image in self.seen_images.values())
-        with torch.no_grad():
+        shapes = (image.shape for image in self.seen_images.values())
+        images = [torch.zeros(shape, device=device) for shape in shapes]
+        with torch.no_grad():  # without vectors, which are not compared
             features = encoder(*images, torch.zeros(1, device=device))
         return BilinearInfoNCE(features.shape[-1])
 
@@ -292,6 +289,7 @@ class SAC(Learner):
             parts.append(
                 RandomViews(
                     self.images,
+                    self.vectors,
                     size=config.crop_size if is_crop else None,
                     padding=0 if is_crop else config.shift_pixels,
                     views=config.views,
@@ -326,6 +324,12 @@ class SAC(Learner):
         }
 
     def _make_rotation(self, probability: float, use: SeedUse) -> SO2Augmentation:
+        if self.vectors:
+            raise ConfigError(
+                f"augmentation 'so2' rotates images and actions, but not the network's vectors "
+                f"({', '.join(self.vectors)}): use augmentation 'none', or leave out "
+                "network.vector_keys"
+            )
         return SO2Augmentation(
             self.images,
             self.problem.actions.sequence,

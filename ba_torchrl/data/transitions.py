@@ -27,6 +27,7 @@ WITH_TARGET = frozenset({"expert", "expert_everywhere"})
 def as_transitions(
     tensordict: TensorDictBase,
     images: Iterable[str],
+    vectors: Iterable[str] = (),
     *,
     is_demonstration: bool,
     imitates: Imitation = "executed",
@@ -36,6 +37,7 @@ def as_transitions(
     Args:
         tensordict: transitions of any batch shape.
         images: keys of the images to store.
+        vectors: keys of the vectors to store.
         is_demonstration: whether they are those of demonstrations.
         imitates: the imitated action, stored as ``target_action`` if it is not the executed one.
 
@@ -43,7 +45,7 @@ def as_transitions(
         KeyError: an entry is missing.
     """
     flat = tensordict if tensordict.ndim == 1 else tensordict.reshape(-1)  # [0] has no reshape
-    state = [*images, keys.HOLDING]
+    state = [*images, keys.HOLDING, *vectors]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)
     out = flat.select(*state, keys.ACTION, *((keys.NEXT, key) for key in (*state, *ends)))
     out[keys.IS_DEMONSTRATION] = torch.full((len(flat), 1), is_demonstration, device="cpu")

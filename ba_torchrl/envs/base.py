@@ -19,7 +19,11 @@ from ba_torchrl.envs.copying import CopiesWithState
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_observation
 from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.envs.observations import enabled_observations, merge_entries
+from ba_torchrl.envs.observations import (
+    enabled_observations,
+    merge_entries,
+    segmentation_names,
+)
 from ba_torchrl.envs.rendering import WORKSPACE_VIEW, Direction, RelativePoint, scene_viewpoint
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
 from ba_torchrl.envs.settings import ResolvedEnv
@@ -67,6 +71,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         """Flags of the last step, by key."""
         self._conditions: dict[str, bool] | None = None
         """The conditions of success after the last step, None before the first."""
+        self._instruction = ""
         self._step_count = 0
         self._fault_counter = FaultCounter(self.task_id)
         self.on_contact: Callable[[], None] | None = None
@@ -161,6 +166,16 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         return dict(self._conditions)
 
     @property
+    def instruction(self) -> str:
+        """The goal of the episode as an English sentence; see `Task.instruction`."""
+        return self._instruction
+
+    @property
+    def segmentation_names(self) -> tuple[str, ...]:
+        """Names of the bodies by their index in the observation ``segmentation``."""
+        return segmentation_names(self._episodes.largest_scene)
+
+    @property
     def is_out_of_reach(self) -> bool:
         """Whether the arm could not reach the pose of the last action; see `Controller`."""
         return self._ends.get(keys.IS_OUT_OF_REACH, False)
@@ -228,6 +243,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         self.base_seed, self._episode = state.base_seed, state.episode
         self._step_count = state.step_count
         self._ends, self._conditions = state.ends, None
+        self._instruction = self.scene.task.instruction()
         return self._tensordict(self._observation, **self._ends)
 
     def __repr__(self) -> str:
@@ -261,6 +277,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         self._step_count = 0
         self._observation = self._begin_episode(with_new_objects=self._episode == 1)
         self._ends, self._conditions = {}, None
+        self._instruction = self.scene.task.instruction()
         return self._tensordict(self._observation)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -320,8 +337,14 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         general[keys.STEP_COUNT] = Unbounded((1,), device="cpu", dtype=torch.int64)
         if self.config.expert:
             general[keys.EXPERT_ACTION] = action.clone()
-        extras = (extra.specs(largest) for extra in self._observations)
-        self.observation_spec = Composite(merge_entries([seen, *extras, general]), device="cpu")
+        extras = merge_entries([extra.specs(largest) for extra in self._observations])
+        self.vectors = {
+            key: spec.shape[0]
+            for key, spec in extras.items()
+            if len(spec.shape) == 1 and spec.dtype.is_floating_point
+        }
+        """Length of each vector of floats that is observed, by key."""
+        self.observation_spec = Composite(merge_entries([seen, extras, general]), device="cpu")
         self.action_spec = action
         # unbounded, since TorchRL's transforms of rewards take no other specification
         self.reward_spec = Unbounded((1,), device="cpu", dtype=torch.float32)

@@ -38,6 +38,8 @@ class TaskDescription:
     """Id of the task."""
     text: str
     """Objects and goal, and what ends an episode early."""
+    instruction: str
+    """The goal of an episode as a sentence, an example."""
     conditions: tuple[str, ...]
     """Names of the conditions, all of which a success fulfils."""
     randomised: tuple[str, ...]
@@ -64,6 +66,7 @@ class TaskDescription:
     def rows(self) -> dict[str, str]:
         """Return everything except id and text, as text by heading; in brackets what is allowed."""
         rows = {
+            "instruction": self.instruction,
             "success": ", ".join(self.conditions),
             "randomised": "; ".join(self.randomised),
             "observations": ", ".join(
@@ -112,6 +115,7 @@ def describe(task: str) -> TaskDescription:
     env = make(task, seed=0)
     try:
         env.reset()
+        instruction = env.instruction
         conditions, components = tuple(env.conditions), env.actions.components
         low, high = env.action_spec.space.low.tolist(), env.action_spec.space.high.tolist()
         observed = {key: tuple(spec.shape) for key, spec in env.observation_spec.items()}
@@ -124,6 +128,7 @@ def describe(task: str) -> TaskDescription:
     return TaskDescription(
         task=task,
         text=inspect.cleandoc(cls.__doc__ or ""),
+        instruction=instruction,
         conditions=conditions,
         randomised=(f"{positions} of the objects", *(["their scale"] * (scales[0] < scales[1]))),
         observations=observed,

@@ -13,6 +13,7 @@ import math
 from collections.abc import Mapping
 
 import torch
+from tensordict import NonTensorData
 
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import SimulationError
@@ -47,14 +48,18 @@ def check_bodies(scene: Scene) -> None:
             raise SimulationError(f"{body.name!r} is lost at ({place}) m")
 
 
-def check_observation(observation: Mapping[str, torch.Tensor]) -> None:
+def check_observation(observation: Mapping[str, torch.Tensor | NonTensorData]) -> None:
     """Check that the entries of an observation are finite.
 
     Raises:
         SimulationError: one is not.
     """
     for key, value in observation.items():
-        if value.is_floating_point() and not math.isfinite(value.sum()):
+        if (
+            isinstance(value, torch.Tensor)
+            and value.is_floating_point()
+            and not math.isfinite(value.sum())
+        ):
             raise SimulationError(f"the observation {key!r} is not finite")
 
 

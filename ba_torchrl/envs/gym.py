@@ -21,7 +21,13 @@ from ba_torchrl.errors import ConfigError, InvalidActionError
 
 Observation = dict[str, np.ndarray]
 
-INFO_KEYS = (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT, keys.EXPERT_ACTION)
+INFO_KEYS = (
+    keys.SUCCESS,
+    keys.FAULT,
+    keys.STEP_COUNT,
+    keys.EXPERT_ACTION,
+    keys.INSTRUCTION,
+)
 """Entries that are in ``info`` and not in the observation."""
 
 
@@ -30,7 +36,8 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     ``info`` holds ``success``, ``fault``, ``step_count``, the conditions of success and, with
     ``expert=True``, ``expert_action``; ``is_success`` is ``success`` under the name that
-    Stable-Baselines3 logs; ``is_out_of_reach`` tells an action that the arm cannot execute.
+    Stable-Baselines3 logs; ``is_out_of_reach`` tells an action that the arm cannot execute;
+    ``instruction`` is the goal as a sentence.
 
     Args:
         task: as listed by `ba_torchrl.list_tasks`.
@@ -129,6 +136,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         info["is_success"] = info[keys.SUCCESS]
         info |= self.torchrl_env.conditions
         info[keys.IS_OUT_OF_REACH] = self.torchrl_env.is_out_of_reach
+        info[keys.INSTRUCTION] = self.torchrl_env.instruction
         if keys.EXPERT_ACTION in state:
             info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
         return observation, info

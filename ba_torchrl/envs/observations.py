@@ -1,4 +1,4 @@
-"""Observations in addition to the images of the control: poses, RGB-D images, point clouds.
+"""Observations in addition to the images of the control: poses, RGB-D images, instructions.
 
 Each is a registered class. It is enabled by its name in the environment's parameter `observations`.
 """
@@ -11,8 +11,9 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+from tensordict import NonTensorData
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Bounded, NonTensor, TensorSpec, Unbounded
 
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
@@ -21,10 +22,13 @@ from ba_torchrl.envs.scene import Scene
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.registry import Registry
 from ba_torchrl.sim.vision.depth import point_cloud
-from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses
-from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_rgbd
+from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses, wrist_lens
+from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_owners, render_rgbd
 from ba_torchrl.sim.vision.views import finger_boxes
 from ba_torchrl.tasks.workspace import Workspace
+
+WRIST_RANGE_M = (0.02, 2.0)
+"""Near and far plane of the wrist camera."""
 
 OBSERVATIONS: Registry[type[Observation]] = Registry("observation", "ba_torchrl.envs")
 
@@ -58,7 +62,7 @@ class Observation(ABC):
         return {}
 
     @abstractmethod
-    def observe(self, scene: Scene) -> dict[str, Tensor]:
+    def observe(self, scene: Scene) -> dict[str, Tensor | NonTensorData]:
         """Return its entries, by key."""
 
 
@@ -126,7 +130,7 @@ class RgbDepth(Observation):
 
     def images(self) -> dict[str, ImageSpec]:
         """Return the declarations of the colour image and of its depth."""
-        size, (near, far) = self.config.obs_size, RGBD_RANGE_M
+        size, (near, far) = self.config.camera_pixels, RGBD_RANGE_M
         return {
             keys.RGB: ImageSpec(3, size, 255, storage="exact", frame="camera", dtype=torch.uint8),
             keys.RGB_DEPTH: ImageSpec(1, size, far, near, frame="camera"),
@@ -135,7 +139,7 @@ class RgbDepth(Observation):
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the image and its depth, from the camera opposite the robot."""
         lens = oblique_lens(self.workspace.center)
-        rgb, depth = render_rgbd(scene.world, lens, self.config.obs_size)
+        rgb, depth = render_rgbd(scene.world, lens, self.config.camera_pixels)
         return {
             keys.RGB: torch.from_numpy(rgb).permute(2, 0, 1),
             keys.RGB_DEPTH: torch.from_numpy(depth.astype(np.float32))[None],
@@ -164,3 +168,95 @@ class PointCloud(Observation):
             (workspace.x, workspace.y, workspace.z),
         )
         return {keys.POINT_CLOUD: torch.from_numpy(points)}
+
+
+@OBSERVATIONS.register("proprio")
+class Proprioception(Observation):
+    """Pose of the tool and opening of the gripper."""
+
+    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
+        """Return the specification of the vector."""
+        return {keys.PROPRIO: Unbounded((8,), device="cpu", dtype=torch.float32)}
+
+    def observe(self, scene: Scene) -> dict[str, Tensor]:
+        """Return the vector.
+
+        A quaternion and its negative are the same rotation. With x >= 0, a gripper that points down
+        has no change of sign between the yaws -pi and pi; its w is zero.
+        """
+        robot = scene.robot
+        position, orientation = robot.tool_frame()
+        sign = 1.0 if orientation[0] >= 0 else -1.0
+        values = [*position, *(sign * value for value in orientation), robot.opening()]
+        return {keys.PROPRIO: torch.tensor(values, device="cpu", dtype=torch.float32)}
+
+
+@OBSERVATIONS.register("joints")
+class Joints(Observation):
+    """Angles of the arm's joints."""
+
+    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
+        """Return the specification of the angles."""
+        shape = (len(scene.robot.arm_joints),)
+        return {keys.JOINT_POSITIONS: Unbounded(shape, device="cpu", dtype=torch.float32)}
+
+    def observe(self, scene: Scene) -> dict[str, Tensor]:
+        """Return the measured angles, radians."""
+        angles = scene.robot.measured_joints()
+        return {keys.JOINT_POSITIONS: torch.tensor(angles, device="cpu", dtype=torch.float32)}
+
+
+@OBSERVATIONS.register("wrist_rgb")
+class WristRgb(Observation):
+    """An RGB image of a camera on the gripper: the fingertips and what is between them."""
+
+    def images(self) -> dict[str, ImageSpec]:
+        """Return the declaration of the image."""
+        size = self.config.camera_pixels
+        spec = ImageSpec(3, size, 255, storage="exact", frame="camera", dtype=torch.uint8)
+        return {keys.WRIST_RGB: spec}
+
+    def observe(self, scene: Scene) -> dict[str, Tensor]:
+        """Return the image."""
+        lens = wrist_lens(scene.robot.tool_frame())
+        rgb, _ = render_rgbd(scene.world, lens, self.config.camera_pixels, WRIST_RANGE_M)
+        return {keys.WRIST_RGB: torch.from_numpy(rgb).permute(2, 0, 1)}
+
+
+@OBSERVATIONS.register("segmentation")
+class Segmentation(Observation):
+    """The body in each pixel of the camera of `rgb`."""
+
+    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
+        """Return the specification of the image."""
+        size, last = self.config.camera_pixels, len(segmentation_names(scene)) - 1
+        spec = Bounded(0, last, (1, size, size), device="cpu", dtype=torch.int32)
+        return {keys.SEGMENTATION: spec}
+
+    def observe(self, scene: Scene) -> dict[str, Tensor]:
+        """Return the indices of the bodies in `segmentation_names`."""
+        lens = oblique_lens(self.workspace.center)
+        bodies, links = render_owners(scene.world, lens, self.config.camera_pixels)
+        indices = np.zeros(bodies.shape, dtype=np.int32)
+        indices[bodies == scene.robot.id] = 1
+        for index, body in enumerate(scene.world.bodies, start=2):
+            indices[(bodies == body.id) & np.isin(links, body.links)] = index
+        return {keys.SEGMENTATION: torch.from_numpy(indices)[None]}
+
+
+def segmentation_names(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the indices of ``segmentation``; objects follow background and robot."""
+    return ("background", "robot", *(body.name for body in scene.world.bodies))
+
+
+@OBSERVATIONS.register("instruction")
+class Instruction(Observation):
+    """The goal of the episode as an English sentence."""
+
+    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
+        """Return the specification of the sentence."""
+        return {keys.INSTRUCTION: NonTensor((), example_data="", device="cpu")}
+
+    def observe(self, scene: Scene) -> dict[str, NonTensorData]:
+        """Return the sentence."""
+        return {keys.INSTRUCTION: NonTensorData(scene.task.instruction())}

@@ -52,8 +52,8 @@ class ResolvedEnv:
 
     task_id: str
     config: EnvConfig
-    """The parameters. Of them, only changes of the physics, colours, the seed and, in close loop,
-    the parameters of open loop can be None."""
+    """The parameters. Of them, only changes of the physics, colours, the seed, the
+    cameras' size and, in close loop, the parameters of open loop can be None."""
     actions: CloseLoopActions | OpenLoopActions
     """The action space."""
     modules: tuple[str, ...]

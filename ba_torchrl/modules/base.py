@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 from torch import nn
@@ -30,6 +30,9 @@ class ActorCriticSpec:
         action_sequence: one letter per action component, in the order of the action ("pxyzr").
         critics: number of critics of an ensemble with layer normalisation, see
             `ba_torchrl.modules.actor_critic.critics`; None for twin critics without it.
+        vectors: length of each vector entry of the observation that the network sees, by key, in
+            the order of its arguments after the holding flag.
+        center_m: x and y of the workspace's centre, about which the scene rotates.
 
     Raises:
         ValueError: the sequence is empty, repeats a letter or holds one outside "pxyzr".
@@ -38,6 +41,8 @@ class ActorCriticSpec:
     images: Mapping[str, ImageSpec]
     action_sequence: str
     critics: int | None = None
+    vectors: Mapping[str, int] = field(default_factory=dict)
+    center_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         letters = self.action_sequence
@@ -58,6 +63,11 @@ class ActorCriticSpec:
         return self.images[keys.PIXELS].channels
 
     @property
+    def vector_size(self) -> int:
+        """Length of all vector entries together."""
+        return sum(self.vectors.values())
+
+    @property
     def action_size(self) -> int:
         """Number of action components."""
         return len(self.action_sequence)
@@ -67,10 +77,10 @@ class ActorCritic(NamedTuple):
     """The three plain modules of a Soft Actor-Critic, for any leading batch shape, even none."""
 
     actor: nn.Module
-    """(images [..., C, H, W] each, holding [..., 1]) -> (loc [..., A], scale [..., A]) of the
-    Gaussian before it is squashed."""
+    """(images [..., C, H, W] each, holding [..., 1], vectors [..., V] each) -> (loc [..., A],
+    scale [..., A]) of the Gaussian before it is squashed."""
     encoder: nn.Module
-    """(images, holding) -> features [..., F], shared by the two critics."""
+    """(images, holding, vectors) -> features [..., F], shared by the two critics."""
     critic: nn.Module
     """(features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the
     specification asks for K critics."""
@@ -83,8 +93,8 @@ class NetworkConfig(Protocol):
     """Control of the tasks that it supports. ``build`` returns an `ActorCritic` for close-loop
     tasks and a `ba_torchrl.modules.spatial.base.SpatialQNetwork` for open-loop tasks."""
     image_keys: ClassVar[tuple[str, ...]]
-    """Keys of its input images, in the order of its arguments. The last argument is the holding
-    flag."""
+    """Keys of its input images, in the order of its arguments. The holding flag follows, and then
+    the vectors that a field ``vector_keys`` names, if the network has one."""
 
     def build(self, spec: Any) -> Any:
         """Return freshly initialised modules.

@@ -368,7 +368,8 @@ class BilinearInfoNCE(nn.Module):
     cross-entropy of these similarities over all positives of the batch with the label i.
 
     Args:
-        features: size of the encoder's features.
+        features: size of the encoder's features of an image. Vectors that follow them are not
+            compared: they tell an anchor's positive without the image.
     """
 
     def __init__(self, features: int) -> None:
@@ -377,6 +378,7 @@ class BilinearInfoNCE(nn.Module):
 
     def forward(self, anchors: Tensor, positives: Tensor) -> Tensor:
         """Return the losses [B] of anchors [B, F] and their positives [B, F]."""
+        anchors, positives = (each[:, : len(self.weight)] for each in (anchors, positives))
         similarities = anchors @ self.weight @ positives.mT
         labels = torch.arange(len(anchors), device=anchors.device)
         return F.cross_entropy(similarities, labels, reduction="none")

@@ -156,6 +156,14 @@ class Task(ABC):
     def expert_command(self) -> GripperCommand | PickPlaceCommand:
         """Return the expert's command; it depends on the present scene only."""
 
+    @abstractmethod
+    def instruction(self) -> str:
+        """Return the goal of the present episode as an English sentence: "pick up the red block".
+
+        It begins with a verb in lower case and has no full stop. Colours and numbers are those of
+        the objects.
+        """
+
     @property
     @abstractmethod
     def objects(self) -> Sequence[Body]:

@@ -99,6 +99,9 @@ def check_resets(task: str, *, episodes: int = 10, **config: Any) -> None:
             assert not state[keys.DONE], f"{where}: done at the start"
             assert not state[keys.SUCCESS], f"{where}: success at the start"
             assert state[keys.STEP_COUNT] == 0, f"{where}: the step count does not start at 0"
+            words = env.instruction
+            assert words[:1].islower(), f"{where}: the instruction begins with no verb: {words!r}"
+            assert not words.endswith("."), f"{where}: the instruction ends with a stop: {words!r}"
 
 
 def check_seeds(task: str, **config: Any) -> None:

@@ -210,6 +210,8 @@ def problem_of(config: ExperimentConfig) -> Problem:
     return Problem(
         control=config.resolved_env.task_class.control,
         images=env.images,
+        vectors=env.vectors,
+        center_m=config.resolved_env.workspace.center,
         actions=env.actions,
         total_updates=config.total_updates,
         pretrain_updates=config.pretrain_updates,

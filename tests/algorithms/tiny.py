@@ -66,7 +66,8 @@ def transitions(learner, count=24):
 
     def state():
         images = {key: rand(*image.shape) * image.high for key, image in learner.images.items()}
-        return {**images, keys.HOLDING: rand(1) < 0.5}
+        vectors = {key: rand(size) for key, size in learner.vectors.items()}
+        return {**images, keys.HOLDING: rand(1) < 0.5, **vectors}
 
     ended = torch.zeros(count, 1, dtype=torch.bool)
     following = {

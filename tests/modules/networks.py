@@ -26,10 +26,13 @@ def count(module):
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def actor_critic(name, size=64, sequence="pxyzr", critics=None, seed=0, **fields):
+def actor_critic(
+    name, size=64, sequence="pxyzr", critics=None, seed=0, vectors=None, center_m=(0, 0), **fields
+):
     torch.manual_seed(seed)
     config = NETWORKS[name](**{"precision": "float32", **SIZES.get(name, {}), **fields})
-    return config.build(ActorCriticSpec(close_loop_images(size), sequence, critics))
+    images, vectors = close_loop_images(size), vectors or {}
+    return config.build(ActorCriticSpec(images, sequence, critics, vectors, center_m))
 
 
 def spatial(name, size=32, in_hand_size=24, channels=1, components=XYR, half=True, **fields):

@@ -8,6 +8,7 @@ import torch
 
 pytest.importorskip("escnn")
 
+from ba_torchrl.errors import ConfigError
 from tests.modules.networks import actor_critic
 
 
@@ -191,3 +192,71 @@ def test_the_head_of_the_critic_is_exactly_invariant_under_c8():
             torch.testing.assert_close(critic(turned, turned_action), values, rtol=1e-4, atol=1e-5)
         wrong = critic(features.unflatten(-1, (8, 8)).roll(1, dims=-1).flatten(-2), action)
         assert not torch.allclose(wrong, values, rtol=1e-3)
+
+
+CENTER_M = (0.45, -0.1)
+
+
+def move_proprio(proprio, quarters, flips):
+    """Move position and orientation as the scene moves about its centre; x >= 0 stays."""
+    center = torch.tensor(CENTER_M)
+    turn = torch.tensor([[0.0, -1.0], [1.0, 0.0]]).matrix_power(quarters)
+    turn = turn @ torch.diag(torch.tensor([1.0, -1.0 if flips else 1.0]))
+    xy = (proprio[:, :2] - center) @ turn.T + center
+    yaw = 2 * torch.atan2(proprio[:, 4], proprio[:, 3])
+    yaw = (-yaw if flips else yaw) + quarters * math.pi / 2
+    quaternion = torch.stack([(yaw / 2).cos(), (yaw / 2).sin()], dim=1)
+    quaternion = quaternion * torch.where(quaternion[:, :1] < 0, -1.0, 1.0)
+    return torch.cat([xy, proprio[:, 2:3], quaternion, proprio[:, 5:]], dim=1)
+
+
+@pytest.mark.parametrize("critics", [None, 3])
+@pytest.mark.parametrize(
+    ("group_order", "reflections"), [(4, False), (8, False), (2, False), (4, True)]
+)
+def test_the_grippers_pose_moves_with_the_scene(group_order, reflections, critics):
+    networks = actor_critic(
+        "equi",
+        group_order=group_order,
+        reflections=reflections,
+        critics=critics,
+        vectors={"proprio": 8},
+        center_m=CENTER_M,
+    )
+    generator = torch.Generator().manual_seed(3)
+    pixels = torch.rand(3, 1, 64, 64, generator=generator)
+    holding = torch.tensor([[True], [False], [True]])
+    action = torch.rand(3, 5, generator=generator) * 2 - 1
+    yaw = (torch.rand(3, generator=generator) * 2 - 1) * math.pi
+    proprio = torch.rand(3, 8, generator=generator)
+    proprio[:, 3:7] = torch.stack([(yaw / 2).cos(), (yaw / 2).sin(), 0 * yaw, 0 * yaw], dim=1)
+    with torch.no_grad():
+        for parameter in (each for network in networks for each in network.parameters()):
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+        loc, scale = networks.actor(pixels, holding, proprio)
+        values = networks.critic(networks.encoder(pixels, holding, proprio), action)
+        for entry in (0, 1, 2, 3, 4, 7):  # all but those that are zero
+            other = proprio.clone()
+            other[:, entry] += 0.1
+            changed = torch.cat(networks.actor(pixels, holding, other), dim=1)
+            assert (changed - torch.cat([loc, scale], dim=1)).abs().max() > 1e-3
+        turns = range(4) if group_order > 2 else (0, 2)
+        for quarters, flips in product(turns, [False, True] if reflections else [False]):
+            moved = pixels.flip(-1) if flips else pixels
+            moved = torch.rot90(moved, quarters, (-2, -1)), holding
+            pose = move_proprio(proprio, quarters, flips)
+
+            def move(action, quarters=quarters, flips=flips):
+                action = reflect_action(action, "pxyzr") if flips else action
+                return turn_action(action, "pxyzr", quarters)
+
+            new_loc, new_scale = networks.actor(*moved, pose)
+            torch.testing.assert_close(new_loc, move(loc), atol=2e-5, rtol=1e-4)
+            torch.testing.assert_close(new_scale, scale, atol=2e-5, rtol=1e-4)
+            new_values = networks.critic(networks.encoder(*moved, pose), move(action))
+            torch.testing.assert_close(new_values, values, atol=2e-5, rtol=1e-4)
+
+
+def test_a_vector_with_unknown_rotation_is_refused():
+    with pytest.raises(ConfigError, match="joint_positions rotates"):
+        actor_critic("equi", vectors={"proprio": 8, "joint_positions": 7})

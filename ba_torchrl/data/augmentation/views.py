@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -84,10 +84,11 @@ class RandomViews(SeededModule):
     al., "Reinforcement Learning with Augmented Data", 2020). With several, every view has its own
     offset, and observation or next observation get a dimension of views after the batch (DrQ:
     Kostrikov et al., "Image Augmentation Is All You Need", 2021). No other entry changes: the
-    holding flag of a view is that of the transition.
+    holding flag and the vectors of a view are those of the transition.
 
     Args:
         images: declarations of the images by key.
+        vectors: keys of the other entries of the observation besides the holding flag.
         size: rows and columns of a view, pixels; None for those of the image.
         padding: pixels added on each side of an image, which repeat its border.
         views: number of views of the image.
@@ -103,6 +104,7 @@ class RandomViews(SeededModule):
     def __init__(
         self,
         images: Mapping[str, ImageSpec],
+        vectors: Iterable[str] = (),
         *,
         seed: int,
         size: int | None = None,
@@ -115,6 +117,8 @@ class RandomViews(SeededModule):
         if min(views, target_views) < 1:
             raise ValueError(f"views must be positive, got {views} and {target_views}")
         self.sizes = {key: image.size if size is None else size for key, image in images.items()}
+        self.others = [keys.HOLDING, *vectors]
+        """Keys of the entries of the observation that are the same in all views."""
         self.padding = padding
         self.views = views
         self.target_views = target_views
@@ -138,14 +142,15 @@ class RandomViews(SeededModule):
             if self.has_positive:
                 positive = self._take(key, image, self._draw(key, image, 1))
                 out.set((keys.POSITIVE, key), positive)
-        holding, following = tensordict[keys.HOLDING], tensordict[keys.NEXT, keys.HOLDING]
-        if self.has_positive:
-            out.set((keys.POSITIVE, keys.HOLDING), holding)
-        if self.views > 1:
-            out.set(keys.HOLDING, holding[:, None].expand(-1, self.views, -1))
-        if self.target_views > 1:
-            expanded = following[:, None].expand(-1, self.target_views, -1)
-            out.set((keys.NEXT, keys.HOLDING), expanded)
+        for key in self.others:
+            value, following = tensordict[key], tensordict[keys.NEXT, key]
+            if self.has_positive:
+                out.set((keys.POSITIVE, key), value)
+            if self.views > 1:
+                out.set(key, value[:, None].expand(-1, self.views, -1))
+            if self.target_views > 1:
+                expanded = following[:, None].expand(-1, self.target_views, -1)
+                out.set((keys.NEXT, key), expanded)
         return out
 
     def _draw(self, key: str, image: Tensor, views: int) -> Tensor:

@@ -9,7 +9,7 @@ from ctypes import Array, c_byte
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NonTensorStack, TensorDictBase
 from torch import multiprocessing as mp
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
@@ -117,7 +117,12 @@ class VectorEnv(SeededVector, ParallelEnv):
         """Step, and reset the environments that are done; see `EnvBase.step_and_maybe_reset`."""
         self._check_actions(tensordict)
         with self._stepping():
-            return super().step_and_maybe_reset(tensordict)
+            step, state = super().step_and_maybe_reset(tensordict)
+        if self._has_instruction:
+            self._write_instructions(step[keys.NEXT])
+            self._read_instructions(step[keys.NEXT, keys.DONE])
+            self._write_instructions(state)
+        return step, state
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """End the workers, and keep the number of torch threads, which TorchRL increases."""
@@ -131,7 +136,7 @@ class VectorEnv(SeededVector, ParallelEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._check_actions(tensordict)
         with self._stepping():
-            return super()._step(tensordict)
+            return self._write_instructions(super()._step(tensordict))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         if self.is_closed:
@@ -141,12 +146,51 @@ class VectorEnv(SeededVector, ParallelEnv):
         if mask is None or kwargs:
             with self._waiting():
                 self._replacements.finish(wait_for_all=True)
-                return super()._reset(tensordict, **kwargs)
+                state = super()._reset(tensordict, **kwargs)
+                self._read_instructions(mask)
+                return self._write_instructions(state)
         self._replacements.finish(wait_for_all=self.wait_for_restarts)
         if not mask.any():  # TorchRL would fail
-            return self.shared_tensordict_parent.select(*self._selected_reset_keys_filt).clone()
+            state = self.shared_tensordict_parent.select(*self._selected_reset_keys_filt).clone()
+            return self._write_instructions(state)
         with self._muted(self._replacements.starting):
-            return super()._reset(tensordict, **kwargs)
+            state = super()._reset(tensordict, **kwargs)
+        self._read_instructions(mask)
+        return self._write_instructions(state)
+
+    def _create_td(self) -> None:
+        """Make the shared memory, which holds tensors only.
+
+        The instruction of an episode is asked of the worker after each reset instead.
+        """
+        super()._create_td()
+        self._has_instruction = keys.INSTRUCTION in self._non_tensor_keys
+        self._instructions = [""] * self.num_workers
+        if others := set(self._non_tensor_keys) - {keys.INSTRUCTION}:
+            raise ValueError(f"workers cannot share {sorted(others)}, which are no tensors")
+        self._non_tensor_keys = []
+
+    def _read_instructions(self, is_reset: torch.Tensor | None) -> None:
+        """Ask workers for the instructions of new episodes; one that has failed keeps its last.
+
+        Args:
+            is_reset: bool [num_workers, 1]; None for all.
+        """
+        if not self._has_instruction:
+            return
+        for index, worker in enumerate(self.parent_channels):
+            is_new = is_reset is None or bool(is_reset[index].any())
+            if is_new and index not in self._replacements.starting:
+                with contextlib.suppress(WorkerError):
+                    (self._instructions[index],) = ask_all(
+                        [worker], keys.INSTRUCTION, [()], self.workers.timeout_s
+                    )
+
+    def _write_instructions(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Set the instructions of the present episodes, if they are observed."""
+        if self._has_instruction:
+            tensordict.set(keys.INSTRUCTION, NonTensorStack(*self._instructions))
+        return tensordict
 
     def _seed_env(self, index: int, seed: int) -> None:
         self._replacements.on_seed(index)
@@ -165,8 +209,6 @@ class VectorEnv(SeededVector, ParallelEnv):
         self._replacements.base_seed = self._base_seed
 
     def _start_workers(self) -> None:
-        if self._non_tensor_keys:
-            raise ValueError(f"workers cannot share {self._non_tensor_keys}, which are no tensors")
         # TorchRL raises if a process in `_workers` has ended; here it is replaced instead.
         self._workers: list[Any] = []
         self._timeout = self.shutdown_timeout
@@ -361,7 +403,7 @@ class VectorEnv(SeededVector, ParallelEnv):
         answer = root
         if to_next:
             answer = root.get("next")
-            for key in self.observation_keys:
+            for key in set(self.observation_keys) - {keys.INSTRUCTION}:
                 answer.get(key).copy_(root.get(key))
         for key in values.keys() & set(answer.keys()):
             answer.get(key).fill_(values[key])

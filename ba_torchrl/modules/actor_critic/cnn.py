@@ -42,9 +42,11 @@ class PlainActor(nn.Module):
         self.loc = loc
         self.log_std = log_std
 
-    def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
+    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of pixels [..., C, H, W], holding [..., 1] and
+        vectors, which are appended to the features of the policy."""
         features = self.head(self.trunk(pixels, holding))
+        features = torch.cat([features, *vectors], dim=-1) if vectors else features
         return self.loc(features), scale_from_log_std(self.log_std(features))
 
 
@@ -99,7 +101,7 @@ class CNNConfig(ImageNetworkConfig):
     def build(self, spec: ActorCriticSpec) -> ActorCritic:
         """Return freshly initialised modules."""
         self.check_images(spec)
-        features = scaled_width(_WIDTHS[-1], self.width)
+        features = scaled_width(_WIDTHS[-1], self.width) + spec.vector_size
         trunk = self._trunk(spec)
         loc, log_std = (nn.Linear(features, spec.action_size) for _ in range(2))
         networks = ActorCritic(

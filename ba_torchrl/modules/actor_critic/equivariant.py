@@ -7,6 +7,7 @@ sign. Reflecting the scene's y axis reverses the columns of the image, dy and th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,6 +15,8 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
+from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
 from ba_torchrl.modules.actor_critic.trunk import (
     ImageNetworkConfig,
@@ -31,6 +34,7 @@ from ba_torchrl.modules.steerable.layers import (
 )
 
 if TYPE_CHECKING:
+    from escnn.group import Representation
     from escnn.gspaces import GSpace2D
 
 
@@ -89,29 +93,129 @@ class ActionFields:
         return torch.stack([fields[..., i] for i in self._restore], dim=-1)
 
 
+class PoseFields:
+    """How the pose of the gripper, the entry ``proprio``, transforms under rotations, reflections.
+
+    Its position relative to the centre of the scene and the direction in which the fingers close
+    are vectors; height and opening are invariant.
+
+    Args:
+        spec: vectors of the observation, and the centre.
+        has_reflections: whether the group contains reflections.
+
+    Raises:
+        ConfigError: another vector than ``proprio`` is observed.
+    """
+
+    def __init__(self, spec: ActorCriticSpec, *, has_reflections: bool = False) -> None:
+        if others := [key for key in spec.vectors if key != keys.PROPRIO]:
+            raise ConfigError(
+                f"network.vector_keys: it is unknown how {', '.join(others)} rotates with the "
+                f"scene; an equivariant network takes {keys.PROPRIO!r} only"
+            )
+        self.is_observed = bool(spec.vectors)
+        self.center_m = spec.center_m
+        self.has_reflections = has_reflections
+
+    def types(self, gspace: GSpace2D) -> FieldTypes:
+        """Return the fields [two vectors, two invariants], or none without ``proprio``."""
+        if not self.is_observed:
+            return []
+        rotation = gspace.irrep(1, 1) if self.has_reflections else gspace.irrep(1)
+        return [(rotation, 4 // rotation.size), (gspace.trivial_repr, 2)]
+
+    def fields(self, vectors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        """Return the fields [..., 6] of ``proprio`` [..., 8], or nothing of nothing."""
+        if not vectors:
+            return ()
+        x, y, z, *quaternion, opening = vectors[0].unbind(dim=-1)
+        i, j, k, w = quaternion
+        closing = 1 - 2 * (j * j + k * k), 2 * (i * j + k * w)
+        plane = (x - self.center_m[0], y - self.center_m[1], *closing)
+        return (torch.stack([*plane, z, opening], dim=-1),)
+
+
+class EquivariantEncoder(nn.Module):
+    """An image trunk, with the fields of the gripper's pose appended to its features.
+
+    Args:
+        trunk: the image trunk.
+        pose: how the pose transforms.
+    """
+
+    def __init__(self, trunk: ImageTrunk, pose: PoseFields) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.pose = pose
+
+    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
+        """Return fields [..., F] of pixels [..., C, H, W], holding [..., 1] and ``proprio``."""
+        return self.trunk(pixels, holding, *self.pose.fields(vectors))
+
+
+def steerable_linear(gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes) -> nn.Module:
+    """Return a steerable map between vectors of fields, whose inputs may repeat representations."""
+    merged: dict[str, tuple[Representation, int]] = {}
+    for rep, count in inputs:
+        merged[rep.name] = rep, count + merged.get(rep.name, (rep, 0))[1]
+    linear = SteerableLinear(gspace, list(merged.values()), outputs)
+    if len(merged) == len(inputs):
+        return linear
+    names = [rep.name for rep, _ in inputs]
+    order = [i for name in merged for i, other in enumerate(names) if other == name]
+    return nn.Sequential(Reordered([rep.size * count for rep, count in inputs], order), linear)
+
+
+class Reordered(nn.Module):
+    """A permutation of the parts of the last dimension.
+
+    Args:
+        sizes: of the parts.
+        order: number of the part that is at each place.
+    """
+
+    def __init__(self, sizes: Sequence[int], order: Sequence[int]) -> None:
+        super().__init__()
+        self.sizes = list(sizes)
+        self.order = list(order)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return x [..., N] with its parts in the new order."""
+        parts = x.split(self.sizes, dim=-1)
+        return torch.cat([parts[i] for i in self.order], dim=-1)
+
+
 class EquivariantActor(nn.Module):
     """Gaussian policy with equivariant mean and invariant log-std, before the squashing.
 
     Args:
         gspace: images and their symmetry group.
         trunk: the image trunk.
-        features: fields that the trunk returns.
+        features: fields of the trunk and of the pose.
         action: how the action transforms.
+        pose: how the gripper's pose transforms.
     """
 
     def __init__(
-        self, gspace: GSpace2D, trunk: ImageTrunk, features: FieldTypes, action: ActionFields
+        self,
+        gspace: GSpace2D,
+        trunk: ImageTrunk,
+        features: FieldTypes,
+        action: ActionFields,
+        pose: PoseFields,
     ) -> None:
         super().__init__()
         self.trunk = trunk
         self.action = action
+        self.pose = pose
         # The log standard deviations are invariant as well.
         outputs = action.types(gspace, extra_invariants=action.size)
         self.head = SteerableLinear(gspace, features, outputs)
 
-    def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (loc, scale), each [..., A], of pixels [..., C, H, W] and holding [..., 1]."""
-        fields = self.head(self.trunk(pixels, holding))
+    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of pixels [..., C, H, W], holding [..., 1] and, if it
+        is observed, ``proprio`` [..., 8]."""
+        fields = self.head(self.trunk(pixels, holding, *self.pose.fields(vectors)))
         loc, log_std = fields.split(self.action.size, dim=-1)
         return self.action.ungroup(loc), scale_from_log_std(log_std)
 
@@ -121,18 +225,18 @@ class EquivariantTwinCritic(nn.Module):
 
     Args:
         gspace: images and their symmetry group.
-        features: fields of the features, all regular.
+        features: fields of the features, first regular ones.
         action: how the action transforms.
     """
 
     def __init__(self, gspace: GSpace2D, features: FieldTypes, action: ActionFields) -> None:
         super().__init__()
         self.action = action
-        ((regular, count),) = features
+        regular, count = features[0]
         self._group_order = regular.size
         inputs = [*features, *action.types(gspace)]
         self.hidden = nn.ModuleList(
-            SteerableLinear(gspace, inputs, [(regular, count)]) for _ in range(2)
+            steerable_linear(gspace, inputs, [(regular, count)]) for _ in range(2)
         )
         # From invariants to one value: the only steerable kernel is the identity, so this is a
         # plain linear layer.
@@ -175,10 +279,13 @@ class EquivariantConfig(ImageNetworkConfig):
         group = planar_rotations_and_flips if self.reflections else planar_rotations
         gspace = group(self.group_order)
         action = ActionFields(spec.action_sequence, has_reflections=self.reflections)
-        features = [(gspace.regular_repr, self.n_hidden)]
+        pose = PoseFields(spec, has_reflections=self.reflections)
+        features = [(gspace.regular_repr, self.n_hidden), *pose.types(gspace)]
+        actor = EquivariantActor(gspace, self._trunk(gspace, spec), features, action, pose)
+        encoder: nn.Module = self._trunk(gspace, spec)
         return ActorCritic(
-            actor=EquivariantActor(gspace, self._trunk(gspace, spec), features, action),
-            encoder=self._trunk(gspace, spec),
+            actor=actor,
+            encoder=EquivariantEncoder(encoder, pose) if spec.vectors else encoder,
             critic=self._critic(gspace, features, action, spec.critics),
         )
 
@@ -189,7 +296,7 @@ class EquivariantConfig(ImageNetworkConfig):
             return EquivariantTwinCritic(gspace, features, action)
         regular, fields = gspace.regular_repr, self.n_hidden
         inputs = [*features, *action.types(gspace)]
-        first = SteerableLinear(gspace, inputs, [(regular, critics * fields)])
+        first = steerable_linear(gspace, inputs, [(regular, critics * fields)])
         return EnsembleCritic(first, critics, fields, regular.size, action.group)
 
     def _trunk(self, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:

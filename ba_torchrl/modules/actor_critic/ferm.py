@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import torch
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -33,9 +34,10 @@ class FERMEncoder(nn.Module):
         self.trunk = trunk
         self.head = _normalised(width, features)
 
-    def forward(self, pixels: Tensor, holding: Tensor) -> Tensor:
-        """Return features [..., F] of pixels [..., C, H, W] and holding [..., 1]."""
-        return self.head(self.trunk(pixels, holding))
+    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
+        """Return features [..., F] of pixels [..., C, H, W] and holding [..., 1], then vectors."""
+        features = self.head(self.trunk(pixels, holding))
+        return torch.cat([features, *vectors], dim=-1) if vectors else features
 
 
 def _normalised(width: int, features: int) -> nn.Sequential:
@@ -52,7 +54,7 @@ class FERMConfig(ImageNetworkConfig):
 
     Args:
         width: factor on the width of convolutions and hidden layers; 1 is the reference's size.
-        features: size of the encoder's features, on which the contrastive loss acts.
+        features: size of the encoder's features of the image, on which the contrastive loss acts.
     """
 
     shares_encoder: ClassVar[bool] = True
@@ -66,11 +68,12 @@ class FERMConfig(ImageNetworkConfig):
         width, hidden, size = widths[-1], scaled_width(_HIDDEN, self.width), spec.action_size
         trunk = plain_trunk(self, spec, widths)
         head = _normalised(width, self.features)
-        loc, log_std = (mlp(self.features, hidden, hidden, size) for _ in range(2))
+        features = self.features + spec.vector_size
+        loc, log_std = (mlp(features, hidden, hidden, size) for _ in range(2))
         networks = ActorCritic(
             actor=PlainActor(trunk, head, loc, log_std),
             encoder=FERMEncoder(trunk, width, self.features),
-            critic=PlainTwinCritic(mlp(self.features + size, hidden, hidden, 1) for _ in range(2)),
+            critic=PlainTwinCritic(mlp(features + size, hidden, hidden, 1) for _ in range(2)),
         )
         for network in networks:
             network.apply(initialise_plain)

@@ -64,6 +64,8 @@ class ImageNetworkConfig(StrictModel):
         negative_slope: slope of the activation function below zero; 0 is a ReLU, as in the
             reference implementation. After a max pool, narrow layers with a ReLU can hide an object
             completely, and then receive no gradient from it.
+        vector_keys: keys of vectors in the observation that join the features of the image, such
+            as "proprio"; none in the paper.
     """
 
     control: ClassVar[Control] = "close_loop"
@@ -76,6 +78,7 @@ class ImageNetworkConfig(StrictModel):
     depth_center_m: float = 0.0
     depth_scale_m: float = Field(default=1.0, gt=0)
     negative_slope: float = Field(default=0.0, ge=0, lt=1)
+    vector_keys: list[str] = Field(default=[])
 
     def input_channels(self, image_channels: int) -> int:
         """Return the number of input channels of the first convolution."""
@@ -100,7 +103,8 @@ class ImageTrunk(nn.Module):
     """Depth image and holding flag to one feature vector, through convolutions.
 
     Activations are channels-last in the compute dtype; parameters stay float32 and each
-    convolution casts its own filter. The result is float32.
+    convolution casts its own filter. The result is float32. Vectors of the observation are appended
+    to it.
 
     Args:
         convs: convolutions that take and return plain tensors in the input's dtype.
@@ -116,8 +120,8 @@ class ImageTrunk(nn.Module):
         self.pools = tuple(pools)
         self.config = config
 
-    def forward(self, pixels: Tensor, holding: Tensor) -> Tensor:
-        """Return features [..., F] of pixels [..., C, H, W] and holding [..., 1]."""
+    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
+        """Return features [..., F] of pixels [..., C, H, W], holding [..., 1] and vectors."""
         leading = pixels.shape[:-3]
         x = self._input(pixels.flatten(0, -4) if leading else pixels[None], holding)
         slope = self.config.negative_slope
@@ -127,7 +131,8 @@ class ImageTrunk(nn.Module):
                 x = relu_of_max_pool(x, slope)
             else:
                 x = F.leaky_relu(x, slope) if slope else F.relu(x)
-        return x.flatten(1).float().reshape(*leading, -1)
+        features = x.flatten(1).float().reshape(*leading, -1)
+        return torch.cat([features, *vectors], dim=-1) if vectors else features
 
     def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:
         batch, channels, height, width = pixels.shape

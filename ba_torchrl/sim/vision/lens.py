@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import Pose, Vector
 
 Range = tuple[float, float]
 
@@ -17,25 +17,32 @@ NEAR_M = 0.01
 FAR_M = 10.0
 """Far plane of perspective cameras."""
 
+WRIST_EYE_M = (0.0, -0.095, -0.125)
+"""Position of the wrist camera in the tool frame."""
+WRIST_FOV_RAD = math.radians(65)
+"""Field of view of the wrist camera."""
+
 
 @dataclass(frozen=True)
 class Lens:
     """Pose and field of view of a perspective camera with square images.
 
-    The field of view is between opposite edges of the image.
+    The field of view is between opposite edges of the image. Image rows follow ``down``, as far as
+    it is perpendicular to the view; by default +x, or -z if the camera looks along x.
     """
 
     eye_m: Vector
     target_m: Vector
     fov_rad: float
+    down: Vector | None = None
 
     @cached_property
     def axes(self) -> np.ndarray:
         """Directions of the image rows, of the image columns and of the view, [3, 3] as rows."""
         forward = np.subtract(self.target_m, self.eye_m)
         forward = forward / np.linalg.norm(forward)
-        # image rows follow +x, or -z if the camera looks along x
-        hint = np.array([1.0, 0.0, 0.0] if abs(forward[0]) < 0.99 else [0.0, 0.0, -1.0])
+        default = [1.0, 0.0, 0.0] if abs(forward[0]) < 0.99 else [0.0, 0.0, -1.0]
+        hint = np.array(default if self.down is None else self.down)
         down = hint - (hint @ forward) * forward
         down /= np.linalg.norm(down)
         return np.stack([down, np.cross(down, forward), forward])
@@ -69,6 +76,19 @@ def oblique_lens(center_m: tuple[float, float]) -> Lens:
     """Return the camera opposite the robot, 0.81 m from the workspace centre at 47 degrees."""
     x, y = center_m
     return Lens((x + 0.55, y, 0.6), (x, y, 0.0), math.radians(40))
+
+
+def wrist_lens(tool: Pose) -> Lens:
+    """Return a camera on the gripper that looks along the fingers at the point between their tips.
+
+    It is beside the hand, in the plane between the fingers; image columns follow the closing axis.
+
+    Args:
+        tool: pose of the tool frame.
+    """
+    eye = tool.compose(Pose(WRIST_EYE_M)).position
+    down = tool.compose(Pose((0.0, 1.0, 0.0))).position
+    return Lens(eye, tool.position, WRIST_FOV_RAD, tuple(np.subtract(down, tool.position)))
 
 
 def side_lenses(center_m: tuple[float, float], width_m: float) -> tuple[Lens, Lens]:

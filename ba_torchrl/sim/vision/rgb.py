@@ -117,17 +117,37 @@ def render_rgb(
     return _smooth_edges(image, segmentation).round().astype(np.uint8)
 
 
-def render_rgbd(world: World, lens: Lens, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+def render_rgbd(
+    world: World, lens: Lens, pixels: int, range_m: tuple[float, float] = RGBD_RANGE_M
+) -> tuple[np.ndarray, np.ndarray]:
     """Render colours and depths of the scene with the robot.
 
     They are [pixels, pixels, 3] uint8, and [pixels, pixels] float64 metres along the optical axis,
-    at most the far plane of `RGBD_RANGE_M`.
+    between the near and the far plane of ``range_m``.
     """
-    near, far = RGBD_RANGE_M
-    view = pybullet.computeViewMatrix(lens.eye_m, lens.target_m, (-lens.axes[0]).tolist())
-    projection = pybullet.computeProjectionMatrixFOV(math.degrees(lens.fov_rad), 1.0, near, far)
-    rgb, buffer, _ = _render(world, pixels, pixels, view, projection)
+    near, far = range_m
+    rgb, buffer, _ = _render(world, pixels, pixels, *_matrices(lens, range_m))
     return rgb, far * near / (far - (far - near) * buffer.astype(float))
+
+
+def render_owners(world: World, lens: Lens, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Render PyBullet's ids of body and link in each pixel of `render_rgbd`.
+
+    Both are [pixels, pixels] int32. The body is -1 where there is none, the link -1 for a base.
+    """
+    matrices = _matrices(lens, RGBD_RANGE_M)
+    _, _, segmentation = _render(world, pixels, pixels, *matrices, links=True)
+    is_body = segmentation >= 0
+    bodies = np.where(is_body, segmentation & 0xFFFFFF, -1)
+    return bodies, np.where(is_body, (segmentation >> 24) - 1, -1)
+
+
+def _matrices(lens: Lens, range_m: tuple[float, float]) -> tuple[Sequence[float], Sequence[float]]:
+    """Return PyBullet's view and projection matrix."""
+    return (
+        pybullet.computeViewMatrix(lens.eye_m, lens.target_m, (-lens.axes[0]).tolist()),
+        pybullet.computeProjectionMatrixFOV(math.degrees(lens.fov_rad), 1.0, *range_m),
+    )
 
 
 def _render(

@@ -13,6 +13,7 @@ from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.meshes import bowl_parts, centroid
 from ba_torchrl.sim.shapes import Solid
 from ba_torchrl.tasks.base import BLUE, TASKS, CloseLoopTask
+from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import CLOSED, OPEN, grasped_body, move_toward
 from ba_torchrl.tasks.manipulation.transport import pick_up, travel
 from ba_torchrl.tasks.workspace import Spacing, random_points
@@ -92,6 +93,10 @@ class BlockInBowl(CloseLoopTask):
     def is_valid(self) -> bool:
         """Whether block and bowl are inside the workspace and the bowl has not tipped over."""
         return super().is_valid() and self.bowl.tilt_rad < self.tipped_rad
+
+    def instruction(self) -> str:
+        """Return the instruction with the colours of block and bowl."""
+        return f"put the {colored(self.block, 'block')} into the {colored(self.bowl, 'bowl')}"
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, carry it over the rim and release it inside."""

@@ -11,6 +11,7 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import grasp, grasped_body, lift
 
 
@@ -42,6 +43,10 @@ class BlockPicking(CloseLoopTask):
             "is_grasped": self.robot.held_body() is self.block,
             "is_lifted": self.robot.tool_pose()[0][2] > self.lift_height_m,
         }
+
+    def instruction(self) -> str:
+        """Return the instruction with the block's colour."""
+        return f"pick up the {colored(self.block, 'block')}"
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, then lift it."""

@@ -12,6 +12,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import BLUE, RED, TASKS, CloseLoopTask
+from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import (
     STANDOFF_M,
     behind_point,
@@ -54,6 +55,11 @@ class BlockPulling(CloseLoopTask):
     def evaluate(self) -> dict[str, bool]:
         """Return whether the blocks touch."""
         return {"is_touching": self.blocks[0].touches(self.blocks[1])}
+
+    def instruction(self) -> str:
+        """Return the instruction with the blocks' colours."""
+        first, second = (colored(block, "block") for block in self.blocks)
+        return f"pull the {first} and the {second} together"
 
     def expert_command(self) -> GripperCommand:
         """Move behind the block with the lower cost and pull it to the other."""

@@ -13,6 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.tasks.base import BLOCK_M, GREEN, TASKS, CloseLoopTask
+from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import push
 
 
@@ -48,6 +49,10 @@ class BlockPushing(CloseLoopTask):
         """Return whether the block is within 5 cm of the goal area."""
         distance_m = math.dist(self.block.position[:2], self.goal.position[:2])
         return {"is_at_goal": distance_m < self.goal_radius_m}
+
+    def instruction(self) -> str:
+        """Return the instruction with the colours of block and goal area."""
+        return f"push the {colored(self.block, 'block')} onto the {colored(self.goal, 'square')}"
 
     def expert_command(self) -> GripperCommand:
         """Move behind the block and push it with half-open fingers.

@@ -11,6 +11,7 @@ import numpy as np
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import OPEN, grasp
 
 
@@ -40,6 +41,10 @@ class BlockReaching(CloseLoopTask):
         """Return whether the tool point is within 3 cm of the block's centre."""
         distance_m = math.dist(self.robot.tool_pose()[0], self.block.position)
         return {"is_reached": distance_m < self.goal_distance_m}
+
+    def instruction(self) -> str:
+        """Return the instruction with the block's colour."""
+        return f"move the gripper to the {colored(self.block, 'block')}"
 
     def expert_command(self) -> GripperCommand:
         """Descend around the block with open fingers."""

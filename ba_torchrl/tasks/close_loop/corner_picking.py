@@ -15,6 +15,7 @@ from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, transform_mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.clearance import finger_extent_m
 from ba_torchrl.tasks.manipulation.primitives import (
     CLOSED,
@@ -128,6 +129,10 @@ class CornerPicking(CloseLoopTask):
             "is_grasped": self.robot.held_body() is self.block,
             "is_lifted": self.robot.tool_pose()[0][2] > self.lift_height_m,
         }
+
+    def instruction(self) -> str:
+        """Return the instruction with the block's colour."""
+        return f"pick up the {colored(self.block, 'block')} from the corner of the two walls"
 
     def expert_command(self) -> GripperCommand:
         """Drag the block out of the corner until a grasp has clearance, then grasp and lift it."""

@@ -16,6 +16,7 @@ from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import Mesh, box_mesh, rod_mesh, transform_mesh
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.clearance import (
     SIDE_MARGIN_M,
     passing_height_m,
@@ -132,6 +133,10 @@ class DrawerOpening(CloseLoopTask):
     def evaluate(self) -> dict[str, bool]:
         """Return whether the drawer is open by more than 15 cm."""
         return {"is_open": self.cabinet.travel_m > self._goal_m}
+
+    def instruction(self) -> str:
+        """Return the instruction with the cabinet's colour."""
+        return f"open the drawer of the {colored(self.cabinet.base, 'cabinet')}"
 
     def expert_command(self) -> GripperCommand:
         """Descend behind the handle with closed fingers and pull it.

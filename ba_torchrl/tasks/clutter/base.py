@@ -17,6 +17,7 @@ from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.clutter.grasp_planner import GraspPlanner
+from ba_torchrl.tasks.instructions import counted
 from ba_torchrl.tasks.terrain.tray import Tray
 
 DROP_Z_M = 0.2
@@ -146,6 +147,12 @@ class ClutterTask(Task):
         """The grasp planner of the expert, made at its first use."""
         camera = HeightCamera(self.world.bodies)
         return GraspPlanner(self.pool.bodies, camera, self.settings.workspace, self.robot.gripper)
+
+    def instruction(self) -> str:
+        """Return the instruction with the number of objects that are left."""
+        count = len(self.objects)
+        number = "one of " if count > 1 else ""
+        return f"pick up {number}the {counted(count, 'object')} in the tray"
 
     @property
     def objects(self) -> Sequence[Body]:

@@ -16,6 +16,7 @@ from ba_torchrl.sim.shapes import Box, Color, Shape, Solid
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.instructions import colored, counted
 from ba_torchrl.tasks.manipulation.commands import no_op, perturbed_pick, pick_command
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, narrowest, outline
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
@@ -174,6 +175,13 @@ class BinPacking(PackingTask):
             if other is not body and other is not held and vertical_extent(other)[1] > above_m
         ]
         return found + self._walls() if self._rim_m() > above_m else found
+
+    def instruction(self) -> str:
+        """Return the instruction with the number of objects and the bin's colour."""
+        return (
+            f"put the {counted(len(self.objects), 'object')} into the "
+            f"{colored(self.container, 'bin')}"
+        )
 
     def expert_command(self) -> PickPlaceCommand:
         """Pick the largest object that can be grasped, and drop it at the best site in the bin."""

@@ -15,6 +15,7 @@ from ba_torchrl.sim.meshes import lathe_parts
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.instructions import colored, counted
 from ba_torchrl.tasks.manipulation.clearance import half_gap_m, outline_clearances_m
 from ba_torchrl.tasks.manipulation.commands import no_op, pick_command
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
@@ -164,6 +165,13 @@ class BottleArrangement(PackingTask):
             body.tilt_rad < UPRIGHT_RAD
             and abs(body.position[2] - floor) <= FLOOR_TOLERANCE_M
             and self._inside().contains(np.array([body.position]))
+        )
+
+    def instruction(self) -> str:
+        """Return the instruction with the number of bottles and the tray's colour."""
+        return (
+            f"stand the {counted(len(self.objects), 'bottle')} in the "
+            f"{colored(self.container, 'tray')}"
         )
 
     def expert_command(self) -> PickPlaceCommand:

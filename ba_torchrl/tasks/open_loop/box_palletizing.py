@@ -16,6 +16,7 @@ from ba_torchrl.sim.geometry import Pose, Vector
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
+from ba_torchrl.tasks.instructions import colored, counted
 from ba_torchrl.tasks.manipulation.commands import (
     LEVEL_RAD,
     carrying_pose,
@@ -179,6 +180,13 @@ class BoxPalletizing(PackingTask):
         """Restore the active boxes, and where each box arrives."""
         active, self._arrivals = state
         super().set_state(active)
+
+    def instruction(self) -> str:
+        """Return the instruction with number and colour of the boxes."""
+        return (
+            f"stack the {counted(self.settings.num_objects, colored(self.pool.bodies[0], 'box'))} "
+            f"on the {colored(self.container, 'pallet')}{self.terrain.place_words}"
+        )
 
     def expert_command(self) -> PickPlaceCommand:
         """Place the highest box that is not stacked in the next slot."""

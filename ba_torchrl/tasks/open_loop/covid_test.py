@@ -17,6 +17,7 @@ from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, OpenLoopTask
 from ba_torchrl.tasks.body_pool import deactivate_body
+from ba_torchrl.tasks.instructions import colored, counted
 from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m
 from ba_torchrl.tasks.manipulation.commands import (
     no_op,
@@ -380,6 +381,14 @@ class CovidTest(OpenLoopTask):
         return new_rows(self._tube_m[0], self._swab_m[0])
 
     # -- expert ------------------------------------------------------------------------------
+
+    def instruction(self) -> str:
+        """Return the instruction with the number of tests and the colours of the areas."""
+        return (
+            f"{counted(self.rounds, 'time')}, lay a tube and a swab in the "
+            f"{colored(self.layout.test_area, 'area')} and then put the tube into the "
+            f"{colored(self.layout.used_box, 'box')}"
+        )
 
     def expert_command(self) -> PickPlaceCommand:
         """Collect a used tube, or present a tube or swab that is missing for the next test."""

@@ -13,6 +13,7 @@ from ba_torchrl.actions import GripperCommand, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.shapes import Color
 from ba_torchrl.tasks.base import BLUE, GREEN, RED, CloseLoopTask, OpenLoopTask, Task
+from ba_torchrl.tasks.instructions import structure_instruction
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
 from ba_torchrl.tasks.structures.experts import PickPlaceExpert, gripper_command
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
@@ -55,6 +56,12 @@ class StructureGoal(Task):
     def evaluate(self) -> dict[str, bool]:
         """Return whether the structure stands and whether no piece is held."""
         return self.structure.assigner(self.robot.held_body()).evaluate()
+
+    def instruction(self) -> str:
+        """Return the instruction to build the structure of the blueprint."""
+        bodies = [(piece.kind, body) for body, piece in self.structure.pieces.items()]
+        words = structure_instruction(self.structure.blueprint, bodies)
+        return words + self.terrain.place_words
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""

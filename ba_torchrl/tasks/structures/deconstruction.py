@@ -112,6 +112,10 @@ class Deconstruction(OpenLoopTask):
             "is_apart": not self._pieces_to_move(),
         }
 
+    def instruction(self) -> str:
+        """Return the instruction to build the structure, which the reversed episode does."""
+        return self.task.instruction()
+
     def is_valid(self) -> bool:
         """Whether the scene is valid for the structure task."""
         return self.task.is_valid()

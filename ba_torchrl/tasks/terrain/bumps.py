@@ -59,6 +59,8 @@ class Bumps(SlopedTerrain):
         random_orientation: whether the platform has a random heading.
     """
 
+    place_words = ", amid the bumps"
+
     def __init__(
         self,
         world: World,

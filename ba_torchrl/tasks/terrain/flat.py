@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -25,6 +25,9 @@ class Terrain(ABC):
     Args:
         world: not sealed yet; the terrain loads its own bodies.
     """
+
+    place_words: ClassVar[str] = ""
+    """Words that instructions add for the place where structures stand."""
 
     def __init__(self, world: World, workspace: Workspace) -> None:
         self.world = world

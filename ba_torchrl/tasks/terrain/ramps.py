@@ -58,6 +58,8 @@ class Ramps(SlopedTerrain):
         world: not sealed yet.
     """
 
+    place_words = ", between the ramps"
+
     def __init__(self, world: World, workspace: Workspace) -> None:
         super().__init__(world, workspace)
         radius_m = math.hypot(*(high - low for low, high in self.spawn_area)) / 2 + BORDER_M

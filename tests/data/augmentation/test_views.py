@@ -32,6 +32,17 @@ def batch(count=6, size=SIZE):
     )
 
 
+def test_every_view_has_the_vectors_of_its_transition():
+    data = batch()
+    data["proprio"] = torch.rand(6, 8)
+    data[keys.NEXT, "proprio"] = torch.rand(6, 8)
+    settings = {"views": 2, "target_views": 3, "has_positive": True, "padding": 1}
+    out = RandomViews(close_loop_images(SIZE), ["proprio"], seed=0, **settings)(data)
+    for key, count in (("proprio", 2), ((keys.NEXT, "proprio"), 3)):
+        assert torch.equal(out[key], data[key][:, None].expand(6, count, 8))
+    assert torch.equal(out[keys.POSITIVE, "proprio"], data["proprio"])
+
+
 def views(size=SIZE, **settings):
     return RandomViews(close_loop_images(size), seed=0, **settings)
 

@@ -50,6 +50,10 @@ class TallBlock(CloseLoopTask):
             "is_over_corner": distance_m < self.settings.parameters.tolerance_m,
         }
 
+    def instruction(self):
+        """Return the goal as a sentence."""
+        return "hold the red block over the corner"
+
     def expert_command(self):
         """Grasp the block, then carry it to its place."""
         if self.robot.held_body() is not self.block or self.robot.opening() >= 0.9:
