@@ -12,6 +12,7 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.manipulation.primitives import grasp, grasped_body, lift
+from ba_torchrl.tasks.manipulation.progress import lift_height, reach, staged
 
 
 @TASKS.register("close_loop/block_picking")
@@ -42,6 +43,14 @@ class BlockPicking(CloseLoopTask):
             "is_grasped": self.robot.held_body() is self.block,
             "is_lifted": self.robot.tool_pose()[0][2] > self.lift_height_m,
         }
+
+    def progress(self) -> float:
+        """Return the progress in three stages: reach, grasp, lift."""
+        if self.robot.held_body() is self.block:
+            low_m = self.settings.workspace.z[0]
+            return staged(1.0, 1.0, lift_height(self.robot, low_m, self.lift_height_m))
+        yaw = self.block.yaw_rad
+        return staged(reach(self.robot, self.block, (yaw, yaw + math.pi / 2)), 0.0, 0.0)
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, then lift it."""

@@ -12,6 +12,7 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.manipulation.primitives import OPEN, grasp
+from ba_torchrl.tasks.manipulation.progress import nearness, staged
 
 
 @TASKS.register("close_loop/block_reaching")
@@ -40,6 +41,11 @@ class BlockReaching(CloseLoopTask):
         """Return whether the tool point is within 3 cm of the block's centre."""
         distance_m = math.dist(self.robot.tool_pose()[0], self.block.position)
         return {"is_reached": distance_m < self.goal_distance_m}
+
+    def progress(self) -> float:
+        """Return the nearness of the tool point to the region of success."""
+        distance_m = math.dist(self.robot.tool_pose()[0], self.block.position)
+        return staged(nearness(distance_m - self.goal_distance_m))
 
     def expert_command(self) -> GripperCommand:
         """Descend around the block with open fingers."""

@@ -29,6 +29,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
+from ba_torchrl.tasks.manipulation.progress import nearness, share, staged, turn_m
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS
 
 CABINET_M: Vector = (0.22, 0.23, 0.11)
@@ -131,6 +132,24 @@ class DrawerOpening(CloseLoopTask):
     def evaluate(self) -> dict[str, bool]:
         """Return whether the drawer is open by more than 15 cm."""
         return {"is_open": self.cabinet.travel_m > self._goal_m}
+
+    def progress(self) -> float:
+        """Return the progress in two stages: reach behind the handle, and travel of the drawer."""
+        robot, scale = self.robot, self.settings.scale
+        (x, y, z), _ = robot.tool_pose()
+        (rx, ry, rz), heading = self.handle_pose
+        ahead, across = PlanarFrame(rx, ry, heading).to_local(x, y)
+        finger, radius = robot.gripper.half_width_m, ROD_DIAMETER_M / 2 * scale
+        near, far = -radius - finger, finger - ROD_OFFSET_M * scale  # fingers touch rod or front
+        offset = (
+            max(far - ahead, ahead - near, 0.0),
+            max(abs(across) - POST_GAP_M / 2 * scale + finger, 0.0),
+            max(z - tips_below_tool_m(robot) - rz + LEAST_HOOK_M, 0.0),
+        )
+        return staged(
+            nearness(math.hypot(*offset) + turn_m(robot, [heading + math.pi / 2])),
+            share(self.cabinet.travel_m, 0.0, self._goal_m),
+        )
 
     def expert_command(self) -> GripperCommand:
         """Descend behind the handle with closed fingers and pull it.

@@ -16,6 +16,7 @@ from ba_torchrl.tasks.base import BLUE, GREEN, RED, CloseLoopTask, OpenLoopTask,
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
 from ba_torchrl.tasks.structures.experts import PickPlaceExpert, gripper_command
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
+from ba_torchrl.tasks.structures.progress import structure_progress
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.workspace import Spacing, random_points
 
@@ -55,6 +56,11 @@ class StructureGoal(Task):
     def evaluate(self) -> dict[str, bool]:
         """Return whether the structure stands and whether no piece is held."""
         return self.structure.assigner(self.robot.held_body()).evaluate()
+
+    def progress(self) -> float:
+        """Return the progress of the structure; see `structure_progress`."""
+        moves_gradually = self.control == "close_loop"
+        return structure_progress(self.structure, self.robot, moves_gradually=moves_gradually)
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""
