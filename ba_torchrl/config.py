@@ -210,8 +210,9 @@ class EnvConfig(StrictModel):
     two fields above, None is the value of "fast", here 1e-5 in open loop and 0 in close loop."""
     reward: Literal["sparse", "dense", "difference"] = "sparse"
     """"sparse": 1 on success, else 0. "dense": on success 1, else the progress Phi of the task, in
-    [0, 1). "difference": sparse, plus `reward_discount` Phi(s') - Phi(s), where Phi is 0 in a
-    terminated state; optimal policies are those of the sparse reward (Ng et al., 1999)."""
+    [0, 1), and success is truncated, not terminated. "difference": sparse, plus `reward_discount`
+    Phi(s') - Phi(s), where Phi is 0 in a terminated state; optimal policies are those of the sparse
+    reward (Ng et al., 1999)."""
     reward_discount: float = Field(default=0.99, gt=0, le=1)
     """Discount of the learner, for the reward "difference"."""
     expert: bool = False

@@ -284,8 +284,10 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             self._on_fault()
         else:
             self._fault_counter.count_step()
-        terminated = not fault and (success or not valid)
-        at_limit = self._step_count >= self.max_steps
+        # the dense rewards that would follow a success belong to its value
+        cuts_rewards = success and self.config.reward == "dense"
+        terminated = not fault and not cuts_rewards and (success or not valid)
+        at_limit = cuts_rewards or self._step_count >= self.max_steps
         if at_limit and self.task_class.terminates_at_limit:
             terminated = not fault
         truncated = fault or (at_limit and not terminated)

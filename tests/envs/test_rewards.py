@@ -104,7 +104,7 @@ def test_reaching_rewards_the_distance_to_the_region_of_success(make):
         scene.controller.reset(((0.45, 0.0, 0.025 + distance_m), 0.0))
         x, y, z = scene.robot.tool_pose()[0]
         from_goal = math.hypot(x - 0.45, y, z - 0.025) - 0.03
-        expected = 0.9 * (1 - math.tanh(from_goal / 0.1))
+        expected = 0.9 * (1 - math.tanh(from_goal / 0.15))
         assert scene.task.progress() == pytest.approx(expected)
 
 
@@ -114,7 +114,7 @@ def test_picking_counts_reach_grasp_and_lift_as_a_third_each(make):
     scene, task = env.scene, env.scene.task
     task.block.place((0.45, 0.0, 0.025))
     scene.controller.reset(((0.45, 0.0, 0.125), 0.0))
-    assert task.progress() == pytest.approx(0.3 * (1 - math.tanh(1.0)), abs=1e-3)
+    assert task.progress() == pytest.approx(0.3 * (1 - math.tanh(0.1 / 0.15)), abs=1e-3)
     scene.controller.move_to((0.45, 0.0, 0.025), 0.0)
     assert task.progress() == pytest.approx(0.3, abs=0.01)
     scene.controller.grip(0.0)
@@ -141,11 +141,11 @@ def test_a_structure_counts_its_filled_slots_and_the_way_of_one_more_piece(make)
 
     # one cube stands on the ground; the other, 4 cm too far off, is a part of half the way
     far = progress(most_m + 0.04)
-    assert far == pytest.approx(0.9 * (1 + 0.5 * (1 - math.tanh(0.4))) / 3, abs=2e-3)
+    assert far == pytest.approx(0.9 * (1 + 0.5 * (1 - math.tanh(0.04 / 0.15))) / 3, abs=2e-3)
     # both stand, and the roof, on the ground, is 3 cm too low and aside of their centre
     x = 0.4 + (most_m - 0.005) / 2 - 0.35
     off = math.hypot(x, 0.1, 0.03)
-    expected = 0.9 * (2 + 0.5 * (1 - math.tanh(off / 0.1))) / 3
+    expected = 0.9 * (2 + 0.5 * (1 - math.tanh(off / 0.15))) / 3
     assert progress(most_m - 0.005) == pytest.approx(expected, abs=2e-3)
 
 
@@ -180,7 +180,7 @@ def test_an_object_that_leaves_the_workspace_costs_the_progress(make):
 
 @pytest.mark.parametrize("task", ["close_loop/block_pulling", "open_loop/block_stacking"])
 def test_the_reward_changes_nothing_else(make, task, monkeypatch):
-    played = play(make(task, reward="dense"), 0, expert=True)[1]
+    played = play(make(task, reward="difference"), 0, expert=True)[1]
     monkeypatch.setattr(TASKS[task], "progress", lambda task: pytest.fail("sparse measures none"))
     sparse = play(make(task), 0, expert=True)[1]
     assert (played.exclude(keys.REWARD) == sparse.exclude(keys.REWARD)).all()
@@ -216,6 +216,24 @@ def test_vectors_and_gymnasium_have_the_same_reward(make):
         assert state[keys.REWARD][0].item() == reward == expected
     envs.close()
     env.close()
+
+
+def test_value_targets_continue_behind_a_success_with_dense_rewards_only(make):
+    for reward, ends in (
+        ("sparse", "terminated"),
+        ("difference", "terminated"),
+        ("dense", "truncated"),
+    ):
+        last = play(make(PICKING, reward=reward, obs_type="vec"), 0, expert=True)[1][-1]
+        assert last[keys.SUCCESS]
+        assert last[keys.DONE]
+        assert [name for name in (keys.TERMINATED, keys.TRUNCATED) if last[name]] == [ends]
+    env = make(PICKING, reward="dense", obs_type="vec", expert=False)
+    env.reset()
+    env.scene.task.block.place((0.45, 0.16, 0.025))
+    outcome = env._step(env.full_action_spec.zero())
+    assert outcome[keys.TERMINATED]
+    assert not outcome[keys.TRUNCATED]
 
 
 def test_a_fault_has_no_reward(make, monkeypatch):

@@ -18,7 +18,7 @@ from ba_torchrl.tasks.workspace import Workspace
 
 MOST = 0.9
 """Progress of a state in which all stages are complete; a success has the reward 1."""
-LENGTH_M = 0.1
+LENGTH_M = 0.15
 """Distance at which `nearness` is 0.24."""
 TURN_M = 0.03
 """Distance that counts as much as a yaw error of one radian: fingertips are this far off the tool

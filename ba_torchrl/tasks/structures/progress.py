@@ -53,6 +53,9 @@ def place_distance_m(
 ) -> float:
     """Return the distance of a piece from its place in an empty slot, metres.
 
+    It is infinite where only the ground and no other piece defines the place: a piece on the ground
+    that does not fill such a slot stands where the terrain supports no structure.
+
     Args:
         structure: the pieces in their world.
         assigner: for their present states.
@@ -61,15 +64,17 @@ def place_distance_m(
         assignment: of the other slots.
     """
     slot, (x, y, _) = structure.blueprint.slots[number], body.position
+    partner = structure.blueprint.partner(number)
+    other = None if partner is None else assignment[partner]
+    if not slot.on and other is None:
+        return math.inf
     below = [assignment[i] for i in slot.centered_over or slot.on]
     floor_m = max(
         (vertical_extent(assignment[i])[1] for i in slot.on),
         default=structure.terrain.height_m((x, y)),
     )
     aside_m = math.dist((x, y), mean_position(b.position for b in below)[:2]) if below else 0.0
-    partner = structure.blueprint.partner(number)
     if partner is not None:  # beside another piece, under the same bridge
-        other = assignment[partner]
         bridge = structure.blueprint.slots[structure.blueprint.bridge_on(number)]
         aside_m = max(aside_m - bridge.span.most_m / 2, 0.0)
         if other is not None:
