@@ -86,6 +86,8 @@ def test_progress_rises_to_success_along_the_experts_episodes(make, task):
         assert [value == 1 for value in seen] == success
         assert all(0 <= value < 1 for value in [first, *seen[:-1]])
         assert seen[-2] > first + 0.2
+        if task != "close_loop/object_grasping":  # whose expert grasps again after a slip
+            assert min(np.diff([first, *seen])) > -0.03
         thirds.append([np.mean(part) for part in np.array_split([first, *seen[:-1]], 3)])
         _, steps = play(env, seed, expert=False)
         assert all(0 <= value < 1 for value in rewards(steps))
@@ -100,10 +102,10 @@ def test_reaching_rewards_the_distance_to_the_region_of_success(make):
     env.reset()
     scene = env.scene
     scene.task.block.place((0.45, 0.0, 0.025))
-    for distance_m in (0.03, 0.08, 0.18):
+    for distance_m in (0.02, 0.08, 0.18):
         scene.controller.reset(((0.45, 0.0, 0.025 + distance_m), 0.0))
         x, y, z = scene.robot.tool_pose()[0]
-        from_goal = math.hypot(x - 0.45, y, z - 0.025) - 0.03
+        from_goal = max(math.hypot(x - 0.45, y, z - 0.025) - 0.03, 0.0)
         expected = 0.9 * (1 - math.tanh(from_goal / 0.15))
         assert scene.task.progress() == pytest.approx(expected)
 
