@@ -106,8 +106,13 @@ def test_reaching_rewards_the_distance_to_the_region_of_success(make):
         scene.controller.reset(((0.45, 0.0, 0.025 + distance_m), 0.0))
         x, y, z = scene.robot.tool_pose()[0]
         from_goal = max(math.hypot(x - 0.45, y, z - 0.025) - 0.03, 0.0)
+        yaw, opening = scene.robot.tool_pose()[1], scene.robot.opening()
+        from_goal += 0.03 * abs(yaw) + 0.03 * (1 - opening)
         expected = 0.9 * (1 - math.tanh(from_goal / 0.15))
         assert scene.task.progress() == pytest.approx(expected)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.205), 0.5)
+    assert scene.task.progress() == pytest.approx(0.9 * (1 - math.tanh(0.195 / 0.15)), abs=5e-3)
 
 
 def test_picking_counts_reach_grasp_and_lift_as_a_third_each(make):

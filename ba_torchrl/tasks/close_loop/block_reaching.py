@@ -12,7 +12,7 @@ from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.manipulation.primitives import OPEN, grasp
-from ba_torchrl.tasks.manipulation.progress import nearness, staged
+from ba_torchrl.tasks.manipulation.progress import reach, staged
 
 
 @TASKS.register("close_loop/block_reaching")
@@ -43,9 +43,9 @@ class BlockReaching(CloseLoopTask):
         return {"is_reached": distance_m < self.goal_distance_m}
 
     def progress(self) -> float:
-        """Return the nearness of the tool point to the region of success."""
-        distance_m = math.dist(self.robot.tool_pose()[0], self.block.position)
-        return staged(nearness(distance_m - self.goal_distance_m))
+        """Return the nearness of the tool point, with open fingers, to the region of success."""
+        yaws = (self.block.yaw_rad, self.block.yaw_rad + math.pi / 2)
+        return staged(reach(self.robot, self.block, yaws, self.goal_distance_m))
 
     def expert_command(self) -> GripperCommand:
         """Descend around the block with open fingers."""

@@ -147,7 +147,7 @@ class CornerPicking(CloseLoopTask):
         start_m = self.block_m / 2 - finger_extent_m(robot.gripper)
         drag = share(max(map(self.clearance_m, yaws)), start_m, GRASP_CLEARANCE_M)
         if drag == 1.0:
-            return staged(1.0, 1.0, robot.opening() * reach(robot, block, yaws), 0.0, 0.0)
+            return staged(1.0, 1.0, reach(robot, block, yaws), 0.0, 0.0)
         aside_m = max(math.dist((x, y), block.position[:2]) - self.block_m / 2, 0.0)
         above_m = z - vertical_extent(block)[1] - self._tips_below_m
         return staged(nearness(math.hypot(aside_m, max(above_m, 0.0))), drag, 0.0, 0.0, 0.0)

@@ -23,6 +23,9 @@ LENGTH_M = 0.15
 TURN_M = 0.03
 """Distance that counts as much as a yaw error of one radian: fingertips are this far off the tool
 point."""
+CLOSED_M = 0.03
+"""Distance that counts as much as closed fingers where open ones move around a body. Closed ones
+stop on top of it."""
 
 
 def staged(*stages: float) -> float:
@@ -50,13 +53,17 @@ def turn_m(robot: Robot, yaws_rad: Iterable[float]) -> float:
     return TURN_M * min(abs(wrap_angle(wanted - yaw, math.pi)) for wanted in yaws_rad)
 
 
-def reach(robot: Robot, body: Body, yaws_rad: Iterable[float] | None = None) -> float:
-    """Return the nearness of the tool point to the centre of a body.
+def reach(
+    robot: Robot, body: Body, yaws_rad: Iterable[float] | None = None, within_m: float = 0.0
+) -> float:
+    """Return the nearness of the tool point, with open fingers, to the centre of a body.
 
     Args:
         yaws_rad: yaws of the gripper at which the fingers close on the body; None for any.
+        within_m: distance that counts as none.
     """
-    distance_m = math.dist(robot.tool_pose()[0], body.position)
+    distance_m = max(math.dist(robot.tool_pose()[0], body.position) - within_m, 0.0)
+    distance_m += CLOSED_M * (1 - robot.opening())
     return nearness(distance_m + (0.0 if yaws_rad is None else turn_m(robot, yaws_rad)))
 
 
