@@ -286,6 +286,13 @@ class ExperimentConfig(WorkerOptions):
                 f"env.reward_discount: {env.reward_discount:g} must equal algorithm.gamma, "
                 f"{gamma:g}; otherwise the difference changes which policy is optimal"
             )
+        if env.reward == "dense" and not getattr(
+            self.algorithm_config, "bootstrap_truncated", True
+        ):
+            raise ConfigError(
+                "env.reward: with 'dense', success is truncated and needs "
+                "algorithm.bootstrap_truncated=true"
+            )
 
     def _check_demonstrations(self) -> None:
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")

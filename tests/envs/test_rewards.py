@@ -274,16 +274,24 @@ def test_reversed_episodes_have_the_sparse_reward_only():
         make_deconstruction_env("open_loop/house_building_2", reward="dense")
 
 
-@pytest.mark.parametrize("discount", [0.95, 0.99])
-def test_the_learner_discounts_as_the_difference_does(discount):
+@pytest.mark.parametrize(
+    ("env", "algorithm", "message"),
+    [
+        ({"reward": "difference", "reward_discount": 0.95}, {"gamma": 0.95}, None),
+        ({"reward": "difference"}, {"gamma": 0.95}, r"env.reward_discount: 0.99 .* gamma, 0.95"),
+        ({"reward": "dense"}, {"gamma": 0.95}, None),
+        ({"reward": "dense"}, {"bootstrap_truncated": False}, "needs algorithm.bootstrap_trunc"),
+    ],
+)
+def test_the_learner_values_what_the_rewards_assume(env, algorithm, message):
     values = {
         "task": PICKING,
-        "env": {"reward": "difference", "reward_discount": discount, "obs_size": 64},
-        "algorithm": {"name": "sac", "gamma": 0.95},
+        "env": {"obs_size": 64, **env},
+        "algorithm": {"name": "sac", **algorithm},
         "network": {"name": "cnn"},
     }
-    if discount == 0.95:
+    if message is None:
         ExperimentConfig.parse(values)
         return
-    with pytest.raises(ConfigError, match=r"env.reward_discount: 0.99 .* algorithm.gamma, 0.95"):
+    with pytest.raises(ConfigError, match=message):
         ExperimentConfig.parse(values)
