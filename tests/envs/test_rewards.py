@@ -278,7 +278,11 @@ def test_reversed_episodes_have_the_sparse_reward_only():
     ("env", "algorithm", "message"),
     [
         ({"reward": "difference", "reward_discount": 0.95}, {"gamma": 0.95}, None),
-        ({"reward": "difference"}, {"gamma": 0.95}, r"env.reward_discount: 0.99 .* gamma, 0.95"),
+        (
+            {"reward": "difference"},
+            {"gamma": 0.95},
+            r"env.reward_discount: 0.99 .* algorithm.gamma, 0.95",
+        ),
         ({"reward": "dense"}, {"gamma": 0.95}, None),
         ({"reward": "dense"}, {"bootstrap_truncated": False}, "needs algorithm.bootstrap_trunc"),
     ],
