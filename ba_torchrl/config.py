@@ -212,6 +212,13 @@ class EnvConfig(StrictModel):
     solver_residual: float | None = Field(default=None, ge=0)
     """Custom physics: residual at which the solver stops early; 0 for all iterations. As for the
     two fields above, None is the value of "fast", here 1e-5 in open loop and 0 in close loop."""
+    reward: Literal["sparse", "dense", "difference"] = "sparse"
+    """"sparse": 1 on success, else 0. "dense": on success 1, else the progress Phi of the task, in
+    [0, 1), and success is truncated, not terminated. "difference": sparse, plus `reward_discount`
+    Phi(s') - Phi(s), where Phi is 0 in a terminated state; optimal policies are those of the sparse
+    reward (Ng et al., 1999)."""
+    reward_discount: float = Field(default=0.99, gt=0, le=1)
+    """Discount of the learner, for the reward "difference"."""
     expert: bool = False
     """Add the expert's action to every observation."""
     seed: int | None = Field(default=None, ge=0)
@@ -283,6 +290,9 @@ class EnvConfig(StrictModel):
             raise ValueError(f"{', '.join(custom)} needs physics_mode='custom'")
         if self.physics_mode == "custom" and not custom:
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
+        if self.reward != "difference":
+            for message in changed(self, ["reward_discount"], "without reward='difference'"):
+                raise ValueError(message)
         return self
 
     @property
@@ -344,6 +354,8 @@ class EnvKeywords(TypedDict, total=False):
     time_step_s: float | None
     solver_iterations: int | None
     solver_residual: float | None
+    reward: Literal["sparse", "dense", "difference"]
+    reward_discount: float
     expert: bool
     seed: int | None
 

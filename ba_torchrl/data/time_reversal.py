@@ -49,11 +49,16 @@ class DeconstructionEnv(OpenLoopEnv):
     Every observation contains the action that reverses the last one.
 
     Raises:
-        ConfigError: as for `OpenLoopEnv`, or the task has no structure.
+        ConfigError: as for `OpenLoopEnv`, or the task has no structure, or the reward is dense.
     """
 
     def __init__(self, resolved: ResolvedEnv) -> None:
         check_has_structure(resolved.task_id)
+        if resolved.config.reward != "sparse":
+            raise ConfigError(
+                f"reward: {resolved.config.reward!r} is not that of the reversed episodes of a "
+                "deconstruction; collect the expert's, or leave the reward at 'sparse'"
+            )
         super().__init__(resolved)
 
     def _build_scene(self, scale: float, *, window: bool | None = None) -> Scene:

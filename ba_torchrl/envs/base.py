@@ -72,6 +72,8 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         self._conditions: dict[str, bool] | None = None
         """The conditions of success after the last step, None before the first."""
         self._instruction = ""
+        self._progress = 0.0
+        """The task's progress in the present state, for dense rewards."""
         self._step_count = 0
         self._fault_counter = FaultCounter(self.task_id)
         self.on_contact: Callable[[], None] | None = None
@@ -220,6 +222,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             episode=self._episode,
             step_count=self._step_count,
             ends=self._ends,
+            progress=self._progress,
         )
 
     def set_state(self, state: EnvState) -> TensorDict:
@@ -244,6 +247,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         self._step_count = state.step_count
         self._ends, self._conditions = state.ends, None
         self._instruction = self.scene.task.instruction()
+        self._progress = state.progress
         return self._tensordict(self._observation, **self._ends)
 
     def __repr__(self) -> str:
@@ -291,13 +295,16 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             self._conditions, valid = evaluate_at_rest(scene)
             success = valid and all(self._conditions.values())
             self._observation = self._observe(scene)
+            before, self._progress = self._progress, self._measure_progress(scene)
         except Exception:
             fault, self._conditions = True, dict.fromkeys(self._condition_names, False)
             self._on_fault()
         else:
             self._fault_counter.count_step()
-        terminated = not fault and (success or not valid)
-        at_limit = self._step_count >= self.max_steps
+        # the dense rewards that would follow a success belong to its value
+        cuts_rewards = success and self.config.reward == "dense"
+        terminated = not fault and not cuts_rewards and (success or not valid)
+        at_limit = cuts_rewards or self._step_count >= self.max_steps
         if at_limit and self.task_class.terminates_at_limit:
             terminated = not fault
         truncated = fault or (at_limit and not terminated)
@@ -310,6 +317,8 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             keys.IS_OUT_OF_REACH: scene.controller.is_out_of_reach,
         }
         reward = float(self._ends[keys.SUCCESS])
+        if self.config.reward != "sparse" and not fault:
+            reward = self._dense_reward(before, reward)
         return self._tensordict(self._observation, reward=reward, **self._ends)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
@@ -419,9 +428,37 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         while True:
             rng = np.random.default_rng([self.base_seed, self._episode - 1])
             try:
-                return self._observe(self._episodes.begin(rng, with_new_objects=with_new_objects))
+                scene = self._episodes.begin(rng, with_new_objects=with_new_objects)
+                self._progress = self._measure_progress(scene)
+                return self._observe(scene)
             except SIMULATOR_ERRORS:
                 self._on_fault()
+
+    def _measure_progress(self, scene: Scene) -> float:
+        """Return the task's progress, 0 if the reward is sparse.
+
+        Raises:
+            ValueError: it is not in [0, 1).
+        """
+        if self.config.reward == "sparse":
+            return 0.0
+        with scene.world.fixed_poses():
+            progress = float(scene.task.progress())
+        if not 0 <= progress < 1:
+            raise ValueError(f"{self.task_id}: progress must be in [0, 1), not {progress}")
+        return progress
+
+    def _dense_reward(self, progress_before: float, sparse: float) -> float:
+        """Return the reward of the last step; see `EnvConfig.reward`.
+
+        Args:
+            progress_before: the step.
+            sparse: its sparse reward.
+        """
+        if self.config.reward == "dense":
+            return sparse or self._progress
+        progress = 0.0 if self._ends[keys.TERMINATED] else self._progress
+        return sparse + self.config.reward_discount * progress - progress_before
 
     def _on_fault(self) -> None:
         """Close the worlds and count the fault; the next episode builds a new world."""

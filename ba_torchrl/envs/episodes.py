@@ -33,6 +33,7 @@ class EnvState:
     episode: int
     step_count: int
     ends: dict[str, bool]
+    progress: float
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self  # it never changes, and its snapshot is of one world

@@ -242,6 +242,9 @@ def _check_task_supports(task_id: str, config: EnvConfig) -> None:
         raise ConfigError(
             f"num_objects: {task_id} takes {allowed} objects, not {config.num_objects}"
         )
+    if config.reward != "sparse" and task_class.progress is Task.progress:
+        dense = ", ".join(name for name in TASKS if TASKS[name].progress is not Task.progress)
+        raise ConfigError(f"reward: {task_id} has no dense reward; it is for {dense}")
     if config.close_loop_tray and not task_class.fits_tray:
         fitting = ", ".join(name for name in TASKS if TASKS[name].fits_tray)
         raise ConfigError(

@@ -152,6 +152,13 @@ class Task(ABC):
             Bools, named ``is_...``; success is their conjunction.
         """
 
+    def progress(self) -> float:
+        """Return how near the conditions of `evaluate` are, in [0, 1), for dense rewards.
+
+        It depends on the present scene only. Tasks without this method have sparse rewards only.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no dense reward")
+
     @abstractmethod
     def expert_command(self) -> GripperCommand | PickPlaceCommand:
         """Return the expert's command; it depends on the present scene only."""

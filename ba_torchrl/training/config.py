@@ -226,6 +226,7 @@ class ExperimentConfig(WorkerOptions):
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
         control = config.resolved_env.task_class.control
         config.algorithm_config.check(config.network_config, control)
+        config._check_reward()
         if config.pretrain_updates > config.total_updates:
             raise ConfigError(
                 f"pretrain_updates ({config.pretrain_updates}) is part of total_updates "
@@ -280,6 +281,21 @@ class ExperimentConfig(WorkerOptions):
             yield from changed(self, ["compile_mode"], f"without updates after those of {option}")
         for message in self.algorithm_config.without_effect(self.network_config):
             yield f"algorithm.{message}"
+
+    def _check_reward(self) -> None:
+        env, gamma = self.resolved_env.config, getattr(self.algorithm_config, "gamma", None)
+        if env.reward == "difference" and gamma not in (None, env.reward_discount):
+            raise ConfigError(
+                f"env.reward_discount: {env.reward_discount:g} must equal algorithm.gamma, "
+                f"{gamma:g}; otherwise the difference changes which policy is optimal"
+            )
+        if env.reward == "dense" and not getattr(
+            self.algorithm_config, "bootstrap_truncated", True
+        ):
+            raise ConfigError(
+                "env.reward: with 'dense', success is truncated and needs "
+                "algorithm.bootstrap_truncated=true"
+            )
 
     def _check_demonstrations(self) -> None:
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")

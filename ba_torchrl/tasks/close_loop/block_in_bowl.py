@@ -15,6 +15,7 @@ from ba_torchrl.sim.shapes import Solid
 from ba_torchrl.tasks.base import BLUE, TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import CLOSED, OPEN, grasped_body, move_toward
+from ba_torchrl.tasks.manipulation.progress import nearness, reach, share, staged
 from ba_torchrl.tasks.manipulation.transport import pick_up, travel
 from ba_torchrl.tasks.workspace import Spacing, random_points
 
@@ -97,6 +98,24 @@ class BlockInBowl(CloseLoopTask):
     def instruction(self) -> str:
         """Return the instruction with the colours of block and bowl."""
         return f"put the {colored(self.block, 'block')} into the {colored(self.bowl, 'bowl')}"
+
+    def progress(self) -> float:
+        """Return the progress in five stages: reach, grasp, raise, move over the bowl, lower.
+
+        The last three also count for a block that is released in the bowl.
+        """
+        block, scale = self.block, self.settings.scale
+        low, rim = vertical_extent(block)[0], vertical_extent(self.bowl)[1]
+        aside_m = math.dist(block.position[:2], self.bowl.position[:2])
+        outside_m = aside_m - self.within_rim_m * scale
+        is_within = outside_m <= 0
+        if self.robot.held_body() is not block and not (is_within and low < rim):
+            yaw = block.yaw_rad
+            return staged(reach(self.robot, block, (yaw, yaw + math.pi / 2)), 0.0, 0.0, 0.0, 0.0)
+        foot = self.bowl.position[2] - self.bowl.shape.height_m / 2
+        raised = 1.0 if is_within else share(low, foot, rim + self.clearance_m)
+        lowered = share(low, rim, foot + self.floor_m * scale) if is_within else 0.0
+        return staged(1.0, 1.0, raised, nearness(outside_m), lowered)
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, carry it over the rim and release it inside."""

@@ -13,6 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import grasp, grasped_body, lift
+from ba_torchrl.tasks.manipulation.progress import lift_height, reach, staged
 
 
 @TASKS.register("close_loop/block_picking")
@@ -47,6 +48,14 @@ class BlockPicking(CloseLoopTask):
     def instruction(self) -> str:
         """Return the instruction with the block's colour."""
         return f"pick up the {colored(self.block, 'block')}"
+
+    def progress(self) -> float:
+        """Return the progress in three stages: reach, grasp, lift."""
+        if self.robot.held_body() is self.block:
+            low_m = self.settings.workspace.z[0]
+            return staged(1.0, 1.0, lift_height(self.robot, low_m, self.lift_height_m))
+        yaw = self.block.yaw_rad
+        return staged(reach(self.robot, self.block, (yaw, yaw + math.pi / 2)), 0.0, 0.0)
 
     def expert_command(self) -> GripperCommand:
         """Grasp the block, then lift it."""

@@ -19,9 +19,13 @@ from ba_torchrl.tasks.manipulation.primitives import (
     has_room_behind,
     push,
 )
+from ba_torchrl.tasks.manipulation.progress import nearness, reach_behind, staged
 
 NO_ROOM_COST_M = 1.0
 """Cost of a block with no room behind it for the gripper."""
+
+FARTHEST_M = 2.0
+"""Distance up to which the gap between the blocks is measured."""
 
 PRESS_M = 5e-3
 """Distance that a pull continues after the blocks touch, if it must not push the other block."""
@@ -60,6 +64,16 @@ class BlockPulling(CloseLoopTask):
         """Return the instruction with the blocks' colours."""
         first, second = (colored(block, "block") for block in self.blocks)
         return f"pull the {first} and the {second} together"
+
+    def progress(self) -> float:
+        """Return the progress in two stages: reach behind either block, and gap between both."""
+        first, second = self.blocks
+        reaches = (
+            reach_behind(self.robot, body, other.position[:2], self.settings.workspace)
+            for body, other in ((first, second), (second, first))
+        )
+        gap = gap_m(self.world.client, first.id, second.id, FARTHEST_M)
+        return staged(max(reaches), nearness(gap))
 
     def expert_command(self) -> GripperCommand:
         """Move behind the block with the lower cost and pull it to the other."""

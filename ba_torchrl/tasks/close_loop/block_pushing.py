@@ -15,6 +15,7 @@ from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.tasks.base import BLOCK_M, GREEN, TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import push
+from ba_torchrl.tasks.manipulation.progress import nearness, reach_behind, staged
 
 
 @TASKS.register("close_loop/block_pushing")
@@ -53,6 +54,14 @@ class BlockPushing(CloseLoopTask):
     def instruction(self) -> str:
         """Return the instruction with the colours of block and goal area."""
         return f"push the {colored(self.block, 'block')} onto the {colored(self.goal, 'square')}"
+
+    def progress(self) -> float:
+        """Return the progress in two stages: reach behind the block, and block to the goal area."""
+        goal = self.goal.position[:2]
+        return staged(
+            reach_behind(self.robot, self.block, goal, self.settings.workspace),
+            nearness(math.dist(self.block.position[:2], goal) - self.goal_radius_m),
+        )
 
     def expert_command(self) -> GripperCommand:
         """Move behind the block and push it with half-open fingers.

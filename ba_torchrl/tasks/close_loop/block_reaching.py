@@ -13,6 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import OPEN, grasp
+from ba_torchrl.tasks.manipulation.progress import reach, staged
 
 
 @TASKS.register("close_loop/block_reaching")
@@ -45,6 +46,11 @@ class BlockReaching(CloseLoopTask):
     def instruction(self) -> str:
         """Return the instruction with the block's colour."""
         return f"move the gripper to the {colored(self.block, 'block')}"
+
+    def progress(self) -> float:
+        """Return the nearness of the tool point, with open fingers, to the region of success."""
+        yaws = (self.block.yaw_rad, self.block.yaw_rad + math.pi / 2)
+        return staged(reach(self.robot, self.block, yaws, self.goal_distance_m))
 
     def expert_command(self) -> GripperCommand:
         """Descend around the block with open fingers."""

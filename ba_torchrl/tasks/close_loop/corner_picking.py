@@ -27,6 +27,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
+from ba_torchrl.tasks.manipulation.progress import lift_height, nearness, reach, share, staged
 from ba_torchrl.tasks.manipulation.transport import pick_up
 
 WALL_COLOR: Color = (0.72, 0.7, 0.66, 1.0)
@@ -133,6 +134,28 @@ class CornerPicking(CloseLoopTask):
     def instruction(self) -> str:
         """Return the instruction with the block's colour."""
         return f"pick up the {colored(self.block, 'block')} from the corner of the two walls"
+
+    def progress(self) -> float:
+        """Return the progress in five stages: touch, drag, reach, grasp, lift.
+
+        The first two are complete as soon as open fingers have clearance between block and walls.
+        """
+        robot, block = self.robot, self.block
+        (x, y, z), yaw = robot.tool_pose()
+        if robot.held_body() is block:
+            low_m = self.settings.workspace.z[0]
+            return staged(1.0, 1.0, 1.0, 1.0, lift_height(robot, low_m, self.lift_height_m))
+        yaws = [block.yaw_rad + k * math.pi / 2 for k in (0, 1)]
+        if not self.action_limits.turn_rad:
+            yaws = [yaw]
+        # at the start, the surface of the block is at the walls
+        start_m = self.block_m / 2 - finger_extent_m(robot.gripper)
+        drag = share(max(map(self.clearance_m, yaws)), start_m, GRASP_CLEARANCE_M)
+        if drag == 1.0:
+            return staged(1.0, 1.0, reach(robot, block, yaws), 0.0, 0.0)
+        aside_m = max(math.dist((x, y), block.position[:2]) - self.block_m / 2, 0.0)
+        above_m = z - vertical_extent(block)[1] - self._tips_below_m
+        return staged(nearness(math.hypot(aside_m, max(above_m, 0.0))), drag, 0.0, 0.0, 0.0)
 
     def expert_command(self) -> GripperCommand:
         """Drag the block out of the corner until a grasp has clearance, then grasp and lift it."""

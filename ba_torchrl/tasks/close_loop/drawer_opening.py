@@ -30,6 +30,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
+from ba_torchrl.tasks.manipulation.progress import nearness, share, staged, turn_m
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS
 
 CABINET_M: Vector = (0.22, 0.23, 0.11)
@@ -137,6 +138,24 @@ class DrawerOpening(CloseLoopTask):
     def instruction(self) -> str:
         """Return the instruction with the cabinet's colour."""
         return f"open the drawer of the {colored(self.cabinet.base, 'cabinet')}"
+
+    def progress(self) -> float:
+        """Return the progress in two stages: reach behind the handle, and travel of the drawer."""
+        robot, scale = self.robot, self.settings.scale
+        (x, y, z), _ = robot.tool_pose()
+        (rx, ry, rz), heading = self.handle_pose
+        ahead, across = PlanarFrame(rx, ry, heading).to_local(x, y)
+        finger, radius = robot.gripper.half_width_m, ROD_DIAMETER_M / 2 * scale
+        near, far = -radius - finger, finger - ROD_OFFSET_M * scale  # fingers touch rod or front
+        offset = (
+            max(far - ahead, ahead - near, 0.0),
+            max(abs(across) - POST_GAP_M / 2 * scale + finger, 0.0),
+            max(z - tips_below_tool_m(robot) - rz + LEAST_HOOK_M, 0.0),
+        )
+        return staged(
+            nearness(math.hypot(*offset) + turn_m(robot, [heading + math.pi / 2])),
+            share(self.cabinet.travel_m, 0.0, self._goal_m),
+        )
 
     def expert_command(self) -> GripperCommand:
         """Descend behind the handle with closed fingers and pull it.

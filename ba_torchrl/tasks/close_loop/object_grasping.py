@@ -26,6 +26,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     lift,
     move_toward,
 )
+from ba_torchrl.tasks.manipulation.progress import lift_height, reach, staged
 
 RISKY = 1e3
 """Cost of a risk, more than that of any way to a grasp."""
@@ -66,6 +67,13 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
     def evaluate(self) -> dict[str, bool]:
         """Return whether an object is held and whether the tool is higher than 15 cm."""
         return {"is_grasped": self.robot.held_body() is not None, "is_lifted": self._is_lifted()}
+
+    def progress(self) -> float:
+        """Return the progress in three stages: reach to the nearest object, grasp, lift."""
+        if self.robot.held_body() is not None:
+            low_m = self.settings.workspace.z[0]
+            return staged(1.0, 1.0, lift_height(self.robot, low_m, self.lift_height_m))
+        return staged(max(reach(self.robot, body) for body in self.objects), 0.0, 0.0)
 
     def expert_command(self) -> GripperCommand:
         """Grasp the object with the lowest cost and lift it.

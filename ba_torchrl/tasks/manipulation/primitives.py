@@ -224,7 +224,7 @@ def push(
 
     over_z = body.position[2] + half + passing_height_m(robot.gripper)
     is_behind = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
-    is_obstacle = not is_behind and _distance_to_segment(
+    is_obstacle = not is_behind and distance_to_segment(
         (bx, by), (x, y), behind
     ) < OBSTACLE_SHARE * math.dist(behind, (bx, by))
     is_around = math.dist((x, y), (bx, by)) < footprint_radius_m(body)
@@ -287,7 +287,7 @@ def fits_between_fingers(robot: Robot, body: Body) -> bool:
     return min(body.shape.bounds_m[1][:2]) < half_gap_m(robot.gripper)
 
 
-def _distance_to_segment(
+def distance_to_segment(
     point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]
 ) -> float:
     """Return the distance between a point and a line segment."""

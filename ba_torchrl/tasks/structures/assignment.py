@@ -15,7 +15,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import CONTACT_DISTANCE_M, contacts
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
+from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece, Slot
 from ba_torchrl.tasks.structures.free_space import extent_along_m
 
 SUPPORT_COSINE = 0.5
@@ -218,6 +218,17 @@ class SlotAssigner:
             if math.dist(mean_position((first, second))[:2], support[:2]) >= self.block_m:
                 return False
         bridge = self.blueprint.slots[self.blueprint.bridge_on(number)]
+        if self.span_error_m(bridge, body, other) == 0:
+            return True
+        return any(
+            piece.kind == bridge.piece.kind
+            and self.states[candidate].supports.issuperset((body, other))
+            for candidate, piece in self.pieces.items()
+        )
+
+    def span_error_m(self, bridge: Slot, body: Body, other: Body) -> float:
+        """Return by how much the distance of two pieces is outside the span of a bridge."""
+        first, second = self.states[body].position, self.states[other].position
         distance = math.dist(first[:2], second[:2])
         if bridge.span.gap_m is not None:
             direction = (np.array(second[:2]) - first[:2]) / max(distance, 1e-9)
@@ -225,13 +236,7 @@ class SlotAssigner:
                 extent_along_m(body, direction[None])[0]
                 + extent_along_m(other, -direction[None])[0]
             )
-        if bridge.span.least_m <= distance <= bridge.span.most_m:
-            return True
-        return any(
-            piece.kind == bridge.piece.kind
-            and self.states[candidate].supports.issuperset((body, other))
-            for candidate, piece in self.pieces.items()
-        )
+        return max(bridge.span.least_m - distance, distance - bridge.span.most_m, 0.0)
 
 
 def mean_position(points: Iterable[Vector]) -> Vector:

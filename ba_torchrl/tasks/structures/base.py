@@ -17,6 +17,7 @@ from ba_torchrl.tasks.instructions import structure_instruction
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
 from ba_torchrl.tasks.structures.experts import PickPlaceExpert, gripper_command
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
+from ba_torchrl.tasks.structures.progress import structure_progress
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.workspace import Spacing, random_points
 
@@ -62,6 +63,11 @@ class StructureGoal(Task):
         bodies = [(piece.kind, body) for body, piece in self.structure.pieces.items()]
         words = structure_instruction(self.structure.blueprint, bodies)
         return words + self.terrain.place_words
+
+    def progress(self) -> float:
+        """Return the progress of the structure; see `structure_progress`."""
+        moves_gradually = self.control == "close_loop"
+        return structure_progress(self.structure, self.robot, moves_gradually=moves_gradually)
 
     def is_valid(self) -> bool:
         """Whether all pieces are inside the workspace, and upright where required."""

@@ -1,0 +1,301 @@
+"""Dense rewards: the progress of the tasks, and its difference, which keeps optimal policies."""
+
+import copy
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import ba_torchrl
+from ba_torchrl.data.time_reversal import make_deconstruction_env
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS, Task
+from ba_torchrl.tasks.close_loop.block_picking import BlockPicking
+from ba_torchrl.training.config import ExperimentConfig
+from tests.specs import slow_except
+
+REACHING, PICKING = "close_loop/block_reaching", "close_loop/block_picking"
+DENSE = [name for name in TASKS if TASKS[name].progress is not Task.progress]
+SEEDS = range(3)
+
+
+@pytest.fixture
+def make():
+    """Make environments with small observations that are closed at the end."""
+    made = []
+
+    def make(task=PICKING, **config):
+        made.append(ba_torchrl.make(task, **{"seed": 0, "expert": True, **config}))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+def play(env, seed, *, expert):
+    """Return the first state and the steps [T] of an episode of the expert or of random actions."""
+    state, rng = env.reset(seed=seed), np.random.default_rng(seed)
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    start, steps = state, []
+    while not steps or not state[keys.DONE]:
+        share = torch.from_numpy(rng.random(len(low), dtype=np.float32))
+        action = state[keys.EXPERT_ACTION] if expert else low + (high - low) * share
+        state = env.step(state.clone().set(keys.ACTION, action))[keys.NEXT]
+        steps.append(state)
+    return start, torch.stack(steps)
+
+
+def rewards(steps):
+    return steps[keys.REWARD].flatten().tolist()
+
+
+def test_the_close_loop_tasks_and_the_structures_have_dense_rewards():
+    assert {name for name in TASKS if name.startswith("close_loop/")} < set(DENSE)
+    sparse = {"bin_packing", "bottle_arrangement", "box_palletizing", "covid_test"}
+    sparse |= {"object_grasping"}
+    assert {name.split("/")[1] for name in TASKS if name not in DENSE} == sparse
+    assert len(DENSE) == 25
+
+
+@pytest.mark.parametrize(
+    "task",
+    slow_except(
+        DENSE,
+        [
+            *(name for name in DENSE if name.startswith("close_loop/")),
+            "open_loop/house_building_3",
+            "ramp/improvise_house_building_2",
+        ],
+    ),
+)
+def test_progress_rises_to_success_along_the_experts_episodes(make, task):
+    size = {"obs_type": "vec"} if task.startswith("close_loop") else {"obs_size": 128}
+    env = make(task, reward="dense", **size)
+    thirds, random_means = [], []
+    for seed in SEEDS:
+        env.reset(seed=seed)
+        first = env.scene.task.progress()
+        _, steps = play(env, seed, expert=True)
+        seen, success = rewards(steps), steps[keys.SUCCESS].flatten().tolist()
+        assert success[-1]
+        assert [value == 1 for value in seen] == success
+        assert all(0 <= value < 1 for value in [first, *seen[:-1]])
+        assert seen[-2] > first + 0.2
+        if task != "close_loop/object_grasping":  # whose expert grasps again after a slip
+            assert min(np.diff([first, *seen])) > -0.03
+        thirds.append([np.mean(part) for part in np.array_split([first, *seen[:-1]], 3)])
+        _, steps = play(env, seed, expert=False)
+        assert all(0 <= value < 1 for value in rewards(steps))
+        random_means.append(np.mean(rewards(steps)))
+    low, middle, high = np.mean(thirds, axis=0)
+    assert low + 0.05 < middle < high - 0.05
+    assert np.mean(random_means) < middle
+
+
+def test_reaching_rewards_the_distance_to_the_region_of_success(make):
+    env = make(REACHING, reward="dense", obs_type="vec", expert=False)
+    env.reset()
+    scene = env.scene
+    scene.task.block.place((0.45, 0.0, 0.025))
+    for distance_m in (0.02, 0.08, 0.18):
+        scene.controller.reset(((0.45, 0.0, 0.025 + distance_m), 0.0))
+        x, y, z = scene.robot.tool_pose()[0]
+        from_goal = max(math.hypot(x - 0.45, y, z - 0.025) - 0.03, 0.0)
+        yaw, opening = scene.robot.tool_pose()[1], scene.robot.opening()
+        from_goal += 0.03 * abs(yaw) + 0.03 * (1 - opening)
+        expected = 0.9 * (1 - math.tanh(from_goal / 0.15))
+        assert scene.task.progress() == pytest.approx(expected)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.205), 0.5)
+    assert scene.task.progress() == pytest.approx(0.9 * (1 - math.tanh(0.195 / 0.15)), abs=5e-3)
+
+
+def test_picking_counts_reach_grasp_and_lift_as_a_third_each(make):
+    env = make(PICKING, reward="dense", obs_type="vec", expert=False, random_orientation=False)
+    env.reset()
+    scene, task = env.scene, env.scene.task
+    task.block.place((0.45, 0.0, 0.025))
+    scene.controller.reset(((0.45, 0.0, 0.125), 0.0))
+    assert task.progress() == pytest.approx(0.3 * (1 - math.tanh(0.1 / 0.15)), abs=1e-3)
+    scene.controller.move_to((0.45, 0.0, 0.025), 0.0)
+    assert task.progress() == pytest.approx(0.3, abs=0.01)
+    scene.controller.grip(0.0)
+    scene.controller.move_to((0.45, 0.0, 0.08), 0.0)
+    assert task.progress() == pytest.approx(0.6 + 0.3 * 0.07 / 0.14, abs=0.01)
+    scene.controller.grip(1.0)  # a hand at that height without the block has no share of the lift
+    assert task.progress() < 0.3
+
+
+def test_a_structure_counts_its_filled_slots_and_the_way_of_one_more_piece(make):
+    env = make("open_loop/house_building_2", reward="dense", obs_size=32, expert=False)
+    env.reset()
+    task = env.scene.task
+    kinds = {piece.kind: body for body, piece in task.structure.pieces.items()}
+    cubes = [body for body, piece in task.structure.pieces.items() if piece.kind == "cube"]
+    most_m = task.structure.blueprint.slots[2].span.most_m
+
+    def progress(gap_m):
+        kinds["roof"].place((0.35, 0.0, 0.015))
+        for x, body in zip((0.4, 0.4 + gap_m), cubes, strict=True):
+            body.place((x, 0.1, 0.015))
+        env.scene.world.step(2)
+        return task.progress()
+
+    # one cube stands on the ground; the other, 4 cm too far off, is a part of half the way
+    far = progress(most_m + 0.04)
+    assert far == pytest.approx(0.9 * (1 + 0.5 * (1 - math.tanh(0.04 / 0.15))) / 3, abs=2e-3)
+    # both stand, and the roof, on the ground, is 3 cm too low and aside of their centre
+    x = 0.4 + (most_m - 0.005) / 2 - 0.35
+    off = math.hypot(x, 0.1, 0.03)
+    expected = 0.9 * (2 + 0.5 * (1 - math.tanh(off / 0.15))) / 3
+    assert progress(most_m - 0.005) == pytest.approx(expected, abs=2e-3)
+
+
+@pytest.mark.parametrize("expert", [True, False])
+@pytest.mark.parametrize("task", [PICKING, "close_loop/block_pushing"])
+def test_the_discounted_differences_add_up_to_those_of_the_ends(make, task, expert):
+    settings = {"obs_type": "vec", "max_steps": 20}
+    env = make(task, reward="difference", reward_discount=0.9, **settings)
+    dense = make(task, reward="dense", **settings)
+    for seed in SEEDS:
+        dense.reset(seed=seed)
+        first = dense.scene.task.progress()
+        _, steps = play(dense, seed, expert=expert)
+        _, shaped = play(env, seed, expert=expert)
+        terminated = bool(shaped[keys.TERMINATED][-1])
+        assert terminated or bool(shaped[keys.TRUNCATED][-1])
+        last = 0.0 if terminated else rewards(steps)[-1]
+        added = np.array(rewards(shaped)) - shaped[keys.SUCCESS].flatten().float().numpy()
+        total = sum(0.9**t * value for t, value in enumerate(added))
+        assert total == pytest.approx(0.9 ** len(added) * last - first, abs=1e-5)
+        assert any(abs(value) > 1e-3 for value in added)
+
+
+def test_an_object_that_leaves_the_workspace_costs_the_progress(make):
+    env = make(PICKING, reward="difference", obs_type="vec", expert=False)
+    before = (env.reset(), env.scene.task.progress())[1]
+    env.scene.task.block.place((0.45, 0.16, 0.025))
+    outcome = env._step(env.full_action_spec.zero())
+    assert outcome[keys.TERMINATED]
+    assert outcome[keys.REWARD].item() == pytest.approx(-before)
+
+
+@pytest.mark.parametrize("task", ["close_loop/block_pulling", "open_loop/block_stacking"])
+def test_the_reward_changes_nothing_else(make, task, monkeypatch):
+    played = play(make(task, reward="difference"), 0, expert=True)[1]
+    monkeypatch.setattr(TASKS[task], "progress", lambda task: pytest.fail("sparse measures none"))
+    sparse = play(make(task), 0, expert=True)[1]
+    assert (played.exclude(keys.REWARD) == sparse.exclude(keys.REWARD)).all()
+    assert torch.equal(sparse[keys.REWARD], sparse[keys.SUCCESS].float())
+
+
+def test_states_and_copies_keep_the_progress(make):
+    env = make(PICKING, reward="difference", obs_type="vec")
+    state = env.reset()
+    for _ in range(3):
+        state = env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION].clone()))[keys.NEXT]
+    action = state.clone().set(keys.ACTION, state[keys.EXPERT_ACTION])
+    saved, other = env.get_state(), copy.deepcopy(env)
+    expected = env.step(action.clone())[keys.NEXT, keys.REWARD]
+    assert expected.item() > 0.01
+    env.step(env.reset(seed=7).set(keys.ACTION, torch.zeros(5)))
+    env.set_state(saved)
+    assert env.step(action.clone())[keys.NEXT, keys.REWARD] == expected
+    assert other.step(action.clone())[keys.NEXT, keys.REWARD] == expected
+    other.close()
+
+
+def test_vectors_and_gymnasium_have_the_same_reward(make):
+    _, steps = play(make(PICKING, reward="dense", obs_type="vec"), 0, expert=True)
+    settings = {"reward": "dense", "obs_type": "vec", "expert": True}
+    envs = ba_torchrl.make_vector_env(PICKING, 2, seed=0, parallel=False, **settings)
+    state = envs.reset()
+    env = gymnasium.make("BulletArm/CloseLoopBlockPicking-v0", **settings)
+    _, info = env.reset(seed=0)
+    for expected in rewards(steps):
+        state = envs.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION].clone()))[keys.NEXT]
+        _, reward, *_, info = env.step(info["expert_action"])
+        assert state[keys.REWARD][0].item() == reward == expected
+    envs.close()
+    env.close()
+
+
+def test_value_targets_continue_behind_a_success_with_dense_rewards_only(make):
+    for reward, ends in (
+        ("sparse", "terminated"),
+        ("difference", "terminated"),
+        ("dense", "truncated"),
+    ):
+        last = play(make(PICKING, reward=reward, obs_type="vec"), 0, expert=True)[1][-1]
+        assert last[keys.SUCCESS]
+        assert last[keys.DONE]
+        assert [name for name in (keys.TERMINATED, keys.TRUNCATED) if last[name]] == [ends]
+    env = make(PICKING, reward="dense", obs_type="vec", expert=False)
+    env.reset()
+    env.scene.task.block.place((0.45, 0.16, 0.025))
+    outcome = env._step(env.full_action_spec.zero())
+    assert outcome[keys.TERMINATED]
+    assert not outcome[keys.TRUNCATED]
+
+
+def test_a_fault_has_no_reward(make, monkeypatch):
+    env = make(PICKING, reward="dense", obs_type="vec", expert=False)
+    state = env.reset()
+    monkeypatch.setattr(type(env), "_act", lambda *_: 1 / 0)
+    state = env.step(state.set(keys.ACTION, torch.zeros(5)))[keys.NEXT]
+    assert state[keys.FAULT]
+    assert state[keys.REWARD] == 0
+
+
+@pytest.mark.parametrize("value", [1.0, -0.1, math.nan])
+def test_a_progress_outside_its_range_is_refused(make, monkeypatch, value):
+    monkeypatch.setattr(BlockPicking, "progress", lambda task: value)
+    with pytest.raises(ValueError, match=r"progress must be in \[0, 1\)"):
+        make(PICKING, reward="dense", obs_type="vec").reset()
+
+
+def test_a_task_without_a_dense_reward_names_those_that_have_one():
+    with pytest.raises(ConfigError, match=r"bin_packing has no dense reward; it is for .*house_b"):
+        resolve_env("open_loop/bin_packing", {"reward": "difference"})
+
+
+def test_a_discount_without_a_difference_is_refused():
+    with pytest.raises(ConfigError, match=r"reward_discount has no effect without"):
+        resolve_env(PICKING, {"reward": "dense", "reward_discount": 0.9})
+
+
+def test_reversed_episodes_have_the_sparse_reward_only():
+    with pytest.raises(ConfigError, match=r"reward: 'dense' is not that of the reversed"):
+        make_deconstruction_env("open_loop/house_building_2", reward="dense")
+
+
+@pytest.mark.parametrize(
+    ("env", "algorithm", "message"),
+    [
+        ({"reward": "difference", "reward_discount": 0.95}, {"gamma": 0.95}, None),
+        (
+            {"reward": "difference"},
+            {"gamma": 0.95},
+            r"env.reward_discount: 0.99 .* algorithm.gamma, 0.95",
+        ),
+        ({"reward": "dense"}, {"gamma": 0.95}, None),
+        ({"reward": "dense"}, {"bootstrap_truncated": False}, "needs algorithm.bootstrap_trunc"),
+    ],
+)
+def test_the_learner_values_what_the_rewards_assume(env, algorithm, message):
+    values = {
+        "task": PICKING,
+        "env": {"obs_size": 64, **env},
+        "algorithm": {"name": "sac", **algorithm},
+        "network": {"name": "cnn"},
+    }
+    if message is None:
+        ExperimentConfig.parse(values)
+        return
+    with pytest.raises(ConfigError, match=message):
+        ExperimentConfig.parse(values)
