@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from tensordict import TensorDict
 
 from ba_torchrl import __version__
 from ba_torchrl.data.demos import Source
+from ba_torchrl.data.exchange import check_same_environment, env_values, import_demonstrations
 from ba_torchrl.data.files import (
     check,
     publish,
@@ -22,7 +24,7 @@ from ba_torchrl.data.files import (
     write_state,
     write_text,
 )
-from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.data.formats.base import find_format
 from ba_torchrl.errors import ConfigError
 
 _METADATA_FILE = "demonstrations.json"
@@ -66,7 +68,7 @@ def save_demonstrations(
     write_state(scratch, {**dict(steps.items()), _LENGTHS: lengths})
     metadata = {
         "task": task,
-        "env": _env_values(task, env),
+        "env": env_values(task, env),
         "seed": seed,
         "source": source,
         "episodes": len(episodes),
@@ -81,47 +83,90 @@ def save_demonstrations(
     publish(scratch, path)
 
 
-def load_demonstrations(path: str | Path, *, task: str, env: dict[str, Any]) -> list[TensorDict]:
+def load_demonstrations(
+    path: str | Path,
+    *,
+    task: str,
+    env: dict[str, Any],
+    mapping: str | Path | Mapping[str, Any] | None = None,
+) -> list[TensorDict]:
     """Read episodes that were collected from the same task with the same parameters.
 
     Args:
-        path: folder that `save_demonstrations` wrote.
+        path: folder that `save_demonstrations` wrote, or a file or folder of another library's
+            format, as of `export_demonstrations`.
         task: id of the task.
         env: fields of `EnvConfig` of the environments.
+        mapping: of the entries of somebody else's file, see `import_demonstrations`.
 
     Raises:
         ConfigError: there are none at ``path``, their files are damaged, or task or parameters
             differ; the message names every difference.
     """
     path = Path(path)
+    if not _is_own(path, mapping):
+        return import_demonstrations(path, task=task, env=env, mapping=mapping)
     check_demonstrations(path, task=task, env=env)
-    state = read_state(path)
-    try:
-        lengths = state.pop(_LENGTHS).tolist()
-        if not lengths or not all(isinstance(value, torch.Tensor) for value in state.values()):
-            raise ValueError("there are none, or their entries are no tensors")
-        steps = TensorDict(state, batch_size=[sum(lengths)]).unflatten_keys(_SEPARATOR)
-        return [episode.clone() for episode in steps.split(lengths)]
-    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ConfigError(f"{path} does not hold episodes: {error}") from error
+    return _read_episodes(path)
+
+
+def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, Any]]:
+    """Return the episodes of a folder that `save_demonstrations` wrote, and its metadata.
+
+    Raises:
+        ConfigError: there are none at ``path``, or their files are damaged.
+    """
+    path = Path(path)
+    metadata = _read_metadata(path)
+    return _read_episodes(path), metadata
 
 
 def check_demonstrations(
-    path: str | Path, *, task: str, env: dict[str, Any], least: int = 1
+    path: str | Path,
+    *,
+    task: str,
+    env: dict[str, Any],
+    least: int = 1,
+    mapping: str | Path | Mapping[str, Any] | None = None,
 ) -> None:
     """Check that there are demonstrations of the same task and parameters at ``path``.
 
     Args:
-        path: folder that `save_demonstrations` wrote.
+        path: as for `load_demonstrations`.
         task: id of the task.
         env: fields of `EnvConfig` of the environments.
         least: number of episodes that are needed.
+        mapping: as for `load_demonstrations`.
 
     Raises:
         ConfigError: there are too few at ``path``, their files are damaged, or task or parameters
             differ; the message names every difference.
     """
     path = Path(path)
+    if _is_own(path, mapping):
+        metadata = _read_metadata(path)
+        count = metadata["episodes"]
+        check_same_environment(path, task, env, metadata["task"], metadata["env"])
+    else:
+        count = len(import_demonstrations(path, task=task, env=env, mapping=mapping))
+    if count < least:
+        raise ConfigError(f"{path} holds {count} episodes, {least} are needed")
+
+
+def _is_own(path: Path, mapping: object) -> bool:
+    """Whether there is a folder that `save_demonstrations` wrote, or nothing.
+
+    Raises:
+        ConfigError: there is one, and a mapping of somebody else's entries.
+    """
+    if os.path.lexists(path) and not (path / _METADATA_FILE).exists() and find_format(path):
+        return False
+    if mapping is not None:
+        raise ConfigError(f"{path} is no file of another program; leave out the mapping")
+    return True
+
+
+def _read_metadata(path: Path) -> dict[str, Any]:
     try:
         metadata = json.loads((path / _METADATA_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -132,23 +177,16 @@ def check_demonstrations(
         not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
     ):
         raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
-    if metadata["episodes"] < least:
-        raise ConfigError(f"{path} holds {metadata['episodes']} episodes, {least} are needed")
-    # A field that is missing in the file was added later and has its default value.
-    found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
-    wanted = {"task": task, **_env_values(task, env)}
-    differences = [
-        f"{name}: collected with {found.get(name)!r}, needed {wanted.get(name)!r}"
-        for name in sorted(found.keys() | wanted.keys())
-        if found.get(name) != wanted.get(name)
-    ]
-    if differences:
-        raise ConfigError(
-            f"the demonstrations at {path} do not fit:\n  " + "\n  ".join(differences)
-        )
+    return metadata
 
 
-def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
-    """Return every parameter that affects the data, defaults included, as JSON values."""
-    config = resolve_env(task, env).config
-    return json.loads(config.model_dump_json(exclude={"seed", "render", "expert"}))
+def _read_episodes(path: Path) -> list[TensorDict]:
+    state = read_state(path)
+    try:
+        lengths = state.pop(_LENGTHS).tolist()
+        if not lengths or not all(isinstance(value, torch.Tensor) for value in state.values()):
+            raise ValueError("there are none, or their entries are no tensors")
+        steps = TensorDict(state, batch_size=[sum(lengths)]).unflatten_keys(_SEPARATOR)
+        return [episode.clone() for episode in steps.split(lengths)]
+    except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise ConfigError(f"{path} does not hold episodes: {error}") from error
