@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -154,11 +153,6 @@ def find_format(path: Path) -> Format | None:
     return next((FORMATS[name] for name in FORMATS if FORMATS[name].matches(path)), None)
 
 
-def to_json(value: Any) -> str:
-    """Return plain values as JSON text."""
-    return json.dumps(value, indent=2) + "\n"
-
-
 def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
     """Write episodes with their card.
 
@@ -186,9 +180,9 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
         ]
         last = {name: np.stack([arrays[name][-1] for arrays in named]) for name in observed}
         save_file(last, path / _LAST_FILE)
-    json_file, page = _card_files(path)
+    page = path / "README.md" if path.is_dir() else path.with_suffix(".md")
     write_text(page, card.to_markdown())
-    write_text(json_file, card.model_dump_json(indent=1) + "\n")
+    write_text(card_file(path), card.model_dump_json(indent=1) + "\n")
 
 
 def read_card(path: Path) -> Card | None:
@@ -197,7 +191,7 @@ def read_card(path: Path) -> Card | None:
     Raises:
         ConfigError: the card is damaged.
     """
-    file, _ = _card_files(path)
+    file = card_file(path)
     if not file.exists():
         return None
     try:
@@ -229,11 +223,9 @@ def read_file(form: Format, path: Path) -> list[Arrays]:
         ) from error
 
 
-def _card_files(path: Path) -> tuple[Path, Path]:
-    """Return the card of a file or folder: for programs, and for people."""
-    if path.is_dir():
-        return path / "card.json", path / "README.md"
-    return path.with_suffix(".json"), path.with_suffix(".md")
+def card_file(path: Path) -> Path:
+    """Return the path of the card of a file or folder."""
+    return path / "card.json" if path.is_dir() else path.with_suffix(".json")
 
 
 class Source(StrictModel):

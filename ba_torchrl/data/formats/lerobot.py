@@ -14,6 +14,8 @@ from ba_torchrl.envs import keys
 _STATES = ("proprio", keys.OBSERVATION, keys.HOLDING)
 """Keys of which the first one there is ``observation.state``."""
 _STATE, _TASK, _DONE = "observation.state", "task", "next.done"
+_VIDEO_BACKEND = "pyav"
+"""The decoder that needs no FFmpeg on the system."""
 _OWN = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 """Entries that LeRobot adds."""
 
@@ -51,6 +53,7 @@ class LeRobot(Format):
             root=path,
             robot_type=card.robot,
             use_videos=False,
+            video_backend=_VIDEO_BACKEND,
         )
         for arrays in episodes:
             values = {
@@ -71,7 +74,10 @@ class LeRobot(Format):
         """Read by `LeRobotDataset`: depth in metres, colours as uint8."""
         datasets = self.library("lerobot.datasets.lerobot_dataset")
         dataset = datasets.LeRobotDataset(
-            f"ba_torchrl/{path.name}", root=path, depth_output_unit="m"
+            f"ba_torchrl/{path.name}",
+            root=path,
+            depth_output_unit="m",
+            video_backend=_VIDEO_BACKEND,
         )
         cameras = set(dataset.meta.camera_keys) - set(dataset.meta.depth_keys)
         episodes: dict[int, list[dict[str, Any]]] = {}
