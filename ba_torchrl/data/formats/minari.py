@@ -78,7 +78,7 @@ class Minari(Format):
                 raise ConfigError(
                     f"the Gymnasium environment does not observe {', '.join(missing)}"
                 )
-            with _datasets_at(path.parent), warnings.catch_warnings():
+            with _datasets_at(path.resolve().parent), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of e-mail and web addresses that are not given
                 minari.create_dataset_from_buffers(
                     path.name,
