@@ -178,7 +178,9 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
             for entry in card.entries.values()
             if entry.role == "observation" and entry.dtype != "str"
         ]
-        last = {name: np.stack([arrays[name][-1] for arrays in named]) for name in observed}
+        last = {
+            name: np.ascontiguousarray([arrays[name][-1] for arrays in named]) for name in observed
+        }
         save_file(last, path / _LAST_FILE)
     page = path / "README.md" if path.is_dir() else path.with_suffix(".md")
     write_text(page, card.to_markdown())

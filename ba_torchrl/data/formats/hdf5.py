@@ -40,6 +40,7 @@ class Robomimic(Format):
     def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
         """Write one file."""
         h5py = self.library("h5py")
+        results = {entry.name for entry in card.entries.values() if entry.role == "result"}
         env_args = {"env_name": gym_id(card.task), "type": _GYM_TYPE, "env_kwargs": card.env}
         with h5py.File(path, "w") as file:
             data = file.create_group("data")
@@ -49,7 +50,7 @@ class Robomimic(Format):
                 demo = data.create_group(f"demo_{i}")
                 dones = arrays[keys.TERMINATED] | arrays[keys.TRUNCATED]
                 demo.attrs["num_samples"] = len(dones)
-                demo["dones"] = dones.astype(np.int64)
+                demo["dones"] = dones[:, 0].astype(np.int64)
                 for name, values in arrays.items():
                     if name == _LANGUAGE:
                         demo.attrs["ep_meta"] = json.dumps({"lang": str(values[0])})
@@ -57,7 +58,7 @@ class Robomimic(Format):
                         _store(demo, name, values[:-1])
                         _store(demo, name.replace(_OBS, _NEXT_OBS, 1), values[1:])
                     else:
-                        _store(demo, name, values)
+                        _store(demo, name, values[:, 0] if name in results else values)
 
     def read(self, path: Path) -> list[Arrays]:
         """Read every group of ``data``; ``obs`` gets its last row from ``next_obs``."""
