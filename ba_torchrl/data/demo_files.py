@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 import torchrl
-from tensordict import TensorDict
+from tensordict import NonTensorStack, TensorDict
 
 from ba_torchrl import __version__
 from ba_torchrl.data.demos import Source
@@ -65,7 +65,11 @@ def save_demonstrations(
     shutil.rmtree(scratch, ignore_errors=True)
     lengths = torch.tensor([len(episode) for episode in episodes], device="cpu")
     steps = torch.cat(list(episodes)).flatten_keys(_SEPARATOR)
-    write_state(scratch, {**dict(steps.items()), _LENGTHS: lengths})
+    entries: dict[str, Any] = {}
+    for key in steps.keys():  # noqa: SIM118 -- a TensorDict
+        value = steps[key]  # an instruction is a string, or a list with one per step
+        entries[key] = [value] * len(steps) if isinstance(value, str) else value
+    write_state(scratch, {**entries, _LENGTHS: lengths})
     metadata = {
         "task": task,
         "env": env_values(task, env),
@@ -184,9 +188,20 @@ def _read_episodes(path: Path) -> list[TensorDict]:
     state = read_state(path)
     try:
         lengths = state.pop(_LENGTHS).tolist()
-        if not lengths or not all(isinstance(value, torch.Tensor) for value in state.values()):
-            raise ValueError("there are none, or their entries are no tensors")
-        steps = TensorDict(state, batch_size=[sum(lengths)]).unflatten_keys(_SEPARATOR)
+        if not lengths or not all(map(_is_entry, state.values())):
+            raise ValueError("there are none, or their entries are neither tensors nor sentences")
+        entries = {
+            key: NonTensorStack(*value) if isinstance(value, list) else value
+            for key, value in state.items()
+        }
+        steps = TensorDict(entries, batch_size=[sum(lengths)]).unflatten_keys(_SEPARATOR)
         return [episode.clone() for episode in steps.split(lengths)]
     except (RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path} does not hold episodes: {error}") from error
+
+
+def _is_entry(value: Any) -> bool:
+    """Return whether a value is a tensor, or a list of strings."""
+    if isinstance(value, list):
+        return bool(value) and all(isinstance(item, str) for item in value)
+    return isinstance(value, torch.Tensor)
