@@ -158,16 +158,15 @@ def check_demonstrations(
 
 
 def _is_own(path: Path, mapping: object) -> bool:
-    """Whether there is a folder that `save_demonstrations` wrote, or nothing.
+    """Whether there is a folder that `save_demonstrations` wrote, or nothing known.
 
     Raises:
         ConfigError: there is one, and a mapping of somebody else's entries.
     """
-    if os.path.lexists(path) and not (path / _METADATA_FILE).exists() and find_format(path):
-        return False
-    if mapping is not None:
-        raise ConfigError(f"{path} is no file of another program; leave out the mapping")
-    return True
+    is_own = os.path.exists(path / _METADATA_FILE)
+    if is_own and mapping is not None:
+        raise ConfigError(f"{path} has our entries; leave out the mapping (demonstrations_mapping)")
+    return is_own or find_format(path) is None
 
 
 def _read_metadata(path: Path) -> dict[str, Any]:

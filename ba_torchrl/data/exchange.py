@@ -133,8 +133,7 @@ def import_demonstrations(
     """
     form = find_format(path)
     if form is None:
-        known = ", ".join(FORMATS)
-        raise ConfigError(f"no demonstrations at {path}: neither a folder of ours nor {known}")
+        raise ConfigError(f"no demonstrations at {path} in the formats {', '.join(FORMATS)}")
     card = read_card(path)
     if mapping is None:
         if card is None:

@@ -280,7 +280,7 @@ def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
     with pytest.raises(ConfigError, match=r"demonstrations_mapping\). It holds actions \[5\], obs"):
         load_demonstrations(path, task=TASK, env=ENV)
     save_demonstrations(tmp_path / "ours", collected, task=TASK, env=ENV, seed=0)
-    with pytest.raises(ConfigError, match="leave out the mapping"):
+    with pytest.raises(ConfigError, match="has our entries; leave out the mapping"):
         load_demonstrations(tmp_path / "ours", task=TASK, env=ENV, mapping=FOREIGN)
     (tmp_path / "b.yaml").write_text("- a\n- b\n")
     with pytest.raises(ConfigError, match=r"b\.yaml: must map keys to names"):

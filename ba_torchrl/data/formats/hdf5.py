@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -27,7 +28,7 @@ class Robomimic(Format):
 
     def matches(self, path: Path) -> bool:
         """Return whether it is a file with the suffix of HDF5."""
-        return path.is_file() and path.suffix.lower() in (".hdf5", ".h5")
+        return os.path.isfile(path) and path.suffix.lower() in (".hdf5", ".h5")
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``obs/pixels``, ``actions``, ``rewards``, and other keys unchanged."""

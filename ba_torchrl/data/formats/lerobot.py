@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ class LeRobot(Format):
 
     def matches(self, path: Path) -> bool:
         """Return whether it is the folder of a data set."""
-        return (path / "meta" / "info.json").is_file()
+        return os.path.isfile(path / "meta" / "info.json")
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``observation.state``, ``observation.images.NAME`` and ``next.reward``."""

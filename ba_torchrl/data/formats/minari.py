@@ -35,7 +35,7 @@ class Minari(Format):
 
     def matches(self, path: Path) -> bool:
         """Return whether it is the folder of a data set."""
-        return (path / "data" / "metadata.json").is_file()
+        return os.path.isfile(path / "data" / "metadata.json")
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``observations/pixels``, ``actions``, ``infos/success``."""

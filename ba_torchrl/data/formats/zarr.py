@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -22,7 +23,7 @@ class DiffusionPolicy(Format):
 
     def matches(self, path: Path) -> bool:
         """Return whether it is a folder with the metadata of a group."""
-        return any((path / name).is_file() for name in (".zgroup", "zarr.json"))
+        return any(os.path.isfile(path / name) for name in (".zgroup", "zarr.json"))
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return the keys unchanged: the format leaves names to the user's ``shape_meta``."""
