@@ -208,7 +208,7 @@ def foreign(path, **changes):
         for i, steps in enumerate((3, 2)):
             data = {
                 "obs/depth": rng.integers(0, 200, (steps, SIZE, SIZE, 1), dtype=np.uint16),
-                "obs/state": rng.random((steps, 2)),
+                "obs/state": np.array([[0.1, 0.2], [0.3, 0.9], [0.6, 0.4]]),
                 "actions": rng.uniform(0, 0.05, (steps, 5)),
                 **changes,
             }
@@ -227,11 +227,11 @@ def test_demonstrations_of_another_robot_are_mapped(as_file, tmp_path):
     first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
     with h5py.File(path) as file:
         demo = file["data/demo_0"]
-        depth, state, action = (demo[name][:] for name in ("obs/depth", "obs/state", "actions"))
+        depth, action = demo["obs/depth"][:], demo["actions"][:]
     pixels = torch.from_numpy(depth.transpose(0, 3, 1, 2) * 0.001).float()
     assert torch.equal(first["pixels"], pixels)
     assert torch.equal(first["next", "pixels"], torch.cat([pixels[1:], pixels[-1:]]))
-    assert first["holding"].flatten().tolist() == (state[:, 1] < 0.5).tolist()
+    assert first["holding"].flatten().tolist() == [True, False, True]
     wanted = np.c_[action[:, 4] * 2 - 1, action[:, :3] * 20, action[:, 3]]
     np.testing.assert_allclose(first["action"], wanted, rtol=1e-6)
     assert second["next", "success"].flatten().tolist() == [False, True]
@@ -247,8 +247,11 @@ def test_demonstrations_of_another_robot_are_mapped(as_file, tmp_path):
 
 
 def test_results_of_another_robot_are_mapped(tmp_path):
-    fail = np.zeros(3)
-    path = foreign(tmp_path / "a.hdf5", won=fail)
+    path = foreign(tmp_path / "a.hdf5", won=np.array([0, 1, 1]))
+    found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
+    assert found[0]["next", "reward"].flatten().tolist() == [0, 1, 1]
+    assert found[0]["next", "terminated"].flatten().tolist() == [False, False, True]
+    path = foreign(tmp_path / "b.hdf5", won=np.zeros(3))
     found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
     assert not any(each["next", "success"].any() for each in found)
     assert found[0]["next", "truncated"].flatten().tolist() == [False, False, True]
@@ -263,6 +266,7 @@ def test_results_of_another_robot_are_mapped(tmp_path):
         ({"holding": "obs/grip"}, "episode 0: holding: there is no 'obs/grip'. Known: .*obs/state"),
         ({"holding": "obs/state"}, r"holding: has the shape \[2\], needed \[1\]"),
         ({"pixels": "obs/depth"}, r"pixels: has values from 0 to 199, needed .*; set scale"),
+        ({"action": {"source": "actions", "offset": -3}}, "action: has values from -3 to -2.95"),
         ({"action": {"source": "actions", "components": [9]}}, "action: actions.*out of bounds"),
         ({"action": {"source": "actions", "scale": [1, 2]}}, "action: actions.*broadcast"),
         ({"action": {"sauce": "actions"}}, "mapping: action.*: Field required"),

@@ -84,7 +84,6 @@ class Minari(Format):
                     path.name,
                     buffers,
                     env=env.spec,
-                    eval_env=env.spec,
                     observation_space=gymnasium.spaces.Dict({key: spaces[key] for key in observed}),
                     action_space=env.action_space,
                     algorithm_name=card.source,
