@@ -54,6 +54,10 @@ UNEVEN_COST = 0.5
 """Cost of the height of a site above its mean height."""
 OPEN_COST_M = 0.01
 """Cost of a site without enclosing surroundings, as a height."""
+NEAR_COST = 0.01
+"""Cost of a site, as a height, per distance towards the objects outside the bin."""
+ACROSS_COST_M = 0.5e-3
+"""Cost of a release with fingers that close across the bin, as a height."""
 
 
 def object_shapes(unit: float) -> dict[str, Shape]:
@@ -219,25 +223,33 @@ class BinPacking(PackingTask):
         ]
 
     def _drop(self, held: Body) -> PickPlaceCommand:
-        """Return the place that drops an object at the site with the lowest cost."""
+        """Return the place that drops an object at the site with the lowest cost.
+
+        Of sites that are equal by the symmetry of the bin, it is the farthest from the objects
+        outside, and fingers close along the bin.
+        """
         tool_yaw = self.robot.tool_pose()[1]
         own = narrowest(held, None if self.action_limits.turn_rad else tool_yaw)[0]
-        heights = self._heights()
+        heights, inside = self._heights(), self._inside()
+        slope = self._slope(held)
         best: tuple[float, tuple[float, float], float, float] | None = None
         for quarter in (0, 1):
             half = (own.half_x, own.half_y) if quarter == 0 else (own.half_y, own.half_x)
-            turn = self._inside().yaw_rad + quarter * math.pi / 2 - own.yaw_rad
+            turn = inside.yaw_rad + quarter * math.pi / 2 - own.yaw_rad
             if not self.action_limits.turn_rad:
                 if abs(wrap_angle(turn + tool_yaw, math.pi)) > math.pi / 4:
                     continue  # without yaw only the nearest of the two orientations is possible
                 turn = -tool_yaw
-            found = _best_site(heights, half)
-            if found is not None and (best is None or found[0] < best[0]):
-                best = (*found, turn)
+            found = _best_site(heights, half, slope)
+            if found is None:
+                continue
+            across = ACROSS_COST_M * abs(math.sin(tool_yaw + turn - inside.yaw_rad))
+            if best is None or found[0] + across < best[0]:
+                best = (found[0] + across, *found[1:], turn)
         if best is None:  # the held object is too large for the bin
             best = (0.0, (0.0, 0.0), 0.0, 0.0)
         _, site, top, turn = best
-        x, y = self._inside().frame.to_world(*site)
+        x, y = inside.frame.to_world(*site)
         depth = self.depth_m(held)
         z = max(self._release_m(), top + depth + RELEASE_GAP_M)
         # the centre of the outline is placed at the site, not the origin of the object
@@ -245,6 +257,16 @@ class BinPacking(PackingTask):
         at = PlanarFrame(x, y, turn).to_world(ox, oy)
         command = self.place(held, (*at, held.position[2]), turn)
         return command._replace(z_m=z)
+
+    def _slope(self, held: Body) -> tuple[float, float]:
+        """Return the cost of a site per metre along rows and columns of the height image."""
+        others = [body for body in self.objects if body is not held and not self.is_packed(body)]
+        if not others:
+            return 0.0, 0.0
+        mean = np.mean([body.position[:2] for body in others], axis=0)
+        x, y = self._inside().frame.to_local(*mean)
+        distance_m = max(math.hypot(x, y), 1e-6)
+        return NEAR_COST * x / distance_m, NEAR_COST * y / distance_m
 
     def _heights(self) -> np.ndarray:
         """Return the height image of the bin with its walls, rows along its length."""
@@ -254,13 +276,14 @@ class BinPacking(PackingTask):
 
 
 def _best_site(
-    heights: np.ndarray, half_m: tuple[float, float]
+    heights: np.ndarray, half_m: tuple[float, float], slope: tuple[float, float]
 ) -> tuple[float, tuple[float, float], float] | None:
     """Return the site for a box with the lowest cost: low, even and enclosed by its surroundings.
 
     Args:
         heights: [N, N] height image in metres, with pixels of `PIXEL_M`.
         half_m: half the extents of the box along rows and columns.
+        slope: cost of a site per metre along rows and columns.
 
     Returns:
         Cost, centre of the site relative to the centre of the image, and height of its highest
@@ -282,6 +305,10 @@ def _best_site(
         taller[at] = _window_sums(is_taller, wide)[at]
     enclosed = taller / (wide[0] * wide[1] - size[0] * size[1])
     costs = tops + UNEVEN_COST * (tops - means) + OPEN_COST_M * (1 - enclosed)
+    along, across = (
+        PIXEL_M * part * np.arange(count) for part, count in zip(slope, costs.shape, strict=True)
+    )
+    costs += along[:, None] + across
     row, column = np.unravel_index(int(costs.argmin()), costs.shape)
     center = [
         (first + extent / 2 - count / 2) * PIXEL_M

@@ -19,7 +19,7 @@ from ba_torchrl.tasks.manipulation.clearance import half_gap_m, outline_clearanc
 from ba_torchrl.tasks.manipulation.commands import no_op, pick_command
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
 from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
-from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
+from ba_torchrl.tasks.packing.base import FILLING_ORDERS, RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
 
@@ -247,12 +247,29 @@ class BottleArrangement(PackingTask):
         )
 
     def _free_site(self, held: Body | None) -> tuple[float, float]:
-        """Return the first free slot, or the site in the tray with the largest gap."""
+        """Return the next free slot, or the site in the tray with the largest gap.
+
+        Rows are filled from the corner farthest from the bottles outside, so that the next slot
+        does not depend on which of the two ends of the symmetric tray is its front.
+        """
         tray = self.container_outline()
         sites = [tray.frame.to_world(x * self.unit, y * self.unit) for x, y in slots()]
-        for site in sites:
-            if self._neighbor_gap_m(site, held) >= NEIGHBOR_GAP_M:
-                return site
+        are_filled = [self._neighbor_gap_m(site, held) < NEIGHBOR_GAP_M for site in sites]
+        if not all(are_filled):
+            outside = [
+                body.position[:2]
+                for body in self.objects
+                if body is not held and not self.stands_in_tray(body)
+            ]
+
+            def preference(order: Sequence[int]) -> tuple[list[bool], float]:
+                filled = [are_filled[slot] for slot in order]
+                first = sites[order[filled.index(False)]]
+                away = min((math.dist(first, point) for point in outside), default=0.0)
+                return filled, away
+
+            order = max(FILLING_ORDERS, key=preference)
+            return next(sites[slot] for slot in order if not are_filled[slot])
         inside, half = self._inside(), BOTTLE_M * self.unit / 2 + NEIGHBOR_GAP_M
         along, across = inside.half_x - half, inside.half_y - half
         sites += [

@@ -27,7 +27,12 @@ from ba_torchrl.tasks.manipulation.commands import (
 )
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest, outline
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
-from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, SUFFICIENT_CLEARANCE_M, PackingTask
+from ba_torchrl.tasks.packing.base import (
+    FILLING_ORDERS,
+    RELEASE_GAP_M,
+    SUFFICIENT_CLEARANCE_M,
+    PackingTask,
+)
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.packing.tilted_grasps import tilted_grasp
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD
@@ -244,7 +249,7 @@ class BoxPalletizing(PackingTask):
         return None
 
     def _place_in_slot(self, held: Body, stacked: dict[tuple[int, int], Body]) -> PickPlaceCommand:
-        """Return the place in the first free slot, or on the ground if an obstacle is in each."""
+        """Return the place in the next free slot, or on the ground if an obstacle is in each."""
         if CUBOID.tilt_rad(held) > math.pi / 4:
             return self._tip_over(held)
         layer = min(len(stacked) // PER_LAYER, self.settings.num_objects // PER_LAYER - 1)
@@ -257,9 +262,11 @@ class BoxPalletizing(PackingTask):
             if body is not held and body not in stacked.values()
         ]
         neighbors = [outline(body) for slot, body in stacked.items() if slot[0] == layer]
-        for number, (x, y, yaw) in enumerate(slots(layer)):
+        places = slots(layer)
+        for number in self._order(layer, stacked):
             if (layer, number) in stacked:
                 continue
+            x, y, yaw = places[number]
             center = Rectangle(
                 *pallet.frame.to_world(x * self.unit, y * self.unit),
                 pallet.yaw_rad + yaw,
@@ -275,6 +282,22 @@ class BoxPalletizing(PackingTask):
         (x, y), yaw = max(self._arrivals, key=lambda arrival: self._gap_at_m(arrival, held))
         z = self.terrain.height_m((x, y)) + height + RELEASE_GAP_M
         return self.place(held, (x, y, z), yaw - heading)
+
+    def _order(self, layer: int, stacked: dict[tuple[int, int], Body]) -> Sequence[int]:
+        """Return the slots of a layer in the order in which they are filled.
+
+        Columns are filled from the corner farthest from the workspace's centre, so that the next
+        slot does not depend on which of the two ends of the symmetric pallet is its front.
+        """
+        frame, center = self.container_outline().frame, self.settings.workspace.center
+
+        def preference(order: Sequence[int]) -> tuple[list[bool], float]:
+            filled = [(layer, number) in stacked for number in order]
+            x, y, _ = slots(layer)[order[filled.index(False) if False in filled else 0]]
+            corner = frame.to_world(x * self.unit, y * self.unit)
+            return filled, math.dist(corner, center)
+
+        return max(FILLING_ORDERS, key=preference)
 
     def _site(self, slot: Rectangle, row: int, neighbors: Sequence[Rectangle]) -> Rectangle:
         """Return the site in a slot, off its centre if the fingers have no space there otherwise.

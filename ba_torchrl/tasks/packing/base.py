@@ -32,6 +32,13 @@ SUFFICIENT_CLEARANCE_M = 4e-3
 """Clearances above this are equally good."""
 YAW_MARGIN_RAD = 1e-4
 """Yaws within this of half a turn count as zero, so that rounding does not matter."""
+FILLING_ORDERS = (
+    (0, 1, 2, 3, 4, 5),
+    (2, 1, 0, 5, 4, 3),
+    (3, 4, 5, 0, 1, 2),
+    (5, 4, 3, 2, 1, 0),
+)
+"""Six slots in two rows of three, row by row from each of the four corners."""
 UNDERGROUND_M = 0.02
 """Depth of a container's floor below the ground. Fast objects would pass through a thin sheet."""
 

@@ -1,6 +1,7 @@
 """What the packing tasks share: sizes, containers, layouts, numbers of objects, experts."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -128,3 +129,21 @@ def test_the_expert_recovers_from_noisy_actions(make_env, task, least):
     # an object that lies against the outside of the bin leaves no clearance for a finger
     assert len(outcomes) >= 5
     assert np.mean(outcomes) >= least, outcomes
+
+
+@pytest.mark.parametrize("task_id", [BIN, BOTTLES, BOXES])
+def test_the_next_site_is_the_same_if_the_container_is_turned_by_half_a_turn(make_env, task_id):
+    env = make_env(task_id, expert=True)
+    state = env.reset()
+    task = env.scene.task
+    for _ in range(5):
+        state["action"] = state["expert_action"]
+        state = env.step(state)["next"]
+        if not state["holding"]:
+            continue
+        before = task.expert_command()
+        *position, yaw = *task.container.position, task.container.yaw_rad
+        task.container.place(position, yaw + math.pi)
+        after = task.expert_command()
+        assert after[1:3] == pytest.approx(before[1:3], abs=2e-3)
+        assert math.sin(after.rz_rad - before.rz_rad) == pytest.approx(0.0, abs=0.02)
