@@ -168,7 +168,13 @@ def _mapped(
                 arrays[key] = _fitted(values, specs[key]) if key in specs else values
             except ConfigError as error:
                 raise ConfigError(f"{path}, episode {number}: {key}: {error}") from None
+        for key in arrays.keys() - {INSTRUCTION}:
+            is_observed = key in specs and key != keys.ACTION
+            where = f"{path}, episode {number}: {key}"
+            _check_rows(where, arrays[key], len(arrays[keys.ACTION]), is_observed)
         episodes.append(_with_results(arrays))
+    if not episodes:
+        raise ConfigError(f"{path} holds no episodes")
     entries = {
         key: Entry(
             name=key,
@@ -221,6 +227,16 @@ def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
                 f"{low.min().item():g} to {high.max().item():g}; set scale and offset"
             )
     return values.astype(torch.empty(0, dtype=spec.dtype, device="cpu").numpy().dtype, copy=False)
+
+
+def _check_rows(what: str, values: np.ndarray, steps: int, is_observed: bool) -> None:
+    """Check that there is a row for each step, of observations perhaps also one after the last.
+
+    Raises:
+        ConfigError: there is not; the message begins with ``what``.
+    """
+    if len(values) - steps not in ((0, 1) if is_observed else (0,)):
+        raise ConfigError(f"{what} has {len(values)} rows, and there are {steps} actions")
 
 
 def _with_results(arrays: Arrays) -> Arrays:
@@ -276,7 +292,7 @@ def _to_episode(entries: Mapping[str, Entry], arrays: Arrays) -> TensorDict:
     Raises:
         ConfigError: an entry is missing or has another shape than the card says.
     """
-    steps = len(arrays[next(e.name for e in entries.values() if e.role == "action")])
+    steps = len(arrays[entries[keys.ACTION].name])
     now: dict[str, Any] = {}
     following: dict[str, Any] = {}
     for key, entry in entries.items():
@@ -296,6 +312,7 @@ def _to_episode(entries: Mapping[str, Entry], arrays: Arrays) -> TensorDict:
                 )
             values = values[..., None]
         rows = torch.from_numpy(np.array(values, dtype=entry.dtype))
+        _check_rows(entry.name, values, steps, entry.role == "observation")
         if entry.role == "observation":
             if len(rows) == steps:
                 rows = torch.cat([rows, rows[-1:]])

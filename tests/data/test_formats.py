@@ -279,6 +279,22 @@ def test_mappings_that_do_not_fit_are_refused_by_name(changes, message, tmp_path
         load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
 
 
+@pytest.mark.parametrize("lost", ["obs/depth", "actions"])
+def test_rows_that_are_missing_are_named(lost, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        rows = file[f"data/demo_1/{lost}"][:-1]
+        del file[f"data/demo_1/{lost}"]
+        file[f"data/demo_1/{lost}"] = rows[:0] if lost == "actions" else rows
+    with pytest.raises(ConfigError, match=r"episode 1: .* rows, and there are [02] actions"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        del file["data"]
+        file.create_group("data")
+    with pytest.raises(ConfigError, match="holds no episodes"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+
+
 def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
     path = foreign(tmp_path / "a.hdf5")
     with pytest.raises(ConfigError, match=r"demonstrations_mapping\). It holds actions \[5\], obs"):

@@ -106,7 +106,7 @@ class Minari(Format):
         minari = self.library("minari")
         episodes = []
         for episode in minari.MinariDataset(path / "data").iterate_episodes():
-            arrays = {name: getattr(episode, name) for name in ("actions", *list(_FIXED.values()))}
+            arrays = {name: getattr(episode, name) for name in _FIXED.values()}
             for place, values in ((_OBSERVATIONS, episode.observations), (_INFOS, episode.infos)):
                 if isinstance(values, dict):
                     arrays |= {f"{place}{name}": part for name, part in values.items()}
