@@ -16,13 +16,20 @@ from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
 from ba_torchrl.config import EnvConfig, env_config_model
+from ba_torchrl.data.formats.base import FORMATS
 from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
-CHOICES = {"robot": ROBOTS, "robots": ROBOTS, "view_type": VIEWS, "observations": OBSERVATIONS}
+CHOICES = {
+    "format": FORMATS,
+    "observations": OBSERVATIONS,
+    "robot": ROBOTS,
+    "robots": ROBOTS,
+    "view_type": VIEWS,
+}
 """Registries that fields of these names choose from."""
 _INDENT = 6
 

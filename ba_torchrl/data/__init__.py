@@ -6,6 +6,7 @@ from ba_torchrl.data.augmentation.views import RandomViews
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, expert_policy, expert_scores
 from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
+from ba_torchrl.data.exchange import export_demonstrations
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
@@ -24,6 +25,7 @@ __all__ = [
     "collect_episodes",
     "expert_policy",
     "expert_scores",
+    "export_demonstrations",
     "load_demonstrations",
     "make_replay",
     "mean_length",

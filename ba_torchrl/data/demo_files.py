@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from tensordict import NonTensorStack, TensorDict
 
 from ba_torchrl import __version__
 from ba_torchrl.data.demos import Source
+from ba_torchrl.data.exchange import check_same_environment, env_values, import_demonstrations
 from ba_torchrl.data.files import (
     check,
     publish,
@@ -22,7 +24,7 @@ from ba_torchrl.data.files import (
     write_state,
     write_text,
 )
-from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.data.formats.base import find_format
 from ba_torchrl.errors import ConfigError
 
 _METADATA_FILE = "demonstrations.json"
@@ -70,7 +72,7 @@ def save_demonstrations(
     write_state(scratch, {**entries, _LENGTHS: lengths})
     metadata = {
         "task": task,
-        "env": _env_values(task, env),
+        "env": env_values(task, env),
         "seed": seed,
         "source": source,
         "episodes": len(episodes),
@@ -86,21 +88,107 @@ def save_demonstrations(
 
 
 def load_demonstrations(
-    path: str | Path, *, task: str | None = None, env: dict[str, Any] | None = None
+    path: str | Path,
+    *,
+    task: str | None = None,
+    env: dict[str, Any] | None = None,
+    mapping: str | Path | Mapping[str, Any] | None = None,
 ) -> list[TensorDict]:
-    """Read the episodes of a folder of `ba-torchrl collect`, a TensorDict [T] each.
+    """Read episodes, a TensorDict [T] each.
 
     Args:
-        path: folder that `save_demonstrations` wrote.
-        task: id of the task that they must be of; None for any task with any parameters.
+        path: folder of `ba-torchrl collect` or `save_demonstrations`, or a file or folder of
+            another library's format, as of `export_demonstrations`.
+        task: id of the task that they must be of; None for any, of a folder of this package.
         env: fields of `EnvConfig` that they must have been collected with.
+        mapping: of the entries of somebody else's file, see `import_demonstrations`.
 
     Raises:
         ConfigError: there are none at ``path``, their files are damaged, or task or parameters
             differ; the message names every difference.
     """
     path = Path(path)
-    check_demonstrations(path, task=task, env=env or {})
+    if not _is_own(path, mapping):
+        if task is None:
+            raise ConfigError(f"{path} is of another library: name the task and its env")
+        return import_demonstrations(path, task=task, env=env or {}, mapping=mapping)
+    if task is None:
+        _read_metadata(path)
+    else:
+        check_demonstrations(path, task=task, env=env or {})
+    return _read_episodes(path)
+
+
+def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, Any]]:
+    """Return the episodes of a folder that `save_demonstrations` wrote, and its metadata.
+
+    Raises:
+        ConfigError: there are none at ``path``, or their files are damaged.
+    """
+    path = Path(path)
+    metadata = _read_metadata(path)
+    return _read_episodes(path), metadata
+
+
+def check_demonstrations(
+    path: str | Path,
+    *,
+    task: str,
+    env: dict[str, Any],
+    least: int = 1,
+    mapping: str | Path | Mapping[str, Any] | None = None,
+) -> None:
+    """Check that there are demonstrations of the same task and parameters at ``path``.
+
+    Args:
+        path: as for `load_demonstrations`.
+        task: id of the task.
+        env: fields of `EnvConfig` of the environments.
+        least: number of episodes that are needed.
+        mapping: as for `load_demonstrations`.
+
+    Raises:
+        ConfigError: there are too few at ``path``, their files are damaged, or task or parameters
+            differ; the message names every difference.
+    """
+    path = Path(path)
+    if _is_own(path, mapping):
+        metadata = _read_metadata(path)
+        count = metadata["episodes"]
+        check_same_environment(path, task, env, metadata["task"], metadata["env"])
+    else:
+        count = len(import_demonstrations(path, task=task, env=env, mapping=mapping))
+    if count < least:
+        raise ConfigError(f"{path} holds {count} episodes, {least} are needed")
+
+
+def _is_own(path: Path, mapping: object) -> bool:
+    """Whether there is a folder that `save_demonstrations` wrote, or nothing known.
+
+    Raises:
+        ConfigError: there is one, and a mapping of somebody else's entries.
+    """
+    is_own = os.path.exists(path / _METADATA_FILE)
+    if is_own and mapping is not None:
+        raise ConfigError(f"{path} has our entries; leave out the mapping (demonstrations_mapping)")
+    return is_own or find_format(path) is None
+
+
+def _read_metadata(path: Path) -> dict[str, Any]:
+    try:
+        metadata = json.loads((path / _METADATA_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"no demonstrations at {path}: {error}") from None
+    check(path)
+    kinds = {"task": str, "env": dict, "episodes": int}
+    if not isinstance(metadata, dict) or any(
+        not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
+    ):
+        raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
+    return metadata
+
+
+def _read_episodes(path: Path) -> list[TensorDict]:
     state = read_state(path)
     try:
         lengths = state.pop(_LENGTHS).tolist()
@@ -121,53 +209,3 @@ def _is_entry(value: Any) -> bool:
     if isinstance(value, list):
         return bool(value) and all(isinstance(item, str) for item in value)
     return isinstance(value, torch.Tensor)
-
-
-def check_demonstrations(
-    path: str | Path, *, task: str | None, env: dict[str, Any], least: int = 1
-) -> None:
-    """Check that there are demonstrations of the same task and parameters at ``path``.
-
-    Args:
-        path: folder that `save_demonstrations` wrote.
-        task: id of the task; None for any task with any parameters.
-        env: fields of `EnvConfig` of the environments.
-        least: number of episodes that are needed.
-
-    Raises:
-        ConfigError: there are too few at ``path``, their files are damaged, or task or parameters
-            differ; the message names every difference.
-    """
-    path = Path(path)
-    try:
-        metadata = json.loads((path / _METADATA_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"no demonstrations at {path}: {error}") from None
-    check(path)
-    kinds = {"task": str, "env": dict, "episodes": int}
-    if not isinstance(metadata, dict) or any(
-        not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
-    ):
-        raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
-    if metadata["episodes"] < least:
-        raise ConfigError(f"{path} holds {metadata['episodes']} episodes, {least} are needed")
-    if task is None:
-        return
-    # A field that is missing in the file was added later and has its default value.
-    found = {"task": metadata["task"], **_env_values(task, {}), **metadata["env"]}
-    wanted = {"task": task, **_env_values(task, env)}
-    differences = [
-        f"{name}: collected with {found.get(name)!r}, needed {wanted.get(name)!r}"
-        for name in sorted(found.keys() | wanted.keys())
-        if found.get(name) != wanted.get(name)
-    ]
-    if differences:
-        raise ConfigError(
-            f"the demonstrations at {path} do not fit:\n  " + "\n  ".join(differences)
-        )
-
-
-def _env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
-    """Return every parameter that affects the data, defaults included, as JSON values."""
-    config = resolve_env(task, env).config
-    return json.loads(config.model_dump_json(exclude={"seed", "render", "expert"}))

@@ -100,7 +100,12 @@ def gather_demonstrations(
         RuntimeError: no episode can be used.
     """
     if config.demonstrations_path is not None:
-        episodes = load_demonstrations(config.demonstrations_path, task=config.task, env=config.env)
+        episodes = load_demonstrations(
+            config.demonstrations_path,
+            task=config.task,
+            env=config.env,
+            mapping=config.demonstrations_mapping,
+        )
         for name in ("demonstrations_noise", "demonstrations_turn_noise", "demonstrations_source"):
             if getattr(config, name) != type(config).model_fields[name].default:
                 logger.warning("%s has no effect on episodes of demonstrations_path", name)

@@ -103,8 +103,11 @@ class ExperimentConfig(WorkerOptions):
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
     policy that has not learnt to turn arrives. None in the appendix."""
     demonstrations_path: str | None = None
-    """Folder that `ba-torchrl collect` wrote; its episodes replace newly collected ones, and
-    source and noise are those of the folder."""
+    """Folder that `ba-torchrl collect` wrote, or demonstrations in the format of LeRobot, Minari,
+    robomimic or Diffusion Policy. They replace newly collected ones, and source and noise are
+    theirs."""
+    demonstrations_mapping: str | None = None
+    """YAML file with the names of the entries in somebody else's demonstrations (docs/data.md)."""
     pretrain_updates: int = Field(default=0, ge=0)
     """Updates on the demonstrations before the first environment step."""
     total_updates: int = Field(default=10_000, ge=1)
@@ -311,8 +314,14 @@ class ExperimentConfig(WorkerOptions):
             if not self.demonstrations:
                 raise ConfigError("demonstrations_path: set demonstrations, the number of episodes")
             check_demonstrations(
-                self.demonstrations_path, task=self.task, env=self.env, least=self.demonstrations
+                self.demonstrations_path,
+                task=self.task,
+                env=self.env,
+                least=self.demonstrations,
+                mapping=self.demonstrations_mapping,
             )
+        elif self.demonstrations_mapping is not None:
+            raise ConfigError("demonstrations_mapping: set demonstrations_path, whose it is")
 
 
 def usable_device(name: str) -> torch.device:

@@ -37,7 +37,12 @@ from ba_torchrl.training.checkpoint import (
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
 
 TENSORS, CARD = ".safetensors", ".json"
-_OF_TRAINING = {"logger": "csv", "collector": {"name": "single"}, "demonstrations_path": None}
+_OF_TRAINING = {
+    "logger": "csv",
+    "collector": {"name": "single"},
+    "demonstrations_path": None,
+    "demonstrations_mapping": None,
+}
 """Fields of a run that its policy does not need, with values that need no package or file."""
 
 

@@ -1,6 +1,7 @@
 import itertools
 import json
 import os
+import shutil
 import signal
 
 import pytest
@@ -12,6 +13,7 @@ from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.demo_files import save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.data.exchange import export_demonstrations
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.checkpoint import (
@@ -208,6 +210,11 @@ FERM = {
             {"demonstrations": 0, **NO_PRETRAINING, "demonstrations_path": "/a"},
             "set demonstrations",
         ),
+        ({"demonstrations_mapping": "a.yaml"}, "demonstrations_mapping: set demonstrations_path"),
+        (
+            {"demonstrations_path": "/no/such/folder", "demonstrations_mapping": "a.yaml"},
+            "no demonstrations at",
+        ),
         ({"network": {"name": "fcn"}}, "network 'fcn' is for open_loop tasks"),
         ({"algorithm": {"name": "sac", "init": "bc"}, **NO_PRETRAINING}, "init: 'bc' takes effect"),
         ({"algorithm": FERM, **NO_PRETRAINING}, "pretraining: 'contrastive' takes effect"),
@@ -240,6 +247,38 @@ def test_demonstrations_of_a_folder_are_filtered(tmp_path, caplog):
     assert "demonstrations_turn_noise has no effect" in caplog.text
     with pytest.raises(ConfigError, match=r"no episode of .* succeeds"):
         gather_demonstrations(bad, algorithm)
+
+
+def test_demonstrations_of_another_library_are_those_of_the_folder(tmp_path):
+    """A run takes an exported file, and with a mapping the same file without its card."""
+    env = {"obs_size": 64, "max_steps": 8}
+    vector = make_vector_env(TINY["task"], 1, parallel=False, seed=0, expert=True, **env)
+    episodes = collect_demonstrations(vector, 2, seed=0)
+    vector.close()
+    options = {"task": TINY["task"], "env": env, "seed": 0}
+    save_demonstrations(tmp_path / "folder", episodes, **options)
+    export_demonstrations(tmp_path / "a.hdf5", episodes, format="hdf5", **options)
+    shutil.copy(tmp_path / "a.hdf5", tmp_path / "b.hdf5")
+    names = {"pixels": "obs/pixels", "holding": "obs/holding", "action": "actions"}
+    mapping = tmp_path / "mapping.yaml"
+    mapping.write_text("".join(f"{key}: {name}\n" for key, name in names.items()))
+    changes = {"demonstrations": 2}
+    runs = [
+        tiny(tmp_path, demonstrations_path=str(tmp_path / "folder"), **changes),
+        tiny(tmp_path, demonstrations_path=str(tmp_path / "a.hdf5"), **changes),
+        tiny(
+            tmp_path,
+            demonstrations_path=str(tmp_path / "b.hdf5"),
+            demonstrations_mapping=str(mapping),
+            **changes,
+        ),
+    ]
+    for run in runs:
+        found = gather_demonstrations(run, build_algorithm(run))
+        for one, other in zip(found, episodes, strict=True):
+            assert (one == other).all()
+    with pytest.raises(ConfigError, match=r"written by another program.*obs/pixels \[64, 64, 1\]"):
+        tiny(tmp_path, demonstrations_path=str(tmp_path / "b.hdf5"), **changes)
 
 
 def test_a_logger_without_its_package_is_refused(tmp_path, monkeypatch):

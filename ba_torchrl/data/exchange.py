@@ -1,0 +1,373 @@
+"""Demonstrations in the formats of other libraries: export, and import of ours and of others'."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import NonTensorStack, TensorDict, TensorDictBase
+from torchrl.data import NonTensor, TensorSpec
+
+from ba_torchrl import __version__
+from ba_torchrl.data.demos import Source
+from ba_torchrl.data.episodes import success_rate
+from ba_torchrl.data.formats.base import (
+    FORMATS,
+    INSTRUCTION,
+    RESULTS,
+    Arrays,
+    Card,
+    DemonstrationMapping,
+    Entry,
+    Format,
+    find_format,
+    read_card,
+    read_file,
+    write_file,
+)
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.description import summary
+from ba_torchrl.envs.factory import make
+from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.errors import ConfigError
+
+_COUNTED = {*keys.STEP_FLAGS, keys.STEP_COUNT}
+"""Entries of a state that follow from the results of the steps before it."""
+_NOT_OBSERVED = {*_COUNTED, keys.EXPERT_ACTION, INSTRUCTION}
+_MOST_INSTRUCTIONS = 20
+_TOLERANCE = 1e-4
+"""Part of a range by which values may exceed it, for rounding."""
+
+
+def export_demonstrations(
+    path: str | Path,
+    episodes: Sequence[TensorDict],
+    *,
+    format: str,
+    task: str,
+    env: dict[str, Any],
+    seed: int,
+    source: Source = "expert",
+) -> None:
+    """Write episodes for another library, with a card beside them.
+
+    Args:
+        path: a new file or folder; of Minari's format, its name is the data set's id.
+        episodes: TensorDicts [T], as `collect_demonstrations` and `load_demonstrations` return.
+        format: "lerobot", "minari", "hdf5" (robomimic), "zarr" (Diffusion Policy) or another
+            registered one.
+        task: id of the task.
+        env: fields of `EnvConfig` that were set.
+        seed: of the first episodes.
+        source: how the demonstrations were made.
+
+    Raises:
+        ConfigError: the format is unknown or its package missing, or ``path`` exists.
+        ValueError: there are no episodes.
+    """
+    form, path = FORMATS[format], Path(path)
+    if not episodes:
+        raise ValueError("there are no episodes to export")
+    if os.path.lexists(path):
+        raise ConfigError(f"{path} exists already; choose another path")
+    roles = _roles(episodes[0])
+    arrays = [_to_arrays(episode, roles) for episode in episodes]
+    entries = {
+        key: Entry(
+            name=key,
+            role=role,
+            dtype="str" if arrays[0][key].dtype.kind == "U" else str(arrays[0][key].dtype),
+            shape=arrays[0][key].shape[1:],
+        )
+        for key, role in roles.items()
+    }
+    names = form.names(entries)
+    entries = {key: entry.model_copy(update={"name": names[key]}) for key, entry in entries.items()}
+    values = env_values(task, env)
+    texts = dict.fromkeys(str(each[INSTRUCTION][0]) for each in arrays if INSTRUCTION in each)
+    card = Card(
+        format=format,
+        task=task,
+        goal=summary(task),
+        robot=values["robot"],
+        source=source,
+        seed=seed,
+        env=values,
+        episodes=len(episodes),
+        steps=sum(len(episode) for episode in episodes),
+        success_rate=success_rate(episodes),
+        instructions=list(texts)[:_MOST_INSTRUCTIONS],
+        versions={"ba_torchrl": __version__, form.package: _version(form.package)},
+        entries=entries,
+    )
+    write_file(form, path, arrays, card)
+
+
+def import_demonstrations(
+    path: Path,
+    *,
+    task: str,
+    env: dict[str, Any],
+    mapping: str | Path | Mapping[str, Any] | None,
+) -> list[TensorDict]:
+    """Read episodes from a file of another library's format.
+
+    Args:
+        path: a file or folder of a registered format.
+        task: id of the task.
+        env: fields of `EnvConfig` of the environments.
+        mapping: by our keys, the names in somebody else's file: a YAML file, or its values. None
+            for a file that `export_demonstrations` wrote. Without ``success``, every episode ends
+            in one; without ``terminated``, ``truncated`` and ``reward``, these follow from it. If
+            the observation after the last action is not in the file, the last one is repeated.
+
+    Raises:
+        ConfigError: task or parameters differ from those of the card; or an entry is missing, or
+            its type, shape or range is not that of the environment.
+    """
+    form = find_format(path)
+    if form is None:
+        raise ConfigError(f"no demonstrations at {path} in the formats {', '.join(FORMATS)}")
+    card = read_card(path)
+    if mapping is None:
+        if card is None:
+            raise ConfigError(
+                f"{path} was written by another program; say where its entries belong in a mapping "
+                f"(demonstrations_mapping). It holds {_listed(read_file(form, path))}"
+            )
+        check_same_environment(path, task, env, card.task, card.env)
+        return [_to_episode(card.entries, arrays) for arrays in read_file(form, path)]
+    return _mapped(form, path, task, env, DemonstrationMapping.parse(mapping))
+
+
+def _mapped(
+    form: Format, path: Path, task: str, env: dict[str, Any], mapping: DemonstrationMapping
+) -> list[TensorDict]:
+    """Return the episodes of somebody else's file, whose entries are those of the environment."""
+    specs = _specs(task, env)
+    wanted = {*specs, *RESULTS, INSTRUCTION}
+    if unknown := mapping.entries.keys() - wanted:
+        raise ConfigError(
+            f"{path}: the environment has no {', '.join(sorted(unknown))}. "
+            f"Known: {', '.join(sorted(wanted))}"
+        )
+    if missing := specs.keys() - mapping.entries.keys():
+        raise ConfigError(f"{path}: the mapping has no {', '.join(sorted(missing))}")
+    episodes = []
+    for number, raw in enumerate(read_file(form, path)):
+        arrays = {}
+        for key, source in mapping.entries.items():
+            try:
+                values = source.values(raw)
+                arrays[key] = _fitted(values, specs[key]) if key in specs else values
+            except ConfigError as error:
+                raise ConfigError(f"{path}, episode {number}: {key}: {error}") from None
+        for key in arrays.keys() - {INSTRUCTION}:
+            is_observed = key in specs and key != keys.ACTION
+            where = f"{path}, episode {number}: {key}"
+            _check_rows(where, arrays[key], len(arrays[keys.ACTION]), is_observed)
+        episodes.append(_with_results(arrays))
+    if not episodes:
+        raise ConfigError(f"{path} holds no episodes")
+    entries = {
+        key: Entry(
+            name=key,
+            role="result" if key in RESULTS else "action" if key == keys.ACTION else "observation",
+            dtype="str" if values.dtype.kind == "U" else str(values.dtype),
+            shape=values.shape[1:],
+        )
+        for key, values in episodes[0].items()
+    }
+    return [_to_episode(entries, arrays) for arrays in episodes]
+
+
+def _specs(task: str, env: dict[str, Any]) -> dict[str, TensorSpec]:
+    """Return the specifications of an environment's observations and actions, by key."""
+    made = make(task, **env)
+    try:
+        specs = {
+            key: spec
+            for key, spec in made.observation_spec.items()
+            if key not in _NOT_OBSERVED and not isinstance(spec, NonTensor)
+        }
+        return {**specs, keys.ACTION: made.action_spec}
+    finally:
+        made.close()
+
+
+def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
+    """Return values with the type and the shape that an environment has.
+
+    Numbers become flags where they exceed 0.5; channels of images may be last.
+
+    Raises:
+        ConfigError: the shape differs, or a value is out of range.
+    """
+    shape = tuple(spec.shape)
+    if values.shape[1:] != shape and len(shape) == 3 == values.ndim - 1:
+        values = np.moveaxis(values, -1, 1)
+    if values.shape[1:] != shape:
+        raise ConfigError(f"has the shape {list(values.shape[1:])}, needed {list(shape)}")
+    if spec.dtype == torch.bool:
+        return values if values.dtype == bool else values > 0.5
+    if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
+        raise ConfigError("has values that are no finite numbers")
+    low, high = (getattr(spec.space, name, None) for name in ("low", "high"))
+    if low is not None and high is not None:
+        slack = _TOLERANCE * (high - low).numpy()
+        if (values < low.numpy() - slack).any() or (values > high.numpy() + slack).any():
+            raise ConfigError(
+                f"has values from {values.min():g} to {values.max():g}, needed "
+                f"{low.min().item():g} to {high.max().item():g}; set scale and offset"
+            )
+    return values.astype(torch.empty(0, dtype=spec.dtype, device="cpu").numpy().dtype, copy=False)
+
+
+def _check_rows(what: str, values: np.ndarray, steps: int, is_observed: bool) -> None:
+    """Check that there is a row for each step, of observations perhaps also one after the last.
+
+    Raises:
+        ConfigError: there is not; the message begins with ``what``.
+    """
+    if len(values) - steps not in ((0, 1) if is_observed else (0,)):
+        raise ConfigError(f"{what} has {len(values)} rows, and there are {steps} actions")
+
+
+def _with_results(arrays: Arrays) -> Arrays:
+    """Return an episode with the results of its steps, which its file may lack."""
+    steps = len(arrays[keys.ACTION])
+    is_last = np.arange(steps)[:, None] == steps - 1
+
+    def flags(key: str, default: np.ndarray) -> np.ndarray:
+        return arrays[key].reshape(steps, 1) > 0.5 if key in arrays else default
+
+    success = flags(keys.SUCCESS, is_last)
+    terminated = flags(keys.TERMINATED, success & is_last)
+    truncated = flags(keys.TRUNCATED, is_last & ~terminated)
+    reward = np.asarray(arrays.get(keys.REWARD, success), dtype=np.float32).reshape(steps, 1)
+    results = (reward, terminated, truncated, success)
+    out = arrays | dict(zip(RESULTS, results, strict=True))
+    if INSTRUCTION in arrays:
+        text = arrays[INSTRUCTION].astype(str).reshape(-1)
+        out[INSTRUCTION] = np.resize(text[:1], steps + 1)
+    return out
+
+
+def _roles(episode: TensorDictBase) -> dict[str, Any]:
+    """Return the role of each entry that a file holds."""
+    following = set(episode[keys.NEXT].keys())
+    roles: dict[str, Any] = {
+        key: "observation" if key in following else "action"
+        for key in sorted(set(episode.keys()) - _COUNTED - {keys.NEXT})
+    }
+    return roles | dict.fromkeys(RESULTS, "result")
+
+
+def _to_arrays(episode: TensorDictBase, roles: Mapping[str, Any]) -> Arrays:
+    """Return an episode [T] as arrays by key, observations with the one after the last action."""
+    following = episode[keys.NEXT]
+    arrays = {}
+    for key, role in roles.items():
+        part = _to_array(following if role == "result" else episode, key)
+        if role == "observation":
+            part = np.concatenate([part, _to_array(following[-1:], key)])
+        arrays[key] = part
+    return arrays
+
+
+def _to_array(tensordict: TensorDictBase, key: str) -> np.ndarray:
+    values = tensordict.get(key)
+    return values.numpy() if isinstance(values, torch.Tensor) else np.array(values.tolist())
+
+
+def _to_episode(entries: Mapping[str, Entry], arrays: Arrays) -> TensorDict:
+    """Return an episode [T] as training has it, from the entries of a file.
+
+    Raises:
+        ConfigError: an entry is missing or has another shape than the card says.
+    """
+    steps = len(arrays[entries[keys.ACTION].name])
+    now: dict[str, Any] = {}
+    following: dict[str, Any] = {}
+    for key, entry in entries.items():
+        if entry.name not in arrays:
+            raise ConfigError(f"the file has no {entry.name!r}, which its card names")
+        values = arrays[entry.name]
+        if entry.dtype == "str":
+            text = np.resize(values.astype(str).reshape(-1), steps + 1)
+            now[key], following[key] = (_as_text(part) for part in (text[:-1], text[1:]))
+            continue
+        if values.shape[1:] != entry.shape and entry.is_image:
+            values = np.moveaxis(values, -1, 1)
+        if values.shape[1:] != entry.shape:
+            if (*values.shape[1:], 1) != entry.shape:
+                raise ConfigError(
+                    f"{entry.name} has the shape {values.shape[1:]}, its card says {entry.shape}"
+                )
+            values = values[..., None]
+        rows = torch.from_numpy(np.array(values, dtype=entry.dtype))
+        _check_rows(entry.name, values, steps, entry.role == "observation")
+        if entry.role == "observation":
+            if len(rows) == steps:
+                rows = torch.cat([rows, rows[-1:]])
+            now[key], following[key] = rows[:-1], rows[1:].clone()
+        else:
+            (following if entry.role == "result" else now)[key] = rows
+    following |= {
+        keys.DONE: following[keys.TERMINATED] | following[keys.TRUNCATED],
+        keys.FAULT: torch.zeros(steps, 1, dtype=torch.bool, device="cpu"),
+        keys.STEP_COUNT: torch.arange(1, steps + 1, device="cpu")[:, None],
+    }
+    for key in _COUNTED:
+        now[key] = torch.cat([torch.zeros_like(following[key][:1]), following[key][:-1]])
+    return TensorDict({**now, keys.NEXT: TensorDict(following, [steps])}, [steps])
+
+
+def _as_text(values: np.ndarray) -> NonTensorStack:
+    return NonTensorStack(*map(str, values))
+
+
+def env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
+    """Return every parameter that affects the data, defaults included, as JSON values."""
+    config = resolve_env(task, env).config
+    return json.loads(config.model_dump_json(exclude={"seed", "render", "expert"}))
+
+
+def check_same_environment(
+    path: Path, task: str, env: dict[str, Any], found_task: str, found_env: dict[str, Any]
+) -> None:
+    """Check that demonstrations have the task and the parameters of a run.
+
+    Raises:
+        ConfigError: they differ; the message names every difference.
+    """
+    # A field that is missing in the file was added later and has its default value.
+    found = {"task": found_task, **env_values(task, {}), **found_env}
+    wanted = {"task": task, **env_values(task, env)}
+    differences = [
+        f"{name}: collected with {found.get(name)!r}, needed {wanted.get(name)!r}"
+        for name in sorted(found.keys() | wanted.keys())
+        if found.get(name) != wanted.get(name)
+    ]
+    if differences:
+        raise ConfigError(
+            f"the demonstrations at {path} do not fit:\n  " + "\n  ".join(differences)
+        )
+
+
+def _listed(episodes: list[Arrays]) -> str:
+    first = episodes[0] if episodes else {}
+    return ", ".join(f"{name} {list(first[name].shape[1:])}" for name in sorted(first)) or "nothing"
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

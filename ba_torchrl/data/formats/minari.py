@@ -1,0 +1,147 @@
+"""Minari's data sets."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from ba_torchrl.data.formats.base import FORMATS, INSTRUCTION, Arrays, Card, Entry, Format
+from ba_torchrl.envs import keys
+from ba_torchrl.envs.registration import gym_id, register_task
+from ba_torchrl.errors import ConfigError
+
+_ROOT = "MINARI_DATASETS_PATH"
+_OBSERVATIONS, _INFOS = "observations/", "infos/"
+_FIXED = {
+    keys.ACTION: "actions",
+    keys.REWARD: "rewards",
+    keys.TERMINATED: "terminations",
+    keys.TRUNCATED: "truncations",
+}
+
+
+class Minari(Format):
+    """Dictionaries of observations in the environment's spaces; other entries are infos.
+
+    The last part of the path is the data set's id, which ends in a version: ``picking-v0``.
+    """
+
+    package = "minari"
+
+    def matches(self, path: Path) -> bool:
+        """Return whether it is the folder of a data set."""
+        return os.path.isfile(path / "data" / "metadata.json")
+
+    def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
+        """Return names: ``observations/pixels``, ``actions``, ``infos/success``."""
+        observed = {
+            key: entry.role == "observation" and key != INSTRUCTION
+            for key, entry in entries.items()
+        }
+        return {
+            key: _FIXED.get(key, f"{_OBSERVATIONS if is_observed else _INFOS}{key}")
+            for key, is_observed in observed.items()
+        }
+
+    def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
+        """Write by Minari, with an environment that `recover_environment` makes."""
+        import gymnasium
+
+        minari = self.library("minari")
+        self.library("h5py")
+        register_task(card.task)
+        env = gymnasium.make(gym_id(card.task), **card.env)
+        buffers = [
+            minari.data_collector.EpisodeBuffer(
+                id=i,
+                observations=_below(arrays, _OBSERVATIONS),
+                actions=arrays["actions"],
+                rewards=arrays["rewards"][:, 0],
+                terminations=arrays["terminations"][:, 0],
+                truncations=arrays["truncations"][:, 0],
+                infos={
+                    name: list(map(str, values)) if values.dtype.kind == "U" else values
+                    for name, values in _below(arrays, _INFOS).items()
+                },
+            )
+            for i, arrays in enumerate(episodes)
+        ]
+        spaces = env.observation_space.spaces
+        observed = buffers[0].observations
+        try:
+            if missing := observed.keys() - spaces.keys():
+                raise ConfigError(
+                    f"the Gymnasium environment does not observe {', '.join(missing)}"
+                )
+            with _datasets_at(path.resolve().parent), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of e-mail and web addresses that are not given
+                minari.create_dataset_from_buffers(
+                    path.name,
+                    buffers,
+                    env=env.spec,
+                    observation_space=gymnasium.spaces.Dict({key: spaces[key] for key in observed}),
+                    action_space=env.action_space,
+                    algorithm_name=card.source,
+                    author="BA-TorchRL",
+                    description=f"{card.goal} Robot: {card.robot}.",
+                    data_format="hdf5",
+                    requirements=[f"ba-torchrl=={card.versions['ba_torchrl']}"],
+                )
+        except ValueError as error:
+            if "Malformed" not in str(error):
+                raise
+            raise ConfigError(
+                f"path: its last part is the id of the data set, such as {path.name}-v0: {error}"
+            ) from None
+        finally:
+            env.close()
+
+    def read(self, path: Path) -> list[Arrays]:
+        """Read every episode; observations of a single space are named ``observations``."""
+        minari = self.library("minari")
+        episodes = []
+        for episode in minari.MinariDataset(path / "data").iterate_episodes():
+            arrays = {name: getattr(episode, name) for name in _FIXED.values()}
+            for place, values in ((_OBSERVATIONS, episode.observations), (_INFOS, episode.infos)):
+                if isinstance(values, dict):
+                    arrays |= {f"{place}{name}": part for name, part in values.items()}
+                elif values is not None:
+                    arrays[place.rstrip("/")] = values
+            episodes.append({name: _plain(values) for name, values in arrays.items()})
+        return episodes
+
+
+def _plain(values: object) -> np.ndarray:
+    """Return an array of numbers or of text."""
+    array = np.asarray(values)
+    return np.char.decode(array.astype(bytes), "utf-8") if array.dtype.kind == "O" else array
+
+
+def _below(arrays: Arrays, place: str) -> Arrays:
+    return {
+        name.removeprefix(place): values
+        for name, values in arrays.items()
+        if name.startswith(place)
+    }
+
+
+@contextmanager
+def _datasets_at(folder: Path) -> Iterator[None]:
+    """Let Minari write its data sets into a folder."""
+    before = os.environ.get(_ROOT)
+    os.environ[_ROOT] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_ROOT]
+        else:
+            os.environ[_ROOT] = before
+
+
+FORMATS.register("minari")(Minari())

@@ -1,0 +1,367 @@
+"""Demonstrations in other libraries' formats; most episodes are made by hand."""
+
+import json
+import sys
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import zarr
+from tensordict import NonTensorStack, TensorDict
+
+import ba_torchrl
+from ba_torchrl.data import (
+    collect_demonstrations,
+    export_demonstrations,
+    load_demonstrations,
+    save_demonstrations,
+)
+from ba_torchrl.data.demo_files import check_demonstrations
+from ba_torchrl.data.demos import source_config
+from ba_torchrl.data.formats.base import FORMATS, Format, read_card
+from ba_torchrl.errors import ConfigError, MissingPackageError, UnknownNameError
+
+TASK, ENV, SIZE = "close_loop/block_picking", {"obs_size": 64}, 64
+PATHS = {
+    "minari": "picking-v0",
+    "hdf5": "picking.hdf5",
+    "zarr": "picking.zarr",
+    "lerobot": "picking",
+}
+SHAPES = {
+    "pixels": ((1, SIZE, SIZE), torch.float32),
+    "in_hand": ((3, 24, 24), torch.float32),
+    "wrist_rgb": ((3, 48, 48), torch.uint8),
+    "segmentation": ((1, SIZE, SIZE), torch.int32),
+    "point_cloud": ((16, 3), torch.float32),
+    "proprio": ((8,), torch.float32),
+    "holding": ((1,), torch.bool),
+}
+
+
+def values(shape, dtype, generator):
+    numbers = torch.rand(shape, generator=generator)
+    if dtype == torch.bool:
+        return numbers > 0.5
+    return numbers if dtype.is_floating_point else (200 * numbers).to(dtype)
+
+
+def episode(steps, seed, success=True):
+    """Return an episode [steps] with all kinds of entries."""
+    generator = torch.Generator().manual_seed(seed)
+    now, following = {}, {}
+    for key, (shape, dtype) in SHAPES.items():
+        rows = values((steps + 1, *shape), dtype, generator)
+        now[key], following[key] = rows[:-1], rows[1:]
+    for key in ("action", "expert_action"):
+        now[key] = values((steps, 5), torch.float32, generator)
+    now["is_expert"] = values((steps, 1), torch.bool, generator)
+    is_last = torch.arange(steps)[:, None] == steps - 1
+    following["success"] = following["terminated"] = is_last & success
+    following["truncated"] = is_last & (not success)
+    following["done"], following["fault"] = is_last, torch.zeros_like(is_last)
+    following["reward"] = following["success"].float()
+    following["step_count"] = torch.arange(1, steps + 1)[:, None]
+    for key in ("success", "terminated", "truncated", "done", "fault", "step_count"):
+        now[key] = torch.cat([torch.zeros_like(following[key][:1]), following[key][:-1]])
+    text = [f"pick up block {seed}"] * steps
+    now["instruction"], following["instruction"] = NonTensorStack(*text), NonTensorStack(*text)
+    return TensorDict({**now, "next": TensorDict(following, [steps])}, [steps]).clone()
+
+
+@pytest.fixture
+def episodes():
+    return [episode(3, 0), episode(2, 1, success=False), episode(4, 2)]
+
+
+@pytest.fixture(scope="module")
+def collected():
+    env = ba_torchrl.make_vector_env(
+        TASK, 1, parallel=False, seed=0, **ENV, **source_config("expert")
+    )
+    yield collect_demonstrations(env, 2, seed=0, noise=0.2)
+    env.close()
+
+
+def exported(path, episodes, name, **changes):
+    options = {"format": name, "task": TASK, "env": ENV, "seed": 7, **changes}
+    export_demonstrations(path / PATHS[name], episodes, **options)
+    return path / PATHS[name]
+
+
+def assert_equal(found, wanted):
+    assert len(found) == len(wanted)
+    for one, other in zip(found, wanted, strict=True):
+        assert set(one.keys(True, True)) == set(other.keys(True, True))
+        for key in other.keys(True, True):
+            ours, theirs = one.get(key), other.get(key)
+            if isinstance(theirs, torch.Tensor):
+                assert ours.dtype == theirs.dtype, key
+                assert torch.equal(ours, theirs), key
+            else:
+                assert ours.tolist() == theirs.tolist(), key
+
+
+@pytest.mark.parametrize("name", ["hdf5", "zarr", "lerobot"])
+def test_every_value_comes_back(name, episodes, tmp_path):
+    if name == "lerobot":
+        pytest.importorskip("lerobot")
+    path = exported(tmp_path, episodes, name)
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
+    card = read_card(path)
+    assert (card.task, card.robot, card.seed, card.source) == (TASK, "kuka", 7, "expert")
+    assert (card.episodes, card.steps, card.success_rate) == (3, 9, pytest.approx(2 / 3))
+    assert card.instructions == [f"pick up block {i}" for i in range(3)]
+    page = (path / "README.md" if path.is_dir() else path.with_suffix(".md")).read_text()
+    assert f"| `{card.entries['proprio'].name}` | observation `proprio` | float32 | [8] |" in page
+
+
+@pytest.mark.parametrize("name", ["minari", "hdf5", "zarr", "lerobot"])
+def test_episodes_of_an_environment_come_back(name, collected, tmp_path):
+    if name == "lerobot":
+        pytest.importorskip("lerobot")
+    path = exported(tmp_path, collected, name)
+    check_demonstrations(path, task=TASK, env=ENV, least=2)
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), collected)
+    with pytest.raises(ConfigError, match="obs_size: collected with 64, needed 128"):
+        load_demonstrations(path, task=TASK, env={})
+    with pytest.raises(ConfigError, match="holds 2 episodes, 3 are needed"):
+        check_demonstrations(path, task=TASK, env=ENV, least=3)
+    with pytest.raises(ConfigError, match="exists already"):
+        exported(tmp_path, collected, name)
+
+
+def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):
+    import minari
+
+    exported(tmp_path, collected, "minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    dataset = minari.load_dataset(PATHS["minari"])
+    env = dataset.recover_environment()
+    assert env.observation_space == dataset.observation_space
+    assert env.spec.id == "BulletArm/CloseLoopBlockPicking-v0"
+    env.reset(seed=0)
+    first = next(iter(dataset.iterate_episodes()))
+    for action, pixels in zip(first.actions, first.observations["pixels"][1:], strict=True):
+        np.testing.assert_array_equal(env.step(action)[0]["pixels"], pixels)
+    env.close()
+
+
+def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_path, episodes):
+    options = {"format": "minari", "task": TASK, "env": ENV, "seed": 0}
+    with pytest.raises(ConfigError, match="such as pick ing-v0"):
+        export_demonstrations(tmp_path / "pick ing", collected, **options)
+    with pytest.raises(ConfigError, match=r"does not observe .*wrist_rgb"):
+        export_demonstrations(tmp_path / "a-v0", episodes, **options)
+
+
+def test_hdf5_has_the_layout_of_robomimic(episodes, tmp_path):
+    with h5py.File(exported(tmp_path, episodes, "hdf5")) as file:
+        assert file["data"].attrs["total"] == 9
+        env_args = json.loads(file["data"].attrs["env_args"])
+        assert env_args["env_name"] == "BulletArm/CloseLoopBlockPicking-v0"
+        demo = file["data/demo_1"]
+        assert demo.attrs["num_samples"] == 2
+        assert demo["obs/wrist_rgb"].shape == demo["next_obs/wrist_rgb"].shape == (2, 48, 48, 3)
+        assert demo["dones"][:].tolist() == [0, 1]
+        assert demo["rewards"].shape == (2,)
+        np.testing.assert_array_equal(demo["actions"], episodes[1]["action"])
+        assert json.loads(demo.attrs["ep_meta"]) == {"lang": "pick up block 1"}
+
+
+def test_zarr_has_the_layout_of_diffusion_policy(episodes, tmp_path):
+    root = zarr.open(str(exported(tmp_path, episodes, "zarr")), mode="r")
+    assert root["meta/episode_ends"][:].tolist() == [3, 5, 9]
+    assert root["data/wrist_rgb"].shape == (9, 48, 48, 3)
+    np.testing.assert_array_equal(root["data/action"][3:5], episodes[1]["action"])
+
+
+def test_lerobot_has_its_names(episodes, tmp_path):
+    pytest.importorskip("lerobot")
+    exported(tmp_path, episodes, "lerobot")
+    info = json.loads((tmp_path / PATHS["lerobot"] / "meta/info.json").read_text())
+    features = info["features"]
+    assert features["observation.state"]["shape"] == [8]
+    assert features["observation.images.wrist_rgb"]["dtype"] == "image"
+    assert features["observation.images.pixels"]["info"]["is_depth_map"]
+    assert {"action", "next.reward", "next.done", "next.success"} <= features.keys()
+
+
+# Another robot's teleoperation: depth in millimetres with channels last, an action of
+# (x, y, z, yaw, gripper) in metres, radians and opening.
+FOREIGN = {
+    "pixels": {"source": "obs/depth", "scale": 0.001},
+    "holding": {"source": "obs/state", "components": [1], "scale": -1, "offset": 1},
+    "action": {
+        "source": "actions",
+        "components": [4, 0, 1, 2, 3],
+        "scale": [2, 20, 20, 20, 1],
+        "offset": [-1, 0, 0, 0, 0],
+    },
+}
+
+
+def foreign(path, **changes):
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for i, steps in enumerate((3, 2)):
+            data = {
+                "obs/depth": rng.integers(0, 200, (steps, SIZE, SIZE, 1), dtype=np.uint16),
+                "obs/state": np.array([[0.1, 0.2], [0.3, 0.9], [0.6, 0.4]]),
+                "actions": rng.uniform(0, 0.05, (steps, 5)),
+                **changes,
+            }
+            for name, rows in data.items():
+                file[f"data/demo_{i}/{name}"] = rows[:steps]
+    return path
+
+
+@pytest.mark.parametrize("as_file", [False, True])
+def test_demonstrations_of_another_robot_are_mapped(as_file, tmp_path):
+    path = foreign(tmp_path / "teleoperation.hdf5")
+    mapping = FOREIGN
+    if as_file:
+        mapping = tmp_path / "mapping.yaml"
+        mapping.write_text(json.dumps(FOREIGN))  # JSON is YAML
+    first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    with h5py.File(path) as file:
+        demo = file["data/demo_0"]
+        depth, action = demo["obs/depth"][:], demo["actions"][:]
+    pixels = torch.from_numpy(depth.transpose(0, 3, 1, 2) * 0.001).float()
+    assert torch.equal(first["pixels"], pixels)
+    assert torch.equal(first["next", "pixels"], torch.cat([pixels[1:], pixels[-1:]]))
+    assert first["holding"].flatten().tolist() == [True, False, True]
+    wanted = np.c_[action[:, 4] * 2 - 1, action[:, :3] * 20, action[:, 3]]
+    np.testing.assert_allclose(first["action"], wanted, rtol=1e-6)
+    assert second["next", "success"].flatten().tolist() == [False, True]
+    assert second["next", "terminated"].flatten().tolist() == [False, True]
+    assert second["next", "reward"].flatten().tolist() == [0, 1]
+    env = ba_torchrl.make(TASK, seed=0, **ENV)
+    plain = env.rollout(2)
+    env.close()
+    assert set(first.keys(True, True)) == set(plain.keys(True, True))
+    for key in plain.keys(True, True):
+        assert first[key].dtype == plain[key].dtype, key
+        assert first[key].shape[1:] == plain[key].shape[1:], key
+
+
+def test_results_of_another_robot_are_mapped(tmp_path):
+    path = foreign(tmp_path / "a.hdf5", won=np.array([0, 1, 1]))
+    found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
+    assert found[0]["next", "reward"].flatten().tolist() == [0, 1, 1]
+    assert found[0]["next", "terminated"].flatten().tolist() == [False, False, True]
+    path = foreign(tmp_path / "b.hdf5", won=np.zeros(3))
+    found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
+    assert not any(each["next", "success"].any() for each in found)
+    assert found[0]["next", "truncated"].flatten().tolist() == [False, False, True]
+    assert found[0]["next", "reward"].sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"holding": None}, "the mapping has no holding"),
+        ({"gripper": "obs/state"}, "the environment has no gripper. Known: .*holding"),
+        ({"holding": "obs/grip"}, "episode 0: holding: there is no 'obs/grip'. Known: .*obs/state"),
+        ({"holding": "obs/state"}, r"holding: has the shape \[2\], needed \[1\]"),
+        ({"pixels": "obs/depth"}, r"pixels: has values from 0 to 199, needed .*; set scale"),
+        ({"action": {"source": "actions", "offset": -3}}, "action: has values from -2.99"),
+        ({"action": {"source": "actions", "components": [9]}}, "action: actions.*out of bounds"),
+        ({"action": {"source": "actions", "scale": [1, 2]}}, "action: actions.*broadcast"),
+        ({"action": {"sauce": "actions"}}, "mapping: action.*: Field required"),
+    ],
+)
+def test_mappings_that_do_not_fit_are_refused_by_name(changes, message, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    mapping = {key: value for key, value in {**FOREIGN, **changes}.items() if value is not None}
+    with pytest.raises(ConfigError, match=message):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+
+
+@pytest.mark.parametrize("lost", ["obs/depth", "actions"])
+def test_rows_that_are_missing_are_named(lost, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        rows = file[f"data/demo_1/{lost}"][:-1]
+        del file[f"data/demo_1/{lost}"]
+        file[f"data/demo_1/{lost}"] = rows[:0] if lost == "actions" else rows
+    with pytest.raises(ConfigError, match=r"episode 1: .* rows, and there are [02] actions"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        del file["data"]
+        file.create_group("data")
+    with pytest.raises(ConfigError, match="holds no episodes"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+
+
+def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    with pytest.raises(ConfigError, match=r"demonstrations_mapping\). It holds actions \[5\], obs"):
+        load_demonstrations(path, task=TASK, env=ENV)
+    save_demonstrations(tmp_path / "ours", collected, task=TASK, env=ENV, seed=0)
+    with pytest.raises(ConfigError, match="has our entries; leave out the mapping"):
+        load_demonstrations(tmp_path / "ours", task=TASK, env=ENV, mapping=FOREIGN)
+    (tmp_path / "b.yaml").write_text("- a\n- b\n")
+    with pytest.raises(ConfigError, match=r"b\.yaml: must map keys to names"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "b.yaml")
+    (tmp_path / "c.hdf5").write_text("no HDF5")
+    with pytest.raises(ConfigError, match=r"c\.hdf5 cannot be read: OSError"):
+        load_demonstrations(tmp_path / "c.hdf5", task=TASK, env=ENV, mapping=FOREIGN)
+
+
+@pytest.mark.parametrize(
+    "pickled",
+    [
+        {"dtype": "|O", "filters": [{"id": "pickle"}]},
+        {"filters": [{"id": "pickle"}]},
+        {"compressor": {"id": "pickle"}},
+    ],
+)
+def test_pickles_in_zarr_are_refused(pickled, episodes, tmp_path):
+    path = exported(tmp_path, episodes, "zarr")
+    array = {"shape": [9], "chunks": [9], "dtype": "<f4", "filters": None, "compressor": None}
+    array |= {"fill_value": None, "order": "C", "zarr_format": 2, **pickled}
+    (path / "data/note").mkdir()
+    (path / "data/note/.zarray").write_text(json.dumps(array))
+    with pytest.raises(ConfigError, match=r"note is not opened|No Zarr data type"):
+        load_demonstrations(path, task=TASK, env=ENV)
+
+
+@pytest.mark.parametrize("name", ["hdf5", "zarr", "minari", "lerobot"])
+def test_a_missing_package_is_named(name, collected, tmp_path, monkeypatch):
+    for module in ("h5py", "zarr", "minari", "lerobot.datasets.lerobot_dataset"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingPackageError, match=f"pip install .*{FORMATS[name].package}"):
+        exported(tmp_path, collected, name)
+
+
+def test_a_format_from_outside_the_package(episodes, tmp_path, monkeypatch):
+    class Npz(Format):
+        """One archive of NumPy."""
+
+        package = "numpy"
+
+        def matches(self, path):
+            return path.suffix == ".npz"
+
+        def names(self, entries):
+            return {key: key.upper() for key in entries}
+
+        def write(self, path, episodes, card):
+            flat = {f"{i} {k}": v for i, each in enumerate(episodes) for k, v in each.items()}
+            np.savez(path, **flat)
+
+        def read(self, path):
+            found = {}
+            for name, rows in np.load(path).items():
+                found.setdefault(int(name.split()[0]), {})[name.split()[1]] = rows
+            return list(found.values())
+
+    monkeypatch.setattr(FORMATS, "_entries", {**FORMATS._entries})
+    FORMATS.register("npz")(Npz())
+    options = {"task": TASK, "env": ENV}
+    export_demonstrations(tmp_path / "a.npz", episodes, format="npz", seed=0, **options)
+    assert_equal(load_demonstrations(tmp_path / "a.npz", **options), episodes)
+    with pytest.raises(UnknownNameError, match="Did you mean 'npz'"):
+        export_demonstrations(tmp_path / "b", episodes, format="npy", seed=0, **options)

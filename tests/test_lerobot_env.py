@@ -1,0 +1,82 @@
+"""recipes/lerobot_env.py, by the contract of LeRobot's EnvHub and by its loader if it is there."""
+
+import importlib.util
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+
+FILE = Path(__file__).parents[1] / "recipes/lerobot_env.py"
+CONFIG = {"obs_size": 64, "rgb": True, "max_steps": 3}
+
+
+@pytest.fixture
+def hub():
+    """Load the file as LeRobot does: not as a module that can be imported by its name."""
+    spec = importlib.util.spec_from_file_location("hub_env_user_repo", FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.TASKS = ("close_loop/block_picking", "close_loop/block_reaching")
+    module.ENV = CONFIG
+    return module
+
+
+def close(suites):
+    for vectors in suites.values():
+        for vector in vectors.values():
+            vector.close()
+
+
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_a_suite_of_vectors(hub, use_async_envs):
+    hub.TASKS = hub.TASKS[: 1 if use_async_envs else 2]
+    suites = hub.make_env(n_envs=2, use_async_envs=use_async_envs)
+    try:
+        assert list(suites) == ["ba_torchrl"]
+        assert list(suites["ba_torchrl"]) == list(range(len(hub.TASKS)))
+        vector = suites["ba_torchrl"][0]
+        assert isinstance(vector, gymnasium.vector.VectorEnv)
+        assert vector.num_envs == 2
+        assert vector.call("task") == ("close_loop/block_picking",) * 2
+        assert all(len(text) > 10 for text in vector.call("task_description"))
+        assert vector.call("_max_episode_steps") == (3, 3)
+        observation, _ = vector.reset(seed=[0, 1], options={"lerobot_new_rollout": True})
+        assert vector.observation_space.contains(observation)
+        assert observation["images.pixels"].shape == (2, 1, 64, 64)
+        assert observation["agent_pos"].dtype == np.float32
+        rgb = observation["pixels"]["rgb"]
+        assert (rgb.shape, rgb.dtype) == ((2, 64, 64, 3), np.uint8)
+        assert rgb.std() > 1
+        ended = np.zeros(2, bool)
+        for _ in range(3):
+            _, _, terminated, truncated, info = vector.step(np.full((2, 5), 1.5))
+            ended |= terminated | truncated
+        assert ended.all()
+        assert info["is_success"].tolist() == [False, False]
+    finally:
+        close(suites)
+
+
+def test_the_configuration_names_the_task(hub):
+    suites = hub.make_env(n_envs=1, cfg=SimpleNamespace(task="close_loop/block_reaching"))
+    assert suites["ba_torchrl"][0].call("task") == ("close_loop/block_reaching",)
+    close(suites)
+
+
+def test_lerobot_loads_it(tmp_path, monkeypatch):
+    utils = pytest.importorskip("lerobot.envs.utils")
+    from lerobot.envs.factory import make_env
+
+    file = Path(shutil.copy(FILE, tmp_path / "env.py"))
+    monkeypatch.setattr(utils, "hf_hub_download", lambda **_: str(file))  # in place of the network
+    suites = make_env("user/repo", n_envs=2, trust_remote_code=True)
+    vector = suites["ba_torchrl"][0]
+    observation, _ = vector.reset(seed=[0, 1])
+    batch = utils.preprocess_observation(observation)
+    assert batch["observation.images.pixels"].shape == (2, 1, 128, 128)
+    assert batch["observation.state"].shape == (2, 1)
+    utils.check_env_attributes_and_types(vector)
+    close(suites)
