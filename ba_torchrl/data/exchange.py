@@ -19,7 +19,6 @@ from ba_torchrl.data.demos import Source
 from ba_torchrl.data.episodes import success_rate
 from ba_torchrl.data.formats.base import (
     FORMATS,
-    INSTRUCTION,
     RESULTS,
     Arrays,
     Card,
@@ -39,7 +38,7 @@ from ba_torchrl.errors import ConfigError
 
 _COUNTED = {*keys.STEP_FLAGS, keys.STEP_COUNT}
 """Entries of a state that follow from the results of the steps before it."""
-_NOT_OBSERVED = {*_COUNTED, keys.EXPERT_ACTION, INSTRUCTION}
+_NOT_OBSERVED = {*_COUNTED, keys.EXPERT_ACTION, keys.INSTRUCTION}
 _MOST_INSTRUCTIONS = 20
 _TOLERANCE = 1e-4
 """Part of a range by which values may exceed it, for rounding."""
@@ -90,7 +89,9 @@ def export_demonstrations(
     names = form.names(entries)
     entries = {key: entry.model_copy(update={"name": names[key]}) for key, entry in entries.items()}
     values = env_values(task, env)
-    texts = dict.fromkeys(str(each[INSTRUCTION][0]) for each in arrays if INSTRUCTION in each)
+    texts = dict.fromkeys(
+        str(each[keys.INSTRUCTION][0]) for each in arrays if keys.INSTRUCTION in each
+    )
     card = Card(
         format=format,
         task=task,
@@ -151,7 +152,7 @@ def _mapped(
 ) -> list[TensorDict]:
     """Return the episodes of somebody else's file, whose entries are those of the environment."""
     specs = _specs(task, env)
-    wanted = {*specs, *RESULTS, INSTRUCTION}
+    wanted = {*specs, *RESULTS, keys.INSTRUCTION}
     if unknown := mapping.entries.keys() - wanted:
         raise ConfigError(
             f"{path}: the environment has no {', '.join(sorted(unknown))}. "
@@ -168,7 +169,7 @@ def _mapped(
                 arrays[key] = _fitted(values, specs[key]) if key in specs else values
             except ConfigError as error:
                 raise ConfigError(f"{path}, episode {number}: {key}: {error}") from None
-        for key in arrays.keys() - {INSTRUCTION}:
+        for key in arrays.keys() - {keys.INSTRUCTION}:
             is_observed = key in specs and key != keys.ACTION
             where = f"{path}, episode {number}: {key}"
             _check_rows(where, arrays[key], len(arrays[keys.ACTION]), is_observed)
@@ -253,9 +254,9 @@ def _with_results(arrays: Arrays) -> Arrays:
     reward = np.asarray(arrays.get(keys.REWARD, success), dtype=np.float32).reshape(steps, 1)
     results = (reward, terminated, truncated, success)
     out = arrays | dict(zip(RESULTS, results, strict=True))
-    if INSTRUCTION in arrays:
-        text = arrays[INSTRUCTION].astype(str).reshape(-1)
-        out[INSTRUCTION] = np.resize(text[:1], steps + 1)
+    if keys.INSTRUCTION in arrays:
+        text = arrays[keys.INSTRUCTION].astype(str).reshape(-1)
+        out[keys.INSTRUCTION] = np.resize(text[:1], steps + 1)
     return out
 
 

@@ -25,8 +25,6 @@ Arrays = dict[str, np.ndarray]
 observation after the last action is known."""
 Role = Literal["observation", "action", "result"]
 """Of an entry: known before the step, chosen in it, or known after it."""
-INSTRUCTION = "instruction"
-"""Key of the sentence that says what the episode is about, one string per row."""
 _LAST_FILE = "last_observations.safetensors"
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, INSTRUCTION, Arrays, Card, Entry, Format
+from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id
 
@@ -32,7 +32,7 @@ class Robomimic(Format):
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``obs/pixels``, ``actions``, ``rewards``, and other keys unchanged."""
-        fixed = {keys.ACTION: "actions", keys.REWARD: "rewards", INSTRUCTION: _LANGUAGE}
+        fixed = {keys.ACTION: "actions", keys.REWARD: "rewards", keys.INSTRUCTION: _LANGUAGE}
         return {
             key: fixed.get(key, f"{_OBS}{key}" if entry.role == "observation" else key)
             for key, entry in entries.items()

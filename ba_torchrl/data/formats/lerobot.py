@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, INSTRUCTION, Arrays, Card, Entry, Format
+from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format
 from ba_torchrl.envs import keys
 
 _STATES = ("proprio", keys.OBSERVATION, keys.HOLDING)
@@ -35,7 +35,7 @@ class LeRobot(Format):
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``observation.state``, ``observation.images.NAME`` and ``next.reward``."""
         state = next((key for key in _STATES if key in entries), None)
-        fixed = {state: _STATE, INSTRUCTION: _TASK}
+        fixed = {state: _STATE, keys.INSTRUCTION: _TASK}
         prefixes = {"observation": "observation.", "action": "", "result": "next."}
         return {
             key: fixed.get(key, f"{prefixes[entry.role]}{'images.' * _is_camera(entry)}{key}")

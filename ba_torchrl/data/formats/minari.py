@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, INSTRUCTION, Arrays, Card, Entry, Format
+from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id, register_task
 from ba_torchrl.errors import ConfigError
@@ -40,7 +40,7 @@ class Minari(Format):
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``observations/pixels``, ``actions``, ``infos/success``."""
         observed = {
-            key: entry.role == "observation" and key != INSTRUCTION
+            key: entry.role == "observation" and key != keys.INSTRUCTION
             for key, entry in entries.items()
         }
         return {

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, INSTRUCTION, Arrays, Card, Entry, Format
+from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format
+from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 
 _CHUNK_STEPS = 64
@@ -35,14 +36,14 @@ class DiffusionPolicy(Format):
         version = {"zarr_format": 2} if _major(zarr) >= 3 else {}
         root = zarr.open_group(str(path), mode="w", **version)
         data, meta = root.create_group("data"), root.create_group("meta")
-        for name in episodes[0].keys() - {INSTRUCTION}:
+        for name in episodes[0].keys() - {keys.INSTRUCTION}:
             parts = [arrays[name] for arrays in episodes]
             has_last = card.entries[name].role == "observation"
             _store(data, name, np.concatenate([part[:-1] if has_last else part for part in parts]))
         lengths = [len(arrays["action"]) for arrays in episodes]
         _store(meta, "episode_ends", np.cumsum(lengths, dtype=np.int64))
-        if INSTRUCTION in episodes[0]:
-            meta.attrs[INSTRUCTION] = [str(arrays[INSTRUCTION][0]) for arrays in episodes]
+        if keys.INSTRUCTION in episodes[0]:
+            meta.attrs[keys.INSTRUCTION] = [str(arrays[keys.INSTRUCTION][0]) for arrays in episodes]
 
     def read(self, path: Path) -> list[Arrays]:
         """Read every array of ``data``, cut at the ends of the episodes."""
@@ -57,8 +58,8 @@ class DiffusionPolicy(Format):
             {name: values[start:end] for name, values in steps.items()}
             for start, end in zip([0, *ends], ends, strict=False)
         ]
-        for arrays, text in zip(episodes, meta.attrs.get(INSTRUCTION, ()), strict=False):
-            arrays[INSTRUCTION] = np.array([text])
+        for arrays, text in zip(episodes, meta.attrs.get(keys.INSTRUCTION, ()), strict=False):
+            arrays[keys.INSTRUCTION] = np.array([text])
         return episodes
 
 
