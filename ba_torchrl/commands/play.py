@@ -99,8 +99,9 @@ def _record_keyboard(settings: Settings) -> None:
             f"policy: the keyboard moves the gripper of close-loop tasks; the actions of "
             f"{settings.task} are poses, record its expert by ba-torchrl collect"
         )
-    print(f"keys in the window:\n{Keyboard(resolved.actions).help()}")
     env = make(resolved, seed=settings.seed)
+    # after the lines that PyBullet writes when it opens the window
+    print(f"keys in the window:\n{Keyboard(resolved.actions).help()}")
     kept = []
     try:
         for episode in record_demonstrations(
