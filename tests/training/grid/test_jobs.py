@@ -129,7 +129,7 @@ def test_a_setting_that_is_newer_than_a_finished_run_has_its_default_there(tmp_p
     assert status(run).state == "done"
     saved["config"]["env"]["reward"] = "dense"
     path.write_text(json.dumps(saved))
-    with pytest.raises(ConfigError, match="env.reward: 'dense' there, 'sparse' now"):
+    with pytest.raises(ConfigError, match=r"env\.reward: 'dense' there, 'sparse' now"):
         status(run)
 
 
