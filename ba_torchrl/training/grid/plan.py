@@ -26,7 +26,7 @@ from ba_torchrl.record.results import (
     read_result,
 )
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training.checkpoint import build_algorithm, problem_of, read_config
+from ba_torchrl.training.checkpoint import build_algorithm, parse_saved, problem_of, read_config
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.persistence import lock_holder
 from ba_torchrl.training.resume import check_same_run, resumable_updates
@@ -209,7 +209,9 @@ def status(run: ExperimentConfig) -> Status:
             result = read_result(folder)
         except ValueError as error:
             return Status("failed", f"{error}; delete the folder to start the run again")
-        found = differences(result.config, run.resolved())
+        # settings that are newer than the run have their defaults
+        started = parse_saved(result.config, folder / RESULT_FILE, device=run.device)
+        found = differences(started.resolved(), run.resolved())
         if found:
             lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
             raise ConfigError(

@@ -119,6 +119,20 @@ def test_a_failed_run_is_recorded_and_repeated_by_the_next_call(tmp_path, fake):
     assert not (runs[1].folder / "failure.json").exists()
 
 
+def test_a_setting_that_is_newer_than_a_finished_run_has_its_default_there(tmp_path, fake):
+    run = planned(tmp_path)[0]
+    fake([run])
+    path = run.folder / "result.json"
+    saved = json.loads(path.read_text())
+    del saved["config"]["env"]["reward"]
+    path.write_text(json.dumps(saved))
+    assert status(run).state == "done"
+    saved["config"]["env"]["reward"] = "dense"
+    path.write_text(json.dumps(saved))
+    with pytest.raises(ConfigError, match=r"env\.reward: 'dense' there, 'sparse' now"):
+        status(run)
+
+
 def test_a_run_that_exceeds_its_time_limit_is_stopped(tmp_path, fake):
     runs = planned(tmp_path)
     started = time.monotonic()
