@@ -50,7 +50,6 @@ KEYS = (
     Key(pybullet.B3G_SHIFT, "shift", "held with these: a quarter of the step", "fine"),
     Key(pybullet.B3G_SPACE, "space", "open or close the gripper", "p"),
     Key(ord("r"), "r", "discard the episode and begin it again", "discard"),
-    Key(pybullet.B3G_BACKSPACE, "backspace", "the same", "discard"),
     Key(ord("q"), "q", "end", "end"),
     Key(ESCAPE, "escape", "the same", "end"),
 )
@@ -95,11 +94,12 @@ class Keyboard:
         pressed = active - self._held
         self._held = {c for c in active if not events[c] & pybullet.KEY_WAS_RELEASED}
         chosen = [key for key in self.keys if key.code in active]
-        effects = {key.effect for key in chosen}
         for effect in ("end", "discard"):
             if any(key.effect == effect and key.code in pressed for key in chosen):
                 return effect
-        factor = FINE if "fine" in effects else 1.0
+        # also at its release, which may be read together with a short press of another key
+        is_fine = any(key.effect == "fine" and key.code in events for key in self.keys)
+        factor = FINE if is_fine else 1.0
         value = dict.fromkeys(self._sequence, 0.0)
         for key in chosen:
             if key.effect in value:
