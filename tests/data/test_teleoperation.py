@@ -241,6 +241,7 @@ def display():
 X_NAMES = {"up arrow": "Up", "down arrow": "Down", "left arrow": "Left", "right arrow": "Right"}
 
 
+@pytest.mark.slow  # the window is drawn by the CPU
 @pytest.mark.skipif(
     not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
 )
@@ -259,7 +260,7 @@ def test_keys_in_the_window_record_an_episode(end, tmp_path, env):
             stderr=subprocess.STDOUT,
             text=True,
         )
-        limit = threading.Timer(90, process.kill)
+        limit = threading.Timer(240, process.kill)
         limit.start()
 
         def send(*names):
