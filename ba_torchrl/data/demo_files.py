@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torchrl
@@ -38,7 +38,7 @@ def save_demonstrations(
     task: str,
     env: dict[str, Any],
     seed: int,
-    source: Source = "expert",
+    source: Literal[Source, "keyboard"] = "expert",
 ) -> None:
     """Write episodes as one table of tensors, with their task and parameters.
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -52,7 +52,7 @@ def export_demonstrations(
     task: str,
     env: dict[str, Any],
     seed: int,
-    source: Source = "expert",
+    source: Literal[Source, "keyboard"] = "expert",
 ) -> None:
     """Write episodes for another library, with a card beside them.
 

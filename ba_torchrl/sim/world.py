@@ -74,7 +74,8 @@ def _temporary_file() -> Iterator[str]:
 
 
 def _remove_state(state: int, client: int, connection: weakref.finalize) -> None:
-    if connection.alive:  # otherwise the client id may already belong to another world
+    # otherwise the client id may already belong to another world, or the window is closed
+    if connection.alive and pybullet.isConnected(physicsClientId=client):
         pybullet.removeState(state, physicsClientId=client)
 
 
