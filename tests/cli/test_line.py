@@ -213,6 +213,6 @@ def test_tasks_are_listed_described_and_written(tmp_path, capsys):
     cli.main(["tasks"])
     assert "  close_loop/block_picking           the block is held" in capsys.readouterr().out
     cli.main(["tasks", "close_loop/block_picking"])
-    assert "expert:       1.000 in 7.0 steps" in capsys.readouterr().out
+    assert "expert:       kuka 1.000 in 7.0 steps" in capsys.readouterr().out
     cli.main(["tasks", "close_loop/block_picking", f"path={tmp_path / 'page.md'}"])
     assert "### `close_loop/block_picking`" in (tmp_path / "page.md").read_text()

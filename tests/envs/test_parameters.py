@@ -218,6 +218,7 @@ def test_a_resolved_configuration_is_valid_and_complete(task):
     assert again == resolved == pickle.loads(pickle.dumps(resolved))
     unset = {name for name, value in resolved.config.model_dump().items() if value is None}
     optional = {
+        "camera_size",
         "floor_color",
         "workspace_color",
         *CUSTOM_PHYSICS,

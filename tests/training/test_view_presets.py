@@ -34,7 +34,7 @@ def test_a_run_collects_learns_and_evaluates(tmp_path, preset, network, obs_size
     result = Experiment(config, progress=False).run()
     scalars = read_scalars(tmp_path / "run")
     assert result.updates == 4
-    assert scalars["eval/success_rate"].steps.tolist() == [4]
+    assert scalars["eval/success_rate"].steps.tolist() == [0, 4]
     pretraining = [] if network == "ferm" else [1, 2]  # of the encoder alone
     assert scalars["train/loss_qvalue"].steps.tolist() == [*pretraining, 3, 4]
     assert ("train/loss_contrastive" in scalars) is (network == "ferm")
