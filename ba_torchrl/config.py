@@ -290,6 +290,10 @@ class EnvConfig(StrictModel):
             raise ValueError(f"{', '.join(custom)} needs physics_mode='custom'")
         if self.physics_mode == "custom" and not custom:
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
+        if self.camera_size is not None and not (self.rgb or self.observations):
+            raise ValueError(
+                "camera_size has no effect without rgb=True or observations=['wrist_rgb']"
+            )
         if self.reward != "difference":
             for message in changed(self, ["reward_discount"], "without reward='difference'"):
                 raise ValueError(message)

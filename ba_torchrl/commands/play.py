@@ -62,6 +62,8 @@ def main(settings: Settings) -> None:
         return
     if settings.path is not None:
         raise ConfigError("path: only policy=keyboard records; see ba-torchrl collect")
+    if not settings.only_successful:
+        raise ConfigError("only_successful: only policy=keyboard records; leave it out")
     resolved, policy = _task_and_policy(settings)
     torch.manual_seed(settings.seed)
     frames = record_episodes(resolved, policy, settings.episodes, settings.seed)

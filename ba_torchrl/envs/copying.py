@@ -35,6 +35,7 @@ class CopiesWithState:
         "_memory",
         "_ends",
         "_conditions",
+        "_instruction",
         "_progress",
         "_run_type_checks",
         "training",

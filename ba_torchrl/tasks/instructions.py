@@ -19,23 +19,39 @@ COLOR_NAMES: dict[str, tuple[float, float, float]] = {
     "pink": (0.8, 0.45, 0.6),
     "brown": (0.6, 0.45, 0.3),
     "beige": (0.9, 0.78, 0.6),
-    "white": (0.97, 0.97, 0.95),
-    "gray": (0.65, 0.65, 0.65),
-    "black": (0.1, 0.1, 0.1),
 }
 """Red, green and blue of the named colours."""
-NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+GRAY_SHARE = 0.1
+"""Share of the largest component by which those of black, gray and white differ at most."""
+GRAY_RANGE = (0.2, 0.9)
+"""Largest components of gray; black is darker, white is lighter."""
+NUMBERS = (
+    *("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"),
+    *("eleven", "twelve", "thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen"),
+)
 """Words of the numbers; larger ones are digits."""
 NOUNS = {"shape": "object"}
 """Nouns of the kinds of pieces whose name is not a noun for them."""
 
 
 def color_name(color: Color) -> str:
-    """Return the name of the nearest colour of `COLOR_NAMES`."""
-    return min(
-        COLOR_NAMES,
-        key=lambda name: sum((a - b) ** 2 for a, b in zip(COLOR_NAMES[name], color, strict=False)),
-    )
+    """Return the name of a colour: black, gray, white, or the nearest of `COLOR_NAMES`.
+
+    Shades are compared at the same brightness, and the brightness beside them.
+    """
+    brightness = max(color[:3])
+    if brightness - min(color[:3]) <= GRAY_SHARE * brightness:
+        dark, light = GRAY_RANGE
+        return "black" if brightness < dark else "white" if brightness > light else "gray"
+
+    def distance(name: str) -> float:
+        other = COLOR_NAMES[name]
+        largest = max(other)
+        shades = zip(color, other, strict=False)
+        shade = sum((a / brightness - b / largest) ** 2 for a, b in shades)
+        return shade + (brightness - largest) ** 2
+
+    return min(COLOR_NAMES, key=distance)
 
 
 def colored(body: Body, noun: str) -> str:
@@ -100,10 +116,8 @@ def structure_instruction(blueprint: Blueprint, bodies: Sequence[tuple[str, Body
     clauses = [f"stack {base}"] if height > 1 else []
     for i, (kind, on, count) in enumerate(layers[height:]):
         if i or height > 1:
-            where = "on top" if len(on) == 1 else "across these"
+            where = "on top" if len(on) == 1 else "across them"
         else:
             where = f"{'on' if len(on) == 1 else 'across'} {base}"
-        clauses.append(f"{pieces(kind, count)} {where}")
-    if height == 1 or len(clauses) > 1:
-        clauses[height > 1] = f"put {clauses[height > 1]}"
-    return joined(clauses)
+        clauses.append(f"put {pieces(kind, count)} {where}")
+    return joined(clauses) if len(clauses) < 3 else ", then ".join(clauses)

@@ -124,7 +124,16 @@ class TrainedPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``; the observation may be on another device than the policy."""
+        """Write ``action``; the observation may be on another device than the policy.
+
+        Raises:
+            ConfigError: the observation lacks an entry that the policy reads.
+        """
+        if missing := [key for key in self.in_keys if key not in tensordict.keys(True)]:
+            raise ConfigError(
+                f"the policy of {self.task} reads {', '.join(map(str, missing))}, which is not "
+                "observed: make the environment with **policy.env_config"
+            )
         device = next(self.parameters()).device
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
             found = self.policy(tensordict.select(*self.in_keys).to(device))[keys.ACTION]

@@ -1,7 +1,9 @@
 """Observations that are enabled by name: gripper, joints, cameras, segmentation, instruction."""
 
+import copy
 import functools
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from torchrl.envs.utils import check_env_specs
 import ba_torchrl
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.gym import GymEnv
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix
+from ba_torchrl.tasks.instructions import color_name
 
 PICKING = "close_loop/block_picking"
 GRASPING = "close_loop/object_grasping"
@@ -156,14 +160,42 @@ WORDS = {
     "open_loop/block_stacking": "stack the four red cubes",
     "open_loop/house_building_1": "stack the three red cubes and put the green triangle on top",
     "open_loop/house_building_4": (
-        "put the blue cuboid across two red cubes, the other two red cubes on top and the green "
-        "roof across these"
+        "put the blue cuboid across two red cubes, then put the other two red cubes on top, then "
+        "put the green roof across them"
     ),
-    "open_loop/box_palletizing": "stack the 18 beige boxes on the brown pallet",
+    "open_loop/box_palletizing": "stack the eighteen beige boxes on the brown pallet",
     "ramp/improvise_house_building_2": (
         "put the green roof across the two orange objects, between the ramps"
     ),
 }
+
+
+@pytest.mark.parametrize(
+    ("color", "name"),
+    [
+        ((0.3, 0.3, 0.3), "gray"),
+        ((0.8, 0.8, 0.8), "gray"),
+        ((0.05, 0.05, 0.05), "black"),
+        ((1.0, 1.0, 1.0), "white"),
+        ((0.5, 0.0, 0.0), "red"),
+        ((0.0, 0.0, 0.3), "blue"),
+    ],
+)
+def test_dark_and_gray_colours_have_their_names(color, name):
+    assert color_name((*color, 1.0)) == name
+
+
+def test_a_copy_has_the_instruction(make):
+    env = make("open_loop/block_stacking", num_objects=2, object_type="cylinder")
+    env.reset()
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert other.instruction == env.instruction == "stack the two orange cylinders"
+        other.close()
+
+
+def test_the_size_of_a_camera_that_is_not_observed_is_refused(make):
+    with pytest.raises(ConfigError, match="camera_size has no effect"):
+        make(PICKING, camera_size=64)
 
 
 def test_an_instruction_follows_the_parameters_and_the_episode(make):

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 import ba_torchrl
 from ba_torchrl.commands import evaluate
@@ -47,6 +48,13 @@ def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
     assert env.config.model_copy(update={"seed": None}) == config.resolved_env.config
     env.rollout(2, policy)
     env.close()
+
+
+def test_an_observation_without_what_the_policy_reads_is_named(run):
+    policy = ba_torchrl.load_policy(run)
+    state = TensorDict({"holding": torch.zeros(1, dtype=torch.bool)}, batch_size=[])
+    with pytest.raises(ConfigError, match=r"reads pixels, which is not observed: make the env"):
+        policy(state)
 
 
 def test_a_file_acts_like_the_run(run, tmp_path):

@@ -385,9 +385,8 @@ class CovidTest(OpenLoopTask):
     def instruction(self) -> str:
         """Return the instruction with the number of tests and the colours of the areas."""
         return (
-            f"{counted(self.rounds, 'time')}, lay a tube and a swab in the "
-            f"{colored(self.layout.test_area, 'area')} and then put the tube into the "
-            f"{colored(self.layout.used_box, 'box')}"
+            f"lay a tube and a swab in the {colored(self.layout.test_area, 'area')}, then put the "
+            f"tube into the {colored(self.layout.used_box, 'box')}, {counted(self.rounds, 'time')}"
         )
 
     def expert_command(self) -> PickPlaceCommand:

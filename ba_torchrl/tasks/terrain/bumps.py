@@ -59,7 +59,7 @@ class Bumps(SlopedTerrain):
         random_orientation: whether the platform has a random heading.
     """
 
-    place_words = ", amid the bumps"
+    place_words = ", between the bumps"
 
     def __init__(
         self,
