@@ -205,21 +205,29 @@ def _specs(task: str, env: dict[str, Any]) -> dict[str, TensorSpec]:
 def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
     """Return values with the type and the shape that an environment has.
 
-    Numbers become flags where they exceed 0.5; channels of images may be last.
+    Numbers become flags where they exceed 0.5; channels of images may be last; an axis of one at
+    the end may be missing. Values beyond the range by no more than rounding are clipped.
 
     Raises:
         ConfigError: the shape differs, or a value is out of range.
     """
     shape = tuple(spec.shape)
+    if values.ndim and (*values.shape[1:], 1) == shape:
+        values = values[..., None]
     if values.shape[1:] != shape and len(shape) == 3 == values.ndim - 1:
         values = np.moveaxis(values, -1, 1)
     if values.shape[1:] != shape:
         raise ConfigError(f"has the shape {list(values.shape[1:])}, needed {list(shape)}")
-    if spec.dtype == torch.bool:
-        return values if values.dtype == bool else values > 0.5
     if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
         raise ConfigError("has values that are no finite numbers")
+    if spec.dtype == torch.bool:
+        return values if values.dtype == bool else values > 0.5
     low, high = (getattr(spec.space, name, None) for name in ("low", "high"))
+    if values.dtype.kind == "f" and not spec.dtype.is_floating_point:
+        # Zeros alone are black in either range.
+        if high is not None and (high == 255).all() and 0 < values.max(initial=0) <= 1:
+            raise ConfigError("has values from 0 to 1, needed 0 to 255; set scale: 255")
+        values = values.round()
     if low is not None and high is not None:
         slack = _TOLERANCE * (high - low).numpy()
         if (values < low.numpy() - slack).any() or (values > high.numpy() + slack).any():
@@ -227,6 +235,7 @@ def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
                 f"has values from {values.min():g} to {values.max():g}, needed "
                 f"{low.min().item():g} to {high.max().item():g}; set scale and offset"
             )
+        values = values.clip(low.numpy(), high.numpy())
     return values.astype(torch.empty(0, dtype=spec.dtype, device="cpu").numpy().dtype, copy=False)
 
 

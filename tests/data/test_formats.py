@@ -279,6 +279,34 @@ def test_mappings_that_do_not_fit_are_refused_by_name(changes, message, tmp_path
         load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_colours_between_0_and_1_are_scaled_and_rounded(dtype, tmp_path):
+    env = {**ENV, "observations": ["wrist_rgb"]}
+    colours = np.random.default_rng(0).integers(0, 256, (3, SIZE, SIZE, 3), dtype=np.uint8)
+    path = foreign(tmp_path / "a.hdf5", rgb=(colours / 255).astype(dtype))
+    for source in ("rgb", {"source": "rgb", "scale": 1.0}):
+        with pytest.raises(ConfigError, match="wrist_rgb: has values from 0 to 1, .*scale: 255"):
+            load_demonstrations(path, task=TASK, env=env, mapping={**FOREIGN, "wrist_rgb": source})
+    mapping = {**FOREIGN, "wrist_rgb": {"source": "rgb", "scale": 255}}
+    first, _ = load_demonstrations(path, task=TASK, env=env, mapping=mapping)
+    np.testing.assert_array_equal(first["wrist_rgb"], colours.transpose(0, 3, 1, 2))
+
+
+def test_actions_beyond_their_bounds_by_rounding_are_clipped(tmp_path):
+    actions = np.full((3, 5), [1.00001, -1.00001, 0.5, 0, 0])
+    path = foreign(tmp_path / "a.hdf5", actions=actions)
+    first, _ = load_demonstrations(
+        path, task=TASK, env=ENV, mapping={**FOREIGN, "action": "actions"}
+    )
+    assert first["action"][0].tolist() == [1, -1, 0.5, 0, 0]
+
+
+def test_flags_without_an_axis_of_components_fit(tmp_path):
+    path = foreign(tmp_path / "a.hdf5", grip=np.array([1, 0, 1]))
+    first, _ = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "holding": "grip"})
+    assert first["holding"].tolist() == [[True], [False], [True]]
+
+
 @pytest.mark.parametrize("lost", ["obs/depth", "actions"])
 def test_rows_that_are_missing_are_named(lost, tmp_path):
     path = foreign(tmp_path / "a.hdf5")
