@@ -85,9 +85,9 @@ def export_demonstrations(
     names = form.names(entries)
     entries = {key: entry.model_copy(update={"name": names[key]}) for key, entry in entries.items()}
     values = env_values(task, env)
-    texts = dict.fromkeys(
-        str(each[keys.INSTRUCTION][0]) for each in arrays if keys.INSTRUCTION in each
-    )
+    is_observed = keys.INSTRUCTION in roles
+    texts = [str(each[keys.INSTRUCTION][0]) for each in arrays] if is_observed else []
+    texts = list(dict.fromkeys(texts or [_instruction(task, env)]))
     card = Card(
         format=format,
         task=task,
@@ -99,7 +99,7 @@ def export_demonstrations(
         episodes=len(episodes),
         steps=sum(len(episode) for episode in episodes),
         success_rate=success_rate(episodes),
-        instructions=list(texts)[:_MOST_INSTRUCTIONS] or [_instruction(task, env)],
+        instructions=list(filter(None, texts))[:_MOST_INSTRUCTIONS],
         versions={"ba_torchrl": __version__, form.package: _version(form.package)},
         entries=entries,
     )

@@ -372,6 +372,14 @@ def test_an_instruction_that_was_not_observed_is_that_of_the_task(episodes, tmp_
     assert card.model_copy(update={"instructions": []}).prompt == card.goal
 
 
+def test_lerobot_gets_the_prompt_of_its_environment(episodes, tmp_path):
+    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset")
+    plain = [each.exclude("instruction", ("next", "instruction")) for each in episodes]
+    path = exported(tmp_path, plain, "lerobot")
+    dataset = datasets.LeRobotDataset("a/b", root=path, video_backend="pyav")
+    assert dataset[0]["task"] == ba_torchrl.describe(TASK).instruction
+
+
 def test_only_folders_of_ours_are_read_for_an_export(tmp_path):
     for path in (foreign(tmp_path / "a.hdf5"), tmp_path):
         with pytest.raises(ConfigError, match="folders of `ba-torchrl collect` or `play`"):

@@ -202,10 +202,11 @@ def read_card(path: Path) -> Card | None:
     if not file.exists():
         return None
     try:
-        values = json.loads(file.read_text(encoding="utf-8"))
+        text = file.read_text(encoding="utf-8")
+        values = json.loads(text)
         if not isinstance(values, dict) or not {"format", "entries"} <= values.keys():
             return None  # somebody else's file of that name
-        return Card.model_validate_json(json.dumps(values))
+        return Card.model_validate_json(text)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{file} is damaged: {str(error).splitlines()[0]}") from None
 
