@@ -126,6 +126,11 @@ def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, A
         ConfigError: there are none at ``path``, or their files are damaged.
     """
     path = Path(path)
+    if os.path.exists(path) and not os.path.exists(path / _METADATA_FILE):
+        raise ConfigError(
+            f"no demonstrations of ours at {path}: export takes folders of `ba-torchrl collect` or "
+            "`play`"
+        )
     metadata = _read_metadata(path)
     return _read_episodes(path), metadata
 

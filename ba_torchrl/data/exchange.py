@@ -25,6 +25,7 @@ from ba_torchrl.data.formats.base import (
     DemonstrationMapping,
     Entry,
     Format,
+    Role,
     find_format,
     read_card,
     read_file,
@@ -67,31 +68,26 @@ def export_demonstrations(
         source: how the demonstrations were made.
 
     Raises:
-        ConfigError: the format is unknown or its package missing, or ``path`` exists.
+        ConfigError: the format is unknown or its package missing, or ``path`` exists or has not
+            the format's suffix.
         ValueError: there are no episodes.
     """
     form, path = FORMATS[format], Path(path)
     if not episodes:
         raise ValueError("there are no episodes to export")
+    if form.suffixes and path.suffix.lower() not in form.suffixes:
+        raise ConfigError(f"{path} could not be read back; end the path in {form.suffixes[0]}")
     if os.path.lexists(path):
         raise ConfigError(f"{path} exists already; choose another path")
     roles = _roles(episodes[0])
     arrays = [_to_arrays(episode, roles) for episode in episodes]
-    entries = {
-        key: Entry(
-            name=key,
-            role=role,
-            dtype="str" if arrays[0][key].dtype.kind == "U" else str(arrays[0][key].dtype),
-            shape=arrays[0][key].shape[1:],
-        )
-        for key, role in roles.items()
-    }
+    entries = {key: _entry(key, role, arrays[0][key]) for key, role in roles.items()}
     names = form.names(entries)
     entries = {key: entry.model_copy(update={"name": names[key]}) for key, entry in entries.items()}
     values = env_values(task, env)
-    texts = dict.fromkeys(
-        str(each[keys.INSTRUCTION][0]) for each in arrays if keys.INSTRUCTION in each
-    )
+    is_observed = keys.INSTRUCTION in roles
+    texts = [str(each[keys.INSTRUCTION][0]) for each in arrays] if is_observed else []
+    texts = list(dict.fromkeys(texts or [_instruction(task, env)]))
     card = Card(
         format=format,
         task=task,
@@ -103,11 +99,21 @@ def export_demonstrations(
         episodes=len(episodes),
         steps=sum(len(episode) for episode in episodes),
         success_rate=success_rate(episodes),
-        instructions=list(texts)[:_MOST_INSTRUCTIONS],
+        instructions=list(filter(None, texts))[:_MOST_INSTRUCTIONS],
         versions={"ba_torchrl": __version__, form.package: _version(form.package)},
         entries=entries,
     )
     write_file(form, path, arrays, card)
+
+
+def _instruction(task: str, env: dict[str, Any]) -> str:
+    """Return the goal as a sentence: the example of `describe`, with these parameters."""
+    made = make(task, **{**env, "seed": 0})
+    try:
+        made.reset()
+        return made.instruction
+    finally:
+        made.close()
 
 
 def import_demonstrations(
@@ -135,8 +141,8 @@ def import_demonstrations(
     form = find_format(path)
     if form is None:
         raise ConfigError(f"no demonstrations at {path} in the formats {', '.join(FORMATS)}")
-    card = read_card(path)
     if mapping is None:
+        card = read_card(path)
         if card is None:
             raise ConfigError(
                 f"{path} was written by another program; say where its entries belong in a mapping "
@@ -166,7 +172,11 @@ def _mapped(
         for key, source in mapping.entries.items():
             try:
                 values = source.values(raw)
-                arrays[key] = _fitted(values, specs[key]) if key in specs else values
+                if key in specs:
+                    values = _fitted(values, specs[key])
+                elif key in RESULTS:
+                    values = _one_number(values)
+                arrays[key] = values
             except ConfigError as error:
                 raise ConfigError(f"{path}, episode {number}: {key}: {error}") from None
         for key in arrays.keys() - {keys.INSTRUCTION}:
@@ -177,15 +187,20 @@ def _mapped(
     if not episodes:
         raise ConfigError(f"{path} holds no episodes")
     entries = {
-        key: Entry(
-            name=key,
-            role="result" if key in RESULTS else "action" if key == keys.ACTION else "observation",
-            dtype="str" if values.dtype.kind == "U" else str(values.dtype),
-            shape=values.shape[1:],
+        key: _entry(
+            key,
+            "result" if key in RESULTS else "action" if key == keys.ACTION else "observation",
+            values,
         )
         for key, values in episodes[0].items()
     }
     return [_to_episode(entries, arrays) for arrays in episodes]
+
+
+def _entry(key: str, role: Role, values: np.ndarray) -> Entry:
+    """Return the entry of an episode's values, named by its key."""
+    dtype = "str" if values.dtype.kind == "U" else str(values.dtype)
+    return Entry(name=key, role=role, dtype=dtype, shape=values.shape[1:])
 
 
 def _specs(task: str, env: dict[str, Any]) -> dict[str, TensorSpec]:
@@ -205,21 +220,29 @@ def _specs(task: str, env: dict[str, Any]) -> dict[str, TensorSpec]:
 def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
     """Return values with the type and the shape that an environment has.
 
-    Numbers become flags where they exceed 0.5; channels of images may be last.
+    Numbers become flags where they exceed 0.5; channels of images may be last; an axis of one at
+    the end may be missing. Values beyond the range by no more than rounding are clipped.
 
     Raises:
         ConfigError: the shape differs, or a value is out of range.
     """
     shape = tuple(spec.shape)
+    if values.ndim and (*values.shape[1:], 1) == shape:
+        values = values[..., None]
     if values.shape[1:] != shape and len(shape) == 3 == values.ndim - 1:
         values = np.moveaxis(values, -1, 1)
     if values.shape[1:] != shape:
         raise ConfigError(f"has the shape {list(values.shape[1:])}, needed {list(shape)}")
-    if spec.dtype == torch.bool:
-        return values if values.dtype == bool else values > 0.5
     if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
         raise ConfigError("has values that are no finite numbers")
+    if spec.dtype == torch.bool:
+        return values if values.dtype == bool else values > 0.5
     low, high = (getattr(spec.space, name, None) for name in ("low", "high"))
+    if values.dtype.kind == "f" and not spec.dtype.is_floating_point:
+        # Zeros alone are black in either range.
+        if high is not None and (high == 255).all() and 0 < values.max(initial=0) <= 1:
+            raise ConfigError("has values from 0 to 1, needed 0 to 255; set scale: 255")
+        values = values.round()
     if low is not None and high is not None:
         slack = _TOLERANCE * (high - low).numpy()
         if (values < low.numpy() - slack).any() or (values > high.numpy() + slack).any():
@@ -227,7 +250,26 @@ def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
                 f"has values from {values.min():g} to {values.max():g}, needed "
                 f"{low.min().item():g} to {high.max().item():g}; set scale and offset"
             )
+        values = values.clip(low.numpy(), high.numpy())
     return values.astype(torch.empty(0, dtype=spec.dtype, device="cpu").numpy().dtype, copy=False)
+
+
+def _one_number(values: np.ndarray) -> np.ndarray:
+    """Return results of the steps as [T, 1].
+
+    Raises:
+        ConfigError: they are text, not finite, or several numbers per step.
+    """
+    if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
+        raise ConfigError(
+            "has values that are no finite numbers; needed one number per step: set components, "
+            "or another source"
+        )
+    if not values.ndim or values.shape[1:] not in ((), (1,)):
+        raise ConfigError(
+            f"has the shape {list(values.shape[1:])}, needed one number per step; set components"
+        )
+    return values.reshape(-1, 1)
 
 
 def _check_rows(what: str, values: np.ndarray, steps: int, is_observed: bool) -> None:
@@ -246,12 +288,13 @@ def _with_results(arrays: Arrays) -> Arrays:
     is_last = np.arange(steps)[:, None] == steps - 1
 
     def flags(key: str, default: np.ndarray) -> np.ndarray:
-        return arrays[key].reshape(steps, 1) > 0.5 if key in arrays else default
+        return arrays[key] > 0.5 if key in arrays else default
 
     success = flags(keys.SUCCESS, is_last)
     terminated = flags(keys.TERMINATED, success & is_last)
-    truncated = flags(keys.TRUNCATED, is_last & ~terminated)
-    reward = np.asarray(arrays.get(keys.REWARD, success), dtype=np.float32).reshape(steps, 1)
+    ends = is_last & ~terminated  # also where the file marks no end
+    truncated = flags(keys.TRUNCATED, ends) | ends
+    reward = np.asarray(arrays.get(keys.REWARD, success), dtype=np.float32)
     results = (reward, terminated, truncated, success)
     out = arrays | dict(zip(RESULTS, results, strict=True))
     if keys.INSTRUCTION in arrays:

@@ -17,7 +17,7 @@ from ba_torchrl.data import (
     load_demonstrations,
     save_demonstrations,
 )
-from ba_torchrl.data.demo_files import check_demonstrations
+from ba_torchrl.data.demo_files import check_demonstrations, read_demonstrations
 from ba_torchrl.data.demos import source_config
 from ba_torchrl.data.formats.base import FORMATS, Format, read_card
 from ba_torchrl.errors import ConfigError, MissingPackageError, UnknownNameError
@@ -113,7 +113,9 @@ def test_every_value_comes_back(name, episodes, tmp_path):
     assert (card.task, card.robot, card.seed, card.source) == (TASK, "kuka", 7, "expert")
     assert (card.episodes, card.steps, card.success_rate) == (3, 9, pytest.approx(2 / 3))
     assert card.instructions == [f"pick up block {i}" for i in range(3)]
-    page = (path / "README.md" if path.is_dir() else path.with_suffix(".md")).read_text()
+    page = (
+        path / "README.md" if path.is_dir() else path.with_name("picking.hdf5.card.md")
+    ).read_text()
     assert f"| `{card.entries['proprio'].name}` | observation `proprio` | float32 | [8] |" in page
 
 
@@ -277,6 +279,111 @@ def test_mappings_that_do_not_fit_are_refused_by_name(changes, message, tmp_path
     mapping = {key: value for key, value in {**FOREIGN, **changes}.items() if value is not None}
     with pytest.raises(ConfigError, match=message):
         load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_colours_between_0_and_1_are_scaled_and_rounded(dtype, tmp_path):
+    env = {**ENV, "observations": ["wrist_rgb"]}
+    colours = np.random.default_rng(0).integers(0, 256, (3, SIZE, SIZE, 3), dtype=np.uint8)
+    path = foreign(tmp_path / "a.hdf5", rgb=(colours / 255).astype(dtype))
+    for source in ("rgb", {"source": "rgb", "scale": 1.0}):
+        with pytest.raises(ConfigError, match=r"wrist_rgb: has values from 0 to 1, .*scale: 255"):
+            load_demonstrations(path, task=TASK, env=env, mapping={**FOREIGN, "wrist_rgb": source})
+    mapping = {**FOREIGN, "wrist_rgb": {"source": "rgb", "scale": 255}}
+    first, _ = load_demonstrations(path, task=TASK, env=env, mapping=mapping)
+    np.testing.assert_array_equal(first["wrist_rgb"], colours.transpose(0, 3, 1, 2))
+
+
+def test_actions_beyond_their_bounds_by_rounding_are_clipped(tmp_path):
+    actions = np.full((3, 5), [1.00001, -1.00001, 0.5, 0, 0])
+    path = foreign(tmp_path / "a.hdf5", actions=actions)
+    first, _ = load_demonstrations(
+        path, task=TASK, env=ENV, mapping={**FOREIGN, "action": "actions"}
+    )
+    assert first["action"][0].tolist() == [1, -1, 0.5, 0, 0]
+
+
+def test_flags_without_an_axis_of_components_fit(tmp_path):
+    path = foreign(tmp_path / "a.hdf5", grip=np.array([1, 0, 1]))
+    first, _ = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "holding": "grip"})
+    assert first["holding"].tolist() == [[True], [False], [True]]
+
+
+@pytest.mark.parametrize("names", [("ends", "cuts"), ("ends",), ("cuts",)])
+def test_an_episode_whose_file_marks_no_end_is_truncated(names, tmp_path):
+    path = foreign(tmp_path / "a.hdf5", ends=np.zeros(3), cuts=np.zeros((3, 1)))
+    keys = {"ends": "terminated", "cuts": "truncated"}
+    mapping = {**FOREIGN, **{keys[name]: name for name in names}}
+    first, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    is_truncated = "ends" in names  # else the success of the last step terminates
+    last = first["next"][-1]
+    assert (last["truncated"].item(), last["terminated"].item()) == (is_truncated, not is_truncated)
+    assert first["next", "done"].flatten().tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("key", ["reward", "success", "terminated", "truncated"])
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([0, np.nan, 1], "no finite numbers"),
+        ([0, np.inf, 1], "no finite numbers"),
+        ([[0, 1]] * 3, r"has the shape \[2\], .*; set components"),
+        (np.array([b"no", b"no", b"yes"]), "no finite numbers; .*set components"),
+    ],
+)
+def test_results_that_are_not_one_number_are_refused_by_name(key, values, message, tmp_path):
+    path = foreign(tmp_path / "a.hdf5", won=np.array(values))
+    with pytest.raises(ConfigError, match=rf"a\.hdf5, episode 0: {key}: .*{message}"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, key: "won"})
+
+
+def test_files_beside_an_export_are_left_alone(episodes, tmp_path):
+    others = [tmp_path / "picking.json", tmp_path / "picking.md"]
+    for file in others:
+        file.write_text("mine")
+    path = exported(tmp_path, episodes, "hdf5")
+    assert [file.read_text() for file in others] == ["mine", "mine"]
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
+    with pytest.raises(ConfigError, match=r"picking could not be read back; end .* in \.hdf5"):
+        export_demonstrations(
+            tmp_path / "picking", episodes, format="hdf5", task=TASK, env=ENV, seed=0
+        )
+    assert not (tmp_path / "picking").exists()
+
+
+def test_cards_of_others_are_not_read(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    card = tmp_path / "a.hdf5.card.json"
+    for text in ("[]", "{}", '{"format": "theirs"}'):
+        card.write_text(text)
+        with pytest.raises(ConfigError, match="written by another program"):
+            load_demonstrations(path, task=TASK, env=ENV)
+    for text in ("no JSON", '{"format": "hdf5", "entries": {}}'):
+        card.write_text(text)
+        with pytest.raises(ConfigError, match="is damaged"):
+            load_demonstrations(path, task=TASK, env=ENV)
+        assert len(load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)) == 2
+
+
+def test_an_instruction_that_was_not_observed_is_that_of_the_task(episodes, tmp_path):
+    plain = [each.exclude("instruction", ("next", "instruction")) for each in episodes]
+    card = read_card(exported(tmp_path, plain, "hdf5"))
+    assert card.instructions == [card.prompt] == [ba_torchrl.describe(TASK).instruction]
+    assert card.model_copy(update={"instructions": []}).prompt == card.goal
+
+
+def test_lerobot_gets_the_prompt_of_its_environment(episodes, tmp_path):
+    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset")
+    plain = [each.exclude("instruction", ("next", "instruction")) for each in episodes]
+    path = exported(tmp_path, plain, "lerobot")
+    dataset = datasets.LeRobotDataset("a/b", root=path, video_backend="pyav")
+    assert dataset[0]["task"] == ba_torchrl.describe(TASK).instruction
+
+
+def test_only_folders_of_ours_are_read_for_an_export(tmp_path):
+    for path in (foreign(tmp_path / "a.hdf5"), tmp_path):
+        with pytest.raises(ConfigError, match="folders of `ba-torchrl collect` or `play`"):
+            read_demonstrations(path)
 
 
 @pytest.mark.parametrize("lost", ["obs/depth", "actions"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -62,13 +63,18 @@ class Card(StrictModel):
     steps: int
     success_rate: float
     instructions: list[str]
-    """The different sentences, at most 20 of them."""
+    """The different sentences, at most 20 of them; an example if they were not observed."""
     depth: str = "float32 in metres, stored without loss: the largest error is 0"
     license: str = "MIT"
     versions: dict[str, str]
     """Of the packages that wrote the file."""
     entries: dict[str, Entry]
     """By key of the TensorDict."""
+
+    @property
+    def prompt(self) -> str:
+        """The first instruction, else the task's goal."""
+        return next(iter(self.instructions), "") or self.goal
 
     @property
     def resolved_env(self) -> ResolvedEnv:
@@ -107,6 +113,8 @@ class Format(ABC):
     """Whether images are stored with their channels last."""
     has_last_observation: ClassVar[bool] = True
     """Whether the observation after the last action has a place; if not, a file beside holds it."""
+    suffixes: ClassVar[tuple[str, ...]] = ()
+    """Of its files, one of which a path must have; none for folders."""
     package: ClassVar[str]
     """The package to install."""
     hint: ClassVar[str] = ""
@@ -180,8 +188,7 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
             name: np.ascontiguousarray([arrays[name][-1] for arrays in named]) for name in observed
         }
         save_file(last, path / _LAST_FILE)
-    page = path / "README.md" if path.is_dir() else path.with_suffix(".md")
-    write_text(page, card.to_markdown())
+    write_text(page_file(path), card.to_markdown())
     write_text(card_file(path), card.model_dump_json(indent=1) + "\n")
 
 
@@ -195,8 +202,12 @@ def read_card(path: Path) -> Card | None:
     if not file.exists():
         return None
     try:
-        return Card.model_validate_json(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, ValidationError) as error:
+        text = file.read_text(encoding="utf-8")
+        values = json.loads(text)
+        if not isinstance(values, dict) or not {"format", "entries"} <= values.keys():
+            return None  # somebody else's file of that name
+        return Card.model_validate_json(text)
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{file} is damaged: {str(error).splitlines()[0]}") from None
 
 
@@ -225,7 +236,12 @@ def read_file(form: Format, path: Path) -> list[Arrays]:
 
 def card_file(path: Path) -> Path:
     """Return the path of the card of a file or folder."""
-    return path / "card.json" if path.is_dir() else path.with_suffix(".json")
+    return path / "card.json" if path.is_dir() else path.with_name(f"{path.name}.card.json")
+
+
+def page_file(path: Path) -> Path:
+    """Return the path of the card of a file or folder as a page."""
+    return path / "README.md" if path.is_dir() else path.with_name(f"{path.name}.card.md")
 
 
 class Source(StrictModel):

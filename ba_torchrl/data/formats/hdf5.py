@@ -25,10 +25,11 @@ class Robomimic(Format):
 
     channels_last = True
     package = "h5py"
+    suffixes = (".hdf5", ".h5")
 
     def matches(self, path: Path) -> bool:
         """Return whether it is a file with the suffix of HDF5."""
-        return os.path.isfile(path) and path.suffix.lower() in (".hdf5", ".h5")
+        return os.path.isfile(path) and path.suffix.lower() in self.suffixes
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``obs/pixels``, ``actions``, ``rewards``, and other keys unchanged."""

@@ -66,7 +66,7 @@ class LeRobot(Format):
             values[_DONE] = arrays["next.terminated"] | arrays["next.truncated"]
             for step in range(len(values[_DONE])):
                 frame: dict[str, Any] = {name: rows[step] for name, rows in values.items()}
-                frame[_TASK] = str(arrays[_TASK][step]) if _TASK in arrays else card.goal
+                frame[_TASK] = str(arrays[_TASK][step]) if _TASK in arrays else card.prompt
                 dataset.add_frame(frame)
             dataset.save_episode()
         dataset.finalize()
