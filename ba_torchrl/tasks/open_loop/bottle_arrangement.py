@@ -175,7 +175,7 @@ class BottleArrangement(PackingTask):
         )
 
     def expert_command(self) -> PickPlaceCommand:
-        """Place a bottle that is not in the tray in the first free slot."""
+        """Place a bottle that is not in the tray in the next free slot."""
         held = self.robot.held_body()
         if held is not None:
             x, y = self._free_site(held)
