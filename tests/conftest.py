@@ -1,4 +1,5 @@
 import contextlib
+import functools
 
 import pytest
 import torch
@@ -23,3 +24,17 @@ def cuda(monkeypatch):
     """The CUDA device; float32 has its full precision."""
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     return torch.device("cuda")
+
+
+@pytest.fixture(scope="session")
+def composed_presets():
+    """`hydra_schema.preset`, which composes each preset once in all tests."""
+    from ba_torchrl.training import hydra_schema
+
+    return functools.cache(hydra_schema.preset)
+
+
+@pytest.fixture
+def cached_presets(composed_presets, monkeypatch):
+    """Grids of the command line take presets that an earlier test has composed."""
+    monkeypatch.setattr("ba_torchrl.training.hydra_schema.preset", composed_presets)

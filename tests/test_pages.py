@@ -2,11 +2,11 @@
 
 import dataclasses
 import importlib
-import os
+import multiprocessing
 import re
+import runpy
 import shlex
-import subprocess
-import sys
+import shutil
 from pathlib import Path
 
 import pytest
@@ -18,8 +18,18 @@ from ba_torchrl.errors import ConfigError
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 DEMONSTRATIONS = "demos/pulling"
-SHORTER = {"agent.learn(10_000)": "agent.learn(120)", "buffer_size=10_000": "buffer_size=200"}
-"""Parts of the pages' Python that take minutes, and what runs instead."""
+SHORTER = {
+    "agent.learn(10_000)": "agent.learn(120)",
+    "buffer_size=10_000": "buffer_size=200",
+    '"close_loop/block_picking", 5,': '"close_loop/block_picking", 2,',
+    '"mine/tall_block", 4)': '"mine/tall_block", 1)',
+}
+"""Parts of the pages' Python that take minutes or many processes, and what runs instead."""
+FRESH = multiprocessing.get_context("forkserver")
+"""Starts processes that have imported torch and TorchRL, and nothing of this package."""
+FRESH.set_forkserver_preload(
+    ["torch", *(f"torchrl.{name}" for name in ("collectors", "data", "envs", "modules"))]
+)
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -61,29 +71,41 @@ def command_lines() -> list[tuple[str, str]]:
     )
 
 
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory):
+    """Return a folder with one episode, as `ba-torchrl collect` writes it."""
+    folder = tmp_path_factory.mktemp("demos") / "pulling"
+    words = ["task=close_loop/block_pulling", "episodes=1", "num_envs=1", "parallel=false"]
+    importlib.import_module("ba_torchrl.commands.collect").COMMAND.run([*words, f"path={folder}"])
+    return folder
+
+
 @pytest.mark.parametrize(
     ("script", "modules"), [s[1:] for s in scripts()], ids=[s[0] for s in scripts()]
 )
-def test_python_of_a_page_runs(script, modules, tmp_path):
+def test_python_of_a_page_runs(script, modules, tmp_path, monkeypatch, request):
     for long, short in SHORTER.items():
         script = script.replace(long, short)
-    (tmp_path / "script.py").write_text(script)
+    path = tmp_path / "script.py"
+    path.write_text(script)
     (tmp_path / "my_tasks.py").write_text(modules)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    collect = "-m ba_torchrl collect task=close_loop/block_pulling episodes=1 num_envs=1"
-    steps = [["script.py"]]
     if DEMONSTRATIONS in script:
-        steps.insert(0, f"{collect} parallel=false path={DEMONSTRATIONS}".split())
-    for words in steps:
-        command = [sys.executable, *words]
-        run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-        assert run.returncode == 0, run.stderr
+        shutil.copytree(request.getfixturevalue("demonstrations"), tmp_path / DEMONSTRATIONS)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    process = FRESH.Process(
+        target=runpy.run_path, args=(str(path),), kwargs={"run_name": "__main__"}
+    )
+    process.start()
+    process.join()
+    assert process.exitcode == 0
 
 
 @pytest.mark.parametrize(
     ("page", "line"), command_lines(), ids=[line for _, line in command_lines()]
 )
-def test_command_line_of_a_page_is_valid(page, line, tmp_path, monkeypatch):
+def test_command_line_of_a_page_is_valid(page, line, tmp_path, monkeypatch, cached_presets):
     monkeypatch.chdir(tmp_path)
     name, *words = shlex.split(line.replace("TASK", "close_loop/block_picking"))[1:]
     if name == "--help" or "--help" in words:
