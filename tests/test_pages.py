@@ -2,9 +2,7 @@
 
 import dataclasses
 import importlib
-import multiprocessing
 import re
-import runpy
 import shlex
 import shutil
 from pathlib import Path
@@ -14,6 +12,7 @@ import pytest
 from ba_torchrl.cli import command_names
 from ba_torchrl.cli.command import Command
 from ba_torchrl.errors import ConfigError
+from tests.fresh import run_script
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -25,11 +24,6 @@ SHORTER = {
     '"mine/tall_block", 4)': '"mine/tall_block", 1)',
 }
 """Parts of the pages' Python that take minutes or many processes, and what runs instead."""
-FRESH = multiprocessing.get_context("forkserver")
-"""Starts processes that have imported torch and TorchRL, and nothing of this package."""
-FRESH.set_forkserver_preload(
-    ["torch", *(f"torchrl.{name}" for name in ("collectors", "data", "envs", "modules"))]
-)
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -83,23 +77,14 @@ def demonstrations(tmp_path_factory):
 @pytest.mark.parametrize(
     ("script", "modules"), [s[1:] for s in scripts()], ids=[s[0] for s in scripts()]
 )
-def test_python_of_a_page_runs(script, modules, tmp_path, monkeypatch, request):
+def test_python_of_a_page_runs(script, modules, tmp_path, request):
     for long, short in SHORTER.items():
         script = script.replace(long, short)
-    path = tmp_path / "script.py"
-    path.write_text(script)
     (tmp_path / "my_tasks.py").write_text(modules)
     if DEMONSTRATIONS in script:
         shutil.copytree(request.getfixturevalue("demonstrations"), tmp_path / DEMONSTRATIONS)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    process = FRESH.Process(
-        target=runpy.run_path, args=(str(path),), kwargs={"run_name": "__main__"}
-    )
-    process.start()
-    process.join()
-    assert process.exitcode == 0
+    done = run_script(tmp_path, script)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(

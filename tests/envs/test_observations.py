@@ -239,9 +239,11 @@ def make_heap(seed):
 def test_vectors_return_the_instruction_of_each_episode(kind):
     """The heap of an environment has one object less after a success."""
     if kind == "torchrl":
-        envs = ParallelEnv(2, [functools.partial(make_heap, seed) for seed in (0, 1)])
+        factories = [functools.partial(make_heap, seed) for seed in (0, 1)]
+        envs = ParallelEnv(2, factories, mp_start_method="fork")
     else:
-        envs = ba_torchrl.make_vector_env(GRASPING, 2, parallel=kind == "parallel", **HEAP)
+        options = {"parallel": kind == "parallel", "start_method": "fork"}
+        envs = ba_torchrl.make_vector_env(GRASPING, 2, **options, **HEAP)
     try:
         state = envs.reset()
         assert list(state["instruction"]) == ["pick up one of the two objects in the tray"] * 2

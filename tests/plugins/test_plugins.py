@@ -14,6 +14,7 @@ from types import ModuleType
 import pytest
 
 from ba_torchrl import make_vector_env
+from tests.fresh import run_script
 
 ROOT = Path(__file__).parents[2]
 PLUGINS = ("my_tasks", "my_learning")
@@ -30,13 +31,12 @@ def folder(tmp_path):
     return tmp_path
 
 
-def run(folder, *command, paths=(), check=True):
+def run(folder, *command, check=True):
     """Run Python in a folder, where the package itself is installed; return the process."""
-    path = os.pathsep.join(map(str, [ROOT, *paths]))
     done = subprocess.run(
         [sys.executable, *map(str, command)],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         timeout=240,
@@ -73,7 +73,8 @@ for task, observations, network in (
     )
     print(json.dumps(config.plugins))
 """
-    known, *recorded = map(json.loads, run(folder, "-c", code).stdout.splitlines()[-3:])
+    done = run_script(folder, code)
+    known, *recorded = map(json.loads, done.stdout.splitlines()[-3:])
     assert known == ["MyKuka", "ReachNear", True]
     assert recorded == [list(PLUGINS), ["my_tasks"]]
 
@@ -102,7 +103,7 @@ from ba_torchrl.tasks.base import TASKS
 print(json.dumps(gymnasium.spec({GYM_ID!r}).kwargs))
 TASKS.register("mine_reach/near")(my_tasks.ReachNear)
 """
-    done = run(folder, "-c", code, check=False)
+    done = run_script(folder, code)
     assert last_line(done) == {"task": "mine/reach_near", "register_modules": ["my_tasks"]}
     assert "'mine/reach_near' and 'mine_reach/near' have the same Gymnasium id" in done.stderr
 
@@ -175,16 +176,13 @@ print(json.dumps([message, play(parallel=False), play(start_method="fork")]))
 
 def test_a_task_of_a_script_and_the_modules_of_robot_and_options_reach_its_workers(folder):
     (folder / "extra.py").write_text("import os\nopen(f'seen-{os.getpid()}', 'w').close()\n")
-    script = folder / "script.py"
-    script.write_text(
-        f"""{IN_MAIN}
+    code = f"""{IN_MAIN}
 if __name__ == "__main__":
     import my_tasks
 
     print(json.dumps(play(robot="mine/kuka", register_modules=["extra"])))
 """
-    )
-    assert last_line(run(folder, script)) == [1, 2, 1, 16, 16]
+    assert last_line(run_script(folder, code)) == [1, 2, 1, 16, 16]
     assert len(list(folder.glob("seen-*"))) == 2
 
 
@@ -214,7 +212,7 @@ def test_installed_plugins_are_found_and_a_broken_one_does_not_stop_the_others(t
     install(packages, "broken", "broken_plugin")
     install(packages, "good", "my_tasks")
     code = "import json, ba_torchrl; print(json.dumps(ba_torchrl.list_tasks()))"
-    done = run(tmp_path, "-c", code, paths=[packages])
+    done = run_script(tmp_path, code, (packages,))
     assert "mine/reach_near" in last_line(done)
     assert done.stderr.count("PluginWarning") == 1
     assert "plugin 'broken' (broken_plugin) of broken is not loaded" in done.stderr
@@ -243,7 +241,7 @@ try:
 except AssertionError as error:
     print(json.dumps(str(error)))
 """
-    assert "mine/always_here: the seed changes nothing" in last_line(run(folder, "-c", code))
+    assert "mine/always_here: the seed changes nothing" in last_line(run_script(folder, code))
 
 
 TRAINING = (
