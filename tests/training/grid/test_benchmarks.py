@@ -15,6 +15,7 @@ from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan
 from tests.training.grid.grids import PICK, PLACE, REACH
 
+pytestmark = pytest.mark.usefixtures("cached_presets")
 ROOT = Path(__file__).parents[3]
 
 

@@ -312,6 +312,7 @@ def children_of(pid):
     return found
 
 
+@pytest.mark.usefixtures("cached_presets")
 def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monkeypatch):
     small = [f"{name}={value}" for name, value in COMMON.items() if not isinstance(value, dict)]
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # the recipe's handler would stay
