@@ -17,13 +17,16 @@ CONTEXT.set_forkserver_preload(
 TIMEOUT_S = 240
 
 
-def run_script(folder: Path, code: str, paths: tuple[Path, ...] = ()) -> CompletedProcess:
+def run_script(
+    folder: Path, code: str, paths: tuple[Path, ...] = (), *, check: bool = True
+) -> CompletedProcess:
     """Run code in a folder as `python script.py` does; return exit code, stdout and stderr.
 
     Args:
         folder: where script.py is written; its modules can be imported.
         code: of the script.
         paths: further folders of modules.
+        check: whether another exit code than 0 fails the test.
     """
     script = folder / "script.py"
     script.write_text(code)
@@ -32,8 +35,9 @@ def run_script(folder: Path, code: str, paths: tuple[Path, ...] = ()) -> Complet
     process.join(TIMEOUT_S)
     if process.exitcode is None:
         process.kill()
-    texts = ((folder / name).read_text() for name in ("stdout", "stderr"))
-    return CompletedProcess([str(script)], process.exitcode, *texts)
+    out, error = ((folder / name).read_text() for name in ("stdout", "stderr"))
+    assert process.exitcode == 0 or not check, error[-3000:]
+    return CompletedProcess([str(script)], process.exitcode, out, error)
 
 
 def _main(script: Path, paths: tuple[Path, ...]) -> None:

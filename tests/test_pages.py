@@ -83,8 +83,7 @@ def test_python_of_a_page_runs(script, modules, tmp_path, request):
     (tmp_path / "my_tasks.py").write_text(modules)
     if DEMONSTRATIONS in script:
         shutil.copytree(request.getfixturevalue("demonstrations"), tmp_path / DEMONSTRATIONS)
-    done = run_script(tmp_path, script)
-    assert done.returncode == 0, done.stderr
+    run_script(tmp_path, script)
 
 
 @pytest.mark.parametrize(
