@@ -82,7 +82,8 @@ def task_page(task: str) -> str:
     film = FOLDER / "gallery" / f"{slug}.gif"
     picture = film if film.exists() else film.with_suffix(".png")
     lines = [f"# {task}", "", f"![{task}](../../gallery/{picture.name})", "", found.text, ""]
-    lines += ["| | allowed values in brackets |", "|---|---|"]
+    lines += ["Keys and units: [environments](../../environments.md#keys).", ""]
+    lines += ["| | value (allowed values) |", "|---|---|"]
     lines += [f"| {name} | {_cell(value)} |" for name, value in found.rows().items()]
     if task in shipped_policies():
         card = read_card(shipped_file(task))

@@ -64,9 +64,9 @@ DESCRIPTIONS = {
 
     The distance between the ramps is 4 to 20 cm, and at least what the pieces on the ground need.
     Their slopes are 0 to 30 degrees, the heights of their lower edges 0 to 1 cm.""",
-    "bump": """on a platform of {0} x {1} cm; all objects arrive on a bumpy surface around it.
+    "bump": """on a platform of {0} x {1} cm, with a bumpy surface around it.
 
-    The surface consists of nine pyramids with slopes of 0 to 15 degrees.""",
+    All objects start on this surface, nine pyramids with slopes of 0 to 15 degrees.""",
 }
 
 
@@ -95,8 +95,8 @@ def task_on(task_id: str, level: type[OpenLoopTask], attributes: dict[str, Any])
     attributes = {**TERRAINS[terrain], **attributes}
     size_cm = (f"{100 * size:g}" for size in attributes.get("platform_m", ()))
     description = f"""{name.replace("_", " ").title()} {DESCRIPTIONS[terrain].format(*size_cm)}
-    The episode ends early when a piece that must stay upright lies on its side, or a piece leaves
-    the workspace. Paper, appendix C.
+    Objects and goal are those of `open_loop/{name}`. The episode ends early when a piece that must
+    stay upright lies on its side, or a piece leaves the workspace. Paper, appendix C.
     """
     own = {"__module__": __name__, "__doc__": description}
     name = f"{terrain.title()}{level.__name__}"

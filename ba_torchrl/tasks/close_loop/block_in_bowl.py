@@ -28,8 +28,8 @@ ends."""
 class BlockInBowl(CloseLoopTask):
     """Objects: a cubic block of 5 cm and a bowl of 16 x 16 x 7 cm.
 
-    Goal: the block lies inside the upright bowl, released. The episode ends early when the bowl
-    tips over or an object leaves the workspace. Paper, appendix A.2.
+    Goal: the block lies inside the upright bowl and is not held. The episode ends early when the
+    bowl tips over or an object leaves the workspace. Paper, appendix A.2.
     """
 
     scale_limits = (0.75, 1.0)

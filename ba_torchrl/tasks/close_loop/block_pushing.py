@@ -20,7 +20,8 @@ from ba_torchrl.tasks.manipulation.progress import nearness, reach_behind, stage
 
 @TASKS.register("close_loop/block_pushing")
 class BlockPushing(CloseLoopTask):
-    """Objects: a cubic block of 5 cm and a square goal area of 9 cm, a recess of 2 cm in the image.
+    """Objects: a cubic block of 5 cm and a square goal area of 9 cm, which images show as a recess
+    of 2 cm.
 
     Goal: the centre of the block is within 5 cm of that of the goal area. The episode ends early
     when the block leaves the workspace. Paper, appendix A.2.

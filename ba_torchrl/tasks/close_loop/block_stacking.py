@@ -12,8 +12,8 @@ from ba_torchrl.tasks.structures.pieces import cube
 class BlockStacking(CloseLoopStructureTask):
     """Objects: two to four cubes of 5 cm, two by default.
 
-    Goal: the cubes form a stack, released. The episode ends early when a cube leaves the workspace.
-    Paper, appendix A.2.
+    Goal: the cubes form a stack, and none is held. The episode ends early when a cube leaves the
+    workspace. Paper, appendix A.2.
     """
 
     num_objects = 2

@@ -12,8 +12,8 @@ from ba_torchrl.tasks.structures.pieces import cube, triangle
 class HouseBuilding(CloseLoopStructureTask):
     """Objects: one to three cubes of 5 cm, one by default, and a triangle of 5 cm.
 
-    Goal: the cubes form a stack with the triangle on top, released. The episode ends early when the
-    triangle tips over or a piece leaves the workspace. Paper, appendix A.2.
+    Goal: the cubes form a stack with the triangle on top, and nothing is held. The episode ends
+    early when the triangle tips over or a piece leaves the workspace. Paper, appendix A.2.
     """
 
     num_objects = 2

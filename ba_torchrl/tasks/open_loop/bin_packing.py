@@ -96,8 +96,8 @@ def object_shapes(unit: float) -> dict[str, Shape]:
 class BinPacking(PackingTask):
     """Objects: one to ten of seven shapes, 4 x 4 x 2 to 8 x 4 x 4 cm, eight by default, and a bin.
 
-    Goal: all objects lie in the bin of 17.6 x 14.4 x 8 cm, their centres below its rim, released.
-    The episode ends early when an object leaves the workspace. Paper, appendix A.1.
+    Goal: all objects lie in the bin of 17.6 x 14.4 x 8 cm, with their centres below its rim, and
+    none is held. The episode ends early when an object leaves the workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.78, 0.86)

@@ -18,8 +18,8 @@ BLOCKS = {"cube": cube, "cylinder": cylinder}
 class BlockStacking(StructureTask):
     """Objects: two to eight cubes or cylinders of 3 cm, four by default.
 
-    Goal: the blocks form a stack, released. The episode ends early when a cylinder tips over or a
-    block leaves the workspace. Paper, appendix A.1.
+    Goal: the blocks form a stack, and none is held. The episode ends early when a cylinder tips
+    over or a block leaves the workspace. Paper, appendix A.1.
     """
 
     class Parameters(TaskParameters):

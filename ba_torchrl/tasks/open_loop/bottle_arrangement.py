@@ -82,8 +82,8 @@ def slots() -> list[tuple[float, float]]:
 class BottleArrangement(PackingTask):
     """Objects: six bottles of eight kinds, 5 cm wide and 13 to 14.4 cm high, and a tray.
 
-    Goal: all bottles stand in the tray of 24 x 16 x 5 cm, released. The episode ends early when a
-    bottle tips over or leaves the workspace. Paper, appendix A.1.
+    Goal: all bottles stand in the tray of 24 x 16 x 5 cm, and none is held. The episode ends early
+    when a bottle tips over or leaves the workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.4, 0.8)

@@ -96,10 +96,10 @@ def slots(layer: int) -> list[tuple[float, float, float]]:
 class BoxPalletizing(PackingTask):
     """Objects: 6, 12 or 18 boxes of 7.2 x 4.5 x 4.5 cm, 18 by default, and a pallet.
 
-    Goal: each slot of each layer on the pallet of 23.2 x 19.2 x 3 cm has its box, released. A box
-    is stacked if it lies in a slot and all layers below it are full. The boxes arrive one at a
-    time, when all earlier ones are stacked and none is held. The episode ends early when a box
-    leaves the workspace. Paper, appendix A.1.
+    Goal: each slot of each layer on the pallet of 23.2 x 19.2 x 3 cm has its box, and none is held.
+    A box is stacked if it lies in a slot and all layers below it are full. The next box arrives
+    when all earlier ones are stacked and none is held. The episode ends early when a box leaves the
+    workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.75, 1.0)

@@ -204,9 +204,8 @@ class CovidTest(OpenLoopTask):
     Goal: three tests are made and all tubes are in the box of used tubes. A test is made when one
     tube and one swab lie in the test area: the swab is removed, and the tube is moved to a random
     pose in the test area, from which it must be collected before the next test. The episode ends
-    early on a violation of this order, which is a second tube or swab in the test area, or a tube
-    and a swab there before the last tube is collected, or when an object leaves the workspace.
-    Paper, appendix A.1.
+    early when a second tube or swab lies in the test area, when a tube and a swab lie there before
+    the last tube is collected, or when an object leaves the workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.5, 0.66)

@@ -15,8 +15,8 @@ from ba_torchrl.tasks.structures.pieces import cube, cuboid, pair_span, roof, tr
 class HouseBuilding1(StructureTask):
     """Objects: one to five cubes of 3 cm, three by default, and a triangle of 3 cm.
 
-    Goal: the cubes form a stack with the triangle on top, released. The episode ends early when the
-    triangle tips over or a piece leaves the workspace. Paper, appendix A.1.
+    Goal: the cubes form a stack with the triangle on top, and nothing is held. The episode ends
+    early when the triangle tips over or a piece leaves the workspace. Paper, appendix A.1.
     """
 
     num_objects = 4
@@ -32,8 +32,8 @@ class HouseBuilding1(StructureTask):
 class HouseBuilding2(StructureTask):
     """Objects: two cubes of 3 cm and a roof of 3 x 12 x 3 cm.
 
-    Goal: the roof lies on both cubes, released. The episode ends early when the roof tips over or a
-    piece leaves the workspace. Paper, appendix A.1.
+    Goal: the roof lies on both cubes, and nothing is held. The episode ends early when the roof
+    tips over or a piece leaves the workspace. Paper, appendix A.1.
     """
 
     num_objects = 3
@@ -50,8 +50,8 @@ class HouseBuilding2(StructureTask):
 class HouseBuilding3(StructureTask):
     """Objects: two cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
 
-    Goal: the cuboid lies on both cubes and the roof on the cuboid, both centred over the cubes,
-    released. The episode ends early when the roof tips over or a piece leaves the workspace.
+    Goal: the cuboid lies on both cubes and the roof on the cuboid, both centred over the cubes, and
+    nothing is held. The episode ends early when the roof tips over or a piece leaves the workspace.
     Paper, appendix A.1.
     """
 
@@ -77,8 +77,8 @@ class HouseBuilding4(StructureTask):
     """Objects: four cubes of 3 cm, a cuboid and a roof of 3 x 12 x 3 cm.
 
     Goal: two cubes support the cuboid, which supports the other two cubes, which support the roof,
-    released. The episode ends early when the roof tips over or a piece leaves the workspace.
-    Paper, appendix A.1.
+    and nothing is held. The episode ends early when the roof tips over or a piece leaves the
+    workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.55, 0.66)
@@ -105,8 +105,8 @@ class HouseBuilding4(StructureTask):
 class ImproviseHouseBuilding2(StructureTask):
     """Objects: two random shapes, 2.5 to 3 cm high, and a roof of 3 x 12 x 3 cm.
 
-    Goal: the roof lies on both shapes, released. The episode ends early when a shape or the roof
-    tips over or leaves the workspace. Paper, appendix A.1.
+    Goal: the roof lies on both shapes, and nothing is held. The episode ends early when a shape or
+    the roof tips over or leaves the workspace. Paper, appendix A.1.
     """
 
     num_objects = 3
@@ -126,8 +126,8 @@ class ImproviseHouseBuilding3(StructureTask):
     """Objects: two random shapes, 2.5 to 3 cm high, a random cuboid and a roof of 3 x 12 x 3 cm.
 
     Goal: the cuboid lies on both shapes and the roof on the cuboid, both centred over the shapes,
-    released. The episode ends early when a shape or the roof tips over, or a piece leaves the
-    workspace. Paper, appendix A.1.
+    and nothing is held. The episode ends early when a shape or the roof tips over, or a piece
+    leaves the workspace. Paper, appendix A.1.
     """
 
     scale_limits = (0.55, 0.9)

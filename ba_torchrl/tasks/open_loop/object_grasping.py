@@ -36,7 +36,7 @@ COST_TOLERANCE = 60.0
 class ObjectGrasping(ClutterTask, OpenLoopTask):
     """Objects: 1 to 20 random objects in a tray, 15 by default.
 
-    Goal: an object is held. An episode is a single pick, after which it ends. Paper, appendix A.1.
+    Goal: an object is held. Every episode ends after one pick. Paper, appendix A.1.
     """
 
     max_steps = 1
