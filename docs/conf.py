@@ -82,7 +82,11 @@ def task_page(task: str) -> str:
     film = FOLDER / "gallery" / f"{slug}.gif"
     picture = film if film.exists() else film.with_suffix(".png")
     lines = [f"# {task}", "", f"![{task}](../../gallery/{picture.name})", "", found.text, ""]
-    lines += ["Keys and units: [environments](../../environments.md#keys).", ""]
+    lines += [
+        "An episode succeeds when all conditions of the row `success` hold. The row `expert` has the",
+        "success rates of the expert. Keys and units: [environments](../../environments.md#keys).",
+        "",
+    ]
     lines += ["| | value (allowed values) |", "|---|---|"]
     lines += [f"| {name} | {_cell(value)} |" for name, value in found.rows().items()]
     if task in shipped_policies():
