@@ -83,8 +83,8 @@ def task_page(task: str) -> str:
     picture = film if film.exists() else film.with_suffix(".png")
     lines = [f"# {task}", "", f"![{task}](../../gallery/{picture.name})", "", found.text, ""]
     lines += [
-        "An episode succeeds when all conditions of the row `success` hold. The row `expert` has the",
-        "success rates of the expert. Keys and units: [environments](../../environments.md#keys).",
+        "An episode succeeds when all conditions of the row `success` hold. The row `expert` has",
+        "success rates. Keys and units: [environments](../../environments.md#keys).",
         "",
     ]
     lines += ["| | value (allowed values) |", "|---|---|"]
