@@ -354,4 +354,4 @@ def test_a_gap_narrower_than_the_pieces_is_refused(world):
 def test_a_row_on_bumps_has_a_platform_of_its_own_or_the_default_size(attributes, size):
     task = task_on("bump/house_building_2", HouseBuilding2, attributes)
     assert task.platform_m == attributes.get("platform_m", (0.13, 0.13))
-    assert task.__doc__.startswith(f"House Building 2 on a platform of {size};")
+    assert task.__doc__.startswith(f"House Building 2 on a platform of {size}, with")
