@@ -16,7 +16,6 @@ from ba_torchrl.tasks.clutter.push_planner import NEAR_M, Push, PushPlanner
 from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.manipulation.primitives import (
     ALIGNED_M,
-    ALIGNED_RAD,
     CLOSED,
     IS_CLOSED,
     IS_OPEN,
@@ -33,6 +32,12 @@ RISKY = 1e3
 TURN_OFFSET_M = 0.02
 """Largest horizontal offset, along each axis, of a gripper that turns to a grasp. The image is
 centred on the gripper, so a policy sees the object whose orientation matters in its centre."""
+GRASP_OFFSET_M = 0.02
+"""Largest horizontal offset, along each axis, of a gripper that descends straight to a grasp and
+closes. With 4 mm, a policy with errors of a centimetre stays above the object: its next action is
+rarely one that descends. A gripper that cannot turn has riskier grasps and aligns first."""
+GRASP_TURN_RAD = 0.5
+"""Largest yaw error of that gripper."""
 WALL_PIXELS = 25
 """Width of the border of the planner's height image that shows the walls of the tray."""
 
@@ -122,7 +127,8 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         gx, gy, gz = grasp.position
         offset = max(abs(gx - x), abs(gy - y))
         turn = abs(wrap_angle(grasp.yaw_rad - yaw))
-        if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
+        reach_m = GRASP_OFFSET_M if limits.turn_rad else ALIGNED_M
+        if offset <= reach_m and turn <= GRASP_TURN_RAD:
             opening = CLOSED if z - gz <= limits.step_m else OPEN
             return move_toward(robot, grasp.position, grasp.yaw_rad, opening)
         if offset > TURN_OFFSET_M:
