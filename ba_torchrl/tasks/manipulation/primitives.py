@@ -29,7 +29,7 @@ ALIGNED_M = 4e-3
 """Largest horizontal offset, along each axis, of a gripper that is aligned with its target."""
 ALIGNED_RAD = 0.08
 """Largest yaw error of a gripper that is aligned with its target."""
-DESCENT_OFFSET_M = 0.01
+DESCENT_OFFSET_M = 0.02
 """Largest horizontal offset, along each axis, of a gripper that descends towards its target."""
 PUSH_HEIGHT_M = 0.02
 """Height of the tool above the lower bound of the workspace during a push."""
