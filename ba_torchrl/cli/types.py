@@ -51,7 +51,12 @@ def without(values: dict[str, Any], **reserved: str) -> dict[str, Any]:
     return values
 
 
-def _is_new(path: str) -> None:
+def check_new(path: str | Path) -> None:
+    """Check that nothing exists at a path.
+
+    Raises:
+        ConfigError: there is something.
+    """
     if os.path.exists(path):
         raise ConfigError(f"{path} exists already; choose another path")
 
@@ -134,7 +139,7 @@ Folders = Annotated[
 """Existing folders, or one."""
 OutputFolder = Annotated[Text, checked(check_writable_folder)]
 OutputFile = Annotated[Text, checked(check_writable_file)]
-NewPath = Annotated[Text, checked(_is_new), checked(check_writable_file)]
+NewPath = Annotated[Text, checked(check_new), checked(check_writable_file)]
 PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(".png",)))]
 VideoFile = Annotated[
     Text, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))
