@@ -122,6 +122,8 @@ def check_untracked(paths: Iterable[str | Path]) -> None:
             raise ConfigError(f"git tracks {path}; choose another path, or set overwrite=true")
 
 
+as_list = BeforeValidator(lambda value: [value] if isinstance(value, str) else value)
+"""Annotation of a list that may be given as its only item."""
 Count = Annotated[int, Field(ge=1)]
 NumEnvs = Annotated[int, Field(ge=1, le=MAX_ENVS)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
@@ -134,7 +136,7 @@ Tasks = Annotated[list[TaskId], Field(min_length=1)] | None
 Folders = Annotated[
     list[Annotated[Text, checked(_folder_exists)]],
     Field(min_length=1),
-    BeforeValidator(lambda value: [value] if isinstance(value, str) else value),
+    as_list,
 ]
 """Existing folders, or one."""
 OutputFolder = Annotated[Text, checked(check_writable_folder)]

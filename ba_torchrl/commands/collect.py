@@ -25,6 +25,7 @@ from ba_torchrl.cli.types import (
     TaskId,
     Text,
     VectorSettings,
+    as_list,
     check_new,
     check_writable_file,
     check_writable_folder,
@@ -52,8 +53,10 @@ class Settings(VectorSettings, EnvSettings):
     """Settings of this command."""
 
     set_by_command: ClassVar[dict[str, str]] = {"seed": "set seed", "expert": "set source"}
-    task: TaskId | Annotated[list[TaskId], Field(min_length=1)] = "close_loop/block_picking"
-    """Id of the task; a list of them with source=graded."""
+    task: Annotated[list[TaskId], Field(min_length=1), as_list] = Field(
+        default=["close_loop/block_picking"]
+    )
+    """Id of the task; with source=graded also a list of them."""
     path: Text | None = None
     """New folder of the demonstrations, or that of graded sets; null for one in demos."""
     source: Source | Literal["graded"] = "expert"
@@ -74,8 +77,8 @@ class Settings(VectorSettings, EnvSettings):
         if self.source == "graded":
             for message in changed(self, _NOT_GRADED, "with source=graded; leave it out"):
                 raise ConfigError(message)
-        elif not isinstance(self.task, str):
-            raise ConfigError("task: give one, or source=graded")
+        elif len(self.task) > 1:
+            raise ConfigError("task: name one; several are for source=graded")
         if self.path is not None and self.source == "graded":
             check_writable_folder(self.path)
         elif self.path is not None:
@@ -94,10 +97,9 @@ def main(settings: Settings) -> None:
 
 def _collect_graded(settings: Settings) -> None:
     """Make every set that is missing; a task that has no medium policy does not stop the others."""
-    tasks = [settings.task] if isinstance(settings.task, str) else settings.task
     problems = []
     least, most = ACCEPTED
-    for task in tasks:
+    for task in settings.task:
         sets = GradedSets(
             Path(settings.path or "demos/graded") / task,
             task,
@@ -128,14 +130,15 @@ def _collect_graded(settings: Settings) -> None:
 
 def _collect(settings: Settings) -> None:
     """Play the expert's episodes, or deconstruct structures."""
-    path = settings.path or f"demos/{settings.task.replace('/', '_')}"
-    actions = resolve_env(settings.task, settings.env).actions
+    (task,) = settings.task
+    path = settings.path or f"demos/{task.replace('/', '_')}"
+    actions = resolve_env(task, settings.env).actions
     check_noise(settings.noise, settings.source, "noise")
     check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")
     if settings.source == "deconstruction":
-        check_has_structure(settings.task)
+        check_has_structure(task)
     env = make_vector_env(
-        settings.task,
+        task,
         settings.num_envs,
         parallel=settings.parallel,
         register_modules=settings.plugins,
@@ -158,21 +161,21 @@ def _collect(settings: Settings) -> None:
     finally:
         env.close()
     if not episodes:
-        raise ConfigError(f"none of {settings.episodes} episodes of {settings.task} can be used")
+        raise ConfigError(f"none of {settings.episodes} episodes of {task} can be used")
     save_demonstrations(
         path,
         episodes,
-        task=settings.task,
+        task=task,
         env=settings.env,
         seed=settings.seed,
         source=settings.source,
     )
     print(
-        f"{len(episodes)} episodes of {settings.task}, success {success_rate(episodes):.2f}, "
+        f"{len(episodes)} episodes of {task}, success {success_rate(episodes):.2f}, "
         f"{mean_length(episodes):.1f} steps each, in {path}"
     )
     if settings.replays and settings.source == "deconstruction":
-        scores = replay_scores(settings.task, settings.replays, seed=settings.seed, **settings.env)
+        scores = replay_scores(task, settings.replays, seed=settings.seed, **settings.env)
         print(
             f"of {settings.replays} structures taken apart {scores.reversible:.3f} can be "
             f"reversed; played in the simulator, {scores.success_rate:.3f} of these reach the goal"
