@@ -70,7 +70,7 @@ def test_python_of_a_page_runs(script, modules, tmp_path):
     (tmp_path / "script.py").write_text(script)
     (tmp_path / "my_tasks.py").write_text(modules)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    collect = "-m ba_torchrl collect task=close_loop/block_pulling episodes=1 num_envs=1"
+    collect = "-m ba_torchrl collect task=close_loop/block_pulling episodes=2 num_envs=1"
     steps = [["script.py"]]
     if DEMONSTRATIONS in script:
         steps.insert(0, f"{collect} parallel=false path={DEMONSTRATIONS}".split())

@@ -65,8 +65,9 @@ def test_every_grade_has_its_card_and_executed_actions_only(folder, sets):
     assert policy == "bc cnn, 4 episodes of the expert, 1 updates, success 0.50 of 50"
 
 
-def test_random_actions_fill_their_range(sets):
+def test_random_actions_fill_their_range_and_none_is_the_experts(sets):
     actions = torch.cat(sets["random"])["action"]
+    assert not torch.isin(actions[:, 0], torch.cat(sets["expert"])["action"][:, 0]).any()
     assert actions.min() < -0.8
     assert actions.max() > 0.8
     assert actions.abs().mean() == pytest.approx(0.5, abs=0.1)
