@@ -123,7 +123,7 @@ def _collect_graded(settings: Settings) -> None:
                 if grade == "medium" and not least <= found["success_rate"] <= most:
                     problems.append(f"{sets.path(grade)}: success is not from {least} to {most}")
         except ConfigError as error:
-            problems.append(str(error))
+            problems.append(f"{task}: {error}")
     if problems:
         raise ConfigError("; ".join(problems))
 

@@ -249,6 +249,6 @@ def half_trained(
             learner.load_state_dict(before)
             updates //= 2
     raise ConfigError(
-        f"{sets.task}: no policy of at most {MOST_UPDATES} updates has a success rate from {least} "
+        f"medium: no policy of at most {MOST_UPDATES} updates has a success rate from {least} "
         f"to {most}; more episodes or another seed may give one"
     )
