@@ -30,32 +30,37 @@ def close(suites):
             vector.close()
 
 
-@pytest.mark.parametrize("use_async_envs", [False, True])
-def test_a_suite_of_vectors(hub, use_async_envs):
-    hub.TASKS = hub.TASKS[: 1 if use_async_envs else 2]
-    suites = hub.make_env(n_envs=2, use_async_envs=use_async_envs)
+# One process: each imports the package.
+@pytest.mark.parametrize(("n_envs", "use_async_envs"), [(2, False), (1, True)])
+def test_a_suite_of_vectors(hub, n_envs, use_async_envs):
+    hub.TASKS = hub.TASKS[:n_envs]
+    suites = hub.make_env(n_envs=n_envs, use_async_envs=use_async_envs)
     try:
         assert list(suites) == ["ba_torchrl"]
         assert list(suites["ba_torchrl"]) == list(range(len(hub.TASKS)))
         vector = suites["ba_torchrl"][0]
-        assert isinstance(vector, gymnasium.vector.VectorEnv)
-        assert vector.num_envs == 2
-        assert vector.call("task") == ("close_loop/block_picking",) * 2
+        vectors = gymnasium.vector
+        kind = vectors.AsyncVectorEnv if use_async_envs else vectors.SyncVectorEnv
+        assert isinstance(vector, kind)
+        assert vector.num_envs == n_envs
+        assert vector.call("task") == ("close_loop/block_picking",) * n_envs
         assert all(len(text) > 10 for text in vector.call("task_description"))
-        assert vector.call("_max_episode_steps") == (3, 3)
-        observation, _ = vector.reset(seed=[0, 1], options={"lerobot_new_rollout": True})
+        assert vector.call("_max_episode_steps") == (3,) * n_envs
+        observation, _ = vector.reset(
+            seed=list(range(n_envs)), options={"lerobot_new_rollout": True}
+        )
         assert vector.observation_space.contains(observation)
-        assert observation["images.pixels"].shape == (2, 1, 64, 64)
+        assert observation["images.pixels"].shape == (n_envs, 1, 64, 64)
         assert observation["agent_pos"].dtype == np.float32
         rgb = observation["pixels"]["rgb"]
-        assert (rgb.shape, rgb.dtype) == ((2, 64, 64, 3), np.uint8)
+        assert (rgb.shape, rgb.dtype) == ((n_envs, 64, 64, 3), np.uint8)
         assert rgb.std() > 1
-        ended = np.zeros(2, bool)
+        ended = np.zeros(n_envs, bool)
         for _ in range(3):
-            _, _, terminated, truncated, info = vector.step(np.full((2, 5), 1.5))
+            _, _, terminated, truncated, info = vector.step(np.full((n_envs, 5), 1.5))
             ended |= terminated | truncated
         assert ended.all()
-        assert info["is_success"].tolist() == [False, False]
+        assert info["is_success"].tolist() == [False] * n_envs
     finally:
         close(suites)
 

@@ -287,13 +287,12 @@ class Learner(ABC):
             )
         self.images = {key: problem.images[key] for key in network.image_keys}
         """Declarations of the networks' input images, which the replay stores."""
-        names = getattr(network, "vector_keys", ())
-        if missing := [key for key in names if key not in problem.vectors]:
+        if missing := [key for key in network.vector_keys if key not in problem.vectors]:
             raise ConfigError(
                 f"network.vector_keys: the environment does not observe {', '.join(missing)}; it "
                 f"observes {', '.join(problem.vectors) or 'no vectors'}. env.observations adds some"
             )
-        self.vectors = {key: problem.vectors[key] for key in names}
+        self.vectors = {key: problem.vectors[key] for key in network.vector_keys}
         """Lengths of the networks' input vectors, which the replay stores."""
         self.observation_keys = [*self.images, keys.HOLDING, *self.vectors]
         self.codecs = make_codecs(self.images)

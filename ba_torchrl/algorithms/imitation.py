@@ -18,17 +18,22 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
-from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, Problem, SeedUse
+from ba_torchrl.algorithms.spatial_actions import (
+    RigidAugmentationConfig,
+    demonstration_on_grid,
+    make_spatial_values,
+)
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialPolicy, spatial_policy
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
 
 
-class ImitationConfig(LearnerConfig):
+class ImitationConfig(RigidAugmentationConfig):
     """Hyper-parameters of a policy that is trained on the expert's actions alone.
 
     The loss is the divergence of sampled actions from the expert's in close-loop tasks, and the
@@ -40,6 +45,15 @@ class ImitationConfig(LearnerConfig):
 
     replay: Literal["uniform"] = "uniform"
     init: Literal["random"] = "random"
+
+    def check(self, network: NetworkConfig, control: Control) -> None:
+        """As for `LearnerConfig`; rigid transforms in close loop are refused too."""
+        super().check(network, control)
+        if control == "close_loop" and self.augmentation != "none":
+            raise ConfigError(
+                f"algorithm.augmentation: {self.augmentation!r} transforms open_loop transitions; "
+                "leave it at 'none' for close_loop tasks"
+            )
 
 
 @ALGORITHMS.register("bc")
@@ -82,6 +96,7 @@ class DAggerConfig(ImitationConfig):
 class BC(Learner):
     """A policy trained on demonstrations only."""
 
+    config: ImitationConfig
     actions: SpatialActions | None = None
     """The grid of actions of an open-loop policy."""
 
@@ -109,6 +124,14 @@ class BC(Learner):
             loss = LevelCrossEntropyLoss(networks)
         loss.set_keys(action=keys.TARGET_ACTION)
         return loss
+
+    def make_augmentation(self) -> nn.Module:
+        """Return the rigid transforms of sampled open-loop transitions."""
+        if self.actions is None:
+            return super().make_augmentation()
+        return self.config.make_augmentation(
+            self.problem, self.images, self.actions, keys.TARGET_ACTION
+        )
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the nearest action that the policy can choose."""

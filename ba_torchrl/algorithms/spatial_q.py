@@ -12,10 +12,14 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import HardUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
-from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, Problem, SeedUse
+from ba_torchrl.algorithms.spatial_actions import (
+    RigidAugmentationConfig,
+    demonstration_on_grid,
+    make_spatial_values,
+)
 from ba_torchrl.config import changed
-from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
+from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.base import NetworkConfig
@@ -24,7 +28,7 @@ from ba_torchrl.objectives.dqn import Demonstrations, LevelDQNLoss
 
 
 @ALGORITHMS.register("spatial_q")
-class SpatialQConfig(LearnerConfig):
+class SpatialQConfig(RigidAugmentationConfig):
     """Hyper-parameters of spatial Q-learning; its variants are presets in ``configs/algorithm``.
 
     The defaults are those of SDQfD in appendix G.1. Where the appendix gives no value, the default
@@ -53,12 +57,6 @@ class SpatialQConfig(LearnerConfig):
     target_interval: int = Field(default=100, ge=1)
     """Updates between two copies of the network to its target; reference implementation."""
     replay: ReplayKind = "symmetric"
-    augmentation: RigidTransforms = "none"
-    """Rigid transforms of sampled transitions: "translation", "cn", "d4" or "se2"."""
-    augmentation_probability: float = Field(default=1.0, ge=0, le=1)
-    """Probability of transforming a sampled transition."""
-    augmentation_order: int = Field(default=16, ge=1)
-    """Number of rotations n of "cn"."""
     epsilon_init: float = Field(default=0.0, ge=0, le=1)
     """Initial probability of a random action; in the appendix, the behaviour policy is greedy."""
     epsilon_end: float = Field(default=0.0, ge=0, le=1)
@@ -68,8 +66,7 @@ class SpatialQConfig(LearnerConfig):
     included."""
 
     def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """As for `LearnerConfig`: fields of another replay, of other terms on demonstrations, and
-        of other augmentations."""
+        """As for `RigidAugmentationConfig`: also fields of other terms on demonstrations."""
         yield from super().without_effect(network)
         kind = f"with demonstrations={self.demonstrations!r}"
         if self.demonstrations == "none":
@@ -78,10 +75,6 @@ class SpatialQConfig(LearnerConfig):
             yield from changed(self, ["margin"], kind)
         if self.demonstrations != "adet":
             yield from changed(self, ["first_beta", "later_beta"], kind)
-        if self.augmentation == "none":
-            yield from changed(self, ["augmentation_probability"], "without augmentation")
-        if self.augmentation != "cn":
-            yield from changed(self, ["augmentation_order"], "without augmentation='cn'")
 
     @property
     def imitates(self) -> Imitation:
@@ -145,16 +138,7 @@ class SpatialQ(Learner):
 
     def make_augmentation(self) -> RigidAugmentation:
         """Return the rigid transforms of sampled transitions."""
-        config = self.config
-        return RigidAugmentation(
-            config.augmentation,
-            self.problem.actions,
-            self.images,
-            seed=self.problem.derived_seed(SeedUse.AUGMENTATION),
-            probability=config.augmentation_probability,
-            order=config.augmentation_order,
-            grid=self.actions,
-        )
+        return self.config.make_augmentation(self.problem, self.images, self.actions)
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the nearest action that the network's levels can choose."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from ba_torchrl.data.episodes import mean_return, success_rate
 from ba_torchrl.data.exchange import check_same_environment, env_values, import_demonstrations
 from ba_torchrl.data.files import (
     check,
-    publish,
+    complete_only,
     read_state,
     seal,
     write_state,
@@ -64,15 +63,12 @@ def save_demonstrations(
     path = Path(path)
     if path.exists() and any(path.iterdir()):
         raise FileExistsError(f"{path} is not empty; choose another folder")
-    scratch = path.with_name(f".{path.name}.scratch")
-    shutil.rmtree(scratch, ignore_errors=True)
     lengths = torch.tensor([len(episode) for episode in episodes], device="cpu")
     steps = torch.cat(list(episodes)).flatten_keys(_SEPARATOR)
     entries: dict[str, Any] = {}
     for key in steps.keys():  # noqa: SIM118 -- a TensorDict
         value = steps[key]  # an instruction is a string, or a list with one per step
         entries[key] = [value] * len(steps) if isinstance(value, str) else value
-    write_state(scratch, {**entries, _LENGTHS: lengths})
     metadata = {
         "task": task,
         "env": env_values(task, env),
@@ -88,9 +84,10 @@ def save_demonstrations(
             "torchrl": torchrl.__version__,
         },
     }
-    write_text(scratch / _METADATA_FILE, json.dumps(metadata, indent=2) + "\n")
-    seal(scratch)
-    publish(scratch, path)
+    with complete_only(path) as scratch:
+        write_state(scratch, {**entries, _LENGTHS: lengths})
+        write_text(scratch / _METADATA_FILE, json.dumps(metadata, indent=2) + "\n")
+        seal(scratch)
 
 
 def load_demonstrations(

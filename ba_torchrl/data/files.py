@@ -13,6 +13,7 @@ import re
 import shutil
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,30 @@ def publish(scratch: Path, folder: Path) -> None:
     os.replace(scratch, folder)
     _flush(folder.parent)
     shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def complete_only(path: Path) -> Iterator[Path]:
+    """Yield a path of the same name in a hidden folder, for a file or folder that is written there.
+
+    When it is complete on the disk, it gets its place, after the files beside it. If the block
+    raises, nothing of it remains.
+
+    Args:
+        path: of a new file or folder.
+    """
+    scratch = path.with_name(f".{path.name}.scratch")
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    try:
+        yield scratch / path.name
+        for part in scratch.rglob("*"):
+            _flush(part)
+        for part in sorted(scratch.iterdir(), key=lambda part: part.name == path.name):
+            os.replace(part, path.with_name(part.name))
+        _flush(path.parent)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def check(folder: str | Path) -> None:

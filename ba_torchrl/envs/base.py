@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
+from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
@@ -301,6 +302,7 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             self._on_fault()
         else:
             self._fault_counter.count_step()
+            self._check_progress()
         # the dense rewards that would follow a success belong to its value
         cuts_rewards = success and self.config.reward == "dense"
         terminated = not fault and not cuts_rewards and (success or not valid)
@@ -430,23 +432,27 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             try:
                 scene = self._episodes.begin(rng, with_new_objects=with_new_objects)
                 self._progress = self._measure_progress(scene)
+                self._check_progress()
                 return self._observe(scene)
             except SIMULATOR_ERRORS:
                 self._on_fault()
 
     def _measure_progress(self, scene: Scene) -> float:
-        """Return the task's progress, 0 if the reward is sparse.
+        """Return the task's progress, 0 if the reward is sparse."""
+        if self.config.reward == "sparse":
+            return 0.0
+        with scene.world.fixed_poses():
+            return scene.task.progress()
+
+    def _check_progress(self) -> None:
+        """Check the progress that the task returned: another value is no fault of the simulator.
 
         Raises:
             ValueError: it is not in [0, 1).
         """
-        if self.config.reward == "sparse":
-            return 0.0
-        with scene.world.fixed_poses():
-            progress = float(scene.task.progress())
-        if not 0 <= progress < 1:
-            raise ValueError(f"{self.task_id}: progress must be in [0, 1), not {progress}")
-        return progress
+        if not (isinstance(self._progress, Real) and 0 <= self._progress < 1):
+            method = f"{self.task_class.__name__}.progress"
+            raise ValueError(f"{self.task_id}: {method} must be in [0, 1), not {self._progress}")
 
     def _dense_reward(self, progress_before: float, sparse: float) -> float:
         """Return the reward of the last step; see `EnvConfig.reward`.

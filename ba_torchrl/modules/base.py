@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
@@ -93,8 +93,9 @@ class NetworkConfig(Protocol):
     """Control of the tasks that it supports. ``build`` returns an `ActorCritic` for close-loop
     tasks and a `ba_torchrl.modules.spatial.base.SpatialQNetwork` for open-loop tasks."""
     image_keys: ClassVar[tuple[str, ...]]
-    """Keys of its input images, in the order of its arguments. The holding flag follows, and then
-    the vectors that a field ``vector_keys`` names, if the network has one."""
+    """Keys of its input images, in the order of its arguments; the holding flag follows."""
+    vector_keys: Sequence[str]
+    """Keys of its input vectors, which follow the holding flag."""
 
     def build(self, spec: Any) -> Any:
         """Return freshly initialised modules.

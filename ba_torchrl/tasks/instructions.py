@@ -30,8 +30,6 @@ NUMBERS = (
     *("eleven", "twelve", "thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen"),
 )
 """Words of the numbers; larger ones are digits."""
-NOUNS = {"shape": "object"}
-"""Nouns of the kinds of pieces whose name is not a noun for them."""
 
 
 def color_name(color: Color) -> str:
@@ -96,14 +94,13 @@ def structure_instruction(blueprint: Blueprint, bodies: Sequence[tuple[str, Body
     def pieces(kind: str, count: int) -> str:
         """Return the phrase for the next pieces of a kind."""
         placed[kind] = placed.get(kind, 0) + count
-        noun = NOUNS.get(kind, kind)
         colors = [color_name(body.shape.color) for other, body in bodies if other == kind]
         is_uniform = len(set(colors)) == 1
         if count == len(colors):
             if not is_uniform:
-                return joined([f"the {color} {noun}" for color in colors])
-            return f"the {counted(count, f'{colors[0]} {noun}')}"
-        phrase = counted(count, f"{colors[0]} {noun}" if is_uniform else noun)
+                return joined([f"the {color} {kind}" for color in colors])
+            return f"the {counted(count, f'{colors[0]} {kind}')}"
+        phrase = counted(count, f"{colors[0]} {kind}" if is_uniform else kind)
         if placed[kind] == len(colors):
             return f"the other {phrase}"
         return phrase if count > 1 else f"a {phrase}"

@@ -43,6 +43,32 @@ def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
     assert torch.equal(learner.nearest_action(nearest), nearest)
 
 
+@pytest.mark.parametrize("algorithm", ["bc", "dagger"])
+def test_the_imitated_action_is_transformed_with_the_scene(algorithm):
+    """The images show a spot at the imitated position, and the executed action is elsewhere."""
+    learner = build(
+        algorithm, "asr", augmentation="cn", augmentation_order=4, batch_size=16, buffer_size=24
+    )
+    data = transitions(learner)
+    size = data["pixels"].shape[-1]
+    rows, columns = torch.arange(len(data)) + 2, 20 - torch.arange(len(data)) // 2
+    target = data[keys.ACTION].clone()
+    for i, low, high in ((1, 0.25, 0.65), (2, -0.2, 0.2)):
+        target[:, i] = low + (high - low) * ((rows, columns)[i - 1] + 0.5) / size
+    data[keys.TARGET_ACTION] = target
+    data["pixels"] = torch.zeros_like(data["pixels"])
+    data["pixels"][torch.arange(len(data)), 0, rows, columns] = 0.1
+    learner.extend(data)
+    batch = learner.sample()
+    spots = batch["pixels"].flatten(1).argmax(dim=1)
+    shown = torch.stack([spots // size, spots % size], dim=1)
+    target = batch[keys.TARGET_ACTION][:, 1:3]
+    chosen = ((target - torch.tensor([0.25, -0.2])) / 0.4 * size).floor().long()
+    assert torch.equal(chosen, shown)
+    stored = {(int(row), int(column)) for row, column in zip(rows, columns, strict=True)}
+    assert any(tuple(place) not in stored for place in shown.tolist())
+
+
 def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
     algorithm = {"name": "sac", "init": "bc", "replay": "prioritized", "augmentation": "none"}
     made = make_experiment(
@@ -191,6 +217,7 @@ def demonstration_error(learner):
         ("asr", {"name": "spatial_q", "init": "bc"}, {**OPEN, "pretrain_updates": 1}, "no actor"),
         ("cnn", {"name": "bc", "replay": "prioritized"}, {}, "replay"),
         ("asr", {"name": "bc"}, {}, "network 'asr' is for open_loop"),
+        ("cnn", {"name": "dagger", "augmentation": "cn"}, {}, "algorithm.augmentation: 'cn'"),
     ],
 )
 def test_what_cannot_run_is_refused(tmp_path, network, algorithm, changes, message):

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import ba_torchrl
+from ba_torchrl.data import demo_files
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import (
     collect_demonstrations,
@@ -118,6 +119,13 @@ def test_demonstrations_are_not_overwritten(collected, tmp_path):
     save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=0)
     with pytest.raises(FileExistsError, match="choose another folder"):
         save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=1)
+
+
+def test_a_folder_that_is_not_complete_is_removed(collected, tmp_path, monkeypatch):
+    monkeypatch.setattr(demo_files, "seal", lambda folder: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        save_demonstrations(tmp_path / "demos", collected[1], task=TASK, env=ENV, seed=0)
+    assert list(tmp_path.iterdir()) == []
 
 
 NOISY_TASK = "close_loop/block_reaching"

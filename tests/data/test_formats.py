@@ -20,6 +20,7 @@ from ba_torchrl.data import (
 )
 from ba_torchrl.data.demo_files import check_demonstrations, read_demonstrations
 from ba_torchrl.data.demos import source_config
+from ba_torchrl.data.formats import base
 from ba_torchrl.data.formats.base import FORMATS, Format, read_card
 from ba_torchrl.errors import ConfigError, MissingPackageError, UnknownNameError
 
@@ -134,6 +135,32 @@ def test_episodes_of_an_environment_come_back(name, collected, tmp_path):
         check_demonstrations(path, task=TASK, env=ENV, least=3)
     with pytest.raises(ConfigError, match="exists already"):
         exported(tmp_path, collected, name)
+
+
+@pytest.mark.parametrize("name", ["minari", "hdf5", "zarr", "lerobot"])
+def test_an_export_that_fails_in_the_middle_leaves_nothing(name, collected, tmp_path, monkeypatch):
+    if name == "lerobot":
+        pytest.importorskip("lerobot")
+    write = type(FORMATS[name]).write
+
+    def write_one_and_stop(self, path, episodes, card):
+        write(self, path, episodes[:1], card)
+        raise KeyboardInterrupt
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    for what in ((type(FORMATS[name]), "write", write_one_and_stop), (base, "card_file", stop)):
+        with monkeypatch.context() as patch:
+            patch.setattr(*what)
+            with pytest.raises(KeyboardInterrupt):
+                exported(tmp_path, collected, name)
+        assert list(tmp_path.iterdir()) == []
+    killed = tmp_path / f".{PATHS[name]}.scratch" / PATHS[name]  # left by a process that was killed
+    (killed / "data").mkdir(parents=True)
+    path = exported(tmp_path, collected, name)
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), collected)
+    assert not killed.parent.exists()
 
 
 def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from ba_torchrl.envs.gym import GymEnv
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix
 from ba_torchrl.tasks.instructions import color_name
+from tests.tasks.episodes import follow_expert
 
 PICKING = "close_loop/block_picking"
 GRASPING = "close_loop/object_grasping"
@@ -36,10 +37,6 @@ def make():
     yield build
     for env in made:
         env.close()
-
-
-def follow_expert(env, state):
-    return env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION]))[keys.NEXT]
 
 
 def test_all_observations_together_follow_their_specs(make):

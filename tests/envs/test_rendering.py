@@ -18,6 +18,7 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.rgb import FOV_DEG, _render, render_rgb
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.workspace import Workspace
+from tests.tasks.episodes import follow_expert
 
 STACKING = "open_loop/block_stacking"
 
@@ -34,10 +35,6 @@ def make():
     yield build
     for env in made:
         env.close()
-
-
-def follow_expert(env, state):
-    return env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION]))[keys.NEXT]
 
 
 def viewpoint_of(env, aspect=4 / 3):

@@ -252,11 +252,18 @@ def test_a_fault_has_no_reward(make, monkeypatch):
     assert state[keys.REWARD] == 0
 
 
-@pytest.mark.parametrize("value", [1.0, -0.1, math.nan])
-def test_a_progress_outside_its_range_is_refused(make, monkeypatch, value):
+@pytest.mark.parametrize("at_reset", [True, False])
+@pytest.mark.parametrize("value", [1.0, -0.1, math.nan, None])
+def test_a_progress_outside_its_range_is_no_fault_of_the_simulator(
+    make, monkeypatch, value, at_reset
+):
+    env = make(PICKING, reward="dense", obs_type="vec")
+    state = None if at_reset else env.reset()
     monkeypatch.setattr(BlockPicking, "progress", lambda task: value)
-    with pytest.raises(ValueError, match=r"progress must be in \[0, 1\)"):
-        make(PICKING, reward="dense", obs_type="vec").reset()
+    message = rf"{PICKING}: BlockPicking\.progress must be in \[0, 1\), not {value}"
+    with pytest.raises(ValueError, match=message):
+        env.reset() if at_reset else env.step(state.set(keys.ACTION, torch.zeros(5)))
+    assert env.faults == 0
 
 
 def test_a_task_without_a_dense_reward_names_those_that_have_one():

@@ -30,6 +30,11 @@ def follow(env, state, steps=1000, action=None):
     return seen
 
 
+def follow_expert(env, state):
+    """Take one expert action; return the next state."""
+    return follow(env, state, steps=1)[0]
+
+
 def play(env, state, action=None):
     """Act until the episode ends; return the last state."""
     return follow(env, state, action=action)[-1]

@@ -210,7 +210,7 @@ def test_objects_lie_flush_on_one_side_of_each_edge(make_env, task):
             assert inside or (across > first).all() or (across < -second).all()
             normal = quaternion_matrix(terrain.surface_pose(body.position[:2]).orientation)[2][2]
             # one of 30 random shapes rests on a facet beside the one it was placed on
-            tolerance = 0.15 if piece.kind == "shape" else 0.06
+            tolerance = 0.15 if piece.kind == "object" else 0.06
             assert body.tilt_rad == pytest.approx(math.acos(min(normal, 1.0)), abs=tolerance)
             if inside:
                 on_base.append(piece.kind)

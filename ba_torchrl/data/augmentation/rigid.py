@@ -82,7 +82,7 @@ class ActionGrid(Protocol):
 
 
 class RigidAugmentation(SeededModule):
-    """Applies a random rigid transform to images, next images and action of each transition.
+    """Applies a random rigid transform to images, next images and one action of each transition.
 
     Images with the gripper's axes do not change, with two exceptions: a reflection reverses the
     gripper's y axis, and a yaw that is wrapped into half a turn, or rounded to the other end of it,
@@ -98,6 +98,7 @@ class RigidAugmentation(SeededModule):
         order: n of C_n.
         grid: of actions, to whose nearest ones transformed actions are rounded; None to keep them
             as they are.
+        action_key: entry of that action; the batch's other action is left out.
 
     Raises:
         ValueError: the probability is outside [0, 1], the order is not positive, an image cannot be
@@ -115,6 +116,7 @@ class RigidAugmentation(SeededModule):
         probability: float = 1.0,
         order: int = 16,
         grid: ActionGrid | None = None,
+        action_key: str = keys.ACTION,
     ) -> None:
         super().__init__(seed)
         if not 0 <= probability <= 1 or order < 1:
@@ -136,6 +138,7 @@ class RigidAugmentation(SeededModule):
         self.probability = probability
         self.order = order
         self._grid = grid
+        self._action_key = action_key
         self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
         self._gripper_images = {
             key: image for key, image in images.items() if image.frame == "gripper"
@@ -148,18 +151,15 @@ class RigidAugmentation(SeededModule):
         """Return a copy of a batch of transitions [B] with some of them transformed.
 
         Args:
-            tensordict: holds the images, ``action`` and their successors.
-
-        Raises:
-            ValueError: it has ``target_action``, which would not be transformed.
+            tensordict: holds the images, the action and their successors.
         """
         out = tensordict.copy()
         if self.transforms == "none":
             return out
-        if keys.TARGET_ACTION in tensordict:
-            raise ValueError(f"augmentation {self.transforms!r} does not transform target_action")
-        device = tensordict[keys.ACTION].device
-        action = tensordict[keys.ACTION].cpu()
+        others = {keys.ACTION, keys.TARGET_ACTION} - {self._action_key}
+        out = out.exclude(*others)
+        device = out[self._action_key].device
+        action = out[self._action_key].cpu()
         is_found, transform = self._draw_inside(action)
         if not is_found.any():
             return out
@@ -169,7 +169,7 @@ class RigidAugmentation(SeededModule):
             map_pairs(out, key, rows, lambda images: transform_images(images, transform))
         moved = action.clone()
         moved[rows], is_turned_over = self._transform_actions(action[rows], transform)
-        out.set(keys.ACTION, to_device(moved, device))
+        out.set(self._action_key, to_device(moved, device))
         for chosen, axes in ((transform.mirrored, "y"), (is_turned_over, "xy")):
             if chosen.any():
                 self._reverse_axes(out, rows[chosen], axes)

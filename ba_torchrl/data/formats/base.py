@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 from safetensors.numpy import load_file, save_file
 
 from ba_torchrl.config import StrictModel
-from ba_torchrl.data.files import write_text
+from ba_torchrl.data.files import complete_only, write_text
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
@@ -166,7 +166,7 @@ def find_format(path: Path) -> Format | None:
 
 
 def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
-    """Write episodes with their card.
+    """Write episodes with their card; they appear under their name when all is on the disk.
 
     Args:
         form: of the file.
@@ -174,7 +174,6 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
         episodes: their entries by key.
         card: of the episodes.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     named = []
     for arrays in episodes:
         moved = {}
@@ -183,19 +182,21 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
             is_moved = form.channels_last and entry.is_image
             moved[entry.name] = np.moveaxis(values, 1, -1) if is_moved else values
         named.append(moved)
-    form.write(path, named, card)
-    if not form.has_last_observation:
-        observed = [
-            entry.name
-            for entry in card.entries.values()
-            if entry.role == "observation" and entry.dtype != "str"
-        ]
-        last = {
-            name: np.ascontiguousarray([arrays[name][-1] for arrays in named]) for name in observed
-        }
-        save_file(last, path / _LAST_FILE)
-    write_text(page_file(path), card.to_markdown())
-    write_text(card_file(path), card.model_dump_json(indent=1) + "\n")
+    with complete_only(path) as scratch:
+        form.write(scratch, named, card)
+        if not form.has_last_observation:
+            observed = [
+                entry.name
+                for entry in card.entries.values()
+                if entry.role == "observation" and entry.dtype != "str"
+            ]
+            last = {
+                name: np.ascontiguousarray([arrays[name][-1] for arrays in named])
+                for name in observed
+            }
+            save_file(last, scratch / _LAST_FILE)
+        write_text(page_file(scratch), card.to_markdown())
+        write_text(card_file(scratch), card.model_dump_json(indent=1) + "\n")
 
 
 def read_card(path: Path) -> Card | None:

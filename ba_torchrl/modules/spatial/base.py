@@ -142,6 +142,7 @@ class SpatialImageConfig(StrictModel):
 
     control: ClassVar[Control] = "open_loop"
     image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS, keys.IN_HAND)
+    vector_keys: ClassVar[tuple[str, ...]] = ()
 
     precision: Precision = "auto"
     height_scale_m: float = Field(default=1.0, gt=0)

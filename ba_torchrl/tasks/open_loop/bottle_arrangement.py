@@ -73,8 +73,11 @@ LAYOUTS = 20
 
 
 def slots() -> list[tuple[float, float]]:
-    """Return the positions of the slots in the tray's frame, at the appendix's size."""
-    length, width, _ = TRAY_M
+    """Return the positions of the slots in the tray's frame, at the appendix's size.
+
+    The centres of equal cells: the gap between two bottles is twice that to a wall.
+    """
+    length, width = (outer - 2 * WALL_M for outer in TRAY_M[:2])
     return [(x, y) for y in (-width / 4, width / 4) for x in (-length / 3, 0.0, length / 3)]
 
 

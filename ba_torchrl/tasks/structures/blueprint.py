@@ -25,7 +25,7 @@ class Piece:
     """A kind of piece, and the shape that is loaded for it.
 
     Args:
-        kind: name by which bodies are matched to slots.
+        kind: noun by which bodies are matched to slots, and which instructions contain.
         yaw_period_rad: angle of its rotational symmetry about the vertical.
         grasp_yaws_rad: yaws of the gripper at which the fingers close on it, relative to its own
             yaw; a yaw half a turn away is equivalent.

@@ -50,7 +50,7 @@ WIDTH_WEIGHT = 2.0
 """Cost of a metre between the fingers, relative to the cosine between surfaces and fingers."""
 ORANGE: Color = (0.9, 0.55, 0.2, 1.0)
 
-SHAPE = Piece("shape", stays_upright=True)
+SHAPE = Piece("object", stays_upright=True)
 """Any of the random shapes. One on its side supports nothing, and no top-down pick turns it
 upright."""
 UP = ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0))

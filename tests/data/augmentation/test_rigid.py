@@ -11,6 +11,7 @@ from ba_torchrl.data.augmentation.rigid import (
     RigidTransform,
     transform_images,
 )
+from ba_torchrl.envs import keys
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from tests.specs import open_loop_images
 
@@ -256,11 +257,14 @@ def test_the_seed_and_a_saved_state_determine_the_draws():
     assert torch.equal(first(data)["action"], second(data)["action"])
 
 
-def test_transitions_with_an_target_action_beside_the_action_are_refused():
+def test_another_action_is_transformed_alone():
     data = batch([(0.45, 0.05)] * 5)
-    data["target_action"] = data["action"].clone()
-    with pytest.raises(ValueError, match="does not transform target_action"):
-        augmentation("se2", layout(), seed=0)(data)
+    expected = augmentation("se2", layout(), seed=0)(data)
+    data["target_action"], data["action"] = data["action"].clone(), torch.zeros_like(data["action"])
+    out = augmentation("se2", layout(), seed=0, action_key=keys.TARGET_ACTION)(data)
+    assert torch.equal(out["target_action"], expected["action"])
+    assert torch.equal(out["pixels"], expected["pixels"])
+    assert "action" not in out
 
 
 def test_transforms_that_the_action_cannot_follow_are_refused():

@@ -64,6 +64,7 @@ class TwoViewsConfig(StrictModel):
 
     control: ClassVar[str] = "close_loop"
     image_keys: ClassVar[tuple[str, ...]] = ("pixels", "wrist")
+    vector_keys: ClassVar[tuple[str, ...]] = ()
     width: int = 4
 
     def build(self, spec):
