@@ -51,7 +51,12 @@ def without(values: dict[str, Any], **reserved: str) -> dict[str, Any]:
     return values
 
 
-def _is_new(path: str) -> None:
+def check_new(path: str | Path) -> None:
+    """Check that nothing exists at a path.
+
+    Raises:
+        ConfigError: there is something.
+    """
     if os.path.exists(path):
         raise ConfigError(f"{path} exists already; choose another path")
 
@@ -117,6 +122,8 @@ def check_untracked(paths: Iterable[str | Path]) -> None:
             raise ConfigError(f"git tracks {path}; choose another path, or set overwrite=true")
 
 
+as_list = BeforeValidator(lambda value: [value] if isinstance(value, str) else value)
+"""Annotation of a list that may be given as its only item."""
 Count = Annotated[int, Field(ge=1)]
 NumEnvs = Annotated[int, Field(ge=1, le=MAX_ENVS)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
@@ -129,12 +136,12 @@ Tasks = Annotated[list[TaskId], Field(min_length=1)] | None
 Folders = Annotated[
     list[Annotated[Text, checked(_folder_exists)]],
     Field(min_length=1),
-    BeforeValidator(lambda value: [value] if isinstance(value, str) else value),
+    as_list,
 ]
 """Existing folders, or one."""
 OutputFolder = Annotated[Text, checked(check_writable_folder)]
 OutputFile = Annotated[Text, checked(check_writable_file)]
-NewPath = Annotated[Text, checked(_is_new), checked(check_writable_file)]
+NewPath = Annotated[Text, checked(check_new), checked(check_writable_file)]
 PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(".png",)))]
 VideoFile = Annotated[
     Text, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))

@@ -1,20 +1,37 @@
 """Collect demonstrations from a task's expert or by deconstruction of structures, and save them.
 
+With source=graded, sets for offline learning are made: TASK/GRADE in the folder, for the grades
+random, expert, medium (a policy of half success) and mixed. The same command makes missing ones.
+
 ba-torchrl collect task=close_loop/block_picking episodes=100 path=demos/picking
+ba-torchrl collect source=graded task=[close_loop/block_picking,ramp/block_stacking] path=graded
 ba-torchrl collect task=open_loop/house_building_4 source=deconstruction
 ba-torchrl collect task=open_loop/house_building_4 source=deconstruction replays=200
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, EnvSettings, NewPath, TaskId, VectorSettings
-from ba_torchrl.data.demo_files import save_demonstrations
+from ba_torchrl.cli.types import (
+    Count,
+    EnvSettings,
+    TaskId,
+    Text,
+    VectorSettings,
+    as_list,
+    check_new,
+    check_writable_file,
+    check_writable_folder,
+)
+from ba_torchrl.config import changed
+from ba_torchrl.data.demo_files import read_metadata, save_demonstrations
 from ba_torchrl.data.demos import (
     Source,
     check_noise,
@@ -27,20 +44,25 @@ from ba_torchrl.data.time_reversal import check_has_structure, replay_scores
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
+from ba_torchrl.training.graded import ACCEPTED, GRADES, GradedSets
+
+_NOT_GRADED = ("replays", "only_successful", "noise", "turn_noise")
 
 
 class Settings(VectorSettings, EnvSettings):
     """Settings of this command."""
 
     set_by_command: ClassVar[dict[str, str]] = {"seed": "set seed", "expert": "set source"}
-    task: TaskId = "close_loop/block_picking"
-    """Id of the task."""
-    path: NewPath = "demos/${file_name:${task}}"
-    """New folder of the demonstrations."""
-    source: Source = "expert"
-    """The expert's episodes, or structures that are taken apart, reversed in time."""
+    task: Annotated[list[TaskId], Field(min_length=1), as_list] = Field(
+        default=["close_loop/block_picking"]
+    )
+    """Id of the task; with source=graded also a list of them."""
+    path: Text | None = None
+    """New folder of the demonstrations, or that of graded sets; null for one in demos."""
+    source: Source | Literal["graded"] = "expert"
+    """The expert's episodes, structures that are taken apart, reversed in time, or all grades."""
     episodes: Count = 100
-    """Their number."""
+    """Their number, in each set."""
     replays: int = Field(default=0, ge=0)
     """Deconstruction: number of episodes whose reversal is checked in the simulator."""
     only_successful: bool = True
@@ -50,16 +72,73 @@ class Settings(VectorSettings, EnvSettings):
     turn_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random turn beside the expert's other components."""
 
+    @model_validator(mode="after")
+    def _check_source(self) -> Self:
+        if self.source == "graded":
+            for message in changed(self, _NOT_GRADED, "with source=graded; leave it out"):
+                raise ConfigError(message)
+        elif len(self.task) > 1:
+            raise ConfigError("task: name one; several are for source=graded")
+        if self.path is not None and self.source == "graded":
+            check_writable_folder(self.path)
+        elif self.path is not None:
+            check_new(self.path)
+            check_writable_file(self.path)
+        return self
+
 
 def main(settings: Settings) -> None:
-    """Play the expert's episodes and write them into a folder."""
-    actions = resolve_env(settings.task, settings.env).actions
+    """Play episodes and write them into a folder."""
+    if settings.source == "graded":
+        _collect_graded(settings)
+    else:
+        _collect(settings)
+
+
+def _collect_graded(settings: Settings) -> None:
+    """Make every set that is missing; a task that has no medium policy does not stop the others."""
+    problems = []
+    least, most = ACCEPTED
+    for task in settings.task:
+        sets = GradedSets(
+            Path(settings.path or "demos/graded") / task,
+            task,
+            settings.episodes,
+            settings.env,
+            settings.seed,
+            settings.num_envs,
+            settings.parallel,
+            settings.plugins,
+        )
+        try:
+            for grade in GRADES:
+                with progress_bar(total=settings.episodes, unit="episode") as bar:
+                    sets.make(grade, lambda _, bar=bar: bar.update())
+                found = read_metadata(sets.path(grade))
+                print(
+                    f"{task} {grade}: {found['episodes']} episodes, success "
+                    f"{found['success_rate']:.2f}, mean return {found['mean_return']:.2f}, "
+                    f"{found['policy']}, in {sets.path(grade)}"
+                )
+                if grade == "medium" and not least <= found["success_rate"] <= most:
+                    problems.append(f"{sets.path(grade)}: success is not from {least} to {most}")
+        except ConfigError as error:
+            problems.append(f"{task}: {error}")
+    if problems:
+        raise ConfigError("; ".join(problems))
+
+
+def _collect(settings: Settings) -> None:
+    """Play the expert's episodes, or deconstruct structures."""
+    (task,) = settings.task
+    path = settings.path or f"demos/{task.replace('/', '_')}"
+    actions = resolve_env(task, settings.env).actions
     check_noise(settings.noise, settings.source, "noise")
     check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")
     if settings.source == "deconstruction":
-        check_has_structure(settings.task)
+        check_has_structure(task)
     env = make_vector_env(
-        settings.task,
+        task,
         settings.num_envs,
         parallel=settings.parallel,
         register_modules=settings.plugins,
@@ -82,21 +161,21 @@ def main(settings: Settings) -> None:
     finally:
         env.close()
     if not episodes:
-        raise ConfigError(f"none of {settings.episodes} episodes of {settings.task} can be used")
+        raise ConfigError(f"none of {settings.episodes} episodes of {task} can be used")
     save_demonstrations(
-        settings.path,
+        path,
         episodes,
-        task=settings.task,
+        task=task,
         env=settings.env,
         seed=settings.seed,
         source=settings.source,
     )
     print(
-        f"{len(episodes)} episodes of {settings.task}, success {success_rate(episodes):.2f}, "
-        f"{mean_length(episodes):.1f} steps each, in {settings.path}"
+        f"{len(episodes)} episodes of {task}, success {success_rate(episodes):.2f}, "
+        f"{mean_length(episodes):.1f} steps each, in {path}"
     )
     if settings.replays and settings.source == "deconstruction":
-        scores = replay_scores(settings.task, settings.replays, seed=settings.seed, **settings.env)
+        scores = replay_scores(task, settings.replays, seed=settings.seed, **settings.env)
         print(
             f"of {settings.replays} structures taken apart {scores.reversible:.3f} can be "
             f"reversed; played in the simulator, {scores.success_rate:.3f} of these reach the goal"

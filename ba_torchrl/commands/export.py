@@ -68,6 +68,7 @@ def main(settings: Settings) -> None:
         env=metadata["env"],
         seed=metadata["seed"],
         source=metadata["source"],
+        policy=metadata.get("policy", ""),
     )
     path = Path(settings.path)
     files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]

@@ -6,14 +6,14 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torchrl
 from tensordict import NonTensorStack, TensorDict
 
 from ba_torchrl import __version__
-from ba_torchrl.data.demos import Source
+from ba_torchrl.data.episodes import mean_return, success_rate
 from ba_torchrl.data.exchange import check_same_environment, env_values, import_demonstrations
 from ba_torchrl.data.files import (
     check,
@@ -37,7 +37,8 @@ def save_demonstrations(
     task: str,
     env: dict[str, Any],
     seed: int,
-    source: Literal[Source, "keyboard"] = "expert",
+    source: str = "expert",
+    policy: str = "",
 ) -> None:
     """Write episodes as one table of tensors, with their task and parameters.
 
@@ -49,7 +50,9 @@ def save_demonstrations(
         task: id of the task.
         env: fields of `EnvConfig` that were set.
         seed: of the first episodes.
-        source: how the demonstrations were made.
+        source: how the demonstrations were made, such as "expert" or "keyboard"; of a graded set,
+            its grade.
+        policy: which acted, in words.
 
     Raises:
         ValueError: there are no episodes.
@@ -71,7 +74,10 @@ def save_demonstrations(
         "env": env_values(task, env),
         "seed": seed,
         "source": source,
+        "policy": policy,
         "episodes": len(episodes),
+        "success_rate": success_rate(episodes),
+        "mean_return": mean_return(episodes),
         "versions": {
             "ba_torchrl": __version__,
             "torch": torch.__version__,
@@ -110,7 +116,7 @@ def load_demonstrations(
             raise ConfigError(f"{path} is of another library: name the task and its env")
         return import_demonstrations(path, task=task, env=env or {}, mapping=mapping)
     if task is None:
-        _read_metadata(path)
+        read_metadata(path)
     else:
         check_demonstrations(path, task=task, env=env or {})
     return _read_episodes(path)
@@ -128,7 +134,7 @@ def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, A
             f"no demonstrations of ours at {path}: export takes folders of `ba-torchrl collect` or "
             "`play`"
         )
-    metadata = _read_metadata(path)
+    metadata = read_metadata(path)
     return _read_episodes(path), metadata
 
 
@@ -155,7 +161,7 @@ def check_demonstrations(
     """
     path = Path(path)
     if _is_own(path, mapping):
-        metadata = _read_metadata(path)
+        metadata = read_metadata(path)
         count = metadata["episodes"]
         check_same_environment(path, task, env, metadata["task"], metadata["env"])
     else:
@@ -176,7 +182,12 @@ def _is_own(path: Path, mapping: object) -> bool:
     return is_own or find_format(path) is None
 
 
-def _read_metadata(path: Path) -> dict[str, Any]:
+def read_metadata(path: Path) -> dict[str, Any]:
+    """Return what a folder that `save_demonstrations` wrote says of its episodes.
+
+    Raises:
+        ConfigError: there are none at ``path``, or their files are damaged.
+    """
     try:
         metadata = json.loads((path / _METADATA_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:

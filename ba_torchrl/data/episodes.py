@@ -103,6 +103,11 @@ def mean_length(episodes: Sequence[TensorDictBase]) -> float:
     return sum(len(episode) for episode in episodes) / len(episodes)
 
 
+def mean_return(episodes: Sequence[TensorDictBase]) -> float:
+    """Return the mean sum of an episode's rewards, without discount."""
+    return sum(float(each[keys.NEXT, keys.REWARD].sum()) for each in episodes) / len(episodes)
+
+
 class EpisodeAssembler:
     """Holds transitions back until their episodes end, and flags those of successful episodes.
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,8 +15,7 @@ from tensordict import NonTensorStack, TensorDict, TensorDictBase
 from torchrl.data import NonTensor, TensorSpec
 
 from ba_torchrl import __version__
-from ba_torchrl.data.demos import Source
-from ba_torchrl.data.episodes import success_rate
+from ba_torchrl.data.episodes import mean_return, success_rate
 from ba_torchrl.data.formats.base import (
     FORMATS,
     RESULTS,
@@ -53,7 +52,8 @@ def export_demonstrations(
     task: str,
     env: dict[str, Any],
     seed: int,
-    source: Literal[Source, "keyboard"] = "expert",
+    source: str = "expert",
+    policy: str = "",
 ) -> None:
     """Write episodes for another library, with a card beside them.
 
@@ -65,7 +65,8 @@ def export_demonstrations(
         task: id of the task.
         env: fields of `EnvConfig` that were set.
         seed: of the first episodes.
-        source: how the demonstrations were made.
+        source: how the demonstrations were made, as for `save_demonstrations`.
+        policy: which acted, in words.
 
     Raises:
         ConfigError: the format is unknown or its package missing, or ``path`` exists or has not
@@ -94,11 +95,13 @@ def export_demonstrations(
         goal=summary(task),
         robot=values["robot"],
         source=source,
+        policy=policy,
         seed=seed,
         env=values,
         episodes=len(episodes),
         steps=sum(len(episode) for episode in episodes),
         success_rate=success_rate(episodes),
+        mean_return=mean_return(episodes),
         instructions=list(filter(None, texts))[:_MOST_INSTRUCTIONS],
         versions={"ba_torchrl": __version__, form.package: _version(form.package)},
         entries=entries,

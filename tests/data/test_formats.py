@@ -9,6 +9,7 @@ import pytest
 import torch
 import zarr
 from tensordict import NonTensorStack, TensorDict
+from torchrl.data.datasets import MinariExperienceReplay
 
 import ba_torchrl
 from ba_torchrl.data import (
@@ -108,9 +109,10 @@ def assert_equal(found, wanted):
 def test_every_value_comes_back(name, episodes, tmp_path):
     if name == "lerobot":
         pytest.importorskip("lerobot")
-    path = exported(tmp_path, episodes, name)
+    path = exported(tmp_path, episodes, name, policy="a hand")
     assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
     card = read_card(path)
+    assert (card.policy, card.mean_return) == ("a hand", card.success_rate)
     assert (card.task, card.robot, card.seed, card.source) == (TASK, "kuka", 7, "expert")
     assert (card.episodes, card.steps, card.success_rate) == (3, 9, pytest.approx(2 / 3))
     assert card.instructions == [f"pick up block {i}" for i in range(3)]
@@ -168,13 +170,31 @@ def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     dataset = minari.load_dataset(PATHS["minari"])
     env = dataset.recover_environment()
-    assert env.observation_space == dataset.observation_space
+    assert env.observation_space["pixels"] == dataset.observation_space["pixels"]
     assert env.spec.id == "BulletArm/CloseLoopBlockPicking-v0"
     env.reset(seed=0)
     first = next(iter(dataset.iterate_episodes()))
     for action, pixels in zip(first.actions, first.observations["pixels"][1:], strict=True):
         np.testing.assert_array_equal(env.step(action)[0]["pixels"], pixels)
     env.close()
+
+
+def test_torchrl_reads_what_minari_wrote(collected, tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    exported(tmp_path, collected, "minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setattr(TensorDict, "memmap_like", TensorDict.memmap)  # which 0.14.1 must call
+    data = MinariExperienceReplay(
+        PATHS["minari"], batch_size=4, root=tmp_path / "torchrl", load_from_local_minari=True
+    )[:]
+    steps = torch.cat(collected)
+    ours = [("pixels",), ("holding",), ("next", "pixels"), ("next", "holding")]
+    theirs = [(*key[:-1], "observation", key[-1]) for key in ours]
+    same = [("action",), ("next", "reward"), ("next", "terminated"), ("next", "truncated")]
+    for key, name in zip([*ours, *same], [*theirs, *same], strict=True):
+        assert torch.equal(data[name], steps[key]), key
+    lengths = torch.tensor([len(each) for each in collected])
+    assert torch.equal(data["episode"], torch.arange(2).repeat_interleave(lengths))
 
 
 def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_path, episodes):

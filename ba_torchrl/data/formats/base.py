@@ -54,7 +54,9 @@ class Card(StrictModel):
     """Of the task, in one sentence."""
     robot: str
     source: str
-    """How the demonstrations were made, such as "expert"."""
+    """How the demonstrations were made, such as "expert"; of a graded set, its grade."""
+    policy: str = ""
+    """Which acted, in words."""
     seed: int
     """Of the first episodes."""
     env: dict[str, Any]
@@ -62,6 +64,8 @@ class Card(StrictModel):
     episodes: int
     steps: int
     success_rate: float
+    mean_return: float | None = None
+    """Mean sum of an episode's rewards, without discount."""
     instructions: list[str]
     """The different sentences, at most 20 of them; an example if they were not observed."""
     depth: str = "float32 in metres, stored without loss: the largest error is 0"
@@ -87,8 +91,10 @@ class Card(StrictModel):
             "task": f"`{self.task}` (Gymnasium: `{gym_id(self.task)}`): {self.goal}",
             "robot": self.robot,
             "demonstrations": f"{self.source}, first seed {self.seed}",
+            "policy": self.policy or self.source,
             "size": f"{self.episodes} episodes, {self.steps} steps",
             "success": f"{self.success_rate:.3f}",
+            "mean return": "unknown" if self.mean_return is None else f"{self.mean_return:.3f}",
             "instructions": "; ".join(self.instructions) or "none",
             "depth and heights": self.depth,
             "licence": self.license,

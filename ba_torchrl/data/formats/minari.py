@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -84,7 +85,9 @@ class Minari(Format):
                     path.name,
                     buffers,
                     env=env.spec,
-                    observation_space=gymnasium.spaces.Dict({key: spaces[key] for key in observed}),
+                    observation_space=gymnasium.spaces.Dict(
+                        {key: _plain_space(spaces[key]) for key in observed}
+                    ),
                     action_space=env.action_space,
                     algorithm_name=card.source,
                     author="BA-TorchRL",
@@ -114,6 +117,14 @@ class Minari(Format):
                     arrays[place.rstrip("/")] = values
             episodes.append({name: _plain(values) for name, values in arrays.items()})
         return episodes
+
+
+def _plain_space(space: Any) -> Any:
+    """Return a space; that of flags as a box from 0 to 1, since TorchRL's reader of Minari's data
+    sets takes no MultiBinary."""
+    from gymnasium.spaces import Box, MultiBinary
+
+    return Box(0, 1, space.shape, np.uint8) if isinstance(space, MultiBinary) else space
 
 
 def _plain(values: object) -> np.ndarray:

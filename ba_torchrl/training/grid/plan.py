@@ -55,11 +55,13 @@ class BenchmarkConfig(StrictModel):
     "sacfd_per_so2"."""
     networks: list[str] = Field(min_length=1)
     """Names of preset files in ``configs/network``."""
+    datasets: list[str] = Field(default_factory=list)
+    """Folders of demonstrations in ``demonstrations_path/TASK``, a further axis; empty for none."""
     seeds: Annotated[int, Field(ge=1, le=1000)] | list[int] = 4
     """A number of seeds, from 0 on, or a list of seeds."""
     skip: list[dict[str, str | list[str]]] = Field(default_factory=list)
     """Runs to leave out: each entry gives a name or a list of names for ``task``, ``algorithm``,
-    ``network`` or several of these; runs that match all of them are left out."""
+    ``network``, ``dataset`` or several of these; runs that match all of them are left out."""
     per_task: Overrides = Field(default_factory=dict)
     """By task, fields that override those common to all runs."""
     per_algorithm: Overrides = Field(default_factory=dict)
@@ -82,7 +84,7 @@ class BenchmarkConfig(StrictModel):
         """Whether the grid leaves out a cell.
 
         Args:
-            cell: its ``task``, ``algorithm`` and ``network``.
+            cell: its ``task``, ``algorithm``, ``network`` and ``dataset``.
         """
         return any(
             all(
@@ -160,10 +162,14 @@ def expand(
     }
     runs = []
     for seed, *cell in product(
-        config.seed_list(), config.tasks, config.algorithms, config.networks
+        config.seed_list(),
+        config.tasks,
+        config.algorithms,
+        config.networks,
+        config.datasets or [""],
     ):
-        task, algorithm, network = cell
-        if config.skips(task=task, algorithm=algorithm, network=network):
+        task, algorithm, network, dataset = cell
+        if config.skips(task=task, algorithm=algorithm, network=network, dataset=dataset):
             continue
         values = _merged(
             {
@@ -178,12 +184,18 @@ def expand(
         taken = [name for name in SET_BY_THE_GRID if name in values]
         if taken:
             raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
-        names = (name.replace("/", "_") for name in (task, f"{algorithm}_{network}"))
+        if dataset:
+            if values.get("demonstrations_path") is None:
+                raise ConfigError("datasets: set demonstrations_path, the folder that they are in")
+            where = Path(values["demonstrations_path"], task, dataset)
+            values["demonstrations_path"] = str(where)
+        label = " ".join(filter(None, (algorithm, network, dataset)))
+        names = (name.replace("/", "_").replace(" ", "_") for name in (task, label))
         where = Path(config.folder, *names, f"seed{seed}")
         values |= {
             "task": task,
             "seed": seed,
-            "label": f"{algorithm} {network}",
+            "label": label,
             "benchmark": config.name,
             "run_dir": str(where),
             "resume": True,
@@ -191,7 +203,7 @@ def expand(
         try:
             runs.append(ExperimentConfig.parse(values))
         except ConfigError as error:
-            raise ConfigError(f"{task} with {algorithm} {network}: {error}") from None
+            raise ConfigError(f"{task} with {label}: {error}") from None
     if not runs:
         raise ConfigError("the grid is empty: `skip` leaves everything out")
     return runs
@@ -243,9 +255,11 @@ def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
         "task": TASKS.__getitem__,
         "algorithm": lambda name: preset("algorithm", name),
         "network": lambda name: preset("network", name),
+        "dataset": lambda name: name,  # its folder is checked with the run
     }
     axes = {"task": config.tasks, "algorithm": config.algorithms, "network": config.networks}
-    for axis, names in (*axes.items(), ("seed", config.seed_list())):
+    datasets = ("dataset", config.datasets or [""])
+    for axis, names in (*axes.items(), datasets, ("seed", config.seed_list())):
         if len(set(names)) < len(names) or not names:
             raise ConfigError(f"{axis}s: {names} is empty or names one twice")
     for axis, names in (*axes.items(), *_mentioned(config)):

@@ -174,3 +174,21 @@ def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_
     labels = {run.label for run in runs}
     assert {"sdqfd equi_deictic_asr", "sdqfd asr", "adet equi_deictic_asr"} < labels
     assert "adet asr" not in labels
+
+
+def test_offline_learning_reads_each_set_and_plays_no_episode(monkeypatch):
+    monkeypatch.setattr("ba_torchrl.training.config.check_demonstrations", lambda *_, **__: None)
+    config, _, runs = shipped("offline")
+    methods = {"close_loop": {"bc cnn", "iql cnn"}, "open_loop": {"bc asr", "sdqfd asr"}}
+    found = {(run.task, run.label) for run in runs}
+    assert found == {
+        (task, f"{method} {dataset}")
+        for task in config.tasks
+        for method in methods[TASKS[task].control]
+        for dataset in ("random", "medium", "expert", "mixed")
+    }
+    assert len(found) == 64
+    for run in runs:
+        assert run.demonstrations_path == f"graded/{run.task}/{run.label.split()[-1]}"
+        assert run.pretrain_updates == run.total_updates
+        assert not run.only_successful_demonstrations

@@ -3,7 +3,8 @@
 import pytest
 
 from ba_torchrl.errors import ConfigError
-from tests.training.grid.grids import PICK, PLACE, PRESETS, REACH, planned
+from ba_torchrl.training.graded import GradedSets
+from tests.training.grid.grids import COMMON, PICK, PLACE, PRESETS, REACH, planned
 
 
 def test_a_grid_is_the_product_of_its_axes_ordered_by_seed(tmp_path):
@@ -97,3 +98,21 @@ def test_wrong_grids_are_refused(tmp_path, changes, message):
     with pytest.raises(ConfigError, match=f"(?s){message}"):
         planned(tmp_path, **changes)
     assert not (tmp_path / "grid").exists()
+
+
+def test_datasets_are_an_axis_of_folders_below_the_task(tmp_path):
+    for grade in ("random", "expert"):
+        GradedSets(tmp_path / "sets" / REACH, REACH, 2, COMMON["env"], parallel=False).make(grade)
+    common = {"demonstrations_path": str(tmp_path / "sets")}
+    options = {"datasets": ["random", "expert"], "networks": ["cnn", "small"], "seeds": 1}
+    rule = {"network": "cnn", "dataset": "expert"}
+    runs = planned(tmp_path, common, skip=[rule], **options)
+    assert [run.label for run in runs] == ["sac cnn random", "sac small random", "sac small expert"]
+    assert runs[2].demonstrations_path == str(tmp_path / "sets" / REACH / "expert")
+    assert runs[2].run_dir.endswith("close_loop_block_reaching/sac_small_expert/seed0")
+    with pytest.raises(ConfigError, match=r"no demonstrations at .*block_reaching/medium"):
+        planned(tmp_path, common, **{**options, "datasets": ["medium"]})
+    with pytest.raises(ConfigError, match="datasets: set demonstrations_path"):
+        planned(tmp_path, **options)
+    with pytest.raises(ConfigError, match="names one twice"):
+        planned(tmp_path, common, datasets=["random", "random"])
