@@ -67,9 +67,9 @@ def command_lines() -> list[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory):
-    """Return a folder with one episode, as `ba-torchrl collect` writes it."""
+    """Return a folder with two episodes, as `ba-torchrl collect` writes it."""
     folder = tmp_path_factory.mktemp("demos") / "pulling"
-    words = ["task=close_loop/block_pulling", "episodes=1", "num_envs=1", "parallel=false"]
+    words = ["task=close_loop/block_pulling", "episodes=2", "num_envs=1", "parallel=false"]
     importlib.import_module("ba_torchrl.commands.collect").COMMAND.run([*words, f"path={folder}"])
     return folder
 
