@@ -56,11 +56,9 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     lift_height_m: ClassVar[float] = 0.15
     """Least height of the tool at success, metres."""
-    travel_weight: ClassVar[float] = 3.0
+    travel_weight: ClassVar[float] = 10.0
     """Weight of the number of actions to a grasp in its cost. A policy that imitates the expert has
     to predict which object is grasped: it is a near one."""
-    risk_preferred: ClassVar[float] = 0.5
-    """Largest risk score of a grasp that is chosen for being near."""
     risk_allowed: ClassVar[float] = 1.0
     """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
     first."""
@@ -107,15 +105,14 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         return self._grasp(grasp, heights)
 
     def _penalty(self, grasps: np.ndarray) -> np.ndarray:
-        """Return the additional costs [N] of grasps [N, 6]: slip, and much for a risk.
+        """Return the additional costs [N] of grasps [N, 6]: slip, and much for too high a risk.
 
-        If a near grasp could outweigh its risk, the expert would repeat it after each failure. A
-        gripper that cannot turn has few grasps; it pushes objects until one is good.
+        A gripper that cannot turn has few grasps; it pushes objects until one is good.
         """
         slip, risk = grasps[:, 5], grasps[:, 4]
         if not self.action_limits.turn_rad:
             return slip
-        return slip + RISKY * ((risk > self.risk_preferred) + 1.0 * (risk > self.risk_allowed))
+        return slip + RISKY * (risk > self.risk_allowed)
 
     def _grasp(self, grasp: TopDownGrasp, heights: np.ndarray) -> GripperCommand:
         """Move to the object with open fingers, turn near it, and close them at the end.

@@ -69,7 +69,7 @@ def test_the_expert_descends_while_it_moves_and_turns_near_the_object_only(make)
     assert far.dx_m > 0.05
     assert far.dz_m < -limits.step_m
     assert far.dyaw_rad == 0
-    x, y, z = brick.position[0] - 0.01, brick.position[1], 0.2
+    x, y, z = *brick.position[:2], 0.2
     task.robot.teleport(task.robot.inverse_kinematics((x, y, z), downward(0.0)))
     near = task.expert_command()
     assert near.dz_m < -limits.step_m
