@@ -56,7 +56,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     lift_height_m: ClassVar[float] = 0.15
     """Least height of the tool at success, metres."""
-    travel_weight: ClassVar[float] = 10.0
+    travel_weight: ClassVar[float] = 3.0
     """Weight of the number of actions to a grasp in its cost. A policy that imitates the expert has
     to predict which object is grasped: it is a near one."""
     risk_allowed: ClassVar[float] = 1.0
