@@ -9,6 +9,7 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
+from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M
@@ -29,6 +30,9 @@ from ba_torchrl.tasks.manipulation.progress import lift_height, reach, staged
 
 RISKY = 1e3
 """Cost of a risk, more than that of any way to a grasp."""
+RISK_ALLOWED, RISK_ALLOWED_WITHOUT_YAW = 0.8, 1.0
+"""Largest risk score of a grasp; with only riskier grasps, the expert pushes an object first. A
+gripper that cannot turn has few grasps."""
 TURN_OFFSET_M = 0.02
 """Largest horizontal offset, along each axis, of a gripper that turns to a grasp. The image is
 centred on the gripper, so a policy sees the object whose orientation matters in its centre."""
@@ -56,12 +60,6 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     lift_height_m: ClassVar[float] = 0.15
     """Least height of the tool at success, metres."""
-    travel_weight: ClassVar[float] = 3.0
-    """Weight of the number of actions to a grasp in its cost. A policy that imitates the expert has
-    to predict which object is grasped: it is a near one."""
-    risk_allowed: ClassVar[float] = 1.0
-    """Largest risk score of a grasp; with only riskier grasps, the expert pushes an object
-    first."""
 
     def default_max_attempts(self) -> int:
         """Return the number of attempts of the reference implementation, 1.5 per object."""
@@ -79,30 +77,40 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         return staged(max(reach(self.robot, body) for body in self.objects), 0.0, 0.0)
 
     def expert_command(self) -> GripperCommand:
-        """Grasp the object with the lowest cost and lift it.
-
-        If no object can be grasped, push one until it can.
-        """
+        """Grasp the nearest object that can be grasped and lift it; else push one until it can."""
         robot, limits, planner = self.robot, self.action_limits, self.planner
         if grasped_body(robot) is not None:
             return lift(limits.step_m)
         heights = planner.heights()
         tool = robot.tool_pose()
-        grasp = planner.plan(
-            self.pool.active,
-            tool,
-            limits,
-            heights,
-            penalty=self._penalty,
-            travel_weight=self.travel_weight,
-        )
-        if grasp is None or grasp.risk > self.risk_allowed:
+        grasp = self._plan(tool, heights)
+        if grasp is None or grasp.risk > self._risk_allowed:
             push = PushPlanner(planner, self.terrain).plan(self.pool.active, tool, limits, heights)
             if push is not None:
                 return self._push(push, heights)
         if grasp is None or robot.opening() < IS_OPEN:
             return lift(limits.step_m, OPEN)
         return self._grasp(grasp, heights)
+
+    @property
+    def _risk_allowed(self) -> float:
+        return RISK_ALLOWED if self.action_limits.turn_rad else RISK_ALLOWED_WITHOUT_YAW
+
+    def _plan(self, tool: YawPose, heights: np.ndarray) -> TopDownGrasp | None:
+        """Return the best grasp of the nearest object with one of an allowed risk, else of any.
+
+        A policy that imitates the expert predicts which object it grasps: the nearest is visible.
+        A gripper that cannot turn has few grasps and takes the best of all objects.
+        """
+        limits, objects, others = self.action_limits, self.pool.active, []
+        if not limits.turn_rad:
+            return self.planner.plan(objects, tool, limits, heights, penalty=self._penalty)
+        for body in sorted(objects, key=lambda body: math.dist(body.position[:2], tool[0][:2])):
+            grasp = self.planner.plan([body], tool, limits, heights, penalty=self._penalty)
+            if grasp is not None and grasp.risk <= self._risk_allowed:
+                return grasp
+            others += [grasp] * (grasp is not None)
+        return min(others, key=lambda grasp: grasp.cost, default=None)
 
     def _penalty(self, grasps: np.ndarray) -> np.ndarray:
         """Return the additional costs [N] of grasps [N, 6]: slip, and much for too high a risk.
@@ -112,7 +120,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         slip, risk = grasps[:, 5], grasps[:, 4]
         if not self.action_limits.turn_rad:
             return slip
-        return slip + RISKY * (risk > self.risk_allowed)
+        return slip + RISKY * (risk > self._risk_allowed)
 
     def _grasp(self, grasp: TopDownGrasp, heights: np.ndarray) -> GripperCommand:
         """Move to the object with open fingers, turn near it, and close them at the end.

@@ -108,14 +108,12 @@ class GraspPlanner:
         limits: ActionLimits,
         heights: np.ndarray,
         penalty: Callable[[np.ndarray], np.ndarray] | None = None,
-        travel_weight: float = 1.0,
     ) -> TopDownGrasp | None:
         """Return the grasp of any of the bodies with the lowest cost; None without a grasp.
 
         Args:
             heights: height image of `heights`.
             penalty: returns the additional costs [N] of grasps [N, 6]: x, y, z, yaw, risk, slip.
-            travel_weight: weight of the number of actions to the grasp in the cost.
         """
         (x, y, z), yaw = tool
         yaws = np.arange(YAWS) * np.pi / YAWS if limits.turn_rad else np.array([yaw])
@@ -147,7 +145,7 @@ class GraspPlanner:
                     distance / limits.step_m, turn / limits.turn_rad if limits.turn_rad else 0
                 )
                 travel += max(z - gz, 0.0) / limits.step_m
-                cost = travel_weight * travel + 12 * risk + added_cost
+                cost = travel + 12 * risk + added_cost
                 if best is None or cost < best.cost:
                     best = TopDownGrasp(
                         body, (gx, gy, gz), target_yaw, risk=float(risk), cost=float(cost)
