@@ -79,12 +79,18 @@ class Settings(VectorSettings, EnvSettings):
                 raise ConfigError(message)
         elif len(self.task) > 1:
             raise ConfigError("task: name one; several are for source=graded")
-        if self.path is not None and self.source == "graded":
-            check_writable_folder(self.path)
-        elif self.path is not None:
-            check_new(self.path)
-            check_writable_file(self.path)
+        if self.source == "graded":
+            check_writable_folder(self.folder)
+        else:
+            check_new(self.folder)
+            check_writable_file(self.folder)
         return self
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the demonstrations, or that of the graded sets of all tasks."""
+        name = "graded" if self.source == "graded" else self.task[0].replace("/", "_")
+        return Path(self.path or f"demos/{name}")
 
 
 def main(settings: Settings) -> None:
@@ -101,7 +107,7 @@ def _collect_graded(settings: Settings) -> None:
     least, most = ACCEPTED
     for task in settings.task:
         sets = GradedSets(
-            Path(settings.path or "demos/graded") / task,
+            settings.folder / task,
             task,
             settings.episodes,
             settings.env,
@@ -131,7 +137,7 @@ def _collect_graded(settings: Settings) -> None:
 def _collect(settings: Settings) -> None:
     """Play the expert's episodes, or deconstruct structures."""
     (task,) = settings.task
-    path = settings.path or f"demos/{task.replace('/', '_')}"
+    path = settings.folder
     actions = resolve_env(task, settings.env).actions
     check_noise(settings.noise, settings.source, "noise")
     check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")

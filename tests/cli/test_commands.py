@@ -58,6 +58,7 @@ REFUSED = [
     ("collect", "env.expert=false", "leave it out, and set source"),
     ("collect", "source=deconstruction", "deconstruction has no meaning for close_loop/block_pick"),
     ("collect", "path=run", "run exists already"),
+    ("collect", "task=close_loop/block_pulling", "demos/close_loop_block_pulling exists already"),
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("play", "env.seed=5", "leave it out, and set seed"),
     ("play", "env.expert=true", "leave it out, and set policy"),
@@ -104,6 +105,7 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     (tmp_path / "folder.mp4").mkdir()
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "folder.json").mkdir()
+    (tmp_path / "demos/close_loop_block_pulling").mkdir(parents=True)
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.json").write_text(json.dumps(RUN))
     (tmp_path / "run/scalars.csv").write_text("step,name,value\n5,torn\n")
