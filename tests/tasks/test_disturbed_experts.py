@@ -146,21 +146,25 @@ def test_a_pull_keeps_the_outlines_of_the_blocks_in_the_workspace(make_env):
     ("task", "error"),
     [
         ("close_loop/object_grasping", 0.2),
+        ("close_loop/house_building", 0.2),
         ("open_loop/bottle_arrangement", 0.018),
     ],
 )
 def test_a_policy_with_errors_succeeds(make_env, task, error):
     """A learned policy's actions differ from the expert's, here by a tenth of the range of every
-    component but the gripper, or by 4 mm and 2 degrees (standard deviations)."""
+    component but the gripper, whose opening is nearer to its mean, or by 4 mm and 2 degrees."""
     env = make_env(task, random_orientation=True)
     generator = torch.Generator().manual_seed(0)
     low, high = env.action_spec.space.low, env.action_spec.space.high
     scale = error * (high - low) / 2
     scale[0] = 0.0
+    shrink = torch.ones(len(low))
+    if task.startswith("close_loop"):
+        shrink[0] = 0.7
 
     def with_error(tensordict):
         noise = scale * torch.randn(len(low), generator=generator)
-        action = expert_policy(tensordict)[keys.ACTION] + noise
+        action = expert_policy(tensordict)[keys.ACTION] * shrink + noise
         return tensordict.set(keys.ACTION, action.clamp(low, high))
 
     solved = 0
