@@ -147,6 +147,8 @@ def test_a_pull_keeps_the_outlines_of_the_blocks_in_the_workspace(make_env):
     [
         ("close_loop/object_grasping", 0.2),
         ("close_loop/house_building", 0.2),
+        ("close_loop/corner_picking", 0.2),
+        ("close_loop/drawer_opening", 0.2),
         ("open_loop/bottle_arrangement", 0.018),
     ],
 )

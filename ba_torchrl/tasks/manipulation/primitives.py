@@ -19,11 +19,9 @@ from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 OPEN, CLOSED = 1.0, 0.0
 """The ends of the range of the gripper's opening."""
-IS_OPEN = 0.5
-"""Least opening of an open gripper. With 0.9, a policy whose opening has an error of a tenth rises
-from an object that it could grasp, and the image hardly shows why."""
-IS_CLOSED = 0.1
-"""Largest opening of a closed gripper."""
+IS_OPEN, IS_CLOSED = 0.5, 0.4
+"""Least opening of an open gripper, and largest of a closed one. With 0.9 and 0.1, the expert does
+something else after a policy's small error of the opening, and the image hardly shows why."""
 LEAST_SQUEEZE = 0.01
 """Least difference between the opening of fingers that press on a body and the commanded one."""
 ALIGNED_M = 4e-3
