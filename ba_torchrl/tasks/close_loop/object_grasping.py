@@ -88,7 +88,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
             push = PushPlanner(planner, self.terrain).plan(self.pool.active, tool, limits, heights)
             if push is not None:
                 return self._push(push, heights)
-        if grasp is None or robot.opening() < IS_OPEN:
+        if grasp is None or min(robot.opening(), robot.commanded_opening) < IS_OPEN:
             return lift(limits.step_m, OPEN)
         return self._grasp(grasp, heights)
 
