@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -28,11 +29,11 @@ from ba_torchrl.tasks.manipulation.primitives import (
 )
 from ba_torchrl.tasks.manipulation.progress import lift_height, reach, staged
 
-RISKY = 1e3
-"""Cost of a risk, more than that of any way to a grasp."""
-RISK_ALLOWED, RISK_ALLOWED_WITHOUT_YAW = 0.8, 1.0
-"""Largest risk score of a grasp; with only riskier grasps, the expert pushes an object first. A
-gripper that cannot turn has few grasps."""
+RISK_ALLOWED_WITHOUT_YAW = 1.0
+"""Largest risk score of a grasp of a gripper that cannot turn and has few grasps; with only riskier
+ones, it pushes an object first."""
+SLIP = 5
+"""Column of the slip in the planner's grasps."""
 TURN_OFFSET_M = 0.02
 """Largest horizontal offset, along each axis, of a gripper that turns to a grasp. The image is
 centred on the gripper, so a policy sees the object whose orientation matters in its centre."""
@@ -84,7 +85,8 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
         heights = planner.heights()
         tool = robot.tool_pose()
         grasp = self._plan(tool, heights)
-        if grasp is None or grasp.risk > self._risk_allowed:
+        is_risky = not limits.turn_rad and grasp and grasp.risk > RISK_ALLOWED_WITHOUT_YAW
+        if grasp is None or is_risky:
             push = PushPlanner(planner, self.terrain).plan(self.pool.active, tool, limits, heights)
             if push is not None:
                 return self._push(push, heights)
@@ -92,35 +94,23 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
             return lift(limits.step_m, OPEN)
         return self._grasp(grasp, heights)
 
-    @property
-    def _risk_allowed(self) -> float:
-        return RISK_ALLOWED if self.action_limits.turn_rad else RISK_ALLOWED_WITHOUT_YAW
-
     def _plan(self, tool: YawPose, heights: np.ndarray) -> TopDownGrasp | None:
-        """Return the best grasp of the nearest object with one of an allowed risk, else of any.
+        """Return the best grasp of the nearest object that has one.
 
         A policy that imitates the expert predicts which object it grasps: the nearest is visible.
         A gripper that cannot turn has few grasps and takes the best of all objects.
         """
-        limits, objects, others = self.action_limits, self.pool.active, []
-        if not limits.turn_rad:
-            return self.planner.plan(objects, tool, limits, heights, penalty=self._penalty)
-        for body in sorted(objects, key=lambda body: math.dist(body.position[:2], tool[0][:2])):
-            grasp = self.planner.plan([body], tool, limits, heights, penalty=self._penalty)
-            if grasp is not None and grasp.risk <= self._risk_allowed:
-                return grasp
-            others += [grasp] * (grasp is not None)
-        return min(others, key=lambda grasp: grasp.cost, default=None)
 
-    def _penalty(self, grasps: np.ndarray) -> np.ndarray:
-        """Return the additional costs [N] of grasps [N, 6]: slip, and much for too high a risk.
+        def best(bodies: Sequence[Body]) -> TopDownGrasp | None:
+            return self.planner.plan(
+                bodies, tool, self.action_limits, heights, penalty=lambda grasps: grasps[:, SLIP]
+            )
 
-        A gripper that cannot turn has few grasps; it pushes objects until one is good.
-        """
-        slip, risk = grasps[:, 5], grasps[:, 4]
+        objects = self.pool.active
         if not self.action_limits.turn_rad:
-            return slip
-        return slip + RISKY * (risk > self._risk_allowed)
+            return best(objects)
+        nearest = sorted(objects, key=lambda body: math.dist(body.position[:2], tool[0][:2]))
+        return next(filter(None, (best([body]) for body in nearest)), None)
 
     def _grasp(self, grasp: TopDownGrasp, heights: np.ndarray) -> GripperCommand:
         """Move to the object with open fingers, turn near it, and close them at the end.
