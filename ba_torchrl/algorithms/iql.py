@@ -42,8 +42,9 @@ class IQLConfig(LearnerConfig):
     """Expectile of the actions' values that is the value of a state."""
     temperature: float = Field(default=10.0, ge=0)
     """Inverse temperature: factor of the advantage in the exponent of a sample's weight."""
-    std_min: float = Field(default=0.1, gt=0, le=1)
-    """Least standard deviation of the policy, which bounds the likelihood of the data."""
+    std_min: float = Field(default=0.3, gt=0, le=1)
+    """Least standard deviation of the policy, which bounds the likelihood of the data. With 0.1,
+    the largest errors can drive a mean to an end of the range, where it stays."""
     gamma: float = Field(default=0.99, gt=0, le=1)
     """Discount factor."""
     tau: float = Field(default=0.005, gt=0, le=1)

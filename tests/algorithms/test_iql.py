@@ -11,7 +11,7 @@ from tests.algorithms.tiny import build, run, transitions
 UNUSUAL = {
     "expectile": 0.8,
     "temperature": 2.5,
-    "std_min": 0.3,
+    "std_min": 0.2,
     "gamma": 0.7,
     "tau": 0.3,
     "batch_size": 6,
