@@ -130,6 +130,13 @@ def test_what_is_no_policy_is_named(run, tmp_path):
         ba_torchrl.load_policy(path)
 
 
+def test_the_cards_of_shipped_policies_name_the_command_that_finds_them():
+    shipped = policies.shipped_policies()
+    commands = {task: ba_torchrl.load_policy(task).card.evaluate for task in shipped}
+    start = "ba-torchrl evaluate policy=trained task="
+    assert [task for task in shipped if not commands[task].startswith(f"{start}{task} ")] == []
+
+
 QUICK = (
     "close_loop/block_picking",
     "close_loop/drawer_opening",
