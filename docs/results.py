@@ -77,23 +77,28 @@ def page_with_results(text: str) -> str:
 def _section(section: Section) -> Iterator[str]:
     name = section.title
     runs = [run.result for group in section.groups for run in group.runs]
-    machines = sorted({f"{run.hardware['cpu']}, {run.hardware['threads']} thread" for run in runs})
+    cpus = sorted({run.hardware["cpu"] for run in runs})
+    marks = {cpu: f" ({'abcdefgh'[number]})" if cpus[1:] else "" for number, cpu in enumerate(cpus)}
     days = sorted({run.finished[:10] for run in runs})
     yield f"## {', '.join(tasks_by_heading(section.tasks))} (`{name}`)\n"
-    yield f"`ba-torchrl benchmark benchmark={name} threads=1 jobs=2`; {'; '.join(machines)};"
-    yield f"{days[0]} to {days[-1]}.\n"
+    yield f"`ba-torchrl benchmark benchmark={name} threads=1 jobs=2`;"
+    yield f"{', '.join(cpu + mark for cpu, mark in marks.items())}; {days[0]} to {days[-1]}.\n"
     yield f"![Success over updates](results/{name}.svg)\n"
     yield f"| {' | '.join(HEADER)} |"
     yield "|" + "---|" * len(HEADER)
     before = ""
     for group in section.groups:
         for run in group.runs:
-            yield f"| {' | '.join(_cells(group, run, is_first=group.task != before))} |"
+            yield f"| {' | '.join(_cells(group, run, marks, is_first=group.task != before))} |"
             before = group.task
 
 
-def _cells(group: Group, run: Run, *, is_first: bool) -> list[str]:
-    """Return the row of a run; the first one of a task has its picture."""
+def _cells(group: Group, run: Run, marks: dict[str, str], *, is_first: bool) -> list[str]:
+    """Return the row of a run; the first one of a task has its picture.
+
+    Args:
+        marks: what stands behind the minutes, by processor.
+    """
     result, task = run.result, group.task
     final, score = result.final, describe(task).experts.get(result.config["env"]["robot"])
     low, high = wilson_interval(round(final.success_rate * final.episodes), final.episodes)
@@ -109,7 +114,7 @@ def _cells(group: Group, run: Run, *, is_first: bool) -> list[str]:
         str(final.updates),
         str(result.curve[-1].updates),
         str(result.curve[-1].env_steps),
-        f"{result.seconds / 60:.0f}",
+        f"{result.seconds / 60:.0f}{marks[result.hardware['cpu']]}",
         result.versions.get("commit", ""),
     ]
 
