@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
@@ -296,13 +296,12 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             self._conditions, valid = evaluate_at_rest(scene)
             success = valid and all(self._conditions.values())
             self._observation = self._observe(scene)
-            before, self._progress = self._progress, self._measure_progress(scene)
         except Exception:
             fault, self._conditions = True, dict.fromkeys(self._condition_names, False)
             self._on_fault()
         else:
             self._fault_counter.count_step()
-            self._check_progress()
+            before, self._progress = self._progress, self._measure_progress(scene)
         # the dense rewards that would follow a success belong to its value
         cuts_rewards = success and self.config.reward == "dense"
         terminated = not fault and not cuts_rewards and (success or not valid)
@@ -431,28 +430,31 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             rng = np.random.default_rng([self.base_seed, self._episode - 1])
             try:
                 scene = self._episodes.begin(rng, with_new_objects=with_new_objects)
-                self._progress = self._measure_progress(scene)
-                self._check_progress()
-                return self._observe(scene)
+                observation = self._observe(scene)
             except SIMULATOR_ERRORS:
                 self._on_fault()
+            else:
+                self._progress = self._measure_progress(scene)
+                return observation
 
     def _measure_progress(self, scene: Scene) -> float:
-        """Return the task's progress, 0 if the reward is sparse."""
-        if self.config.reward == "sparse":
-            return 0.0
-        with scene.world.fixed_poses():
-            return scene.task.progress()
-
-    def _check_progress(self) -> None:
-        """Check the progress that the task returned: another value is no fault of the simulator.
+        """Return the task's progress, 0 if the reward is sparse.
 
         Raises:
-            ValueError: it is not in [0, 1).
+            ConfigError: the task's method raises, or returns no number in [0, 1).
         """
-        if not (isinstance(self._progress, Real) and 0 <= self._progress < 1):
-            method = f"{self.task_class.__name__}.progress"
-            raise ValueError(f"{self.task_id}: {method} must be in [0, 1), not {self._progress}")
+        if self.config.reward == "sparse":
+            return 0.0
+        method = f"{self.task_id}: {self.task_class.__name__}.progress"
+        try:
+            with scene.world.fixed_poses():
+                value = scene.task.progress()
+        except Exception as error:
+            raise ConfigError(f"{method} raised {type(error).__name__}: {error}") from error
+        with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
+            if 0 <= (progress := float(value)) < 1:
+                return progress
+        raise ConfigError(f"{method} must be a number in [0, 1), not {value!r}")
 
     def _dense_reward(self, progress_before: float, sparse: float) -> float:
         """Return the reward of the last step; see `EnvConfig.reward`.

@@ -11,6 +11,8 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ba_torchrl.errors import ConfigError
+
 FLAGS = ("done", "terminated", "truncated")
 
 
@@ -22,7 +24,7 @@ class FakeEnv(EnvBase):
     """Pixels are drawn from the seed; the reward is the sum of the action.
 
     A file named ``<pid>.<when>`` (when: step, reset) in ``folder`` makes that process raise,
-    hang or die as the file says; it is removed first, unless the word starts with "always".
+    refuse, hang or die as the file says; it is removed first, unless the word starts with "always".
     A file named ``build`` makes every constructor raise, kill its process (``kill``), or wait until
     the file is removed (``wait``).
     """
@@ -71,6 +73,8 @@ class FakeEnv(EnvBase):
                 order = path.read_text()
                 if not order.startswith("always"):
                     path.unlink()
+                if order == "refuse":
+                    raise ConfigError("the task is wrong")
                 if order.endswith("raise"):
                     raise ArithmeticError("the simulator exploded")
                 if order.endswith("hang"):

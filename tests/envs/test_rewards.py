@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 
 import gymnasium
 import numpy as np
@@ -253,17 +254,35 @@ def test_a_fault_has_no_reward(make, monkeypatch):
 
 
 @pytest.mark.parametrize("at_reset", [True, False])
-@pytest.mark.parametrize("value", [1.0, -0.1, math.nan, None])
-def test_a_progress_outside_its_range_is_no_fault_of_the_simulator(
-    make, monkeypatch, value, at_reset
+@pytest.mark.parametrize(
+    ("progress", "message"),
+    [
+        (lambda _: 1.0, "must be a number in [0, 1), not 1.0"),
+        (lambda _: -0.1, "must be a number in [0, 1), not -0.1"),
+        (lambda _: math.nan, "must be a number in [0, 1), not nan"),
+        (lambda _: None, "must be a number in [0, 1), not None"),
+        (lambda _: torch.zeros(2), "must be a number in [0, 1), not tensor([0., 0.])"),
+        (lambda _: 1 / 0, "raised ZeroDivisionError: division by zero"),
+    ],
+)
+def test_an_error_of_progress_is_no_fault_of_the_simulator(
+    make, monkeypatch, progress, message, at_reset
 ):
     env = make(PICKING, reward="dense", obs_type="vec")
     state = None if at_reset else env.reset()
-    monkeypatch.setattr(BlockPicking, "progress", lambda task: value)
-    message = rf"{PICKING}: BlockPicking\.progress must be in \[0, 1\), not {value}"
-    with pytest.raises(ValueError, match=message):
+    monkeypatch.setattr(BlockPicking, "progress", progress)
+    with pytest.raises(ConfigError, match=re.escape(f"{PICKING}: BlockPicking.progress {message}")):
         env.reset() if at_reset else env.step(state.set(keys.ACTION, torch.zeros(5)))
     assert env.faults == 0
+
+
+@pytest.mark.parametrize("value", [torch.tensor(0.5), np.float32(0.5), np.array(0.5), 0])
+def test_a_progress_of_any_kind_of_number_is_a_reward(make, monkeypatch, value):
+    env = make(PICKING, reward="dense", obs_type="vec")
+    state = env.reset()
+    monkeypatch.setattr(BlockPicking, "progress", lambda _: value)
+    state = env.step(state.set(keys.ACTION, torch.zeros(5)))[keys.NEXT]
+    assert rewards(state) == [float(value)]
 
 
 def test_a_task_without_a_dense_reward_names_those_that_have_one():

@@ -21,7 +21,7 @@ from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.replacement import Replacements, seed_worker
 from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker, wait_until
-from ba_torchrl.errors import WorkerError
+from ba_torchrl.errors import ConfigError, WorkerError
 
 MakeEnv = Callable[[], EnvBase]
 
@@ -46,7 +46,8 @@ class VectorEnv(SeededVector, ParallelEnv):
     The other workers keep their episodes, and step while the new worker starts. For the environment
     of the failed worker, the step returns the last valid observation with ``fault``, ``truncated``
     and ``done`` set and a reward of zero; TorchRL then resets it like any environment that is done.
-    Actions are validated in this process before they are sent.
+    Actions are validated in this process before they are sent. A `ConfigError` that an environment
+    raises is raised in this process, and its worker is not replaced.
 
     This reset waits for the new worker, unless ``workers.wait_for_restarts`` is False. Then the
     environment is absent until the worker is ready: the reset returns the last valid observation
@@ -455,6 +456,7 @@ def ask_all(
 
     Raises:
         WorkerError: a worker has failed.
+        ConfigError: an environment raised it.
     """
     for worker, args in zip(workers, arguments, strict=True):
         worker.check()
@@ -463,7 +465,7 @@ def ask_all(
     for worker in workers:
         try:
             results.append(worker.read(timeout_s)[1])
-        except WorkerError as error:
+        except (WorkerError, ConfigError) as error:
             worker.abort()  # a late answer would be taken for that to the next command
             failure = error
     if failure is not None:

@@ -23,7 +23,7 @@ from typing import Any
 import torchrl
 from torch import multiprocessing as mp
 
-from ba_torchrl.errors import WorkerError
+from ba_torchrl.errors import ConfigError, WorkerError
 
 logger = logging.getLogger(__name__)
 
@@ -142,6 +142,7 @@ class Worker:
         Raises:
             WorkerError: the worker has ended, or sends nothing for ``timeout_s`` seconds.
             EnvironmentRaisedError: the environment raised, or what it needs cannot be imported.
+            ConfigError: the environment raised it; in a new process it would again.
         """
         try:
             if not self.pipe.poll(timeout_s):
@@ -158,7 +159,11 @@ class Worker:
                 ) from None
             raise WorkerError(reason) from None
         if isinstance(message, tuple) and message[0] == _FAILED:
-            raise EnvironmentRaisedError(f"it raised\n{message[1]}")
+            _, config_error, text = message
+            error = EnvironmentRaisedError(f"it raised\n{text}")
+            if config_error is not None:
+                raise ConfigError(config_error) from error
+            raise error
         return message
 
     def check(self) -> None:
@@ -225,9 +230,10 @@ def _run_worker(loop: Callable[..., None], options: dict[str, Any], parent: int)
     pipe: Connection = options["child_pipe"]
     try:
         loop(**options)
-    except BaseException:
+    except BaseException as error:
+        config_error = str(error) if isinstance(error, ConfigError) else None
         with contextlib.suppress(OSError):  # the parent has ended
-            pipe.send((_FAILED, traceback.format_exc()))
+            pipe.send((_FAILED, config_error, traceback.format_exc()))
         os._exit(1)  # skip the clean-up of the failed environment
 
 

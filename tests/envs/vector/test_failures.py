@@ -13,6 +13,7 @@ from fake_env import FakeEnv, act, assert_lost, assert_stepped
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.parallel import VectorEnv
+from ba_torchrl.errors import ConfigError
 
 
 class TestFailures:
@@ -148,6 +149,17 @@ class TestFailures:
         with pytest.raises(RuntimeError, match="worker 0 failed 3 times"):
             env.reset()
         assert env.is_closed
+
+    @pytest.mark.parametrize("when", ["step", "reset"])
+    def test_of_the_configuration_are_raised_at_once(self, make_fakes, tmp_path, when):
+        env = make_fakes(3, folder=tmp_path)
+        state = act(env, env.reset())
+        (tmp_path / f"{env.worker_pids[1]}.{when}").write_text("refuse")
+        with pytest.raises(ConfigError, match=r"^the task is wrong$"):
+            env.step(state) if when == "step" else env.reset()
+        assert env.restarts == 0
+        state = env.reset()
+        assert_stepped(env.step(act(env, state.clone())), 1, state)
 
     def test_to_build_raise_with_the_cause(self, tmp_path):
         env = VectorEnv(
