@@ -11,6 +11,7 @@ ba-torchrl collect task=open_loop/house_building_4 source=deconstruction replays
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -44,7 +45,7 @@ from ba_torchrl.data.time_reversal import check_has_structure, replay_scores
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.training.graded import ACCEPTED, GRADES, GradedSets
+from ba_torchrl.training.graded import ACCEPTED, GRADES, GradedSets, untrained
 
 _NOT_GRADED = ("replays", "only_successful", "noise", "turn_noise")
 
@@ -77,11 +78,17 @@ class Settings(VectorSettings, EnvSettings):
         if self.source == "graded":
             for message in changed(self, _NOT_GRADED, "with source=graded; leave it out"):
                 raise ConfigError(message)
-        elif len(self.task) > 1:
-            raise ConfigError("task: name one; several are for source=graded")
-        if self.source == "graded":
+            if len(set(self.task)) < len(self.task):
+                raise ConfigError("task: name each one once")
+            for sets in self.graded_sets():
+                try:
+                    untrained(sets)
+                except ConfigError as error:
+                    raise ConfigError(f"medium of {sets.task}: {error}") from None
             check_writable_folder(self.folder)
         else:
+            if len(self.task) > 1:
+                raise ConfigError("task: name one; several are for source=graded")
             check_new(self.folder)
             check_writable_file(self.folder)
         return self
@@ -91,6 +98,20 @@ class Settings(VectorSettings, EnvSettings):
         """The folder of the demonstrations, or that of the graded sets of all tasks."""
         name = "graded" if self.source == "graded" else self.task[0].replace("/", "_")
         return Path(self.path or f"demos/{name}")
+
+    def graded_sets(self) -> Iterator[GradedSets]:
+        """Yield the graded sets of each task."""
+        for task in self.task:
+            yield GradedSets(
+                self.folder / task,
+                task,
+                self.episodes,
+                self.env,
+                self.seed,
+                self.num_envs,
+                self.parallel,
+                self.plugins,
+            )
 
 
 def main(settings: Settings) -> None:
@@ -105,31 +126,21 @@ def _collect_graded(settings: Settings) -> None:
     """Make every set that is missing; a task that has no medium policy does not stop the others."""
     problems = []
     least, most = ACCEPTED
-    for task in settings.task:
-        sets = GradedSets(
-            settings.folder / task,
-            task,
-            settings.episodes,
-            settings.env,
-            settings.seed,
-            settings.num_envs,
-            settings.parallel,
-            settings.plugins,
-        )
+    for sets in settings.graded_sets():
         try:
             for grade in GRADES:
                 with progress_bar(total=settings.episodes, unit="episode") as bar:
                     sets.make(grade, lambda _, bar=bar: bar.update())
                 found = read_metadata(sets.path(grade))
                 print(
-                    f"{task} {grade}: {found['episodes']} episodes, success "
+                    f"{sets.task} {grade}: {found['episodes']} episodes, success "
                     f"{found['success_rate']:.2f}, mean return {found['mean_return']:.2f}, "
                     f"{found['policy']}, in {sets.path(grade)}"
                 )
                 if grade == "medium" and not least <= found["success_rate"] <= most:
                     problems.append(f"{sets.path(grade)}: success is not from {least} to {most}")
         except ConfigError as error:
-            problems.append(f"{task}: {error}")
+            problems.append(f"{sets.task}: {error}")
     if problems:
         raise ConfigError("; ".join(problems))
 

@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
-from ba_torchrl.algorithms.base import SeedUse, derive_seed
+from ba_torchrl.algorithms.base import Learner, SeedUse, derive_seed
 from ba_torchrl.data.demo_files import (
     check_demonstrations,
     load_demonstrations,
@@ -199,6 +199,29 @@ class GradedSets:
         return [episode.exclude(*others) for episode in played]
 
 
+def untrained(sets: GradedSets) -> tuple[ExperimentConfig, Learner]:
+    """Return the configuration of medium and its learner before any update.
+
+    Args:
+        sets: task, parameters, episodes and seed.
+
+    Raises:
+        ConfigError: the parameters are wrong, or the network does not take the images.
+    """
+    config = ExperimentConfig.parse(
+        {
+            "task": sets.task,
+            "env": sets.env,
+            "seed": sets.seed,
+            "plugins": list(sets.plugins),
+            "demonstrations": sets.episodes,
+            "total_updates": MOST_UPDATES,
+            **_MEDIUM[resolve_env(sets.task, sets.env).task_class.control],
+        }
+    )
+    return config, build_algorithm(config)
+
+
 def half_trained(
     sets: GradedSets, env: EnvBase, demonstrations: Sequence[TensorDict]
 ) -> tuple[Policy, str]:
@@ -216,20 +239,9 @@ def half_trained(
         The policy, and how it was trained.
 
     Raises:
-        ConfigError: no policy has such a success rate, or its network does not take the images.
+        ConfigError: no policy has such a success rate, or as `untrained`.
     """
-    config = ExperimentConfig.parse(
-        {
-            "task": sets.task,
-            "env": sets.env,
-            "seed": sets.seed,
-            "plugins": list(sets.plugins),
-            "demonstrations": len(demonstrations),
-            "total_updates": MOST_UPDATES,
-            **_MEDIUM[resolve_env(sets.task, sets.env).task_class.control],
-        }
-    )
-    learner = build_algorithm(config)
+    config, learner = untrained(sets)
     learner.on_demonstrations(demonstrations)
     policy = acting_on(learner.policy, config.torch_device)
     seed = derive_seed(sets.seed, SeedUse.DEMONSTRATIONS, 1 + len(GRADES))

@@ -141,6 +141,22 @@ def test_the_command_makes_all_sets_and_flags_a_medium_far_from_half(
     assert all((tmp_path / TASK / grade).is_dir() for grade in GRADES)
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("env.obs_size=32", "this network takes images of 64 or 128 px, got 32"),
+        ("env.obs_type=vec", "the networks take images"),
+        ("env.obs_sze=3", "unknown parameter 'obs_sze'"),
+        (f"task=[{TASK},{TASK}]", "task: name each one once"),
+    ],
+)
+def test_the_command_refuses_settings_before_it_makes_a_folder(tmp_path, word, message):
+    words = ["source=graded", word, f"path={tmp_path}/new"]
+    with pytest.raises(ConfigError, match=message):
+        collect.COMMAND.run.__wrapped__(collect.COMMAND, words)
+    assert not (tmp_path / "new").exists()
+
+
 def test_random_actions_of_open_loop_have_the_primitive_that_has_an_effect(tmp_path):
     task, env = "open_loop/block_stacking", {"obs_size": 64}
     sets = GradedSets(tmp_path, task, 2, env, num_envs=1, parallel=False)
