@@ -17,7 +17,6 @@ import numpy as np
 from gymnasium import spaces
 
 from ba_torchrl.data.formats.base import FORMATS, Entry
-from ba_torchrl.envs.description import summary
 from ba_torchrl.envs.gym import GymEnv
 
 TASKS = ("close_loop/block_picking", "close_loop/block_stacking")
@@ -58,8 +57,8 @@ class LeRobotEnv(gymnasium.Wrapper):
 
     @property
     def task_description(self) -> str:
-        """The goal in one sentence."""
-        return getattr(self.env.torchrl_env, "instruction", "") or summary(self.task)
+        """The goal of the episode in one sentence; before the first reset, the id of the task."""
+        return self.env.torchrl_env.instruction or self.task
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -106,7 +105,12 @@ def make_env(
         n_envs: environments of a vector.
         use_async_envs: one process per environment.
         cfg: LeRobot's configuration; the task that it names is the only one.
+
+    Raises:
+        ValueError: ``n_envs`` is less than 1.
     """
+    if n_envs < 1:
+        raise ValueError(f"n_envs must be at least 1, not {n_envs}")
     task = getattr(cfg, "task", None)
     vector = gymnasium.vector.AsyncVectorEnv if use_async_envs else gymnasium.vector.SyncVectorEnv
     return {

@@ -44,11 +44,12 @@ def test_a_suite_of_vectors(hub, n_envs, use_async_envs):
         assert isinstance(vector, kind)
         assert vector.num_envs == n_envs
         assert vector.call("task") == ("close_loop/block_picking",) * n_envs
-        assert all(len(text) > 10 for text in vector.call("task_description"))
+        assert vector.call("task_description") == ("close_loop/block_picking",) * n_envs
         assert vector.call("_max_episode_steps") == (3,) * n_envs
         observation, _ = vector.reset(
             seed=list(range(n_envs)), options={"lerobot_new_rollout": True}
         )
+        assert vector.call("task_description") == ("pick up the red block",) * n_envs
         assert vector.observation_space.contains(observation)
         assert observation["images.pixels"].shape == (n_envs, 1, 64, 64)
         assert observation["agent_pos"].dtype == np.float32
@@ -63,6 +64,11 @@ def test_a_suite_of_vectors(hub, n_envs, use_async_envs):
         assert info["is_success"].tolist() == [False] * n_envs
     finally:
         close(suites)
+
+
+def test_a_vector_without_environments_is_refused(hub):
+    with pytest.raises(ValueError, match="n_envs must be at least 1, not 0"):
+        hub.make_env(n_envs=0)
 
 
 def test_the_configuration_names_the_task(hub):
