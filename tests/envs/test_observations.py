@@ -190,9 +190,10 @@ def test_a_copy_has_the_instruction(make):
         other.close()
 
 
-def test_the_size_of_a_camera_that_is_not_observed_is_refused(make):
-    with pytest.raises(ConfigError, match="camera_size has no effect"):
-        make(PICKING, camera_size=64)
+@pytest.mark.parametrize("names", [(), ("proprio", "joints", "instruction")])
+def test_the_size_of_a_camera_that_is_not_observed_is_refused(make, names):
+    with pytest.raises(ConfigError, match=r"camera_size has no effect .*'segmentation'"):
+        make(PICKING, *names, camera_size=64)
 
 
 def test_an_instruction_follows_the_parameters_and_the_episode(make):
