@@ -171,7 +171,7 @@ def check_demonstrations(
 
 
 def _is_own(path: Path, mapping: object) -> bool:
-    """Whether there is a folder that `save_demonstrations` wrote, or nothing known.
+    """Whether there is a folder that `save_demonstrations` wrote, or, unmapped, nothing known.
 
     Raises:
         ConfigError: there is one, and a mapping of somebody else's entries.
@@ -179,7 +179,7 @@ def _is_own(path: Path, mapping: object) -> bool:
     is_own = os.path.exists(path / _METADATA_FILE)
     if is_own and mapping is not None:
         raise ConfigError(f"{path} has our entries; leave out the mapping (demonstrations_mapping)")
-    return is_own or find_format(path) is None
+    return is_own or (mapping is None and find_format(path) is None)
 
 
 def read_metadata(path: Path) -> dict[str, Any]:

@@ -69,8 +69,8 @@ def export_demonstrations(
         policy: which acted, in words.
 
     Raises:
-        ConfigError: the format is unknown or its package missing, or ``path`` exists or has not
-            the format's suffix.
+        ConfigError: the format is unknown or its package missing, ``path`` exists or has not the
+            format's suffix, or an episode has other entries or shapes than the environment.
         ValueError: there are no episodes.
     """
     form, path = FORMATS[format], Path(path)
@@ -81,8 +81,18 @@ def export_demonstrations(
     if os.path.lexists(path):
         raise ConfigError(f"{path} exists already; choose another path")
     roles = _roles(episodes[0])
+    specs = _specs(task, env)
+    if missing := {*roles, *specs} - set.intersection(*(set(_roles(each)) for each in episodes)):
+        raise ConfigError(f"an episode has no {', '.join(sorted(missing))}")
     arrays = [_to_arrays(episode, roles) for episode in episodes]
     entries = {key: _entry(key, role, arrays[0][key]) for key, role in roles.items()}
+    shapes = {key: entry.shape for key, entry in entries.items()}
+    shapes |= {key: tuple(spec.shape) for key, spec in specs.items()}
+    for number, each in enumerate(arrays):
+        for key, shape in shapes.items():
+            if each[key].shape[1:] != shape:
+                found = f"the shape {list(each[key].shape[1:])}"
+                raise ConfigError(f"episode {number}: {key} has {found}, needed {list(shape)}")
     names = form.names(entries)
     entries = {key: entry.model_copy(update={"name": names[key]}) for key, entry in entries.items()}
     values = env_values(task, env)
@@ -134,8 +144,9 @@ def import_demonstrations(
         env: fields of `EnvConfig` of the environments.
         mapping: by our keys, the names in somebody else's file: a YAML file, or its values. None
             for a file that `export_demonstrations` wrote. Without ``success``, every episode ends
-            in one; without ``terminated``, ``truncated`` and ``reward``, these follow from it. If
-            the observation after the last action is not in the file, the last one is repeated.
+            in one; without ``terminated``, ``truncated`` and ``reward``, these follow from it,
+            which only sparse rewards allow. If the observation after the last action is not in the
+            file, the last one is repeated.
 
     Raises:
         ConfigError: task or parameters differ from those of the card; or an entry is missing, or
@@ -152,7 +163,12 @@ def import_demonstrations(
                 f"(demonstrations_mapping). It holds {_listed(read_file(form, path))}"
             )
         check_same_environment(path, task, env, card.task, card.env)
-        return [_to_episode(card.entries, arrays) for arrays in read_file(form, path)]
+        episodes = _to_episodes(path, card.entries, read_file(form, path))
+        if len(episodes) != card.episodes:
+            raise ConfigError(
+                f"{path} holds {len(episodes)} episodes, its card says {card.episodes}"
+            )
+        return episodes
     return _mapped(form, path, task, env, DemonstrationMapping.parse(mapping))
 
 
@@ -167,7 +183,10 @@ def _mapped(
             f"{path}: the environment has no {', '.join(sorted(unknown))}. "
             f"Known: {', '.join(sorted(wanted))}"
         )
-    if missing := specs.keys() - mapping.entries.keys():
+    needed = specs.keys()
+    if env_values(task, env)["reward"] != "sparse":
+        needed |= {keys.REWARD, keys.TERMINATED}
+    if missing := needed - mapping.entries.keys():
         raise ConfigError(f"{path}: the mapping has no {', '.join(sorted(missing))}")
     episodes = []
     for number, raw in enumerate(read_file(form, path)):
@@ -179,6 +198,8 @@ def _mapped(
                     values = _fitted(values, specs[key])
                 elif key in RESULTS:
                     values = _one_number(values)
+                elif values.dtype.kind not in "US":
+                    raise ConfigError("is no text")
                 arrays[key] = values
             except ConfigError as error:
                 raise ConfigError(f"{path}, episode {number}: {key}: {error}") from None
@@ -197,7 +218,7 @@ def _mapped(
         )
         for key, values in episodes[0].items()
     }
-    return [_to_episode(entries, arrays) for arrays in episodes]
+    return _to_episodes(path, entries, episodes)
 
 
 def _entry(key: str, role: Role, values: np.ndarray) -> Entry:
@@ -333,13 +354,28 @@ def _to_array(tensordict: TensorDictBase, key: str) -> np.ndarray:
     return values.numpy() if isinstance(values, torch.Tensor) else np.array(values.tolist())
 
 
-def _to_episode(entries: Mapping[str, Entry], arrays: Arrays) -> TensorDict:
-    """Return an episode [T] as training has it, from the entries of a file.
+def _to_episodes(
+    path: Path, entries: Mapping[str, Entry], episodes: Sequence[Arrays]
+) -> list[TensorDict]:
+    """Return episodes [T] as training has them, from the entries of a file.
 
     Raises:
-        ConfigError: an entry is missing or has another shape than the card says.
+        ConfigError: an entry is missing or has another shape than the card says, or an episode has
+            no steps.
     """
-    steps = len(arrays[entries[keys.ACTION].name])
+    converted = []
+    for number, arrays in enumerate(episodes):
+        try:
+            converted.append(_to_episode(entries, arrays))
+        except ConfigError as error:
+            raise ConfigError(f"{path}, episode {number}: {error}") from None
+    return converted
+
+
+def _to_episode(entries: Mapping[str, Entry], arrays: Arrays) -> TensorDict:
+    steps = len(arrays.get(entries[keys.ACTION].name, ()))
+    if not steps:
+        raise ConfigError("there are no actions")
     now: dict[str, Any] = {}
     following: dict[str, Any] = {}
     for key, entry in entries.items():

@@ -199,8 +199,9 @@ def test_torchrl_reads_what_minari_wrote(collected, tmp_path, monkeypatch):
 
 def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_path, episodes):
     options = {"format": "minari", "task": TASK, "env": ENV, "seed": 0}
-    with pytest.raises(ConfigError, match="such as pick ing-v0"):
-        export_demonstrations(tmp_path / "pick ing", collected, **options)
+    for name in ("pick ing", "picking", "picking-v"):
+        with pytest.raises(ConfigError, match=f"such as {name}-v0"):
+            export_demonstrations(tmp_path / name, collected, **options)
     with pytest.raises(ConfigError, match=r"does not observe .*wrist_rgb"):
         export_demonstrations(tmp_path / "a-v0", episodes, **options)
 
@@ -319,6 +320,7 @@ def test_results_of_another_robot_are_mapped(tmp_path):
         ({"action": {"source": "actions", "components": [9]}}, "action: actions.*out of bounds"),
         ({"action": {"source": "actions", "scale": [1, 2]}}, "action: actions.*broadcast"),
         ({"action": {"sauce": "actions"}}, "mapping: action.*: Field required"),
+        ({"instruction": "obs/state"}, "episode 0: instruction: is no text"),
     ],
 )
 def test_mappings_that_do_not_fit_are_refused_by_name(changes, message, tmp_path):
@@ -412,6 +414,53 @@ def test_cards_of_others_are_not_read(tmp_path):
         assert len(load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)) == 2
 
 
+def test_dense_rewards_are_not_made_up(tmp_path):
+    path = foreign(tmp_path / "a.hdf5", progress=np.array([0.1, 0.2, 1.0]), over=np.zeros(3))
+    options = {"task": TASK, "env": {**ENV, "reward": "dense"}}
+    with pytest.raises(ConfigError, match="the mapping has no reward, terminated"):
+        load_demonstrations(path, mapping=FOREIGN, **options)
+    results = {"reward": "progress", "terminated": "over"}
+    found = load_demonstrations(path, mapping={**FOREIGN, **results}, **options)[0]["next"]
+    assert found["reward"].flatten().tolist() == pytest.approx([0.1, 0.2, 1.0])
+    assert found["truncated"].flatten().tolist() == [False, False, True]
+
+
+def test_episodes_that_differ_are_not_exported(episodes, tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"episode 0: pixels .*\[1, 64, 64\], needed \[1, 128, 128\]"
+    ):
+        exported(tmp_path, episodes, "hdf5", env={})
+    odd = [episodes[0], episodes[1].exclude("proprio", ("next", "proprio"))]
+    with pytest.raises(ConfigError, match="an episode has no proprio"):
+        exported(tmp_path, odd, "hdf5")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda card: card["entries"].pop("action"), "is damaged: .*entries lack action"),
+        (lambda card: card["entries"]["pixels"].update(dtype="foo"), "is damaged: .*'foo'"),
+        (lambda card: card.update(episodes=7), "holds 3 episodes, its card says 7"),
+        (lambda card: card["entries"]["proprio"].update(name="no"), "episode 0: .* no 'no', which"),
+    ],
+)
+def test_a_card_that_does_not_fit_its_file_is_refused(damage, message, episodes, tmp_path):
+    path = exported(tmp_path, episodes, "hdf5")
+    file = path.with_name(f"{path.name}.card.json")
+    card = json.loads(file.read_text())
+    damage(card)
+    file.write_text(json.dumps(card))
+    with pytest.raises(ConfigError, match=message):
+        load_demonstrations(path, task=TASK, env=ENV)
+
+
+def test_a_zarr_folder_without_its_ends_is_refused(episodes, tmp_path):
+    path = exported(tmp_path, episodes, "zarr")
+    (path / "meta/episode_ends/0").unlink()
+    with pytest.raises(ConfigError, match="do not end with the last episode"):
+        load_demonstrations(path, task=TASK, env=ENV)
+
+
 def test_an_instruction_that_was_not_observed_is_that_of_the_task(episodes, tmp_path):
     plain = [each.exclude("instruction", ("next", "instruction")) for each in episodes]
     card = read_card(exported(tmp_path, plain, "hdf5"))
@@ -443,6 +492,13 @@ def test_rows_that_are_missing_are_named(lost, tmp_path):
     with pytest.raises(ConfigError, match=r"episode 1: .* rows, and there are [02] actions"):
         load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
     with h5py.File(path, "a") as file:
+        for name in ("obs/depth", "obs/state", "actions"):
+            rows = file[f"data/demo_1/{name}"][:0]
+            del file[f"data/demo_1/{name}"]
+            file[f"data/demo_1/{name}"] = rows
+    with pytest.raises(ConfigError, match="episode 1: there are no actions"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
         del file["data"]
         file.create_group("data")
     with pytest.raises(ConfigError, match="holds no episodes"):
@@ -459,6 +515,11 @@ def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
     (tmp_path / "b.yaml").write_text("- a\n- b\n")
     with pytest.raises(ConfigError, match=r"b\.yaml: must map keys to names"):
         load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "b.yaml")
+    (tmp_path / "d.yaml").write_text("pixels: [1,\naction: b\n")
+    with pytest.raises(ConfigError, match=r"d\.yaml: .* line 3"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "d.yaml")
+    with pytest.raises(ConfigError, match=r"no demonstrations at .*in the formats"):
+        load_demonstrations(tmp_path / "none.hdf5", task=TASK, env=ENV, mapping=FOREIGN)
     (tmp_path / "c.hdf5").write_text("no HDF5")
     with pytest.raises(ConfigError, match=r"c\.hdf5 cannot be read: OSError"):
         load_demonstrations(tmp_path / "c.hdf5", task=TASK, env=ENV, mapping=FOREIGN)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 from safetensors.numpy import load_file, save_file
 
 from ba_torchrl.config import StrictModel
@@ -26,6 +26,8 @@ Arrays = dict[str, np.ndarray]
 observation after the last action is known."""
 Role = Literal["observation", "action", "result"]
 """Of an entry: known before the step, chosen in it, or known after it."""
+RESULTS = (keys.REWARD, keys.TERMINATED, keys.TRUNCATED, keys.SUCCESS)
+"""Results of a step that files hold; ``done`` is terminated or truncated."""
 _LAST_FILE = "last_observations.safetensors"
 
 
@@ -74,6 +76,18 @@ class Card(StrictModel):
     """Of the packages that wrote the file."""
     entries: dict[str, Entry]
     """By key of the TensorDict."""
+
+    @field_validator("entries")
+    @classmethod
+    def _check_entries(cls, entries: dict[str, Entry]) -> dict[str, Entry]:
+        if missing := {keys.ACTION, *RESULTS} - entries.keys():
+            raise ValueError(f"entries lack {', '.join(sorted(missing))}")
+        for entry in entries.values():
+            try:
+                np.dtype(entry.dtype)
+            except TypeError as error:
+                raise ValueError(f"{entry.name}: {error}") from None
+        return entries
 
     @property
     def prompt(self) -> str:
@@ -215,7 +229,8 @@ def read_card(path: Path) -> Card | None:
             return None  # somebody else's file of that name
         return Card.model_validate_json(text)
     except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{file} is damaged: {str(error).splitlines()[0]}") from None
+        what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise ConfigError(f"{file} is damaged: {what}") from None
 
 
 def read_file(form: Format, path: Path) -> list[Arrays]:
@@ -320,8 +335,4 @@ def _read_yaml(path: Path) -> Any:
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: {str(error).splitlines()[0]}") from None
-
-
-RESULTS = (keys.REWARD, keys.TERMINATED, keys.TRUNCATED, keys.SUCCESS)
-"""Results of a step that files hold; ``done`` is terminated or truncated."""
+        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None

@@ -55,6 +55,13 @@ class Minari(Format):
 
         minari = self.library("minari")
         self.library("h5py")
+        try:
+            self.library("minari.dataset.minari_dataset").parse_dataset_id(path.name)
+        except (ValueError, TypeError):  # TypeError: no version
+            raise ConfigError(
+                "path: its last part is the id of the data set, of letters, digits, _ and -, and "
+                f"with a version, such as {path.name}-v0"
+            ) from None
         register_task(card.task)
         env = gymnasium.make(gym_id(card.task), **card.env)
         buffers = [
@@ -95,12 +102,6 @@ class Minari(Format):
                     data_format="hdf5",
                     requirements=[f"ba-torchrl=={card.versions['ba_torchrl']}"],
                 )
-        except ValueError as error:
-            if "Malformed" not in str(error):
-                raise
-            raise ConfigError(
-                f"path: its last part is the id of the data set, such as {path.name}-v0: {error}"
-            ) from None
         finally:
             env.close()
 
