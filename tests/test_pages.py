@@ -19,6 +19,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 DEMONSTRATIONS = "demos/pulling"
 SHORTER = {
     "agent.learn(10_000)": "agent.learn(120)",
+    "n_eval_episodes=20": "n_eval_episodes=1",
     "buffer_size=10_000": "buffer_size=200",
     '"close_loop/block_picking", 5,': '"close_loop/block_picking", 2,',
     '"mine/tall_block", 4)': '"mine/tall_block", 1)',
