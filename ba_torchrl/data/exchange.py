@@ -70,7 +70,7 @@ def export_demonstrations(
 
     Raises:
         ConfigError: the format is unknown or its package missing, ``path`` exists or has not the
-            format's suffix, or an episode has other entries or shapes than the environment.
+            format's suffix, or an episode lacks an entry or has another shape.
         ValueError: there are no episodes.
     """
     form, path = FORMATS[format], Path(path)
@@ -82,8 +82,14 @@ def export_demonstrations(
         raise ConfigError(f"{path} exists already; choose another path")
     roles = _roles(episodes[0])
     specs = _specs(task, env)
-    if missing := {*roles, *specs} - set.intersection(*(set(_roles(each)) for each in episodes)):
-        raise ConfigError(f"an episode has no {', '.join(sorted(missing))}")
+    for number, episode in enumerate(episodes):
+        if missing := {*roles, *specs} - set(_roles(episode)):
+            raise ConfigError(
+                f"episode {number} has no {', '.join(sorted(missing))}, as episode 0 or the "
+                "environment has"
+            )
+        if not len(episode):
+            raise ConfigError(f"episode {number} has no steps")
     arrays = [_to_arrays(episode, roles) for episode in episodes]
     entries = {key: _entry(key, role, arrays[0][key]) for key, role in roles.items()}
     shapes = {key: entry.shape for key, entry in entries.items()}

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 import numpy as np
+import pybullet
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -296,12 +297,14 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             self._conditions, valid = evaluate_at_rest(scene)
             success = valid and all(self._conditions.values())
             self._observation = self._observe(scene)
+            before, self._progress = self._progress, self._measure_progress(scene)
+        except ConfigError:
+            raise
         except Exception:
             fault, self._conditions = True, dict.fromkeys(self._condition_names, False)
             self._on_fault()
         else:
             self._fault_counter.count_step()
-            before, self._progress = self._progress, self._measure_progress(scene)
         # the dense rewards that would follow a success belong to its value
         cuts_rewards = success and self.config.reward == "dense"
         terminated = not fault and not cuts_rewards and (success or not valid)
@@ -430,18 +433,17 @@ class ManipulationEnv(CopiesWithState, EnvBase):
             rng = np.random.default_rng([self.base_seed, self._episode - 1])
             try:
                 scene = self._episodes.begin(rng, with_new_objects=with_new_objects)
-                observation = self._observe(scene)
+                self._progress = self._measure_progress(scene)
+                return self._observe(scene)
             except SIMULATOR_ERRORS:
                 self._on_fault()
-            else:
-                self._progress = self._measure_progress(scene)
-                return observation
 
     def _measure_progress(self, scene: Scene) -> float:
         """Return the task's progress, 0 if the reward is sparse.
 
         Raises:
             ConfigError: the task's method raises, or returns no number in [0, 1).
+            SIMULATOR_ERRORS: PyBullet fails.
         """
         if self.config.reward == "sparse":
             return 0.0
@@ -449,6 +451,8 @@ class ManipulationEnv(CopiesWithState, EnvBase):
         try:
             with scene.world.fixed_poses():
                 value = scene.task.progress()
+        except (pybullet.error, SimulationError):
+            raise
         except Exception as error:
             raise ConfigError(f"{method} raised {type(error).__name__}: {error}") from error
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):

@@ -200,7 +200,7 @@ def test_torchrl_reads_what_minari_wrote(collected, tmp_path, monkeypatch):
 def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_path, episodes):
     options = {"format": "minari", "task": TASK, "env": ENV, "seed": 0}
     for name in ("pick ing", "picking", "picking-v"):
-        with pytest.raises(ConfigError, match=f"such as {name}-v0"):
+        with pytest.raises(ConfigError, match=f"{name} is no id of a data set"):
             export_demonstrations(tmp_path / name, collected, **options)
     with pytest.raises(ConfigError, match=r"does not observe .*wrist_rgb"):
         export_demonstrations(tmp_path / "a-v0", episodes, **options)
@@ -414,6 +414,21 @@ def test_cards_of_others_are_not_read(tmp_path):
         assert len(load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)) == 2
 
 
+@pytest.mark.parametrize("text", [["pick ü"] * 3, np.array([b"pick"] * 3), "pick"])
+def test_instructions_of_any_kind_of_text_are_read(text, tmp_path):
+    path = tmp_path / "a.hdf5"
+    foreign(path)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo["lang"] = text
+    with pytest.raises(ConfigError, match=r"It holds .*lang \[\]"):
+        load_demonstrations(path, task=TASK, env=ENV)
+    mapping = {**FOREIGN, "instruction": "lang"}
+    found = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    wanted = "pick ü" if isinstance(text, list) else "pick"
+    assert found[0]["instruction"] == [wanted] * 3
+
+
 def test_dense_rewards_are_not_made_up(tmp_path):
     path = foreign(tmp_path / "a.hdf5", progress=np.array([0.1, 0.2, 1.0]), over=np.zeros(3))
     options = {"task": TASK, "env": {**ENV, "reward": "dense"}}
@@ -430,8 +445,10 @@ def test_episodes_that_differ_are_not_exported(episodes, tmp_path):
         ConfigError, match=r"episode 0: pixels .*\[1, 64, 64\], needed \[1, 128, 128\]"
     ):
         exported(tmp_path, episodes, "hdf5", env={})
+    with pytest.raises(ConfigError, match="episode 1 has no steps"):
+        exported(tmp_path, [episodes[0], episodes[1][:0]], "hdf5")
     odd = [episodes[0], episodes[1].exclude("proprio", ("next", "proprio"))]
-    with pytest.raises(ConfigError, match="an episode has no proprio"):
+    with pytest.raises(ConfigError, match="episode 1 has no proprio"):
         exported(tmp_path, odd, "hdf5")
 
 
@@ -439,7 +456,9 @@ def test_episodes_that_differ_are_not_exported(episodes, tmp_path):
     ("damage", "message"),
     [
         (lambda card: card["entries"].pop("action"), "is damaged: .*entries lack action"),
-        (lambda card: card["entries"]["pixels"].update(dtype="foo"), "is damaged: .*'foo'"),
+        (lambda card: card["entries"]["pixels"].update(dtype="foo"), "pixels has the unknown type"),
+        (lambda card: card["entries"]["pixels"].update(dtype="O"), "pixels has the unknown type"),
+        (lambda card: card.update(seed="x"), "is damaged: seed: "),
         (lambda card: card.update(episodes=7), "holds 3 episodes, its card says 7"),
         (lambda card: card["entries"]["proprio"].update(name="no"), "episode 0: .* no 'no', which"),
     ],
@@ -456,8 +475,11 @@ def test_a_card_that_does_not_fit_its_file_is_refused(damage, message, episodes,
 
 def test_a_zarr_folder_without_its_ends_is_refused(episodes, tmp_path):
     path = exported(tmp_path, episodes, "zarr")
+    zarr.open(str(path), mode="a")["meta/episode_ends"][:] = [3, 5, 8]
+    with pytest.raises(ConfigError, match=r"has 9 rows, the episodes \[8\]"):
+        load_demonstrations(path, task=TASK, env=ENV)
     (path / "meta/episode_ends/0").unlink()
-    with pytest.raises(ConfigError, match="do not end with the last episode"):
+    with pytest.raises(ConfigError, match="do not rise"):
         load_demonstrations(path, task=TASK, env=ENV)
 
 

@@ -84,9 +84,11 @@ class Card(StrictModel):
             raise ValueError(f"entries lack {', '.join(sorted(missing))}")
         for entry in entries.values():
             try:
-                np.dtype(entry.dtype)
-            except TypeError as error:
-                raise ValueError(f"{entry.name}: {error}") from None
+                known = entry.dtype == "str" or np.dtype(entry.dtype).kind in "fiub"
+            except TypeError:
+                known = False
+            if not known:
+                raise ValueError(f"{entry.name} has the unknown type {entry.dtype!r}")
         return entries
 
     @property
@@ -229,7 +231,10 @@ def read_card(path: Path) -> Card | None:
             return None  # somebody else's file of that name
         return Card.model_validate_json(text)
     except (OSError, ValueError, RecursionError) as error:
-        what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        what: Any = error
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise ConfigError(f"{file} is damaged: {what}") from None
 
 
@@ -254,6 +259,15 @@ def read_file(form: Format, path: Path) -> list[Arrays]:
         raise ConfigError(
             f"{path} cannot be read: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
         ) from error
+
+
+def plain(values: Any) -> np.ndarray:
+    """Return an array of numbers or of text, which libraries also return as bytes and objects."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "OS":
+        return array
+    texts = [text.decode() if isinstance(text, bytes) else str(text) for text in array.reshape(-1)]
+    return np.array(texts, dtype=str).reshape(array.shape)
 
 
 def card_file(path: Path) -> Path:

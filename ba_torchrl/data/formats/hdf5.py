@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format
+from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format, plain
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id
 
@@ -72,7 +72,9 @@ class Robomimic(Format):
                 group, arrays = data[demo], {}
                 group.visititems(
                     lambda name, item, arrays=arrays: (
-                        arrays.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None
+                        arrays.update({name: plain(item[()])})
+                        if isinstance(item, h5py.Dataset)
+                        else None
                     )
                 )
                 for name in [name for name in arrays if name.startswith(_OBS)]:

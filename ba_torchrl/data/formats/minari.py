@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format
+from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format, plain
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id, register_task
 from ba_torchrl.errors import ConfigError
@@ -59,8 +59,8 @@ class Minari(Format):
             self.library("minari.dataset.minari_dataset").parse_dataset_id(path.name)
         except (ValueError, TypeError):  # TypeError: no version
             raise ConfigError(
-                "path: its last part is the id of the data set, of letters, digits, _ and -, and "
-                f"with a version, such as {path.name}-v0"
+                f"path: {path.name} is no id of a data set, such as picking-v0: letters, digits, _ "
+                "and -, and a version"
             ) from None
         register_task(card.task)
         env = gymnasium.make(gym_id(card.task), **card.env)
@@ -116,7 +116,7 @@ class Minari(Format):
                     arrays |= {f"{place}{name}": part for name, part in values.items()}
                 elif values is not None:
                     arrays[place.rstrip("/")] = values
-            episodes.append({name: _plain(values) for name, values in arrays.items()})
+            episodes.append({name: plain(values) for name, values in arrays.items()})
         return episodes
 
 
@@ -126,12 +126,6 @@ def _plain_space(space: Any) -> Any:
     from gymnasium.spaces import Box, MultiBinary
 
     return Box(0, 1, space.shape, np.uint8) if isinstance(space, MultiBinary) else space
-
-
-def _plain(values: object) -> np.ndarray:
-    """Return an array of numbers or of text."""
-    array = np.asarray(values)
-    return np.char.decode(array.astype(bytes), "utf-8") if array.dtype.kind == "O" else array
 
 
 def _below(arrays: Arrays, place: str) -> Arrays:

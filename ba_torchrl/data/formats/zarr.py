@@ -54,8 +54,11 @@ class DiffusionPolicy(Format):
             _check_plain(array)
         ends = [int(end) for end in meta["episode_ends"][:]]
         steps = {name: data[name][:] for name in data}
-        if ends != sorted(set(ends)) or any(ends[-1:] != [len(rows)] for rows in steps.values()):
-            raise ConfigError(f"{path}: the arrays do not end with the last episode, {ends[-1:]}")
+        if ends != sorted(set(ends)):
+            raise ConfigError(f"{path}: meta/episode_ends do not rise: an episode has no steps")
+        for name, rows in steps.items():
+            if ends[-1:] != [len(rows)]:
+                raise ConfigError(f"{path}: {name} has {len(rows)} rows, the episodes {ends[-1:]}")
         episodes = [
             {name: values[start:end] for name, values in steps.items()}
             for start, end in zip([0, *ends], ends, strict=False)

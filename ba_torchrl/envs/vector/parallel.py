@@ -47,7 +47,7 @@ class VectorEnv(SeededVector, ParallelEnv):
     of the failed worker, the step returns the last valid observation with ``fault``, ``truncated``
     and ``done`` set and a reward of zero; TorchRL then resets it like any environment that is done.
     Actions are validated in this process before they are sent. A `ConfigError` that an environment
-    raises is raised in this process, and its worker is not replaced.
+    raises is raised in this process; only the next reset or step replaces its worker.
 
     This reset waits for the new worker, unless ``workers.wait_for_restarts`` is False. Then the
     environment is absent until the worker is ready: the reset returns the last valid observation
