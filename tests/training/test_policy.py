@@ -156,6 +156,8 @@ def test_a_shipped_policy_reaches_the_goal(task):
     policy = ba_torchrl.load_policy(task)
     assert policy.task == task
     assert policy.card.episodes >= 100
+    if policies.needs_avx512(policy.config):
+        pytest.skip("trained with AVX-512; escnn's bases of filters differ on this CPU")
     env = ba_torchrl.make_vector_env(task, 5, parallel=False, **policy.env_config)
     try:
         found = evaluation.evaluate(env, policy, 20, seed=policy.test_seed)
