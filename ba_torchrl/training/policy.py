@@ -5,7 +5,6 @@ A policy in a file is ``NAME.safetensors``, its parameters, and ``NAME.json``, i
 
 from __future__ import annotations
 
-import logging
 import textwrap
 from importlib.resources import files
 from pathlib import Path
@@ -37,8 +36,6 @@ from ba_torchrl.training.checkpoint import (
 )
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
 
-logger = logging.getLogger(__name__)
-
 TENSORS, CARD = ".safetensors", ".json"
 _OF_TRAINING = {
     "logger": "csv",
@@ -52,7 +49,7 @@ _OF_TRAINING = {
 class PolicyCard(StrictModel):
     """What is known of a policy in a file."""
 
-    format: Literal[1] = 1
+    format: Literal[2] = 2
     task: str
     label: str
     """Name of the method, such as "sacfd equi"."""
@@ -146,15 +143,6 @@ class TrainedPolicy(TensorDictModuleBase):
         return f"TrainedPolicy({self.task}, {self.config.label}, update {self.updates})"
 
 
-def needs_avx512(config: ExperimentConfig) -> bool:
-    """Return whether shipped weights of this network may not fit escnn's bases on this CPU.
-
-    They were trained with AVX-512. escnn computes bases of filters numerically.
-    """
-    is_equivariant = config.network["name"].startswith("equi")
-    return is_equivariant and not torch.backends.cpu.get_cpu_capability().startswith("AVX512")
-
-
 def load_policy(
     source: str | Path, which: Which = "best", device: str = "cpu", **changes: Any
 ) -> TrainedPolicy:
@@ -195,12 +183,6 @@ def load_policy(
     card = read_card(path)
     changes = {"run_dir": str(path.parent), "resume": False, **changes}
     config = parse_saved(card.config, path.with_suffix(CARD), **changes)
-    if str(source) in TASKS and needs_avx512(config):
-        logger.warning(
-            "the shipped policy of %s was seen to fail on a CPU without AVX-512: escnn's bases of "
-            "filters, to which its weights refer, can differ there",
-            source,
-        )
     policy = build_algorithm(config).policy
     try:
         policy.load_state_dict(load_file(path, device=str(config.torch_device)))

@@ -156,8 +156,6 @@ def test_a_shipped_policy_reaches_the_goal(task):
     policy = ba_torchrl.load_policy(task)
     assert policy.task == task
     assert policy.card.episodes >= 100
-    if policies.needs_avx512(policy.config):
-        pytest.skip("seen to fail on a CPU without AVX-512, see needs_avx512")
     env = ba_torchrl.make_vector_env(task, 5, parallel=False, **policy.env_config)
     try:
         found = evaluation.evaluate(env, policy, 20, seed=policy.test_seed)

@@ -1,8 +1,12 @@
-"""The import of escnn without its dependencies for rotations in space.
+"""The import of escnn without its dependencies for rotations in space, with signs that are fixed.
 
 escnn imports `lie_learn`, whose wheels need NumPy 1, for the irreducible representations of SO(3),
 and tries `py3nj`, which needs a Fortran compiler, for its Clebsch-Gordan coefficients. The planar
 groups need neither.
+
+Those of the dihedral groups escnn finds by singular value decompositions, up to a sign that differs
+between CPUs. Weights are coefficients of kernels with these signs, so that without a fixed sign a
+policy that was trained on one CPU fails on another.
 """
 
 from __future__ import annotations
@@ -10,8 +14,12 @@ from __future__ import annotations
 import importlib
 import sys
 import warnings
+from collections.abc import Callable
+from functools import wraps
 from types import ModuleType
 from typing import Any
+
+import numpy as np
 
 from ba_torchrl.errors import MissingPackageError, install_command
 
@@ -43,7 +51,38 @@ def import_escnn(name: str = "escnn") -> ModuleType:
     # scikit-learn's singular value decomposition refuses the matrices that escnn gives it; where
     # scikit-learn is not installed, escnn takes SciPy's.
     importlib.import_module("escnn.group._numerical").randomized_svd = None
+    _fix_signs(importlib.import_module("escnn.group._clebsh_gordan"))
     return module
+
+
+def _fix_signs(coefficients: ModuleType) -> None:
+    """Replace escnn's Clebsch-Gordan coefficients by those whose first large entry is positive.
+
+    A representation occurs at most once in the product of two others of a dihedral group, so that
+    only the sign is undetermined; escnn computes those of cyclic groups in closed form.
+    """
+    if hasattr(coefficients._clebsh_gordan_tensor, "signs_are_fixed"):
+        return
+    coefficients._clebsh_gordan_tensor = _with_fixed_signs(coefficients._clebsh_gordan_tensor)
+    solver = importlib.import_module("escnn.kernels.wignereckart_solver")
+    for basis in (solver.WignerEckartBasis, solver.RestrictedWignerEckartBasis):
+        basis._cached_instances.clear()  # of layers that were made before
+
+
+def _with_fixed_signs(tensor: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    @wraps(tensor)
+    def fixed(*args: Any, **kwargs: Any) -> np.ndarray:
+        found = tensor(*args, **kwargs)  # [J, l, multiplicity, j]
+        values = found.transpose(2, 0, 1, 3).reshape(found.shape[2], -1)
+        if values.size == 0:
+            return found
+        size = np.abs(values)
+        first = np.argmax(size > size.max(axis=1, keepdims=True) / 2, axis=1)
+        signs = np.sign(values[np.arange(len(values)), first])
+        return found * signs[:, None]
+
+    fixed.signs_are_fixed = True
+    return fixed
 
 
 def _replace_lie_learn() -> None:
