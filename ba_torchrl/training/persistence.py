@@ -30,7 +30,7 @@ LOCK_FILE = "run.lock"
 class _StateAdapter(CheckpointAdapter):
     """Writes a component's ``state_dict`` with `write_state`."""
 
-    adapter_id = "ba_torchrl.state"
+    adapter_id = "ba_torchrl.state.2"  # 1: weights of kernels whose signs depended on the CPU
 
     def save(self, component: Any, path: Path, **_: Any) -> None:
         write_state(path, component.state_dict())

@@ -50,6 +50,7 @@ class PolicyCard(StrictModel):
     """What is known of a policy in a file."""
 
     format: Literal[2] = 2
+    """1: weights of kernels whose signs depended on the CPU."""
     task: str
     label: str
     """Name of the method, such as "sacfd equi"."""

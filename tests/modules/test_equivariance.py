@@ -82,7 +82,8 @@ def test_quarter_turns_and_reflections_are_exact(size, sequence, group_order, op
     with torch.no_grad():
         loc, scale = networks.actor(pixels, holding)
         values = networks.critic(networks.encoder(pixels, holding), action)
-        assert loc[:, [sequence.index("x"), sequence.index("y")]].abs().max() > 1e-4
+        planar = loc[:, [sequence.index("x"), sequence.index("y")]]
+        assert planar.abs().max() > 2e-3 * loc.abs().max()  # a hundred times the tolerance below
         turns = range(0, 4, 1 if group_order > 2 else 2)
         for quarters, flips in product(turns, (False, True)[: 1 + ("reflections" in options)]):
             image = pixels.flip(-1) if flips else pixels

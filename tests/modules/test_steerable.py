@@ -11,6 +11,7 @@ pytest.importorskip("escnn")
 
 from escnn import nn as enn
 
+from ba_torchrl.modules.steerable import planar_escnn
 from ba_torchrl.modules.steerable.kernels import he_scales, kernel_block
 from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
@@ -163,6 +164,30 @@ def test_blocks_are_shared_in_the_process():
     again = planar_rotations(8)
     regular = kernel_block(gspace, gspace.regular_repr, gspace.regular_repr, 3)
     assert kernel_block(again, again.regular_repr, again.regular_repr, 3) is regular
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_kernels_of_dihedral_groups_do_not_depend_on_signs_of_singular_vectors(sign, monkeypatch):
+    """Weights of policies refer to kernels with these signs; the sums were recorded on one CPU."""
+    coefficients = planar_escnn.import_escnn("escnn.group._clebsh_gordan")
+    find = coefficients.find_intertwiner_basis_sylvester
+    found = []
+
+    def negated(*matrices):
+        found.append(find(*matrices))
+        return sign * found[-1]
+
+    monkeypatch.setattr(coefficients, "find_intertwiner_basis_sylvester", negated)
+    computed = coefficients._clebsh_gordan_tensor.__wrapped__.func  # without escnn's files
+    monkeypatch.setattr(coefficients, "_clebsh_gordan_tensor", computed)
+    gspace = planar_rotations_and_flips(4)  # escnn keeps kernels in it
+    regular, trivial, vector = gspace.regular_repr, gspace.trivial_repr, gspace.irrep(1, 1)
+    sums = []
+    for reps, size in (((trivial, regular), 3), ((regular, regular), 3), ((regular, vector), 1)):
+        kernels = kernel_block.__wrapped__(gspace, *reps, size).kernels
+        sums.append(float(torch.arange(kernels.numel()).cos() @ kernels.flatten()))
+    assert found
+    assert sums == pytest.approx([1.0364, 3.5929, 1.3485], abs=1e-3)
 
 
 def test_bad_field_types_are_refused():

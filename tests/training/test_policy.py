@@ -123,7 +123,7 @@ def test_what_is_no_policy_is_named(run, tmp_path):
     with pytest.raises(ConfigError, match=r"(?s)this version cannot use .*p.json.*unknown .*'new'"):
         loaded(config={**saved["config"], "new": 1})
     with pytest.raises(ConfigError, match=r"(?s)this version cannot use .*p.json.*format: "):
-        loaded(format=2)
+        loaded(format=1)
     loaded()
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ConfigError, match="does not hold the policy of its card"):
