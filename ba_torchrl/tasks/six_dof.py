@@ -83,7 +83,7 @@ VARIANTS: tuple[tuple[str, type[OpenLoopTask], dict[str, Any]], ...] = (
         "bump/box_palletizing",
         BoxPalletizing,
         # boxes and gripper have no room beside a larger platform
-        {"platform_m": (0.24, 0.2), "scale_limits": (0.75, 0.9)},
+        {"platform_m": (0.24, 0.2), "scale_limits": (0.75, 0.85)},
     ),
 )
 """Id, the same task on level ground, and further attributes that differ from those of it."""
