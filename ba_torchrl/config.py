@@ -107,9 +107,6 @@ MAX_SEED = 2**63 - 1
 
 CUSTOM_PHYSICS = ("time_step_s", "solver_iterations", "solver_residual")
 
-_WITHOUT_CAMERA = {"vec", "point_cloud", "proprio", "joints", "instruction"}
-"""Observations that do not depend on `camera_size`; those of other modules can."""
-
 _CLOSE_LOOP = {"control": "close_loop"}
 _OPEN_LOOP = {"control": "open_loop"}
 
@@ -293,12 +290,6 @@ class EnvConfig(StrictModel):
             raise ValueError(f"{', '.join(custom)} needs physics_mode='custom'")
         if self.physics_mode == "custom" and not custom:
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
-        uses_camera = self.rgb or set(self.observations) - _WITHOUT_CAMERA
-        if self.camera_size is not None and not uses_camera:
-            raise ValueError(
-                "camera_size has no effect without rgb=True, or 'wrist_rgb' or 'segmentation' in "
-                "observations"
-            )
         if self.reward != "difference":
             for message in changed(self, ["reward_discount"], "without reward='difference'"):
                 raise ValueError(message)
