@@ -321,7 +321,7 @@ def _grouped(runs: Sequence[Run]) -> list[Group]:
     for run in runs:
         alike = named.setdefault((run.result.task, run.result.label), [])
         for group in alike:
-            if not _differences(group[0], run):
+            if not _changes_of_method(group[0], run):
                 group.append(run)
                 break
         else:
@@ -343,9 +343,16 @@ def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
     return differences(first.result.config, second.result.config, {*NON_LEARNING_FIELDS, "seed"})
 
 
+def _changes_of_method(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
+    """Return the settings that differ, of those that both runs have: a version can add some."""
+    both = flat(first.result.config).keys() & flat(second.result.config).keys()
+    found = _differences(first, second)
+    return {name: values for name, values in found.items() if name in both}
+
+
 def _distinction(run: Run, others: Sequence[Run]) -> str:
     """Return the settings in which a run differs from others as text, " (env.obs_size 64)"."""
-    names = sorted({name for other in others for name in _differences(run, other)})
+    names = sorted({name for other in others for name in _changes_of_method(run, other)})
     settings = flat(run.result.config)
     values = [f"{name} {settings.get(name)}" for name in names]
     return f" ({', '.join(values)})" if values else ""

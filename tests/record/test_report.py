@@ -247,6 +247,17 @@ def test_the_settings_in_which_methods_differ_are_listed(tmp_path):
     ]
 
 
+def test_seeds_of_a_version_with_more_settings_belong_to_the_same_method(tmp_path):
+    write_run(tmp_path / "old", (0, 0, 1), config={"tau": 0.01})
+    write_run(tmp_path / "new", (0, 0, 1), seed=1, config={"tau": 0.01, "reward": "sparse"})
+    write_run(tmp_path / "other", (0, 0, 1), seed=2, config={"tau": 0.1, "reward": "sparse"})
+    (section,), _ = load_sections([tmp_path])
+    assert {group.method: len(group.runs) for group in section.groups} == {
+        "sacfd equi (tau 0.01)": 2,
+        "sacfd equi (tau 0.1)": 1,
+    }
+
+
 def test_runs_with_other_values_do_not_have_the_name_of_the_benchmark(tmp_path):
     for seed in range(2):
         write_run(tmp_path / f"a{seed}", (0, 0, 1), seed=seed)
