@@ -13,6 +13,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 
+from ba_torchrl.commands.report import completed
 from ba_torchrl.envs.description import describe
 from ba_torchrl.record.report import plot_section
 from ba_torchrl.record.results import (
@@ -64,7 +65,9 @@ def copy(roots: list[str]) -> int:
 
 def sections() -> list[Section]:
     """Return the runs of each benchmark in docs/results, in the order of their names."""
-    return [each for each in load_sections([FOLDER])[0] if each.title != OTHER_RUNS]
+    return [
+        each for each in load_sections([FOLDER], completed=completed)[0] if each.title != OTHER_RUNS
+    ]
 
 
 def page_with_results(text: str) -> str:

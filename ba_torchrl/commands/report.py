@@ -43,7 +43,9 @@ def main(settings: Settings) -> None:
     if not run_folders(settings.runs)[0]:
         raise ConfigError(f"no finished run below {', '.join(settings.runs)}")
     check_writable_folder(folder)
-    page = write_report(settings.runs, folder, axis=settings.axis, changes=changes)
+    page = write_report(
+        settings.runs, folder, axis=settings.axis, changes=changes, completed=completed
+    )
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
     print(f"  tables  {folder / 'table.csv'}, table.md, table.tex; by seed seeds.csv, curves.csv")
@@ -56,11 +58,20 @@ def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:
     planned = _planned(run.benchmark).get((run.task, run.label))
     if planned is None:
         return {"tasks, algorithms and networks": (f"{run.task} with {run.label}", "those listed")}
-    try:  # settings that are newer than the run have their defaults
-        found = ExperimentConfig.parse({**run.config, "device": "cpu"}).resolved()
+    found, ignored = completed(run).config, {*NON_LEARNING_FIELDS, "seed"}
+    return differences(found, planned.resolved(), ignored)
+
+
+def completed(run: RunResult) -> RunResult:
+    """Return the result with the defaults of settings that are newer than the run.
+
+    That of a run whose settings this version does not know is returned as it is.
+    """
+    try:
+        config = ExperimentConfig.parse({**run.config, "device": "cpu"}).resolved()
     except ConfigError:
-        found = run.config
-    return differences(found, planned.resolved(), {*NON_LEARNING_FIELDS, "seed"})
+        return run
+    return run.model_copy(update={"config": config})
 
 
 @functools.cache

@@ -43,6 +43,8 @@ class Observation(ABC):
 
     parameter: ClassVar[str | None] = None
     """Field of `EnvConfig` that enables the observation, in addition to `observations`."""
+    uses_camera: ClassVar[bool] = True
+    """Whether it depends on `camera_size`."""
 
     def __init__(self, config: EnvConfig, workspace: Workspace) -> None:
         self.config = config
@@ -72,10 +74,19 @@ def enabled_observations(config: EnvConfig, workspace: Workspace) -> list[Observ
     Raises:
         ConfigError: a name is unknown.
     """
+    return [enabled(config, workspace) for enabled in enabled_classes(config)]
+
+
+def enabled_classes(config: EnvConfig) -> list[type[Observation]]:
+    """Return the classes of the observations that a configuration enables.
+
+    Raises:
+        ConfigError: a name is unknown.
+    """
     for name in config.observations:
         _ = OBSERVATIONS[name]
     return [
-        OBSERVATIONS[name](config, workspace)
+        OBSERVATIONS[name]
         for name in OBSERVATIONS
         if name in config.observations or OBSERVATIONS[name].is_enabled(config)
     ]
@@ -98,6 +109,8 @@ def merge_entries(parts: list[dict]) -> dict:
 @OBSERVATIONS.register("vec")
 class PoseVector(Observation):
     """The poses of the gripper and the task's landmarks, and the opening of the gripper."""
+
+    uses_camera = False
 
     @classmethod
     def is_enabled(cls, config: EnvConfig) -> bool:
@@ -150,6 +163,8 @@ class RgbDepth(Observation):
 class PointCloud(Observation):
     """Points on the surfaces of floor, bodies and fingers, from two cameras at the sides."""
 
+    uses_camera = False
+
     parameter = "point_cloud"
 
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
@@ -174,6 +189,8 @@ class PointCloud(Observation):
 class Proprioception(Observation):
     """Pose of the tool and opening of the gripper."""
 
+    uses_camera = False
+
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specification of the vector."""
         return {keys.PROPRIO: Unbounded((8,), device="cpu", dtype=torch.float32)}
@@ -194,6 +211,8 @@ class Proprioception(Observation):
 @OBSERVATIONS.register("joints")
 class Joints(Observation):
     """Angles of the arm's joints."""
+
+    uses_camera = False
 
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specification of the angles."""
@@ -252,6 +271,8 @@ def segmentation_names(scene: Scene) -> tuple[str, ...]:
 @OBSERVATIONS.register("instruction")
 class Instruction(Observation):
     """The goal of the episode as an English sentence."""
+
+    uses_camera = False
 
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specification of the sentence."""

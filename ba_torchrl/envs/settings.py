@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Protocol
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import EnvConfig, env_config_model, parse
-from ba_torchrl.envs.observations import OBSERVATIONS, enabled_observations
+from ba_torchrl.envs.observations import OBSERVATIONS, enabled_classes
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import MAIN, check_spawned_process_knows, import_modules
 from ba_torchrl.registry import Registry
@@ -171,14 +171,13 @@ def resolve_env(
         )
     registering = (module for *_, module in _plugins(task_id, config) if module not in MAIN)
     modules = tuple(dict.fromkeys([*modules, *registering]))
-    resolved = ResolvedEnv(task_id, config, actions, modules, given)
-    observations = enabled_observations(config, resolved.workspace)
-    if config.camera_size is not None and not any(part.images() for part in observations):
+    uses_camera = any(part.uses_camera for part in enabled_classes(config))
+    if config.camera_size is not None and not uses_camera:
         raise ConfigError(
-            "camera_size has no effect without an image of a camera, such as rgb=True, or "
-            "'wrist_rgb' or 'segmentation' in observations"
+            "camera_size has no effect without rgb=True, or 'wrist_rgb' or 'segmentation' in "
+            "observations"
         )
-    return resolved
+    return ResolvedEnv(task_id, config, actions, modules, given)
 
 
 def _plugins(task_id: str, config: EnvConfig) -> Iterator[tuple[Registry[Any], str, str]]:

@@ -25,6 +25,7 @@ from ba_torchrl.record.summary import (
     GOOD_RATE,
     Axis,
     Changes,
+    Completed,
     Run,
     Section,
     differing_settings,
@@ -59,6 +60,7 @@ def write_report(
     *,
     axis: Axis = "updates",
     changes: Changes = lambda _: {},
+    completed: Completed = lambda run: run,
 ) -> Path:
     """Write the report of all runs below some folders, and return the path of the page.
 
@@ -67,11 +69,12 @@ def write_report(
         folder: of the report; videos are copied into it.
         axis: of the curves.
         changes: tells which runs do not have the settings of their benchmark.
+        completed: fills in the defaults of settings that are newer than a run.
 
     Raises:
         FileNotFoundError: there is no finished run.
     """
-    sections, unfinished = load_sections(roots, changes)
+    sections, unfinished = load_sections(roots, changes, completed)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     left_out = [f"{_relative(path, folder)}: {why_unfinished(path)}" for path in unfinished]

@@ -34,6 +34,8 @@ Axis = Literal["updates", "env_steps"]
 Changes = Callable[[RunResult], Mapping[str, tuple[Any, Any]]]
 """From a run to the settings in which it differs from its benchmark: its value and the benchmark's,
 by name."""
+Completed = Callable[[RunResult], RunResult]
+"""Fills in the defaults of settings that are newer than the run."""
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
@@ -140,7 +142,9 @@ class Section:
 
 
 def load_sections(
-    roots: Iterable[str | Path], changes: Changes = lambda _: {}
+    roots: Iterable[str | Path],
+    changes: Changes = lambda _: {},
+    completed: Completed = lambda run: run,
 ) -> tuple[list[Section], list[Path]]:
     """Read every finished run below some folders.
 
@@ -160,7 +164,7 @@ def load_sections(
     runs = []
     for folder in finished:
         try:
-            runs.append(Run(folder, read_result(folder)))
+            runs.append(Run(folder, completed(read_result(folder))))
         except ValueError as error:
             logger.warning("left out: %s", error)
             unfinished.append(folder)
@@ -321,7 +325,7 @@ def _grouped(runs: Sequence[Run]) -> list[Group]:
     for run in runs:
         alike = named.setdefault((run.result.task, run.result.label), [])
         for group in alike:
-            if not _changes_of_method(group[0], run):
+            if not _differences(group[0], run):
                 group.append(run)
                 break
         else:
@@ -343,16 +347,9 @@ def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
     return differences(first.result.config, second.result.config, {*NON_LEARNING_FIELDS, "seed"})
 
 
-def _changes_of_method(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
-    """Return the settings that differ, of those that both runs have: a version can add some."""
-    both = flat(first.result.config).keys() & flat(second.result.config).keys()
-    found = _differences(first, second)
-    return {name: values for name, values in found.items() if name in both}
-
-
 def _distinction(run: Run, others: Sequence[Run]) -> str:
     """Return the settings in which a run differs from others as text, " (env.obs_size 64)"."""
-    names = sorted({name for other in others for name in _changes_of_method(run, other)})
+    names = sorted({name for other in others for name in _differences(run, other)})
     settings = flat(run.result.config)
     values = [f"{name} {settings.get(name)}" for name in names]
     return f" ({', '.join(values)})" if values else ""

@@ -190,6 +190,12 @@ def test_a_copy_has_the_instruction(make):
         other.close()
 
 
+@pytest.mark.parametrize("names", [("rgb",), ("wrist_rgb",), ("segmentation", "vec")])
+def test_each_camera_has_the_given_size(make, names):
+    spec = make(PICKING, *names, camera_size=24).observation_spec
+    assert spec[names[0]].shape[-2:] == (24, 24)
+
+
 @pytest.mark.parametrize("names", [(), ("proprio", "joints", "instruction")])
 def test_the_size_of_a_camera_that_is_not_observed_is_refused(make, names):
     with pytest.raises(ConfigError, match=r"camera_size has no effect .*'segmentation'"):

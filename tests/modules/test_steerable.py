@@ -178,8 +178,11 @@ def test_kernels_of_dihedral_groups_do_not_depend_on_signs_of_singular_vectors(s
         return sign * found[-1]
 
     monkeypatch.setattr(coefficients, "find_intertwiner_basis_sylvester", negated)
-    computed = coefficients._clebsh_gordan_tensor.__wrapped__.func  # without escnn's files
-    monkeypatch.setattr(coefficients, "_clebsh_gordan_tensor", computed)
+    # computed, not from escnn's files
+    tensor = coefficients._clebsh_gordan_tensor.__wrapped__.func
+    monkeypatch.setattr(coefficients, "_clebsh_gordan_tensor", tensor)
+    decomposition = coefficients._find_tensor_decomposition.func
+    monkeypatch.setattr(coefficients, "_find_tensor_decomposition", decomposition)
     gspace = planar_rotations_and_flips(4)  # escnn keeps kernels in it
     regular, trivial, vector = gspace.regular_repr, gspace.trivial_repr, gspace.irrep(1, 1)
     sums = []

@@ -247,14 +247,19 @@ def test_the_settings_in_which_methods_differ_are_listed(tmp_path):
     ]
 
 
-def test_seeds_of_a_version_with_more_settings_belong_to_the_same_method(tmp_path):
+def test_a_run_of_a_version_with_fewer_settings_belongs_to_the_method(tmp_path):
     write_run(tmp_path / "old", (0, 0, 1), config={"tau": 0.01})
-    write_run(tmp_path / "new", (0, 0, 1), seed=1, config={"tau": 0.01, "reward": "sparse"})
-    write_run(tmp_path / "other", (0, 0, 1), seed=2, config={"tau": 0.1, "reward": "sparse"})
-    (section,), _ = load_sections([tmp_path])
+    for seed, reward in enumerate(("sparse", "dense"), start=1):
+        config = {"tau": 0.01, "reward": reward}
+        write_run(tmp_path / reward, (0, 0, 1), seed=seed, config=config)
+
+    def completed(run):
+        return run.model_copy(update={"config": {"reward": "sparse", **run.config}})
+
+    (section,), _ = load_sections([tmp_path], completed=completed)
     assert {group.method: len(group.runs) for group in section.groups} == {
-        "sacfd equi (tau 0.01)": 2,
-        "sacfd equi (tau 0.1)": 1,
+        "sacfd equi (reward dense)": 1,
+        "sacfd equi (reward sparse)": 2,
     }
 
 
@@ -383,6 +388,9 @@ def test_runs_are_compared_with_the_benchmark_of_the_package(tmp_path):
             return report.changes(run.model_copy(update={"config": config}))
 
         assert changes() == {}
+        older = {name: value for name, value in grid.resolved().items() if name != "parallel"}
+        completed = report.completed(run.model_copy(update={"config": older}))
+        assert completed.config.keys() == grid.resolved().keys()
         assert changes(total_updates=updates + 1) == {"total_updates": (updates + 1, updates)}
         (listed,) = report.changes(run.model_copy(update={"label": "sac cnn"}))
         assert listed == "tasks, algorithms and networks"

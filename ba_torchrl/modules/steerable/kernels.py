@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ba_torchrl.modules.steerable.irrep_convolution import IrrepKernels, irrep_kernels
+from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 
 if TYPE_CHECKING:
     from escnn.group import Representation
@@ -68,12 +69,11 @@ def kernel_block(
         out_repr: representation of the output field.
         kernel_size: pixels.
     """
-    from escnn.nn import FieldType, R2Conv
-
-    types = FieldType(gspace, [in_repr]), FieldType(gspace, [out_repr])
+    nn = import_escnn("escnn.nn")
+    types = nn.FieldType(gspace, [in_repr]), nn.FieldType(gspace, [out_repr])
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # escnn prints when the basis is empty
-            layer = R2Conv(*types, kernel_size, initialize=False)
+            layer = nn.R2Conv(*types, kernel_size, initialize=False)
     except ValueError as error:
         if "basis" in str(error) and "empty" in str(error):
             return None  # for example trivial to vector with a 1x1 kernel

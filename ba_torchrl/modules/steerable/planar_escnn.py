@@ -1,12 +1,12 @@
-"""The import of escnn without its dependencies for rotations in space, with signs that are fixed.
+"""The import of escnn without its dependencies for rotations in space, and with definite signs.
 
 escnn imports `lie_learn`, whose wheels need NumPy 1, for the irreducible representations of SO(3),
 and tries `py3nj`, which needs a Fortran compiler, for its Clebsch-Gordan coefficients. The planar
 groups need neither.
 
-Those of the dihedral groups escnn finds by singular value decompositions, up to a sign that differs
-between CPUs. Weights are coefficients of kernels with these signs, so that without a fixed sign a
-policy that was trained on one CPU fails on another.
+escnn computes the Clebsch-Gordan coefficients of dihedral groups by singular value decomposition,
+so that their signs differ between CPUs. A policy's weights are coefficients of kernels with these
+signs. `import_escnn` makes the signs the same everywhere, for all uses of escnn in the process.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ def _with_fixed_signs(tensor: Callable[..., np.ndarray]) -> Callable[..., np.nda
     @wraps(tensor)
     def fixed(*args: Any, **kwargs: Any) -> np.ndarray:
         found = tensor(*args, **kwargs)  # [J, l, multiplicity, j]
-        values = found.transpose(2, 0, 1, 3).reshape(found.shape[2], -1)
-        if values.size == 0:
+        if found.size == 0:  # the representation does not occur in the product
             return found
+        values = found.transpose(2, 0, 1, 3).reshape(found.shape[2], -1)
         size = np.abs(values)
         first = np.argmax(size > size.max(axis=1, keepdims=True) / 2, axis=1)
         signs = np.sign(values[np.arange(len(values)), first])
