@@ -315,6 +315,16 @@ def test_a_sealed_manifest_of_another_form_is_refused(run, content):
         load(run)
 
 
+def test_a_checkpoint_whose_weights_refer_to_kernels_of_other_signs_is_refused(run):
+    manifest = find_checkpoint(run, "latest") / "manifest.json"
+    text = manifest.read_text()
+    assert '"ba_torchrl.state.2"' in text
+    manifest.write_text(text.replace("ba_torchrl.state.2", "ba_torchrl.state"))
+    seal(manifest.parent)
+    with pytest.raises(ConfigError, match="does not fit this version"):
+        load(run, "latest")
+
+
 @pytest.mark.parametrize("part", ["resume", "checkpoints"])
 def test_a_state_that_was_about_to_be_replaced_gets_its_name_back(run, part):
     newest = max((run / part).glob("checkpoint-*"))
