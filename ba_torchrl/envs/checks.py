@@ -29,7 +29,7 @@ def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: s
             f"{task_id} takes a float32 action of shape ({size},), one component per letter of "
             f"{action_sequence!r}; got {action.dtype} of shape {tuple(action.shape)}"
         )
-    array = action.detach().numpy()
+    array = action.detach().cpu().numpy()
     if not np.isfinite(array).all():
         raise InvalidActionError(f"the action is not finite: {array.tolist()}")
     return array

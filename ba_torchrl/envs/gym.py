@@ -37,7 +37,8 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     ``info`` holds ``success``, ``fault``, ``step_count``, the conditions of success and, with
     ``expert=True``, ``expert_action``; ``is_success`` is ``success`` under the name that
     Stable-Baselines3 logs; ``is_out_of_reach`` tells an action that the arm cannot execute;
-    ``instruction`` is the goal as a sentence.
+    ``instruction`` is the goal as a sentence, with ``observations=["instruction"]``. The values
+    are scalars and arrays of NumPy.
 
     Args:
         task: as listed by `ba_torchrl.list_tasks`.
@@ -73,6 +74,11 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
             {key: space_of(spec) for key, spec in specs.items() if key not in INFO_KEYS}
         )
         self.action_space = space_of(self.torchrl_env.action_spec)
+
+    @property
+    def instruction(self) -> str:
+        """The goal of the episode as an English sentence."""
+        return self.torchrl_env.instruction
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -130,13 +136,16 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
             key: state[key].numpy().astype(space.dtype, copy=False)
             for key, space in self.observation_space.items()
         }
-        info: dict[str, Any] = {
+        values: dict[str, Any] = {
             key: state[key].item() for key in (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT)
         }
-        info["is_success"] = info[keys.SUCCESS]
-        info |= self.torchrl_env.conditions
-        info[keys.IS_OUT_OF_REACH] = self.torchrl_env.is_out_of_reach
-        info[keys.INSTRUCTION] = self.torchrl_env.instruction
+        values["is_success"] = values[keys.SUCCESS]
+        values |= self.torchrl_env.conditions
+        values[keys.IS_OUT_OF_REACH] = self.torchrl_env.is_out_of_reach
+        if keys.INSTRUCTION in state:
+            values[keys.INSTRUCTION] = self.instruction
+        # NumPy's scalars: TorchRL's readers of infos take a `dtype` for granted, and read no text
+        info = {key: np.asarray(value)[()] for key, value in values.items()}
         if keys.EXPERT_ACTION in state:
             info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
         return observation, info

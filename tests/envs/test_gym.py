@@ -5,6 +5,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+import torchrl.envs
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
@@ -180,9 +181,20 @@ def test_types_are_numpy_or_python_types(make):
     assert type(info["expert_action"]) is np.ndarray
     observation, reward, terminated, truncated, info = env.step(NOTHING)
     assert [type(x) for x in (reward, terminated, truncated)] == [float, bool, bool]
-    assert type(info["success"]) is type(info["fault"]) is bool
+    assert {type(value) for value in info.values()} == {np.ndarray, np.bool_, np.int64}
     assert observation in env.observation_space
     assert "expert_action" not in make().reset()[1]
+
+
+def test_torchrl_registers_all_of_info():
+    env = torchrl.envs.GymEnv(PICKING, obs_size=16, seed=0, expert=True)
+    try:
+        rollout = env.auto_register_info_dict().rollout(2)
+    finally:
+        env.close()
+    assert rollout["next", "step_count"].tolist() == [1, 2]
+    assert rollout["expert_action"].shape == (2, 5)
+    assert {"success", "is_grasped", "is_out_of_reach"} <= set(rollout["next"].keys())
 
 
 def test_the_step_limit_truncates(make):

@@ -7,6 +7,7 @@ from torchrl.collectors import Collector
 
 import ba_torchrl
 from ba_torchrl.envs import faults
+from ba_torchrl.envs.checks import checked_action
 from ba_torchrl.errors import InvalidActionError, SimulationError
 
 TASK = "close_loop/block_picking"
@@ -41,6 +42,21 @@ def test_bad_actions_raise_before_anything_moves(env, action, message):
 def test_a_missing_action_is_an_error(env):
     with pytest.raises(InvalidActionError, match="'action'"):
         env._step(env.reset())
+
+
+class OnDevice(torch.Tensor):
+    """A tensor that NumPy cannot read, as on a GPU."""
+
+    def cpu(self):
+        return self.as_subclass(torch.Tensor)
+
+    def numpy(self):
+        raise TypeError("can't convert a tensor of a device to numpy")
+
+
+def test_an_action_may_be_on_another_device():
+    action = torch.tensor([0.5, 0.0, -0.5]).as_subclass(OnDevice)
+    assert checked_action(action, "task", "pxy").tolist() == [0.5, 0.0, -0.5]
 
 
 def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel():

@@ -224,7 +224,7 @@ def test_gymnasium_has_the_instruction_in_info():
     env = GymEnv(PICKING, obs_size=32, observations=["instruction", "proprio"])
     try:
         observation, info = env.reset(seed=0)
-        assert info["instruction"] == "pick up the red block"
+        assert info["instruction"] == env.instruction == "pick up the red block"
         assert set(observation) == {"pixels", "holding", "proprio"}
         assert env.step(env.action_space.sample())[-1]["instruction"] == "pick up the red block"
         assert env.observation_space.contains(observation)
