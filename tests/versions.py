@@ -1,12 +1,14 @@
-"""Test the package in fresh environments, with the lowest and the newest versions that it allows.
+"""Test the package in fresh environments, with the lowest to the newest versions that it allows.
 
 python tests/versions.py                                   # make test-versions
-python tests/versions.py --pythons 3.12 --sets newest --folder /tmp/versions
+python tests/versions.py --pythons 3.12 --sets newest nightly --folder /tmp/versions
 python tests/versions.py --inside                          # in this environment
 
 An environment has the package's wheel with the extra [train], and escnn. In it: experts of four
 tasks, one update of each algorithm and of each network, environments in processes, and the quick
-start cut short. The table of results is printed; an environment that exists is used again.
+start cut short. The table of results is printed; an environment that exists is used again. The
+set "pinned" has the versions of requirements.txt, "nightly" the latest builds of TorchRL and
+tensordict on top of the newest; a failure of the latter is only printed.
 """
 
 from __future__ import annotations
@@ -18,11 +20,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LOWEST = ROOT / "requirements-lowest.txt"
+CONSTRAINTS = {
+    "lowest": ROOT / "requirements-lowest.txt",
+    "pinned": ROOT / "requirements.txt",
+    "newest": None,
+    "nightly": None,
+}
+"""Constraints of each set of versions."""
+NIGHTLY = ("tensordict", "torchrl")
 ESCNN = "escnn==1.0.11"
 SHOWN = ("torch", "torchrl", "tensordict", "numpy", "pybullet", "gymnasium", "numba", "pydantic")
 EXPERTS = (
@@ -41,9 +50,7 @@ def main() -> int:
     """Return the exit code: 1 if a check failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pythons", nargs="+", default=["3.11", "3.12"])
-    parser.add_argument(
-        "--sets", nargs="+", choices=["lowest", "newest"], default=["lowest", "newest"]
-    )
+    parser.add_argument("--sets", nargs="+", choices=CONSTRAINTS, default=list(CONSTRAINTS))
     parser.add_argument("--folder", type=Path, default=ROOT / ".versions")
     parser.add_argument("--inside", action="store_true")
     options = parser.parse_args()
@@ -58,7 +65,7 @@ def main() -> int:
             print(f"== Python {python}, {name} versions", file=sys.stderr)
             rows.append(run(python, name, options.folder / f"{python}-{name}"))
             print(f"| {' | '.join(rows[-1])} |", flush=True)
-    return int(any("passed" not in row[-2] for row in rows))
+    return int(any("passed" not in row[-2] for row in rows if row[1] != "nightly"))
 
 
 def run(python: str, name: str, folder: Path) -> list[str]:
@@ -66,7 +73,7 @@ def run(python: str, name: str, folder: Path) -> list[str]:
 
     Args:
         python: version of the interpreter, which is on the path as "python3.11".
-        name: "lowest" or "newest".
+        name: of `CONSTRAINTS`.
         folder: of the environment.
     """
     interpreter = folder / "bin/python"
@@ -92,7 +99,8 @@ def install(python: str, name: str, folder: Path) -> None:
     """Install the package's wheel and escnn into a new environment."""
     subprocess.run([f"python{python}", "-m", "venv", "--clear", str(folder)], check=True)
     pip = [str(folder / "bin/python"), "-m", "pip", "install", "--quiet"]
-    constraints = ["--constraint", str(LOWEST)] if name == "lowest" else []
+    file = CONSTRAINTS[name]
+    constraints = [] if file is None else ["--constraint", str(file)]
     subprocess.run([*pip, "--upgrade", "pip"], check=True)
     with tempfile.TemporaryDirectory() as wheels:
         build = [str(folder / "bin/python"), "-m", "pip", "wheel", "--quiet", "--no-deps"]
@@ -100,6 +108,10 @@ def install(python: str, name: str, folder: Path) -> None:
         (wheel,) = Path(wheels).glob("*.whl")
         subprocess.run([*pip, *constraints, f"{wheel}[train]"], check=True)
     subprocess.run([*pip, "--no-deps", ESCNN], check=True)
+    if name == "nightly":
+        subprocess.run([*pip[:3], "uninstall", "--quiet", "--yes", *NIGHTLY], check=True)
+        nightly = [f"{each}-nightly" for each in NIGHTLY]
+        subprocess.run([*pip, "--pre", "--no-deps", *nightly], check=True)
     (folder / ".installed").touch()
 
 
@@ -121,10 +133,17 @@ def check() -> dict[str, object]:
             failures.append(f"{name}: {type(error).__name__}: {error}")
     return {
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in SHOWN},
+        "versions": {name: _version(name) for name in SHOWN},
         "checks": len(checks),
         "failures": failures,
     }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return version(f"{package}-nightly")
 
 
 def check_expert(task: str) -> None:
