@@ -13,7 +13,7 @@ from ba_torchrl.data.files import StateFolder
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 from ba_torchrl.envs import keys
-from ba_torchrl.errors import ReplaySchemaError
+from ba_torchrl.errors import ConfigError, ReplaySchemaError
 
 _INDEX = "index"  # TorchRL's writer adds it
 _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))
@@ -35,7 +35,10 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
         storage: the frame storage.
         sampler: a TorchRL sampler.
         batch_size: of a sample; None if each call of ``sample`` passes it.
-        generator: source of uniform draws.
+        generator: source of the draws of samplers without their own.
+
+    Raises:
+        ConfigError: the storage is not a `FrameStorage`.
     """
 
     def __init__(
@@ -46,6 +49,11 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
         batch_size: int | None,
         generator: torch.Generator,
     ) -> None:
+        if not isinstance(storage, FrameStorage):
+            raise ConfigError(
+                f"{type(self).__name__} needs a FrameStorage; for a {type(storage).__name__}, pass "
+                "the sampler and an ExpertKeepingWriter to TorchRL's TensorDictReplayBuffer"
+            )
         super().__init__(
             storage=storage,
             sampler=sampler,
@@ -98,8 +106,8 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
             data = data[sound]
         if not len(data):
             return torch.zeros(0, dtype=torch.long, device="cpu")
-        data = self.writer.select_fitting(data)
-        return super().extend(data, update_priority=update_priority)
+        index = super().extend(data, update_priority=update_priority)
+        return index[index >= 0]
 
     @property
     def stored_keys(self) -> frozenset[NestedKey]:

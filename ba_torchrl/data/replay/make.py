@@ -44,14 +44,12 @@ def make_replay(
         expert_bonus: added to the priority of demonstrations.
         returns_codes: samples hold the images' codes instead of decoded images.
     """
-    generator = torch.Generator().manual_seed(seed)
     sampler: Sampler = RandomSampler()
     if kind == "symmetric":
         sampler = SymmetricSampler(seed)
     elif kind == "prioritized":
         sampler = ExpertPrioritizedSampler(
             capacity,
-            generator=generator,
             alpha=priority_exponent,
             beta=weight_exponent,
             expert_bonus=expert_bonus,
@@ -60,5 +58,5 @@ def make_replay(
         storage=FrameStorage(capacity, codecs, returns_codes=returns_codes),
         sampler=sampler,
         batch_size=batch_size,
-        generator=generator,
+        generator=torch.Generator().manual_seed(seed),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -11,23 +12,24 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from ba_torchrl import _segment_tree
+from ba_torchrl.data.files import StateFolder
+from ba_torchrl.data.replay.storage import OneProcess, stored_flags
 from ba_torchrl.envs import keys
 
 _segment_tree.install()  # also for a replay without environments
 
 
-class ExpertPrioritizedSampler(PrioritizedSampler):
+class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
     """Prioritised sampling that prefers demonstrations (appendix G.2).
 
     A transition is drawn in proportion to p ^ alpha, with p = |td| + eps, plus the bonus for a
     demonstration. A new one, demonstration or not, has the largest p that an update has set so far,
     and at least one, as in Schaul et al. (2016) and the reference implementation. Each draw has the
     importance weight ``priority_weight`` = (p / p_min) ^ (-alpha beta), in (0, 1]; the loss
-    normalises it over the batch.
+    normalises it over the batch. The source of the draws is the ``generator`` of the buffer.
 
     Args:
         max_capacity: number of transitions of the storage, over all its dimensions.
-        generator: source of every draw.
         alpha: exponent of the priorities.
         beta: initial exponent of the weights; ``anneal`` raises it to one, except from zero.
         eps: added to every priority; the default is that of the reference implementation.
@@ -42,7 +44,6 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
         self,
         max_capacity: int,
         *,
-        generator: torch.Generator,
         alpha: float = 0.6,
         beta: float = 0.4,
         eps: float = 1e-6,
@@ -54,9 +55,15 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
                 f"eps must be positive and expert_bonus not negative, got {eps}, {expert_bonus}"
             )
         super().__init__(
-            max_capacity, alpha=alpha, beta=beta, eps=eps, dtype=torch.float64, reduction="mean"
+            max_capacity,
+            alpha=alpha,
+            beta=beta,
+            eps=0.0,  # TorchRL would add it to the largest p again
+            dtype=torch.float64,
+            reduction="mean",
+            device="cpu",
         )
-        self.generator = generator
+        self.eps = eps
         self.expert_bonus = expert_bonus
         self.expert_key = expert_key
         self._initial_beta = beta
@@ -85,14 +92,19 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
             Indices [B], or for a storage of several dimensions a tuple of them; and the weights.
 
         Raises:
-            RuntimeError: the storage is empty.
+            RuntimeError: the storage is empty, or its transitions have no priorities.
         """
         count = len(storage)
         if count == 0:
             raise RuntimeError("cannot sample from an empty replay")
         total, smallest = self._sum_tree.query(0, count), self._min_tree.query(0, count)
+        if total <= 0:
+            raise RuntimeError(
+                "the stored transitions have no priorities: pass the sampler when the buffer is "
+                "constructed, not to set_sampler"
+            )
         mass = total * torch.rand(
-            batch_size, generator=self.generator, dtype=torch.float64, device="cpu"
+            batch_size, generator=self._rng, dtype=torch.float64, device="cpu"
         )
         # native trees return a number for a single draw
         index = torch.as_tensor(self._sum_tree.scan_lower_bound(mass), device="cpu")
@@ -113,7 +125,7 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
 
         Args:
             index: of the transitions: [N], or for a storage of several dimensions [N, ndim] or a
-                tuple of tensors [N].
+                tuple of tensors [N]. A negative one is that of a transition that is not stored.
             priority: absolute TD error of each transition, or a single one for all; without the
                 bonus.
             storage: storage with the expert flags, which TorchRL's buffers pass.
@@ -122,63 +134,51 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
             ValueError: a priority is not finite, or the storage is missing and the bonus is not
                 zero.
         """
-        index = _flat_index(index, storage)
-        if not index.numel():
-            return
-        error = torch.as_tensor(priority, dtype=self.dtype, device="cpu").detach().reshape(-1).abs()
+        if priority is self.default_priority:  # what TorchRL's `add` passes without a TD error
+            return self.mark_update(index, storage=storage)
+        index = torch.stack(index, -1) if isinstance(index, tuple) else torch.as_tensor(index)
+        index = index.long().cpu()
+        if index.ndim > 1:
+            index = torch.as_tensor(np.ravel_multi_index(index.unbind(-1), storage.shape))
+        index = index.reshape(-1)
+        error = torch.as_tensor(priority, dtype=self.dtype, device="cpu").reshape(-1).abs()
         if not error.isfinite().all():
             raise ValueError("a TD error is not finite: the run has diverged")
-        error = error.expand(index.shape)
-        raw = error + self._eps + self._bonus(index, storage)
-        largest = float(raw.max())
-        if self._max_priority[0] is None or largest > self._max_priority[0]:
-            self._max_priority = (largest, int(index[raw.argmax()]))
-        self._set_leaves(index, raw)
+        is_stored = index >= 0
+        index, error = index[is_stored], error.expand(index.shape)[is_stored]
+        if len(index):
+            super().update_priority(index, error + self.eps + self._bonus(index, storage))
 
     @torch.no_grad()
-    def mark_update(
-        self, index: int | Tensor | tuple[Tensor, ...], *, storage: Storage | None = None
-    ) -> None:
+    def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Give new transitions the largest priority so far, without a further bonus.
 
         Args:
             index: as of `update_priority`.
             storage: as of `update_priority`; needed if it has several dimensions.
         """
-        index = _flat_index(index, storage)
-        largest = max(1.0, self.default_priority)
-        self._set_leaves(index, torch.full(index.shape, largest, dtype=self.dtype, device="cpu"))
-
-    def _set_leaves(self, index: Tensor, raw: Tensor) -> None:
-        """Set priorities before the exponent, float64 [N], at flat indices [N]."""
-        leaf = raw.pow(self.alpha)
-        self._sum_tree[index] = leaf
-        self._min_tree[index] = leaf
+        largest = torch.as_tensor(self.default_priority, dtype=self.dtype).clamp_min(1.0)
+        super().update_priority(index, largest, storage=storage)
 
     def _bonus(self, index: Tensor, storage: Storage | None) -> Tensor | float:
         if not self.expert_bonus:
             return 0.0
         if storage is None:
             raise ValueError("update_priority needs the storage, for the expert flags")
-        if hasattr(storage, "column"):  # does not decode images
-            flags = storage.column(self.expert_key)[index]
-        else:
-            place = torch.unravel_index(index, storage.shape) if storage.ndim > 1 else index
-            flags = storage[place][self.expert_key]
-        return self.expert_bonus * flags.reshape(-1).to(self.dtype)
+        return self.expert_bonus * stored_flags(storage, self.expert_key, index).to(self.dtype)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return priorities, exponents and the generator's state, as tensors and numbers."""
+        """Return priorities and exponent, as tensors and numbers."""
         everything = torch.arange(self._max_capacity, device="cpu")
+        largest, place = self._max_priority
         return {
             "leaves": torch.as_tensor(self._sum_tree[everything], device="cpu").reshape(-1).clone(),
-            "max_priority": self._max_priority,
+            "max_priority": (None, None) if largest is None else (float(largest), int(place)),
             "beta": self.beta,
-            "generator": self.generator.get_state(),
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore priorities, exponents and the generator, from any device.
+        """Restore priorities and exponent, from any device.
 
         Args:
             state_dict: of a sampler of the same capacity.
@@ -197,18 +197,6 @@ class ExpertPrioritizedSampler(PrioritizedSampler):
             self._sum_tree[written] = leaves[written]
             self._min_tree[written] = leaves[written]
         largest, place = state_dict["max_priority"]
-        self._max_priority = None if largest is None else (largest, place)
+        if largest is not None:
+            self._max_priority = torch.tensor(largest, dtype=self.dtype, device="cpu"), place
         self.beta = state_dict["beta"]
-        self.generator.set_state(state_dict["generator"].cpu())
-
-
-def _flat_index(index: int | Tensor | tuple[Tensor, ...], storage: Storage | None) -> Tensor:
-    """Return indices into the flattened storage, int64 [N] on the CPU."""
-    if storage is not None and storage.ndim > 1:
-        if not isinstance(index, tuple):
-            index = torch.as_tensor(index, device="cpu").reshape(-1, storage.ndim).unbind(-1)
-        flat = torch.zeros((), dtype=torch.long, device="cpu")
-        for part, size in zip(index, storage.shape, strict=True):
-            flat = flat * size + torch.as_tensor(part, dtype=torch.long, device="cpu").cpu()
-        return flat.reshape(-1)
-    return torch.as_tensor(index, dtype=torch.long, device="cpu").cpu().reshape(-1)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import sys
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from multiprocessing.context import get_spawning_popen
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import LazyTensorStorage
+from torchrl.data import LazyTensorStorage, TensorStorage
+from torchrl.data.replay_buffers.storages import Storage
 
 from ba_torchrl.data.files import StateFolder
 from ba_torchrl.data.replay.codecs import ImageCodec
@@ -22,6 +24,39 @@ _LEVEL = 1
 """Level of zlib: it compresses rendered depth fifty-fold, and higher ones gain little."""
 _BYTES_PER_FRAME = 100
 """Memory of a frame's slot, count and index entry in CPython, without the compressed frame."""
+
+
+class OneProcess:
+    """A part of a replay whose contents other processes cannot see.
+
+    Precedes TorchRL's class among the bases. `MultiSyncCollector` sends its replay to processes.
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        if get_spawning_popen() is not None:
+            raise RuntimeError(
+                f"{type(self).__name__} cannot be shared between processes: collect without "
+                "replay_buffer, and extend the replay with each batch of the collector"
+            )
+        return super().__getstate__()
+
+
+def stored_flags(storage: Storage, key: NestedKey, index: slice | Tensor = slice(None)) -> Tensor:
+    """Return whether an entry is set in stored items of any of TorchRL's storages.
+
+    Args:
+        storage: of tensordicts; not empty.
+        key: of the entry; of an item with several values, one suffices.
+        index: of the items, int64 [N], counted over all dimensions of the storage.
+
+    Returns:
+        bool [N], on the CPU.
+    """
+    if isinstance(storage, TensorStorage):
+        flags = storage.get(key).flatten(0, storage.ndim - 1)[index]
+    else:
+        flags = torch.stack([item[key] for item in storage.get(index)])
+    return flags.unsqueeze(-1).flatten(1).any(1).cpu()
 
 
 class FrameTable:
@@ -126,7 +161,7 @@ class FrameTable:
         self._packed_bytes = sum(map(sys.getsizeof, self._slots))
 
 
-class FrameStorage(StateFolder, LazyTensorStorage):
+class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
     """A TorchRL storage that stores an image once, also where it is both an image and a next image.
 
     All other entries are ordinary columns. Images are stored as codes of their codec, compressed
@@ -162,25 +197,25 @@ class FrameStorage(StateFolder, LazyTensorStorage):
     def set(
         self,
         cursor: int | Sequence[int] | slice | Tensor,
-        data: TensorDictBase,
+        data: TensorDictBase | list[TensorDictBase],
         *,
         set_cursor: bool = True,
     ) -> None:
         """Store transitions.
 
         Args:
-            cursor: indices of the transitions.
-            data: one transition if ``cursor`` is an int, else a batch of them.
+            cursor: indices of the transitions, or a mask.
+            data: one transition if ``cursor`` is a number, else a batch or list of them.
             set_cursor: whether the storage's length is extended to these indices, as for a writer.
         """
-        if isinstance(cursor, int) or (isinstance(cursor, Tensor) and not cursor.ndim):
-            cursor, data = [int(cursor)], data.unsqueeze(0)
-        indices = (
-            torch.arange(self.max_size, device="cpu")[cursor]
-            if isinstance(cursor, slice)
-            else cursor
-        )
-        indices = torch.as_tensor(indices, dtype=torch.long, device="cpu")
+        if isinstance(cursor, slice):
+            cursor = range(self.max_size)[cursor]
+        indices = torch.as_tensor(cursor, device="cpu")
+        if not indices.ndim:
+            indices, data = indices.unsqueeze(0), data.unsqueeze(0)
+        elif isinstance(data, list):
+            data = torch.stack(data)
+        indices = indices.nonzero()[:, 0] if indices.dtype == torch.bool else indices.long()
         if len(indices) > self.max_size:  # keep the last of each index
             indices, data = indices[-self.max_size :], data[-self.max_size :]
         super().set(indices, data.exclude(*self.frame_keys), set_cursor=set_cursor)
@@ -207,14 +242,20 @@ class FrameStorage(StateFolder, LazyTensorStorage):
                     frames.release(slot)
             slots[place] = new
 
-    def get(self, index: int | Sequence[int] | slice | Tensor) -> TensorDictBase:
+    def get(
+        self, index: int | Sequence[int] | slice | Tensor | NestedKey
+    ) -> TensorDictBase | Tensor:
         """Return transitions with decoded images, or their codes.
 
         A slice over the whole storage decodes every image; `column` decodes none.
 
         Args:
-            index: of the transitions.
+            index: of the transitions; or the key of an entry, of all transitions.
         """
+        if isinstance(index, str) or (isinstance(index, tuple) and isinstance(index[0], str)):
+            key = unravel_key(index)
+            has_images = key == keys.NEXT or key in self.frame_keys
+            return self.get(slice(None))[key] if has_images else self.column(key)
         data = super().get(index).copy()
         for number, (key, codec) in enumerate(self.codecs.items()):
             slots = self._slots[number, : len(self)][index]
@@ -305,24 +346,24 @@ class FrameStorage(StateFolder, LazyTensorStorage):
         size = state_dict["size"]
         if size > self.max_size:
             raise ValueError(f"{size} saved transitions do not fit into {self.max_size}")
-        self._empty()
         if not size:
+            self._empty()
             return
         if set(state_dict["frames"]) != set(self.codecs):
             raise ValueError(
                 f"images saved: {', '.join(state_dict['frames'])}; kept here: "
                 f"{', '.join(self.codecs)}"
             )
+        # copies, as a storage's own state is a view of it
+        saved = state_dict["columns"].items()
         columns = TensorDict(
-            {tuple(name.split("/")): value for name, value in state_dict["columns"].items()},
-            batch_size=[size],
+            {tuple(name.split("/")): value.clone() for name, value in saved}, batch_size=[size]
         )
+        slots = torch.stack([state_dict["frames"][key]["slots"] for key in self.codecs])
+        self._empty()
         super().set(torch.arange(size, device="cpu"), columns)
-        self._frames = {}
-        for number, key in enumerate(self.codecs):
+        self._slots[:, :size] = slots
+        for key, used in zip(self.codecs, slots, strict=True):
             saved = state_dict["frames"][key]
-            self._slots[number, :size] = saved["slots"]
             self._frames[key] = FrameTable(torch.Size(saved["shape"]))
-            self._frames[key].load(
-                saved["packed"], saved["sizes"], saved["slots"].reshape(-1).tolist()
-            )
+            self._frames[key].load(saved["packed"], saved["sizes"], used.reshape(-1).tolist())

@@ -7,15 +7,16 @@ from typing import Any
 import torch
 from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.storages import Storage
 
 from ba_torchrl.data.files import StateFolder
-from ba_torchrl.data.replay.storage import FrameStorage
+from ba_torchrl.data.replay.storage import OneProcess, stored_flags
 from ba_torchrl.envs import keys
 
 _SIDES = ("expert", "online")
 
 
-class SymmetricSampler(StateFolder, Sampler):
+class SymmetricSampler(OneProcess, StateFolder, Sampler):
     """Half of every batch from demonstrations, half from online transitions (appendix G.1).
 
     Each half is drawn uniformly, with replacement, demonstrations first. While there are none of
@@ -23,7 +24,7 @@ class SymmetricSampler(StateFolder, Sampler):
     more.
 
     Args:
-        seed: of the draws; each half has a separate generator.
+        seed: of the draws; each half has a separate generator, and that of the buffer is not used.
     """
 
     def __init__(self, seed: int) -> None:
@@ -31,15 +32,22 @@ class SymmetricSampler(StateFolder, Sampler):
             side: torch.Generator().manual_seed(2 * seed + i) for i, side in enumerate(_SIDES)
         }
 
-    def sample(self, storage: FrameStorage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+    def sample(
+        self, storage: Storage, batch_size: int
+    ) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         """Return indices of transitions, int64 [batch_size], and nothing else.
+
+        Args:
+            storage: the storage that is sampled; with several dimensions, a tuple of indices is
+                returned.
+            batch_size: number of draws.
 
         Raises:
             RuntimeError: the storage is empty.
         """
         if not len(storage):
             raise RuntimeError("cannot sample from an empty replay")
-        is_demonstration = storage.column(keys.IS_DEMONSTRATION).reshape(-1)
+        is_demonstration = stored_flags(storage, keys.IS_DEMONSTRATION)
         expert, online = (flags.nonzero()[:, 0] for flags in (is_demonstration, ~is_demonstration))
         count = batch_size // 2 if len(expert) else batch_size
         count = count if len(online) else 0
@@ -49,7 +57,8 @@ class SymmetricSampler(StateFolder, Sampler):
             for (places, n), generator in zip(halves, self.generators.values(), strict=True)
             if n
         ]
-        return torch.cat(index), {}
+        index = torch.cat(index)
+        return (torch.unravel_index(index, storage.shape) if storage.ndim > 1 else index), {}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the generators."""

@@ -6,7 +6,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictRoundRobinWriter
+from torchrl.data.replay_buffers.storages import Storage
 
+from ba_torchrl.data.replay.storage import stored_flags
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 
@@ -18,54 +20,65 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
     without this entry are written as by TorchRL's writer.
     """
 
-    def select_fitting(self, data: TensorDictBase) -> TensorDictBase:
-        """Return the transitions that fit: all demonstrations, and the newest of the others.
+    def register_storage(self, storage: Storage) -> None:
+        """Set the storage to write into.
+
+        Raises:
+            ConfigError: it has several dimensions.
+        """
+        if storage.ndim > 1:
+            raise ConfigError(
+                f"{type(self).__name__} needs a storage of one dimension, got ndim={storage.ndim}; "
+                "flatten transitions with reshape(-1)"
+            )
+        super().register_storage(storage)
+
+    def add(self, data: TensorDictBase) -> int:
+        """Write one transition; return its index."""
+        return int(self.extend(data.unsqueeze(0)))
+
+    def extend(self, data: TensorDictBase) -> Tensor:
+        """Write transitions: all demonstrations, and as many of the newest others as fit.
 
         Args:
-            data: transitions [N].
+            data: transitions [N]; their entry "index" is set.
+
+        Returns:
+            Their indices, int64 [N]; -1 for those that do not fit, as of TorchRL's
+            `TensorDictMaxValueWriter`.
 
         Raises:
             ConfigError: stored and new demonstrations exceed the capacity.
         """
-        indices = self._writable_indices(data)
-        excess = 0 if indices is None else len(data) - len(indices)
-        if excess <= 0:
-            return data
-        others = (~data[keys.IS_DEMONSTRATION].reshape(-1)).nonzero().reshape(-1)
-        if not len(indices) or excess > len(others):
-            raise ConfigError(
-                f"demonstrations fill the replay of {self._storage.max_size} transitions, and "
-                f"{len(data)} more do not fit; raise buffer_size"
-            )
-        is_chosen = torch.ones(len(data), dtype=torch.bool, device="cpu")
-        is_chosen[others[:excess]] = False
-        return data[is_chosen]
-
-    def extend(self, data: TensorDictBase) -> Tensor:
-        """Write transitions [N] that `select_fitting` returned; return their indices, int64 [N]."""
-        indices = self._writable_indices(data)
-        if indices is None:
+        storage, count = self._storage, len(data)
+        if len(storage) + count <= storage.max_size or keys.IS_DEMONSTRATION not in data:
             return super().extend(data)
-        index = indices[: len(data)]
-        self._cursor = (int(index[-1]) + 1) % self._storage.max_size
-        self._write_count += len(data)
-        data.set("index", index)
-        self._storage.set(index, data)
-        self._mark_update_entities(index)
-        return index
-
-    def _writable_indices(self, data: TensorDictBase) -> Tensor | None:
-        """Return the indices to overwrite, oldest first; None if TorchRL's order applies."""
-        storage = self._storage
-        if len(storage) + len(data) <= storage.max_size or keys.IS_DEMONSTRATION not in data:
-            return None
+        is_new = data[keys.IS_DEMONSTRATION].reshape(count, -1).any(1).cpu()
         is_kept = torch.zeros(storage.max_size, dtype=torch.bool, device="cpu")
         if len(storage):
-            is_kept[: len(storage)] = storage.column(keys.IS_DEMONSTRATION).reshape(-1)
-        if not (is_kept.any() or data[keys.IS_DEMONSTRATION].any()):
-            return None
-        order = (
-            torch.arange(self._cursor, self._cursor + storage.max_size, device="cpu")
-            % storage.max_size
-        )
-        return order[~is_kept[order]]
+            is_kept[: len(storage)] = stored_flags(storage, keys.IS_DEMONSTRATION)
+        if not (is_kept.any() or is_new.any()):
+            return super().extend(data)
+        order = torch.arange(self._cursor, self._cursor + storage.max_size, device="cpu")
+        order = order % storage.max_size
+        places = order[~is_kept[order]]  # oldest first
+        others = (~is_new).nonzero()[:, 0]
+        excess = max(0, count - len(places))
+        if not len(places) or excess > len(others):
+            raise ConfigError(
+                f"demonstrations fill the replay of {storage.max_size} transitions, and {count} "
+                "more do not fit; raise buffer_size"
+            )
+        is_written = torch.ones(count, dtype=torch.bool, device="cpu")
+        is_written[others[:excess]] = False
+        places = places[: count - excess]
+        index = torch.full((count,), -1, device="cpu")
+        index[is_written] = places
+        self._cursor = (int(places[-1]) + 1) % storage.max_size
+        self._write_count += len(places)
+        data.set("index", index)
+        written = data[is_written] if excess else data
+        storage.set(places, written)
+        self._bump_generation(places, written)
+        self._mark_update_entities(places)
+        return index

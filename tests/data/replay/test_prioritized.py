@@ -192,12 +192,14 @@ def make(flags, bonus=1.0, seed=0, capacity=None, **settings):
     capacity = capacity or len(flags)
     sampler = ExpertPrioritizedSampler(
         capacity,
-        generator=torch.Generator().manual_seed(seed),
         expert_bonus=bonus,
         **settings,
     )
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity), sampler=sampler, batch_size=4000
+        storage=LazyTensorStorage(capacity),
+        sampler=sampler,
+        batch_size=4000,
+        generator=torch.Generator().manual_seed(seed),
     )
     buffer.extend(transitions(flags))
     return buffer, sampler
@@ -283,10 +285,12 @@ def test_new_transitions_get_the_largest_priority_of_the_updates():
     assert leaves(sampler, 2) == pytest.approx([0.050001**0.6, 1.0])  # at least one
 
 
-def test_the_largest_priority_does_not_grow_by_a_bonus_per_insertion():
+@pytest.mark.parametrize("method", ["extend", "add"])
+def test_the_largest_priority_does_not_grow_by_a_bonus_per_insertion(method):
     buffer, sampler = make([True] * 4, bonus=1.0, capacity=16)
     for i in range(200):
-        buffer.extend(transitions([i % 2 == 0]))
+        new = transitions([i % 2 == 0])
+        getattr(buffer, method)(new if method == "extend" else new[0])
         sample = buffer.sample(4)
         sample["td_error"] = torch.full((4, 1), 0.2)
         buffer.update_tensordict_priority(sample)
@@ -321,12 +325,14 @@ def test_a_restored_sampler_continues_the_same_draws(on_disk, tmp_path):
     buffer.update_priority(torch.arange(8), torch.tensor(ERRORS))
     buffer.sample()
     state = copy.deepcopy(sampler.state_dict())
+    draws = torch.Generator().set_state(buffer._rng.get_state())
     if on_disk:
         write_state(tmp_path, state)
         state = read_state(tmp_path)
     expected = buffer.sample()
     other, restored = make(FLAGS, capacity=12, seed=77)
     restored.load_state_dict(state)
+    other.set_rng(draws)
     actual = other.sample()
     assert torch.equal(actual["x"], expected["x"])
     assert torch.equal(actual["priority_weight"], expected["priority_weight"])
@@ -337,9 +343,9 @@ def test_a_restored_sampler_continues_the_same_draws(on_disk, tmp_path):
 
 
 def test_a_large_checkpoint_is_saved_and_loaded_fast():
-    sampler = ExpertPrioritizedSampler(100_000, generator=torch.Generator(), expert_bonus=0)
+    sampler = ExpertPrioritizedSampler(100_000, expert_bonus=0)
     sampler.update_priority(torch.arange(100_000), torch.rand(100_000))
-    other = ExpertPrioritizedSampler(100_000, generator=torch.Generator(), expert_bonus=0)
+    other = ExpertPrioritizedSampler(100_000, expert_bonus=0)
     start = time.perf_counter()
     other.load_state_dict(sampler.state_dict())
     assert time.perf_counter() - start < 2
@@ -353,17 +359,23 @@ def test_invalid_arguments_are_refused():
     with pytest.raises(ValueError, match="storage"):
         sampler.update_priority(torch.tensor([0]), 1.0)
     with pytest.raises(ValueError, match="eps"):
-        ExpertPrioritizedSampler(4, generator=torch.Generator(), eps=0)
-    empty = ExpertPrioritizedSampler(4, generator=torch.Generator())
+        ExpertPrioritizedSampler(4, eps=0)
+    empty = ExpertPrioritizedSampler(4)
     with pytest.raises(RuntimeError, match="empty"):
         empty.sample(LazyTensorStorage(4), 2)
+    buffer.set_sampler(ExpertPrioritizedSampler(8))
+    with pytest.raises(RuntimeError, match="have no priorities: pass the sampler when"):
+        buffer.sample()
 
 
 def test_a_storage_of_two_dimensions():
-    generator = torch.Generator().manual_seed(0)
-    sampler = ExpertPrioritizedSampler(12, generator=generator, alpha=1.0, expert_bonus=0.0)
+    sampler = ExpertPrioritizedSampler(12, alpha=1.0, expert_bonus=0.0)
     rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(12, ndim=2), sampler=sampler, batch_size=4000, priority_key="td"
+        storage=LazyTensorStorage(12, ndim=2),
+        sampler=sampler,
+        batch_size=4000,
+        priority_key="td",
+        generator=torch.Generator().manual_seed(0),
     )
     data = TensorDict(
         {
@@ -382,10 +394,12 @@ def test_a_storage_of_two_dimensions():
 
 
 def test_the_bonus_in_a_storage_of_two_dimensions_is_that_of_the_experts():
-    generator = torch.Generator().manual_seed(0)
-    sampler = ExpertPrioritizedSampler(6, generator=generator, alpha=1.0, expert_bonus=1e6)
+    sampler = ExpertPrioritizedSampler(6, alpha=1.0, expert_bonus=1e6)
     rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(6, ndim=2), sampler=sampler, batch_size=200
+        storage=LazyTensorStorage(6, ndim=2),
+        sampler=sampler,
+        batch_size=200,
+        generator=torch.Generator().manual_seed(0),
     )
     is_demonstration = torch.zeros(2, 3, 1, dtype=torch.bool)
     is_demonstration[1, 2] = True
