@@ -136,10 +136,10 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         """
         if priority is self.default_priority:  # what TorchRL's `add` passes without a TD error
             return self.mark_update(index, storage=storage)
-        index = torch.stack(index, -1) if isinstance(index, tuple) else torch.as_tensor(index)
-        index = index.long().cpu()
+        index = torch.stack(index, -1) if isinstance(index, tuple) else index
+        index = torch.as_tensor(index, dtype=torch.long, device="cpu")
         if index.ndim > 1:
-            index = torch.as_tensor(np.ravel_multi_index(index.unbind(-1), storage.shape))
+            index = torch.from_numpy(np.ravel_multi_index(index.unbind(-1), storage.shape))
         index = index.reshape(-1)
         error = torch.as_tensor(priority, dtype=self.dtype, device="cpu").reshape(-1).abs()
         if not error.isfinite().all():
@@ -157,8 +157,8 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             index: as of `update_priority`.
             storage: as of `update_priority`; needed if it has several dimensions.
         """
-        largest = torch.as_tensor(self.default_priority, dtype=self.dtype).clamp_min(1.0)
-        super().update_priority(index, largest, storage=storage)
+        largest = torch.as_tensor(self.default_priority, dtype=self.dtype, device="cpu")
+        super().update_priority(index, largest.clamp_min(1.0), storage=storage)
 
     def _bonus(self, index: Tensor, storage: Storage | None) -> Tensor | float:
         if not self.expert_bonus:
