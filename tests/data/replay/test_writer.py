@@ -1,9 +1,11 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.make import make_replay
+from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 
@@ -90,3 +92,11 @@ def test_a_restored_replay_keeps_its_demonstrations(tmp_path):
         one.extend(transitions(range(20, 29), False))
         assert sorted(numbers_in(one)) == [0, 1, 2, *range(24, 29)]
     assert numbers_in(made) == numbers_in(restored)
+
+
+def test_a_slot_that_is_written_again_has_another_generation():
+    writer = ExpertKeepingWriter(track_generations=True)
+    made = TensorDictReplayBuffer(storage=LazyTensorStorage(4), writer=writer)
+    made.extend(torch.cat([transitions([0], True), transitions([1, 2, 3], False)]))
+    made.extend(transitions([4, 5], False))
+    assert writer.generations_of(torch.arange(4)).tolist() == [0, 1, 1, 0]
