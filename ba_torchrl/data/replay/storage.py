@@ -247,7 +247,8 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
     ) -> TensorDictBase | Tensor:
         """Return transitions with decoded images, or their codes.
 
-        A slice over the whole storage decodes every image; `column` decodes none.
+        A slice over the whole storage decodes every image; `column` decodes none. TorchRL's
+        `SliceSampler` takes such a slice for each batch, its sample unit `Sequence` one entry.
 
         Args:
             index: of the transitions; or the key of an entry, of all transitions.
