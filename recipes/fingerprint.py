@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ba_torchrl.cli.types import check_writable_file
+from ba_torchrl.data.files import write_text
 from ba_torchrl.errors import ConfigError
 from profiling.fingerprint.cases import PARTS, cases
 from profiling.fingerprint.compare import compare, read_record
@@ -45,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"  {name}: {records[name]['facts'][word]}")
     if options.out is not None:
         content = {"parts": list(parts), "versions": versions(), "cases": records}
-        options.out.write_text(json.dumps(content, separators=(",", ":")) + "\n")
+        write_text(options.out, json.dumps(content, separators=(",", ":")) + "\n")
     print(f"{len(records)} cases in {seconds:.0f} s")
     if old is None:
         return 0

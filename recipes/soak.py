@@ -11,7 +11,6 @@ same call continues with the tasks without a file.
 from __future__ import annotations
 
 import gc
-import json
 import logging
 import os
 import subprocess
@@ -29,7 +28,7 @@ from ba_torchrl import list_tasks, make
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import EnvSettings, OutputFolder, TaskId, Tasks, check_writable_file
 from ba_torchrl.data.demos import expert_policy
-from ba_torchrl.data.files import write_text
+from ba_torchrl.data.files import read_json, write_text
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.plugins import load_plugins
@@ -213,7 +212,7 @@ def _read(path: Path, job: SoakJob) -> SoakFigures | None:
     if not path.exists():
         return None
     try:
-        figures = SoakFigures.model_validate(json.loads(path.read_text()))
+        figures = SoakFigures.model_validate(read_json(path))
     except (ValueError, ValidationError, RecursionError) as error:
         logger.warning("%s is damaged and measured again: %s", path, error)
         return None

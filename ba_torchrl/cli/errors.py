@@ -23,6 +23,7 @@ _RESOURCES = {
     errno.EACCES,
     errno.EDQUOT,
     errno.EFBIG,
+    errno.EIO,
     errno.EISDIR,
     errno.ELOOP,
     errno.EMFILE,

@@ -41,6 +41,7 @@ from ba_torchrl.data.demos import (
     source_config,
 )
 from ba_torchrl.data.episodes import mean_length, success_rate
+from ba_torchrl.data.files import complete_only
 from ba_torchrl.data.time_reversal import check_has_structure, replay_scores
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
@@ -154,39 +155,40 @@ def _collect(settings: Settings) -> None:
     check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")
     if settings.source == "deconstruction":
         check_has_structure(task)
-    env = make_vector_env(
-        task,
-        settings.num_envs,
-        parallel=settings.parallel,
-        register_modules=settings.plugins,
-        **{**settings.env, "seed": settings.seed, **source_config(settings.source)},
-    )
-    try:
-        with progress_bar(total=settings.episodes, unit="episode") as bar:
-            episodes = collect_demonstrations(
-                env,
-                settings.episodes,
-                seed=settings.seed,
-                source=settings.source,
-                only_successful=settings.only_successful,
-                noise=settings.noise,
-                turn_noise=settings.turn_noise,
-                turns=actions.turns,
-                primitive=actions.primitive,
-                on_episode=lambda _: bar.update(),
-            )
-    finally:
-        env.close()
-    if not episodes:
-        raise ConfigError(f"none of {settings.episodes} episodes of {task} can be used")
-    save_demonstrations(
-        path,
-        episodes,
-        task=task,
-        env=settings.env,
-        seed=settings.seed,
-        source=settings.source,
-    )
+    with complete_only(path) as scratch:
+        env = make_vector_env(
+            task,
+            settings.num_envs,
+            parallel=settings.parallel,
+            register_modules=settings.plugins,
+            **{**settings.env, "seed": settings.seed, **source_config(settings.source)},
+        )
+        try:
+            with progress_bar(total=settings.episodes, unit="episode") as bar:
+                episodes = collect_demonstrations(
+                    env,
+                    settings.episodes,
+                    seed=settings.seed,
+                    source=settings.source,
+                    only_successful=settings.only_successful,
+                    noise=settings.noise,
+                    turn_noise=settings.turn_noise,
+                    turns=actions.turns,
+                    primitive=actions.primitive,
+                    on_episode=lambda _: bar.update(),
+                )
+        finally:
+            env.close()
+        if not episodes:
+            raise ConfigError(f"none of {settings.episodes} episodes of {task} can be used")
+        save_demonstrations(
+            scratch,
+            episodes,
+            task=task,
+            env=settings.env,
+            seed=settings.seed,
+            source=settings.source,
+        )
     print(
         f"{len(episodes)} episodes of {task}, success {success_rate(episodes):.2f}, "
         f"{mean_length(episodes):.1f} steps each, in {path}"

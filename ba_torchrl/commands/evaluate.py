@@ -29,7 +29,7 @@ from ba_torchrl.cli.types import (
     VectorSettings,
     VideoFile,
 )
-from ba_torchrl.data.files import write_text
+from ba_torchrl.data.files import read_json, write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.results import wilson_interval
@@ -175,7 +175,7 @@ def _kept(policy: TrainedPolicy, settings: Settings, seed: int) -> Evaluation:
         "ba_torchrl": __version__,
     }
     try:
-        saved = dict(json.loads(file.read_text(encoding="utf-8")))
+        saved = dict(read_json(file))
         if asked.items() <= saved.items():
             return Evaluation(**{field.name: saved[field.name] for field in fields(Evaluation)})
     except (OSError, ValueError, TypeError, KeyError):

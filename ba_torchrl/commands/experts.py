@@ -6,7 +6,6 @@ ba-torchrl experts robots=[panda,ur5] episodes=50 tasks=[close_loop/block_pickin
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator
@@ -26,6 +25,7 @@ from ba_torchrl.cli.types import (
     without,
 )
 from ba_torchrl.data.demos import expert_scores
+from ba_torchrl.data.files import write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
@@ -108,7 +108,7 @@ def main(settings: Settings) -> None:
     text = "\n\n".join(tables)
     print(f"\n{text}\n\n{settings.episodes} episodes each, seed {settings.seed}")
     if settings.path is not None:
-        Path(settings.path).write_text(text + "\n")
+        write_text(settings.path, text + "\n")
 
 
 def _table_of(task: str, variants: dict[str, Any]) -> str:

@@ -14,6 +14,8 @@ ba-torchrl play close_loop/block_picking policy=keyboard path=demos/mine episode
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Annotated, ClassVar
 
 import torch
@@ -26,6 +28,7 @@ from ba_torchrl.cli.types import Count, EnvSettings, NewPath, TaskId, Text, Vide
 from ba_torchrl.data.demo_files import save_demonstrations
 from ba_torchrl.data.demos import expert_policy
 from ba_torchrl.data.episodes import Policy, success_rate
+from ba_torchrl.data.files import complete_only
 from ba_torchrl.data.teleoperation import Keyboard, KeyEvents, record_demonstrations
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.errors import ConfigError
@@ -66,11 +69,17 @@ def main(settings: Settings) -> None:
         raise ConfigError("only_successful: only policy=keyboard records; leave it out")
     resolved, policy = _task_and_policy(settings)
     torch.manual_seed(settings.seed)
-    frames = record_episodes(resolved, policy, settings.episodes, settings.seed)
+    frames = record_episodes(
+        resolved, policy, settings.episodes, settings.seed, on_episode=_print_episode
+    )
     print(f"{settings.episodes} episodes of {resolved.task_id}, {len(frames)} pictures")
     if settings.video is not None:
         fps = settings.fps or resolved.video_fps
         print(f"  video  {write_video(settings.video, frames, fps=fps)}")
+
+
+def _print_episode(number: int, steps: int, is_success: bool) -> None:
+    print(f"episode {number}: {'success' if is_success else 'failure'} after {steps} steps")
 
 
 def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
@@ -101,10 +110,12 @@ def _record_keyboard(settings: Settings) -> None:
             f"policy: the keyboard moves the gripper of close-loop tasks; the actions of "
             f"{settings.task} are poses, record its expert by ba-torchrl collect"
         )
+    kept = []
+    written = ExitStack()
+    scratch = written.enter_context(complete_only(Path(settings.path)))
     env = make(resolved, seed=settings.seed)
     # after the lines that PyBullet writes when it opens the window
     print(f"keys in the window:\n{Keyboard(resolved.actions).help()}")
-    kept = []
     try:
         for episode in record_demonstrations(
             env,
@@ -119,15 +130,16 @@ def _record_keyboard(settings: Settings) -> None:
         print("interrupted")
     finally:
         env.close()
-        if kept:
-            save_demonstrations(
-                settings.path,
-                kept,
-                task=settings.task,
-                env=settings.env,
-                seed=settings.seed,
-                source="keyboard",
-            )
+        with written:  # also if an error ends the recording
+            if kept:
+                save_demonstrations(
+                    scratch,
+                    kept,
+                    task=settings.task,
+                    env=settings.env,
+                    seed=settings.seed,
+                    source="keyboard",
+                )
     where = f", success {success_rate(kept):.2f}, in {settings.path}" if kept else ""
     print(f"{len(kept)} episodes of {settings.task}{where}")
 

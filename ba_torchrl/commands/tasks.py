@@ -12,6 +12,7 @@ from pathlib import Path
 from ba_torchrl import describe, list_tasks
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks, check_untracked
+from ba_torchrl.data.files import write_text
 from ba_torchrl.envs.description import summary
 from ba_torchrl.record.task_page import task_page, tasks_by_heading
 
@@ -33,8 +34,7 @@ def main(settings: Settings) -> None:
         path = Path(settings.path)
         if not settings.overwrite:
             check_untracked([path])
-        path.write_text(task_page(settings.tasks), encoding="utf-8")
-        print(path)
+        print(write_text(path, task_page(settings.tasks)))
     elif settings.tasks is not None:
         print("\n\n".join(str(describe(task)) for task in settings.tasks))
     else:

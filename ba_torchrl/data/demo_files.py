@@ -18,6 +18,7 @@ from ba_torchrl.data.exchange import check_same_environment, env_values, import_
 from ba_torchrl.data.files import (
     check,
     complete_only,
+    read_json,
     read_state,
     seal,
     write_state,
@@ -57,6 +58,7 @@ def save_demonstrations(
     Raises:
         ValueError: there are no episodes.
         FileExistsError: the folder already holds demonstrations.
+        ConfigError: another process writes it.
     """
     if not episodes:
         raise ValueError("there are no episodes to save")
@@ -189,7 +191,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
         ConfigError: there are none at ``path``, or their files are damaged.
     """
     try:
-        metadata = json.loads((path / _METADATA_FILE).read_text(encoding="utf-8"))
+        metadata = read_json(path / _METADATA_FILE)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     check(path)

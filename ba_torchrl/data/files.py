@@ -1,17 +1,24 @@
 """Folders of data: tensors in safetensors files and values in JSON, with checksums.
 
 `seal` writes ``checksums.json``, with length and CRC-32 of every file of a folder; `check` compares
-the folder with it. No file of another type is opened, so that none can run code.
+the folder with it. No file of another type is opened, so that none can run code. Hidden files and
+texts are ignored, and links to files are followed.
+
+`replaced` and `complete_only` give a file or folder its name when it is complete on the disk.
+`Lock` keeps other processes out (POSIX systems).
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import re
 import shutil
+import socket
 import zlib
+from codecs import BOM_UTF8
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,9 +32,10 @@ from safetensors.torch import save_file
 from ba_torchrl.errors import ConfigError, DamagedFilesError
 
 OLD = ".old"
-"""Suffix of a folder that `publish` replaces."""
+"""Suffix of a folder that `complete_only` replaces."""
 CHECKSUMS_FILE = "checksums.json"
 _DATA_SUFFIXES = frozenset({".json", ".safetensors"})
+_TEXT_SUFFIXES = frozenset({".md", ".txt"})
 _TENSORS_FILE, _VALUES_FILE = "tensors.safetensors", "values.json"
 _CHUNK = 1 << 20
 
@@ -40,17 +48,34 @@ def write_text(path: str | Path, text: str) -> Path:
         text: its content.
     """
     path = Path(path)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with replaced(path) as scratch:
+        scratch.write_text(text, encoding="utf-8")
+    return path
+
+
+@contextmanager
+def replaced(path: str | Path) -> Iterator[Path]:
+    """Yield a path with the same suffix, for a file that takes a name when it is complete.
+
+    If the block raises, an older file of that name remains. A device is written to directly.
+
+    Args:
+        path: of the file, or a link to it; its folder is created if needed.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        yield path
+        return
+    path = Path(os.path.realpath(path))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{os.getpid()}.{os.urandom(3).hex()}.{path.name}")
     try:
-        with scratch.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
+        yield scratch
+        _flush(scratch)
         os.replace(scratch, path)
     finally:
         scratch.unlink(missing_ok=True)
     _flush(path.parent)
-    return path
 
 
 def seal(folder: str | Path) -> None:
@@ -67,39 +92,81 @@ def seal(folder: str | Path) -> None:
         _flush(path)
 
 
-def publish(scratch: Path, folder: Path) -> None:
-    """Give a sealed folder its final name; a folder of that name is deleted afterwards."""
-    old = folder.with_name(f".{folder.name}{OLD}")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(scratch, folder)
-    _flush(folder.parent)
-    shutil.rmtree(old, ignore_errors=True)
-
-
 @contextmanager
-def complete_only(path: Path) -> Iterator[Path]:
+def complete_only(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a path of the same name in a hidden folder, for a file or folder that is written there.
 
     When it is complete on the disk, it gets its place, after the files beside it. If the block
-    raises, nothing of it remains.
+    raises, nothing of it remains. One process at a time is in the block.
 
     Args:
-        path: of a new file or folder.
+        path: of a file or folder, which is new unless ``replace``.
+        replace: delete an older one of that name afterwards.
+
+    Raises:
+        ConfigError: another process writes it, or it exists.
     """
-    scratch = path.with_name(f".{path.name}.scratch")
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = Lock(path.with_name(f".{path.name}.lock"), f"writes {path}; choose another path")
+    scratch, old = (path.with_name(f".{path.name}{end}") for end in (".scratch", OLD))
     try:
+        is_empty = path.is_dir() and not any(path.iterdir())
+        if os.path.lexists(path) and not replace and not is_empty:
+            raise ConfigError(f"{path} exists already; choose another path")
+        shutil.rmtree(scratch, ignore_errors=True)  # of a process that was killed
+        scratch.mkdir()
         yield scratch / path.name
         for part in scratch.rglob("*"):
             _flush(part)
         for part in sorted(scratch.iterdir(), key=lambda part: part.name == path.name):
-            os.replace(part, path.with_name(part.name))
+            target = path.with_name(part.name)
+            if target.is_dir():
+                shutil.rmtree(old, ignore_errors=True)
+                os.replace(target, old)
+            os.replace(part, target)
         _flush(path.parent)
+        shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+        lock.release()
+
+
+class Lock:
+    """Locks a file, which is created, until `release` or the end of the process.
+
+    Args:
+        path: of the file, which names the process.
+        what: the process does, in words.
+
+    Raises:
+        ConfigError: another process holds the lock; the message names it.
+    """
+
+    def __init__(self, path: Path, what: str) -> None:
+        self._path = path
+        while True:
+            self._file = path.open("a+")
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if os.path.samestat(os.fstat(self._file.fileno()), path.stat()):
+                    break
+            except FileNotFoundError:  # its holder has deleted it
+                pass
+            except BlockingIOError:
+                self._file.seek(0)
+                holder = self._file.read() or "another process"
+                self._file.close()
+                raise ConfigError(f"{holder} {what}") from None
+            self._file.close()
+        self._file.truncate(0)
+        self._file.write(f"process {os.getpid()} on {socket.gethostname()}")
+        self._file.flush()
+
+    def release(self) -> None:
+        """Unlock and delete the file; further calls have no effect."""
+        if not self._file.closed:
+            self._path.unlink(missing_ok=True)
+            self._file.close()
 
 
 def check(folder: str | Path) -> None:
@@ -112,7 +179,7 @@ def check(folder: str | Path) -> None:
     """
     folder = Path(folder)
     try:
-        listed = json.loads((folder / CHECKSUMS_FILE).read_text(encoding="utf-8"))["crc32"]
+        listed = read_json(folder / CHECKSUMS_FILE)["crc32"]
         listed = {name: (int(size), int(checksum)) for name, (size, checksum) in listed.items()}
     except FileNotFoundError:
         raise DamagedFilesError(
@@ -149,12 +216,36 @@ def write_state(folder: str | Path, state: Mapping[str, Any]) -> None:
     tensors: dict[str, torch.Tensor] = {}
     values = _encoded(state, tensors)
     (folder / _VALUES_FILE).write_text(json.dumps(values) + "\n", encoding="utf-8")
+    write_tensors(folder / _TENSORS_FILE, tensors)
+
+
+def write_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
+    """Write a safetensors file.
+
+    Raises:
+        OSError: there is not enough space, or the file cannot be written.
+    """
     try:
-        save_file(tensors, folder / _TENSORS_FILE)
+        save_file(tensors, path)
     except SafetensorError as error:
         number = re.search(r"os error (\d+)", str(error))
         code = int(number[1]) if number else errno.EIO
-        raise OSError(code, os.strerror(code), str(folder / _TENSORS_FILE)) from error
+        raise OSError(code, os.strerror(code), str(path)) from error
+
+
+def json_bytes(path: str | Path) -> bytes:
+    """Return the text of a JSON file, without the byte-order mark that editors may add."""
+    return Path(path).read_bytes().removeprefix(BOM_UTF8)
+
+
+def read_json(path: str | Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is not JSON.
+    """
+    return json.loads(json_bytes(path))
 
 
 def read_state(folder: str | Path) -> dict[str, Any]:
@@ -165,7 +256,7 @@ def read_state(folder: str | Path) -> dict[str, Any]:
     """
     folder = Path(folder)
     try:
-        values = json.loads((folder / _VALUES_FILE).read_text(encoding="utf-8"))
+        values = read_json(folder / _VALUES_FILE)
         with safe_open(folder / _TENSORS_FILE, framework="pt") as file:
             # copies, as the file may be deleted or altered while they are in use
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
@@ -236,13 +327,17 @@ class StateFolder:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Yield the files below a folder.
+    """Yield the files of data below a folder, without hidden files and texts.
 
     Raises:
         ConfigError: one of them is not plain data.
     """
     for path in sorted(folder.rglob("*")):
-        if path.is_symlink() or not (path.is_dir() or path.suffix in _DATA_SUFFIXES):
+        is_hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if is_hidden or path.suffix in _TEXT_SUFFIXES:
+            continue
+        is_folder = path.is_dir() and not path.is_symlink()
+        if not is_folder and not (path.is_file() and path.suffix in _DATA_SUFFIXES):
             raise ConfigError(
                 f"{path} is not opened: only {' and '.join(sorted(_DATA_SUFFIXES))} files are "
                 "data, others could run code. Folders of earlier versions are not read"

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ba_torchrl import make
+from ba_torchrl.data.files import replaced
 from ba_torchrl.data.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import keys
 from ba_torchrl.record.task_page import tasks_by_heading
@@ -138,8 +139,9 @@ class _Sheet:
     def write(self, path: str | Path) -> Path:
         """Write the figure as a PNG with a palette."""
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.canvas.draw()
         image = Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3])
-        image.quantize(_COLORS, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
+        picture = image.quantize(_COLORS, kmeans=2, dither=Image.Dither.NONE)
+        with replaced(path) as scratch:
+            picture.save(scratch, optimize=True)
         return path

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ba_torchrl.data.files import replaced
 from ba_torchrl.errors import MissingPackageError, install_command
 from ba_torchrl.record.logging import read_scalars
 
@@ -160,9 +161,10 @@ def _save(figure: Figure, path: str | Path) -> Path:
     path = Path(path)
     from matplotlib import rc_context
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with rc_context({"svg.hashsalt": path.stem}):  # the same file for the same curves
-        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+    metadata = {"Date": None} if path.suffix == ".svg" else None
+    # the same file for the same curves
+    with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
+        figure.savefig(scratch, metadata=metadata)
     return path
 
 

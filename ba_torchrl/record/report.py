@@ -17,6 +17,7 @@ from typing import Any
 
 from jinja2 import Environment
 
+from ba_torchrl.data.files import replaced, write_text
 from ba_torchrl.record.plots import plot_panels
 from ba_torchrl.record.results import now, why_unfinished
 from ba_torchrl.record.summary import (
@@ -87,16 +88,14 @@ def write_report(
     texts = [_DEFINITIONS, *map(_markdown, parts)]
     if left_out:
         texts.append("\n".join(["## Not finished", "", *(f"- {run}" for run in left_out)]))
-    (folder / "table.md").write_text("\n\n".join(texts) + "\n", encoding="utf-8")
+    write_text(folder / "table.md", "\n\n".join(texts) + "\n")
     tables = "\n\n".join(_latex(part) for part in parts)
-    (folder / "table.tex").write_text(tables + "\n", encoding="utf-8")
+    write_text(folder / "table.tex", tables + "\n")
     template = files("ba_torchrl.record").joinpath("report.html").read_text(encoding="utf-8")
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
     texts = {"definitions": _DEFINITIONS, "unfinished": left_out, "made": now()}
     headers = {"header": _HEADER, "settings_header": _SETTINGS_HEADER}
-    path = folder / "report.html"
-    path.write_text(page.render(sections=parts, **texts, **headers), encoding="utf-8")
-    return path
+    return write_text(folder / "report.html", page.render(sections=parts, **texts, **headers))
 
 
 def plot_section(
@@ -184,7 +183,7 @@ def _cells(row: dict[str, Any]) -> list[tuple[str, Any]]:
 
 def _write_csv(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     rows = list(rows)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replaced(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
@@ -261,8 +260,8 @@ def _videos(section: Section, folder: Path) -> list[dict[str, Any]]:
             if source.is_file():
                 name = _file_name(f"{group.task} {group.method} seed{run.result.seed}")
                 target = folder / "videos" / _file_name(section.title) / (name + source.suffix)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source, target)
+                with replaced(target) as scratch:
+                    shutil.copyfile(source, scratch)
                 videos.append({"seed": run.result.seed, "source": _relative(target, folder)})
         if videos:
             caption = f"{group.task}, {group.method}"

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import platform
 import subprocess
 from collections.abc import Collection, Iterable, Mapping
@@ -19,7 +18,7 @@ from pydantic import Field, ValidationError
 
 from ba_torchrl import __version__
 from ba_torchrl.config import StrictModel
-from ba_torchrl.data.files import write_text
+from ba_torchrl.data.files import json_bytes, read_json, write_text
 
 RESULT_FILE = "result.json"
 CONFIG_FILE = "config.json"
@@ -123,7 +122,7 @@ def read_result(folder: str | Path) -> RunResult:
     """
     path = Path(folder) / RESULT_FILE
     try:
-        return RunResult.model_validate_json(path.read_bytes())
+        return RunResult.model_validate_json(json_bytes(path))
     except ValidationError as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"{path} is not the result of a run: {reason}") from None
@@ -147,7 +146,7 @@ def read_failure(folder: str | Path) -> str | None:
     """Return why a benchmark's last run in a folder failed, None if it did not fail."""
     path = Path(folder) / FAILURE_FILE
     try:
-        return str(json.loads(path.read_text(encoding="utf-8"))["reason"])
+        return str(read_json(path)["reason"])
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):  # nested without end

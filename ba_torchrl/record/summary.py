@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ba_torchrl.errors import MissingPackageError, install_command
+from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
 from ba_torchrl.record.results import (
     NON_LEARNING_FIELDS,
     CurvePoint,
@@ -150,11 +150,12 @@ def load_sections(
 
     Return sections in the order of the benchmarks' names, runs without a benchmark last; and the
     folders of unfinished runs, those with a damaged result included. Runs whose settings are not
-    those of their benchmark have a section of their own, "NAME, changed".
+    those of their benchmark have a section of their own, "NAME, changed". Copies of a run are left
+    out.
 
     Raises:
         FileNotFoundError: a folder is missing, or none holds a finished run.
-        ValueError: a run is found twice.
+        ConfigError: runs have the same settings and seed, and are no copies.
     """
     roots = [Path(root) for root in roots]
     for root in roots:
@@ -164,10 +165,15 @@ def load_sections(
     runs = []
     for folder in finished:
         try:
-            runs.append(Run(folder, completed(read_result(folder))))
+            run = Run(folder, completed(read_result(folder)))
         except ValueError as error:
             logger.warning("left out: %s", error)
             unfinished.append(folder)
+            continue
+        if copied := [other.folder for other in runs if other.result == run.result]:
+            logger.warning("left out: %s is a copy of %s", folder, copied[0])
+        else:
+            runs.append(run)
     if not runs:
         raise FileNotFoundError(
             f"no finished run below {', '.join(map(str, roots))}: "
@@ -337,7 +343,10 @@ def _grouped(runs: Sequence[Run]) -> list[Group]:
             twice = {seed for seed in seeds if seeds.count(seed) > 1}
             if twice:
                 where = ", ".join(str(run.folder) for run in members if run.result.seed in twice)
-                raise ValueError(f"{task}, {label}: runs with the same settings and seed: {where}")
+                raise ConfigError(
+                    f"{task}, {label}: runs with the same settings and seed: {where}; name the "
+                    "folders to report"
+                )
             name = label + _distinction(members[0], [other[0] for other in alike])
             groups.append(Group(task, name, sorted(members, key=lambda run: run.result.seed)))
     return sorted(groups, key=lambda group: (group.task, group.method))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ba_torchrl.data.files import replaced
 from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
 
@@ -85,6 +88,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
 
     Raises:
         ImportError: imageio or its ffmpeg is missing.
+        OSError: there is not enough space, or the file cannot be written.
         ValueError: the suffix is unknown, ``fps`` is out of range, or a frame has another shape or
             type.
     """
@@ -94,21 +98,37 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, fps
     pictures = _checked(frames)
     try:
         import imageio
-        import imageio_ffmpeg  # noqa: F401  imageio reports it later and with less detail
+        import imageio_ffmpeg
     except ImportError as error:
         fix = f"writing videos needs {install_command('imageio', 'imageio-ffmpeg')}"
         raise MissingPackageError(fix) from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if suffix == ".gif":
-        imageio.mimwrite(path, _with_common_colors(pictures), duration=1000 / fps, loop=0)
-        return path
-    # yuv420p halves the resolution of chroma, hence even sizes; by default imageio resizes to
-    # multiples of 16.
-    pictures = [_even(picture) for picture in pictures]
-    imageio.mimwrite(
-        path, pictures, fps=fps, codec="libx264", pixelformat="yuv420p", macro_block_size=2
-    )
+    with replaced(path) as scratch:
+        if suffix == ".gif":
+            gif = _with_common_colors(pictures)
+            options = {"format": "gif", "duration": 1000 / fps, "loop": 0}
+            scratch.write_bytes(imageio.mimwrite("<bytes>", gif, **options))
+        else:
+            _encode(imageio_ffmpeg.get_ffmpeg_exe(), list(map(_even, pictures)), fps, scratch)
     return path
+
+
+def _encode(program: str, pictures: Sequence[np.ndarray], fps: float, path: Path) -> None:
+    """Run ffmpeg, whose exit code imageio does not report.
+
+    yuv420p halves the resolution of chroma, hence even sizes.
+    """
+    height, width = pictures[0].shape[:2]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps)]
+    target = ["-vcodec", "libx264", "-pix_fmt", "yuv420p", str(path)]
+    done = subprocess.run(
+        [program, "-y", "-v", "error", "-xerror", *source, "-i", "-", *target],
+        input=b"".join(picture.tobytes() for picture in pictures),
+        capture_output=True,
+        check=False,
+    )
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").splitlines() or ["no reason given"]
+        raise OSError(errno.EIO, f"ffmpeg: {lines[-1].split('] ')[-1]}")
 
 
 def _checked(frames: Sequence[np.ndarray] | np.ndarray) -> list[np.ndarray]:

@@ -12,7 +12,7 @@ from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner, Problem
-from ba_torchrl.data.files import write_text
+from ba_torchrl.data.files import read_json, write_text
 from ba_torchrl.envs.factory import make
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import check_known
@@ -100,7 +100,7 @@ def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
     """
     file = Path(folder) / CONFIG_FILE
     try:
-        saved = dict(json.loads(file.read_text(encoding="utf-8")))
+        saved = dict(read_json(file))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"cannot read {file}: {error}") from None
     return parse_saved(saved, file, **changes)

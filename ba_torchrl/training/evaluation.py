@@ -96,6 +96,7 @@ def record_episodes(
     episodes: int,
     seed: int,
     hold_frames: int = 4,
+    on_episode: Callable[[int, int, bool], None] = lambda number, steps, is_success: None,
 ) -> list[np.ndarray]:
     """Play greedy episodes and render every step, as a `FrameRecorder` with ``motion`` does.
 
@@ -105,6 +106,7 @@ def record_episodes(
         episodes: their number.
         seed: of the first.
         hold_frames: repetitions of an episode's last image.
+        on_episode: called with the number of each episode from 1, its steps, and its success.
 
     Returns:
         Images [H, W, 3] uint8 in the order of time.
@@ -114,12 +116,15 @@ def record_episodes(
     act = env.rand_action if policy is None else policy
     try:
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
-            for _ in range(episodes):
+            for number in range(1, episodes + 1):
                 state = env.reset()
                 recorder.record()
+                steps = 0
                 while not state[keys.DONE]:
                     state = env.step(act(state))[keys.NEXT]
+                    steps += 1
                     recorder.record()
+                on_episode(number, steps, bool(state[keys.SUCCESS]))
                 recorder.frames += [recorder.frames[-1]] * hold_frames
     finally:
         env.close()

@@ -28,6 +28,7 @@ from ba_torchrl.data.demo_files import (
 )
 from ba_torchrl.data.demos import RandomActions, expert_policy
 from ba_torchrl.data.episodes import Policy, collect_episodes, quotas
+from ba_torchrl.data.files import complete_only
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_vector_env
 from ba_torchrl.envs.settings import resolve_env
@@ -108,7 +109,8 @@ class GradedSets:
             Whether there was none.
 
         Raises:
-            ConfigError: the folder holds another set, or no policy has half success.
+            ConfigError: the folder holds another set, another process makes it, or no policy has
+                half success.
         """
         path = self.path(grade)
         if path.exists():
@@ -120,17 +122,17 @@ class GradedSets:
             "medium": self._medium,
             "mixed": self._mixed,
         }
-        episodes, policy = made_by[grade](on_episode)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_demonstrations(
-            path,
-            episodes,
-            task=self.task,
-            env=self.env,
-            seed=self.seed_of(grade),
-            source=grade,
-            policy=policy,
-        )
+        with complete_only(path) as scratch:
+            episodes, policy = made_by[grade](on_episode)
+            save_demonstrations(
+                scratch,
+                episodes,
+                task=self.task,
+                env=self.env,
+                seed=self.seed_of(grade),
+                source=grade,
+                policy=policy,
+            )
         return True
 
     def _check(self, grade: Grade) -> None:

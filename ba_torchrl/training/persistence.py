@@ -1,5 +1,5 @@
 """Files of a run that survive a loss of power: checkpoints, whose files are checked before they are
-loaded, and the lock on the run folder, which one process at a time holds (POSIX systems)."""
+loaded, and the lock on the run folder, which one process at a time holds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import fcntl
 import logging
 import os
 import shutil
-import socket
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,15 @@ from torchrl.checkpoint import (
     CheckpointLoadResult,
 )
 
-from ba_torchrl.data.files import OLD, check, publish, read_state, seal, write_state
+from ba_torchrl.data.files import (
+    OLD,
+    Lock,
+    check,
+    complete_only,
+    read_state,
+    seal,
+    write_state,
+)
 from ba_torchrl.errors import ConfigError, DamagedFilesError
 
 logger = logging.getLogger(__name__)
@@ -58,14 +65,9 @@ class DurableCheckpoint(Checkpoint):
             OSError: there is not enough space.
         """
         path = Path(path)
-        scratch = path.with_name(f".{path.name}.scratch")
-        shutil.rmtree(scratch, ignore_errors=True)
-        try:
+        with complete_only(path, replace=True) as scratch:
             super().save(scratch, **options)
             seal(scratch)
-            publish(scratch, path)
-        finally:
-            shutil.rmtree(scratch, ignore_errors=True)
         return path
 
     def load(self, path: str | Path, **options: Any) -> CheckpointLoadResult:
@@ -123,7 +125,10 @@ def remove_leftovers(folder: Path) -> None:
         if not checkpoint.exists():
             os.replace(replaced, checkpoint)
     for leftover in folder.glob(".checkpoint-*"):
-        shutil.rmtree(leftover)
+        if leftover.is_dir():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink()
 
 
 def first_sound(paths: Iterable[Path]) -> Path | None:
@@ -141,7 +146,7 @@ def first_sound(paths: Iterable[Path]) -> Path | None:
     return None
 
 
-class RunLock:
+class RunLock(Lock):
     """Locks a run folder until `release` or the end of the process.
 
     Args:
@@ -153,19 +158,7 @@ class RunLock:
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._file = (folder / LOCK_FILE).open("a+")
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._file.close()
-            raise ConfigError(f"{lock_holder(folder)} runs the experiment in {folder}") from None
-        self._file.truncate(0)
-        self._file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        self._file.flush()
-
-    def release(self) -> None:
-        """Unlock the folder; further calls have no effect."""
-        self._file.close()
+        super().__init__(folder / LOCK_FILE, f"runs the experiment in {folder}")
 
 
 def lock_holder(folder: Path) -> str | None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from pydantic import Field, ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -21,7 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.config import StrictModel, explain
-from ba_torchrl.data.files import write_text
+from ba_torchrl.data.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, known_names
@@ -218,6 +218,10 @@ def save_policy(
         episodes: number of episodes that were played.
         seed: of these episodes.
         num_envs: number of environments that played them.
+
+    Raises:
+        ConfigError: another process writes the file.
+        OSError: there is not enough space, or a file cannot be written.
     """
     path = Path(path)
     run: dict[str, Any] = {}
@@ -249,16 +253,16 @@ def save_policy(
         **run,
     )
     tensors = {name: value.detach().cpu() for name, value in policy.policy.state_dict().items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_file(
-        {
-            name: value.half() if value.is_floating_point() else value.clone()
-            for name, value in tensors.items()
-        },
-        path,
-    )
-    path.chmod(0o644)  # safetensors makes it readable for its owner alone
-    write_text(path.with_suffix(CARD), card.model_dump_json(indent=2) + "\n")
+    with complete_only(path, replace=True) as scratch:
+        write_tensors(
+            scratch,
+            {
+                name: value.half() if value.is_floating_point() else value.clone()
+                for name, value in tensors.items()
+            },
+        )
+        scratch.chmod(0o644)  # safetensors makes it readable for its owner alone
+        write_text(scratch.with_suffix(CARD), card.model_dump_json(indent=2) + "\n")
     return card
 
 
@@ -270,7 +274,7 @@ def read_card(path: str | Path) -> PolicyCard:
     """
     file = Path(path).with_suffix(CARD)
     try:
-        return PolicyCard.model_validate_json(file.read_bytes())
+        return PolicyCard.model_validate_json(json_bytes(file))
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror}") from None
     except ValidationError as error:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from ba_torchrl.algorithms.compilation import CompileMode
 from ba_torchrl.config import StrictModel
-from ba_torchrl.data.files import write_text
+from ba_torchrl.data.files import json_bytes, write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.hardware import hardware, onednn_max_cpu_isa
 from ba_torchrl.modules.layers import Precision
@@ -100,7 +100,7 @@ def read_speed_file(path: str | Path) -> SpeedFile:
         ConfigError: it cannot be opened, or `write_speed_file` did not write it.
     """
     try:
-        return SpeedFile.model_validate_json(Path(path).read_bytes())
+        return SpeedFile.model_validate_json(json_bytes(path))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     except ValidationError as error:

@@ -1,8 +1,13 @@
 """Checksums of folders, atomic text files, and states without pickle."""
 
+import contextlib
 import errno
+import fcntl
 import json
 import os
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,9 +17,12 @@ from safetensors import SafetensorError
 from ba_torchrl.data import files
 from ba_torchrl.data.files import (
     CHECKSUMS_FILE,
+    Lock,
     check,
-    publish,
+    complete_only,
+    read_json,
     read_state,
+    replaced,
     seal,
     write_state,
     write_text,
@@ -152,22 +160,127 @@ def test_other_values_are_no_state(tmp_path):
         write_state(tmp_path / "state", {"names": {"a"}})
 
 
-def test_links_are_refused(folder, tmp_path):
-    elsewhere = tmp_path / "elsewhere.json"
-    elsewhere.write_text("{}")
-    (folder / "link.json").symlink_to(elsewhere)
+@pytest.mark.parametrize("target", [".", "nothing.json", "/dev/null"])
+def test_links_to_anything_but_files_are_refused(folder, target):
+    (folder / "link.json").symlink_to(target)
     with pytest.raises(ConfigError, match="is not opened"):
         check(folder)
 
 
-def test_a_published_folder_replaces_the_one_before(folder, tmp_path):
-    scratch = tmp_path / ".scratch"
-    write_state(scratch, {"step": 4})
-    seal(scratch)
-    publish(scratch, folder)
+def test_links_to_files_are_followed(folder, tmp_path):
+    """As in the cache of a hub, whose files have the names of their contents."""
+    for number, path in enumerate(path for path in folder.rglob("*") if path.is_file()):
+        path.rename(tmp_path / str(number))
+        path.symlink_to(tmp_path / str(number))
     check(folder)
+    assert torch.equal(read_state(folder / "part")["weights"], weights)
+    tampered = weights_of(folder)
+    tampered.write_bytes(tampered.read_bytes()[::-1])
+    with pytest.raises(DamagedFilesError, match="its checksum differs"):
+        check(folder)
+
+
+def test_hidden_files_and_texts_are_ignored(folder):
+    names = (".DS_Store", ".nfs0001", ".cache/hub/a.lock", ".git/a.pickle", "README.md", "note.txt")
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x")
+    check(folder)
+    seal(folder)
+    assert not set(names) & set(read_json(folder / CHECKSUMS_FILE)["crc32"])
+
+
+def test_json_may_have_a_byte_order_mark(folder):
+    path = folder / CHECKSUMS_FILE
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    check(folder)
+
+
+def test_a_folder_may_replace_the_one_before(folder, tmp_path):
+    for stop in (True, False):
+        with contextlib.suppress(KeyboardInterrupt), complete_only(folder, replace=True) as scratch:
+            write_state(scratch, {"step": 4})
+            seal(scratch)
+            if stop:
+                raise KeyboardInterrupt
+        check(folder)
+        assert (folder / "part").exists() == stop
+        assert list(tmp_path.iterdir()) == [folder]
     assert read_state(folder) == {"step": 4}
-    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
+
+
+def test_a_second_writer_is_refused(tmp_path):
+    path = tmp_path / "demos"
+    with complete_only(path) as scratch:
+        with (
+            pytest.raises(
+                ConfigError, match=f"process {os.getpid()} on .* writes .*/demos; choose"
+            ),
+            complete_only(path),
+        ):
+            raise AssertionError("in the block")
+        scratch.write_text("first")
+    with pytest.raises(ConfigError, match="exists already"), complete_only(path):
+        raise AssertionError("in the block")
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "first"
+
+
+_WRITER = """
+import os, signal, sys
+from pathlib import Path
+from ba_torchrl.data.files import complete_only
+
+with complete_only(Path(sys.argv[1])) as scratch:
+    scratch.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_writer_that_was_killed_blocks_nobody(tmp_path):
+    path = tmp_path / "demos"
+    killed = subprocess.run([sys.executable, "-c", _WRITER, str(path)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert (tmp_path / ".demos.scratch/demos").exists()
+    with complete_only(path) as scratch:
+        assert not scratch.exists()
+        scratch.write_text("whole")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_lock_on_a_file_that_its_holder_deleted_is_none(tmp_path, monkeypatch):
+    """The second opens the file, the first deletes it, and only then is it locked."""
+    first, lock = Lock(tmp_path / "lock", "works"), fcntl.flock
+
+    def late(*arguments):
+        monkeypatch.undo()
+        first.release()
+        lock(*arguments)
+
+    monkeypatch.setattr(files.fcntl, "flock", late)
+    second = Lock(tmp_path / "lock", "works")
+    with pytest.raises(ConfigError, match="works"):
+        Lock(tmp_path / "lock", "works")
+    second.release()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_is_replaced_when_it_is_complete(tmp_path):
+    path, link = tmp_path / "new" / "film.mp4", tmp_path / "link.mp4"
+    link.symlink_to(path)
+    for content in ("old", "new"):
+        with replaced(link) as scratch:
+            assert scratch.suffix == path.suffix
+            scratch.write_text(content)
+    with contextlib.suppress(OSError), replaced(path) as scratch:
+        scratch.write_text("torn")
+        raise OSError
+    assert path.read_text() == "new"
+    assert link.is_symlink()
+    assert list(path.parent.iterdir()) == [path]
+    with replaced("/dev/null") as device:
+        assert str(device) == "/dev/null"
 
 
 def test_a_text_file_is_whole_or_not_there(tmp_path, monkeypatch):

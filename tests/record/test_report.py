@@ -14,7 +14,7 @@ import pytest
 
 from ba_torchrl.cli.command import Arguments
 from ba_torchrl.commands import report
-from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.errors import ConfigError, MissingPackageError
 from ba_torchrl.record.plots import plot_panels
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import (
@@ -300,10 +300,18 @@ def test_benchmarks_have_sections_and_other_runs_are_last(tmp_path):
 
 
 def test_two_runs_of_one_seed_are_refused(tmp_path):
-    for name in ("a", "b"):
-        write_run(tmp_path / name, (0, 0, 1))
-    with pytest.raises(ValueError, match=r"settings and seed: .*/a, .*/b"):
+    for name, rate in (("a", 0), ("b", 1)):
+        write_run(tmp_path / name, (0, 0, rate))
+    with pytest.raises(ConfigError, match=r"settings and seed: .*/a, .*/b; name the folders"):
         load_sections([tmp_path])
+
+
+def test_a_copy_of_a_run_is_left_out(tmp_path, caplog):
+    write_run(tmp_path / "a", (0, 0, 1))
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+    ((section,), _) = load_sections([tmp_path])
+    assert [run.folder.name for run in section.groups[0].runs] == ["a"]
+    assert f"{tmp_path / 'b'} is a copy of {tmp_path / 'a'}" in caplog.text
 
 
 def test_folders_without_results_are_refused(tmp_path):

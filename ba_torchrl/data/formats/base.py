@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import torch
 from pydantic import Field, ValidationError, field_validator
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from ba_torchrl.config import StrictModel
-from ba_torchrl.data.files import complete_only, write_text
+from ba_torchrl.data.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
@@ -207,10 +208,10 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
                 if entry.role == "observation" and entry.dtype != "str"
             ]
             last = {
-                name: np.ascontiguousarray([arrays[name][-1] for arrays in named])
+                name: torch.from_numpy(np.ascontiguousarray([arrays[name][-1] for arrays in named]))
                 for name in observed
             }
-            save_file(last, scratch / _LAST_FILE)
+            write_tensors(scratch / _LAST_FILE, last)
         write_text(page_file(scratch), card.to_markdown())
         write_text(card_file(scratch), card.model_dump_json(indent=1) + "\n")
 
@@ -225,7 +226,7 @@ def read_card(path: Path) -> Card | None:
     if not file.exists():
         return None
     try:
-        text = file.read_text(encoding="utf-8")
+        text = json_bytes(file)
         values = json.loads(text)
         if not isinstance(values, dict) or not {"format", "entries"} <= values.keys():
             return None  # somebody else's file of that name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -40,11 +41,12 @@ class Robomimic(Format):
         }
 
     def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
-        """Write one file."""
+        """Write one file, built in memory: HDF5 ends the process if its own file cannot grow."""
         h5py = self.library("h5py")
         results = {entry.name for entry in card.entries.values() if entry.role == "result"}
         env_args = {"env_name": gym_id(card.task), "type": _GYM_TYPE, "env_kwargs": card.env}
-        with h5py.File(path, "w") as file:
+        content = io.BytesIO()
+        with h5py.File(content, "w") as file:
             data = file.create_group("data")
             data.attrs["env_args"] = json.dumps(env_args)
             data.attrs["total"] = card.steps
@@ -61,6 +63,7 @@ class Robomimic(Format):
                         _store(demo, name.replace(_OBS, _NEXT_OBS, 1), values[1:])
                     else:
                         _store(demo, name, values[:, 0] if name in results else values)
+        path.write_bytes(content.getbuffer())
 
     def read(self, path: Path) -> list[Arrays]:
         """Read every group of ``data``; ``obs`` gets its last row from ``next_obs``."""

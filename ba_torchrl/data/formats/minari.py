@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,6 +20,8 @@ from ba_torchrl.errors import ConfigError
 
 _ROOT = "MINARI_DATASETS_PATH"
 _OBSERVATIONS, _INFOS = "observations/", "infos/"
+_OVERHEAD, _EMPTY = 1 << 13, 1 << 18
+"""Most bytes of HDF5 beside the values of an entry of an episode, and of an empty file."""
 _FIXED = {
     keys.ACTION: "actions",
     keys.REWARD: "rewards",
@@ -62,6 +66,7 @@ class Minari(Format):
                 f"path: {path.name} is no id of a data set, such as picking-v0: letters, digits, _ "
                 "and -, and a version"
             ) from None
+        _check_space(path.parent, episodes)
         register_task(card.task)
         env = gymnasium.make(gym_id(card.task), **card.env)
         buffers = [
@@ -118,6 +123,19 @@ class Minari(Format):
                     arrays[place.rstrip("/")] = values
             episodes.append({name: plain(values) for name, values in arrays.items()})
         return episodes
+
+
+def _check_space(folder: Path, episodes: Sequence[Arrays]) -> None:
+    """Check that the disk has room: HDF5 ends the process if its file cannot grow.
+
+    Raises:
+        OSError: it has not.
+    """
+    needed = sum(values.nbytes + _OVERHEAD for arrays in episodes for values in arrays.values())
+    free = shutil.disk_usage(folder).free
+    if free < needed + _EMPTY:
+        what = f"{needed / 1e6:.1f} MB are needed, {free / 1e6:.1f} MB are free"
+        raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)}: {what}", str(folder))
 
 
 def _plain_space(space: Any) -> Any:
