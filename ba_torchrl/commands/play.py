@@ -79,7 +79,8 @@ def main(settings: Settings) -> None:
 
 
 def _print_episode(number: int, steps: int, is_success: bool) -> None:
-    print(f"episode {number}: {'success' if is_success else 'failure'} after {steps} steps")
+    result = "success" if is_success else "failure"
+    print(f"episode {number}: {result} after {steps} step{'s' * (steps != 1)}")
 
 
 def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:

@@ -16,6 +16,7 @@ from ba_torchrl.cli import EXIT_CODE, types
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.cli.types import check_writable_file
 from ba_torchrl.config import StrictModel, parse
+from ba_torchrl.data.files import complete_only
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training.config import ExperimentConfig
 from tests.recipes import load_recipe, recipe
@@ -58,6 +59,7 @@ REFUSED = [
     ("collect", "env.expert=false", "leave it out, and set source"),
     ("collect", "source=deconstruction", "deconstruction has no meaning for close_loop/block_pick"),
     ("collect", "path=run", "run exists already"),
+    ("collect", "path=held", "writes held; choose another path"),
     ("collect", "task=close_loop/block_pulling", "demos/close_loop_block_pulling exists already"),
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("play", "env.seed=5", "leave it out, and set seed"),
@@ -109,13 +111,22 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.json").write_text(json.dumps(RUN))
     (tmp_path / "run/scalars.csv").write_text("step,name,value\n5,torn\n")
-    with pytest.raises(SystemExit) as end:
+    with complete_only(tmp_path / "held"), pytest.raises(SystemExit) as end:
         recipe(name, *REQUIRED.get(name, ()), override)
     error = capsys.readouterr().err
     assert end.value.code == EXIT_CODE
     assert words in error
     assert error.count("\n") == 1
     assert "Traceback" not in error
+
+
+def test_play_says_whether_each_episode_succeeded(capsys):
+    for policy, said in (("expert", "success after "), ("random", "failure after 1 step\n")):
+        words = (f"policy={policy}", "env.max_steps=" + ("1" if policy == "random" else "50"))
+        recipe("play", "close_loop/block_reaching", *words, "episodes=2", "video=null")
+        lines = capsys.readouterr().out
+        for number in (1, 2):
+            assert f"episode {number}: {said}" in lines
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -1,7 +1,9 @@
 """Demonstrations in other libraries' formats; most episodes are made by hand."""
 
 import json
+import shutil
 import sys
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -23,6 +25,7 @@ from ba_torchrl.data.demos import source_config
 from ba_torchrl.data.formats import base
 from ba_torchrl.data.formats.base import FORMATS, Format, read_card
 from ba_torchrl.errors import ConfigError, MissingPackageError, UnknownNameError
+from tests.training.test_limits import limited
 
 TASK, ENV, SIZE = "close_loop/block_picking", {"obs_size": 64}, 64
 PATHS = {
@@ -110,6 +113,8 @@ def test_every_value_comes_back(name, episodes, tmp_path):
     if name == "lerobot":
         pytest.importorskip("lerobot")
     path = exported(tmp_path, episodes, name, policy="a hand")
+    card = base.card_file(path)
+    card.write_text(card.read_text(), encoding="utf-8-sig")  # by an editor
     assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
     card = read_card(path)
     assert (card.policy, card.mean_return) == ("a hand", card.success_rate)
@@ -161,6 +166,17 @@ def test_an_export_that_fails_in_the_middle_leaves_nothing(name, collected, tmp_
     path = exported(tmp_path, collected, name)
     assert_equal(load_demonstrations(path, task=TASK, env=ENV), collected)
     assert not killed.parent.exists()
+
+
+def test_a_full_disk_is_an_error_of_the_system(collected, tmp_path, monkeypatch):
+    """HDF5 itself would end the process."""
+    with limited("RLIMIT_FSIZE", 100_000), pytest.raises(OSError, match="File too large"):
+        exported(tmp_path, [episode.repeat(9) for episode in collected], "hdf5")
+    full = SimpleNamespace(free=100_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
+    with pytest.raises(OSError, match=r"No space left on device: .* needed, 0.1 MB are free"):
+        exported(tmp_path, collected, "minari")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):

@@ -340,6 +340,7 @@ def test_leftovers_of_an_interrupted_save_are_removed(run):
     for part in ("resume", "checkpoints"):
         newest = max((run / part).iterdir())
         shutil.copytree(newest, newest.with_name(f".{newest.name}.scratch"))
+        newest.with_name(f".{newest.name}.lock").touch()
     resume(run)
     for part in ("resume", "checkpoints"):
         assert not list((run / part).glob(".*"))

@@ -4,11 +4,17 @@ import contextlib
 import errno
 import os
 
+import numpy as np
 import pytest
+import torch
 
 import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.cli.errors import plain_errors
+from ba_torchrl.data.files import complete_only, write_tensors, write_text
+from ba_torchrl.record.gallery import Strip, strip_figure
+from ba_torchrl.record.plots import plot_learning_curve, plot_panels
+from ba_torchrl.record.video import write_video
 from tests.training.test_resume import config_for, interrupt, run
 
 resource = pytest.importorskip("resource")
@@ -41,6 +47,43 @@ def test_a_state_that_cannot_be_written_leaves_the_one_before(tmp_path, caplog):
     assert "the state could not be saved" in caplog.text
     assert {path: path.read_bytes() for path in before} == before
     assert run(longer).updates == config.total_updates
+
+
+def noise(frames=6):
+    return np.random.default_rng(0).integers(0, 255, (frames, 96, 96, 3), np.uint8)
+
+
+def save_noise(path):
+    with complete_only(path, replace=True) as scratch:
+        write_tensors(scratch, {"noise": torch.tensor(noise())})
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("film.mp4", lambda path: write_video(path, noise(), fps=5)),
+        ("film.gif", lambda path: write_video(path, noise(), fps=5)),
+        ("curve.png", lambda path: plot_learning_curve({"a": ((0, 1), (0, 1))}, path)),
+        ("curve.svg", lambda path: plot_panels({"a": {"b": ((0, 1), (0, 1))}}, [path], names="b")),
+        ("strip.png", lambda path: strip_figure("a", Strip([*noise()], noise()[0]), path)),
+        ("page.md", lambda path: write_text(path, 10_000 * "x")),
+        ("policy.safetensors", save_noise),
+    ],
+)
+def test_a_file_that_cannot_be_written_leaves_the_one_before(name, write, tmp_path, capfd):
+    path = tmp_path / name
+    path.write_text("older")
+    with limited("RLIMIT_FSIZE", 4096), pytest.raises(SystemExit) as end:
+        plain_errors(write)(path)
+    assert end.value.code == EXIT_CODE
+    output = capfd.readouterr()
+    assert output.err.startswith("error: ")
+    assert (output.out + output.err).count("\n") == 1
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "older"
+    write(path)
+    assert path.stat().st_size > 4096
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def lowest_free_handle():

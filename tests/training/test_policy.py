@@ -65,6 +65,8 @@ def test_a_file_acts_like_the_run(run, tmp_path):
         torch.testing.assert_close(weight, before, rtol=2**-11, atol=2**-25)
     path = tmp_path / "p.safetensors"
     card = policies.save_policy(policy, path, successes=3, episodes=4, seed=9, num_envs=2)
+    text = path.with_suffix(".json").read_text()
+    path.with_suffix(".json").write_text(text, encoding="utf-8-sig")  # by an editor
     again = ba_torchrl.load_policy(path)
     state = observed(policy)
     torch.testing.assert_close(
