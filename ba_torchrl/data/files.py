@@ -159,8 +159,12 @@ class Lock:
                 raise ConfigError(f"{holder} {what}") from None
             self._file.close()
         self._file.truncate(0)
-        self._file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        self._file.flush()
+        try:
+            name = f"process {os.getpid()} on {socket.gethostname()}"
+            os.write(self._file.fileno(), name.encode())
+        except OSError:
+            self.release()
+            raise
 
     def release(self) -> None:
         """Unlock and delete the file; further calls have no effect."""

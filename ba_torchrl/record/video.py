@@ -128,7 +128,7 @@ def _encode(program: str, pictures: Sequence[np.ndarray], fps: float, path: Path
     )
     if done.returncode:
         lines = done.stderr.decode(errors="replace").splitlines() or ["no reason given"]
-        raise OSError(errno.EIO, f"ffmpeg: {lines[-1].split('] ')[-1]}")
+        raise OSError(errno.EIO, f"ffmpeg: {lines[0].split('] ')[-1]}")
 
 
 def _checked(frames: Sequence[np.ndarray] | np.ndarray) -> list[np.ndarray]:

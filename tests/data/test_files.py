@@ -249,6 +249,16 @@ def test_a_writer_that_was_killed_blocks_nobody(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_lock_that_cannot_name_its_process_is_deleted(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(files.os, "write", full)
+    with pytest.raises(OSError, match="full"):
+        Lock(tmp_path / "lock", "works")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_lock_on_a_file_that_its_holder_deleted_is_none(tmp_path, monkeypatch):
     """The second opens the file, the first deletes it, and only then is it locked."""
     first, lock = Lock(tmp_path / "lock", "works"), fcntl.flock
