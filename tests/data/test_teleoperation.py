@@ -1,11 +1,11 @@
 """Teleoperation: keys become actions, and what is recorded is what was executed."""
 
+import contextlib
 import os
 import shutil
 import subprocess
 import sys
 import threading
-from contextlib import contextmanager
 
 import numpy as np
 import pybullet
@@ -15,11 +15,14 @@ import torch
 import ba_torchrl
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.cli import EXIT_CODE
+from ba_torchrl.commands import play
 from ba_torchrl.data.demo_files import read_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import is_success
+from ba_torchrl.data.files import complete_only
 from ba_torchrl.data.teleoperation import KEYS, Keyboard, record_demonstrations
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 from tests.recipes import recipe
 
 TASK = "close_loop/block_reaching"
@@ -223,7 +226,24 @@ def test_refusals(words, message, monkeypatch, tmp_path, capsys):
     assert message in capsys.readouterr().err
 
 
-@contextmanager
+@pytest.mark.parametrize("end", [KeyboardInterrupt, pybullet.error])
+def test_episodes_that_are_complete_are_kept(end, env, tmp_path, monkeypatch):
+    def played(*_, **__):
+        yield from record_demonstrations(env, toward_block(env), 1, seed=5, show=lambda _: None)
+        with pytest.raises(ConfigError, match=r"writes .*demos"), complete_only(tmp_path / "demos"):
+            raise AssertionError("a second writer")
+        raise end
+
+    monkeypatch.setattr(play, "make", lambda *_, **__: env)
+    monkeypatch.setattr(play, "record_demonstrations", played)
+    words = (TASK, "policy=keyboard", f"path={tmp_path / 'demos'}", "env.obs_size=24")
+    with contextlib.suppress(pybullet.error):
+        recipe("play", *words)
+    assert read_demonstrations(tmp_path / "demos")[1]["episodes"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["demos"]
+
+
+@contextlib.contextmanager
 def display():
     """A virtual display; yields the environment variables of its clients."""
     read, write = os.pipe()

@@ -11,6 +11,7 @@ from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.commands import collect
 from ba_torchrl.data import load_demonstrations
 from ba_torchrl.data.demo_files import read_metadata
+from ba_torchrl.data.files import complete_only
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.training import graded
 from ba_torchrl.training.graded import GRADES, GradedSets
@@ -48,6 +49,12 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def sets(folder):
     return {grade: load_demonstrations(folder / grade, task=TASK, env=ENV) for grade in GRADES}
+
+
+def test_a_set_that_another_process_makes_is_refused_before_it_plays(tmp_path, monkeypatch):
+    monkeypatch.setattr(graded, "collect_episodes", None)
+    with complete_only(tmp_path / "random"), pytest.raises(ConfigError, match=r"writes .*random"):
+        made(tmp_path)
 
 
 def test_every_grade_has_its_card_and_executed_actions_only(folder, sets):
