@@ -14,7 +14,12 @@ from tensordict import NonTensorStack, TensorDict
 
 from ba_torchrl import __version__
 from ba_torchrl.data.episodes import mean_return, success_rate
-from ba_torchrl.data.exchange import check_same_environment, env_values, import_demonstrations
+from ba_torchrl.data.exchange import (
+    check_same_environment,
+    count_demonstrations,
+    env_values,
+    import_demonstrations,
+)
 from ba_torchrl.data.files import (
     check,
     complete_only,
@@ -167,7 +172,7 @@ def check_demonstrations(
         count = metadata["episodes"]
         check_same_environment(path, task, env, metadata["task"], metadata["env"])
     else:
-        count = len(import_demonstrations(path, task=task, env=env, mapping=mapping))
+        count = count_demonstrations(path, task=task, env=env, mapping=mapping)
     if count < least:
         raise ConfigError(f"{path} holds {count} episodes, {least} are needed")
 

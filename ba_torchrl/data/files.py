@@ -86,7 +86,7 @@ def seal(folder: str | Path) -> None:
     """
     folder = Path(folder)
     (folder / CHECKSUMS_FILE).unlink(missing_ok=True)
-    files = {path.relative_to(folder).as_posix(): _fingerprint(path) for path in _files(folder)}
+    files = {path.relative_to(folder).as_posix(): fingerprint(path) for path in _files(folder)}
     write_text(folder / CHECKSUMS_FILE, json.dumps({"crc32": files}, indent=1) + "\n")
     for path in [folder, *folder.rglob("*")]:
         _flush(path)
@@ -197,7 +197,7 @@ def check(folder: str | Path) -> None:
         reason = "is missing" if name in listed else f"is not listed in {CHECKSUMS_FILE}"
         raise DamagedFilesError(f"{folder / name} {reason}")
     for name, path in found.items():
-        size, checksum = _fingerprint(path)
+        size, checksum = fingerprint(path)
         if size != listed[name][0]:
             raise DamagedFilesError(f"{path} has {size} bytes, {listed[name][0]} were written")
         if (size, checksum) != listed[name]:
@@ -350,7 +350,7 @@ def _files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _fingerprint(path: Path) -> tuple[int, int]:
+def fingerprint(path: Path) -> tuple[int, int]:
     """Return length and CRC-32 of a file."""
     size = checksum = 0
     with path.open("rb") as file:

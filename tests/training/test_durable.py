@@ -14,7 +14,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.files import CHECKSUMS_FILE, _fingerprint, seal
+from ba_torchrl.data.files import CHECKSUMS_FILE, fingerprint, seal
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_failure, read_result
@@ -99,7 +99,7 @@ def resume(folder):
 def reseal(folder):
     """Write checksums of every file, as somebody does who plants one."""
     files = {
-        path.relative_to(folder).as_posix(): _fingerprint(path)
+        path.relative_to(folder).as_posix(): fingerprint(path)
         for path in folder.rglob("*")
         if path.is_file() and path.name != CHECKSUMS_FILE
     }

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -15,16 +16,63 @@ from pydantic import Field, ValidationError, field_validator
 from safetensors.numpy import load_file
 
 from ba_torchrl.config import StrictModel
-from ba_torchrl.data.files import complete_only, json_bytes, write_tensors, write_text
+from ba_torchrl.data.files import (
+    complete_only,
+    fingerprint,
+    json_bytes,
+    write_tensors,
+    write_text,
+)
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
-from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
+from ba_torchrl.errors import (
+    ConfigError,
+    DamagedFilesError,
+    MissingPackageError,
+    install_command,
+)
 from ba_torchrl.registry import Registry
 
 Arrays = dict[str, np.ndarray]
 """An episode of T steps: its entries by name, with T rows, and T + 1 rows of observations where the
 observation after the last action is known."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An entry of an episode in a file, which is read when an array is made of it."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    read: Callable[[], Any]
+    """Return its values."""
+    fault: str = ""
+    """Why it cannot be used."""
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Read the values.
+
+        Raises:
+            ConfigError: they cannot be read.
+        """
+        try:
+            return np.asarray(plain(self.read()), dtype)
+        except ConfigError:
+            raise
+        except Exception as error:  # libraries raise anything at files that are damaged
+            raise ConfigError(f"cannot be read: {_first_line(error)}") from error
+
+    def then(self, last: Any) -> Rows:
+        """Return these rows and one more, the last one of ``last``."""
+        shape = (sum(self.shape[:1]) + 1, *self.shape[1:])
+        return replace(
+            self, shape=shape, read=lambda: np.concatenate([self, np.asarray(last)[-1:]])
+        )
+
+
+StoredArrays = Mapping[str, np.ndarray | Rows]
+"""`Arrays` as a file has them."""
 Role = Literal["observation", "action", "result"]
 """Of an entry: known before the step, chosen in it, or known after it."""
 RESULTS = (keys.REWARD, keys.TERMINATED, keys.TRUNCATED, keys.SUCCESS)
@@ -41,6 +89,8 @@ class Entry(StrictModel):
     """NumPy's name of the type; "str" for text."""
     shape: tuple[int, ...]
     """Of one step, channels of images first."""
+    file_shape: tuple[int, ...] | None = None
+    """Of one step in the file; None in cards that do not say it."""
 
     @property
     def is_image(self) -> bool:
@@ -77,6 +127,8 @@ class Card(StrictModel):
     """Of the packages that wrote the file."""
     entries: dict[str, Entry]
     """By key of the TensorDict."""
+    checksums: dict[str, tuple[int, int]] = Field(default_factory=dict)
+    """Length and CRC-32 of each file, by its path below the folder; of a single file, by "."."""
 
     @field_validator("entries")
     @classmethod
@@ -118,14 +170,15 @@ class Card(StrictModel):
             "versions": ", ".join(f"{name} {version}" for name, version in self.versions.items()),
         }
         lines = ["---", f"license: {self.license.lower()}", "task_categories: [robotics]"]
-        lines += ["tags: [LeRobot, BulletArm, imitation-learning]", "---", ""]
+        lines += [f"tags: [{FORMATS[self.format].tag}, BulletArm, imitation-learning]", "---", ""]
         lines += [f"# Demonstrations of {self.task}", "", "| | |", "|---|---|"]
         lines += [f"| {name} | {value} |" for name, value in rows.items()]
         lines += ["", "| name | meaning | type | shape of a step |", "|---|---|---|---|"]
-        lines += [
-            f"| `{entry.name}` | {entry.role} `{key}` | {entry.dtype} | {list(entry.shape)} |"
-            for key, entry in self.entries.items()
-        ]
+        for key, entry in self.entries.items():
+            shape = entry.shape if entry.file_shape is None else entry.file_shape
+            lines.append(
+                f"| `{entry.name}` | {entry.role} `{key}` | {entry.dtype} | {list(shape)} |"
+            )
         return "\n".join(lines) + "\n"
 
 
@@ -136,6 +189,10 @@ class Format(ABC):
     """Whether images are stored with their channels last."""
     has_last_observation: ClassVar[bool] = True
     """Whether the observation after the last action has a place; if not, a file beside holds it."""
+    before_first_step: ClassVar[str | None] = None
+    """Prefix of the entries that have a row before the first step, as observations have."""
+    tag: ClassVar[str] = "BA-TorchRL"
+    """Of data sets of this format on the Hugging Face Hub."""
     suffixes: ClassVar[tuple[str, ...]] = ()
     """Of its files, one of which a path must have; none for folders."""
     package: ClassVar[str]
@@ -151,13 +208,22 @@ class Format(ABC):
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return the names of entries in the file, after the library's convention, by key."""
 
+    def file_shape(self, entry: Entry) -> tuple[int, ...]:
+        """Return the shape of a step of an entry in the file."""
+        if self.channels_last and entry.is_image:
+            return (*entry.shape[1:], entry.shape[0])
+        return entry.shape
+
     @abstractmethod
     def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
         """Write episodes, whose entries have their names in the file, to a new path."""
 
     @abstractmethod
-    def read(self, path: Path) -> list[Arrays]:
-        """Return the episodes of a file, with all of its entries by name."""
+    def read(self, path: Path) -> Sequence[StoredArrays]:
+        """Return the episodes of a file, with all of its entries by name.
+
+        `Rows` are read later, if they are needed.
+        """
 
     def library(self, module: str) -> Any:
         """Import a module of the library.
@@ -212,6 +278,7 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
                 for name in observed
             }
             write_tensors(scratch / _LAST_FILE, last)
+        card = card.model_copy(update={"checksums": _checksums(scratch)})
         write_text(page_file(scratch), card.to_markdown())
         write_text(card_file(scratch), card.model_dump_json(indent=1) + "\n")
 
@@ -239,7 +306,30 @@ def read_card(path: Path) -> Card | None:
         raise ConfigError(f"{file} is damaged: {what}") from None
 
 
-def read_file(form: Format, path: Path) -> list[Arrays]:
+def _checksums(path: Path) -> dict[str, tuple[int, int]]:
+    """Return length and CRC-32 of the files of an export, by their paths below it."""
+    files = [file for file in [path, *sorted(path.rglob("*"))] if file.is_file()]
+    return {file.relative_to(path).as_posix(): fingerprint(file) for file in files}
+
+
+def check_files(path: Path, card: Card) -> None:
+    """Check that an export consists of the files of its card, unaltered.
+
+    Raises:
+        DamagedFilesError: a file is missing, shorter or altered.
+    """
+    for name, (size, checksum) in card.checksums.items():
+        file = path / name
+        if not file.is_file():
+            raise DamagedFilesError(f"{file} is missing")
+        if fingerprint(file) != (size, checksum):
+            raise DamagedFilesError(
+                f"{file} was altered: {size} bytes were written, of another checksum; if it was on "
+                f"purpose, delete 'checksums' in {card_file(path)}"
+            )
+
+
+def read_file(form: Format, path: Path) -> list[StoredArrays]:
     """Return the episodes of a file, with all of its entries by name.
 
     Raises:
@@ -250,25 +340,69 @@ def read_file(form: Format, path: Path) -> list[Arrays]:
         last_file = path / _LAST_FILE
         last = load_file(last_file) if path.is_dir() and last_file.exists() else {}
         return [
-            arrays
-            | {name: np.concatenate([arrays[name], rows[i : i + 1]]) for name, rows in last.items()}
+            {
+                name: rows_of(values).then(last[name][i : i + 1]) if name in last else values
+                for name, values in arrays.items()
+            }
             for i, arrays in enumerate(episodes)
         ]
     except ConfigError:
         raise
     except Exception as error:  # libraries raise anything at files that are not theirs
-        raise ConfigError(
-            f"{path} cannot be read: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-        ) from error
+        raise ConfigError(f"{path} cannot be read: {_first_line(error)}") from error
+
+
+def entry_of(arrays: StoredArrays, name: str) -> np.ndarray | Rows:
+    """Return an entry of a file.
+
+    Raises:
+        ConfigError: the file has none of that name, or it cannot be used.
+    """
+    if name not in arrays:
+        raise ConfigError(f"there is no {name!r}. Known: {', '.join(sorted(arrays))}")
+    if fault := getattr(arrays[name], "fault", ""):
+        raise ConfigError(fault)
+    return arrays[name]
 
 
 def plain(values: Any) -> np.ndarray:
-    """Return an array of numbers or of text, which libraries also return as bytes and objects."""
+    """Return an array of numbers or of text, which libraries also return as bytes and objects.
+
+    Raises:
+        ConfigError: there are other objects.
+    """
     array = np.asarray(values)
+    if array.dtype.kind == "T":
+        return array.astype(str)
     if array.dtype.kind not in "OS":
         return array
-    texts = [text.decode() if isinstance(text, bytes) else str(text) for text in array.reshape(-1)]
+    texts = [text.decode() if isinstance(text, bytes) else text for text in array.reshape(-1)]
+    if not all(isinstance(text, str) for text in texts):
+        raise ConfigError("holds objects, neither numbers nor text")
     return np.array(texts, dtype=str).reshape(array.shape)
+
+
+def flatten(name: str, values: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the arrays in nested dictionaries and tuples, with names such as ``a/b/0``."""
+    if isinstance(values, tuple):
+        values = dict(enumerate(values))
+    if isinstance(values, Mapping):
+        for key, part in values.items():
+            yield from flatten(f"{name}/{key}", part)
+    elif values is not None:
+        yield name, values
+
+
+def rows_of(values: Any) -> Rows:
+    """Return values, such as an array or a list, as `Rows`."""
+    if isinstance(values, Rows):
+        return values
+    array = np.asarray(values)
+    return Rows(array.shape, array.dtype, lambda: array)
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
 
 
 def card_file(path: Path) -> Path:
@@ -293,17 +427,24 @@ class Source(StrictModel):
     offset: float | list[float] = 0.0
     """Added after scaling."""
 
-    def values(self, arrays: Arrays) -> np.ndarray:
-        """Return the entry's values in an episode.
+    @field_validator("scale", "offset", mode="before")
+    @classmethod
+    def _read_text(cls, given: Any) -> Any:
+        """Read ``1e-3``, which is text in YAML 1.1."""
+        if isinstance(given, list):
+            return [float(value) if isinstance(value, str) else value for value in given]
+        return float(given) if isinstance(given, str) else given
+
+    def values(self, found: np.ndarray) -> np.ndarray:
+        """Return the values of an entry of an episode, from those in the file.
 
         Raises:
-            ConfigError: the file has no such entry, or fewer components.
+            ConfigError: there are fewer components.
         """
-        if self.source not in arrays:
-            raise ConfigError(f"there is no {self.source!r}. Known: {', '.join(sorted(arrays))}")
-        found = arrays[self.source]
         try:
             if self.components is not None:
+                if found.ndim < 2:
+                    raise IndexError("has one number per step, no components")
                 found = found[..., self.components]
             if self.scale == 1.0 and self.offset == 0.0:
                 return found

@@ -5,12 +5,21 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format, plain
+from ba_torchrl.data.formats.base import (
+    FORMATS,
+    Arrays,
+    Card,
+    Entry,
+    Format,
+    Rows,
+    StoredArrays,
+)
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id
 
@@ -26,6 +35,7 @@ class Robomimic(Format):
 
     channels_last = True
     package = "h5py"
+    tag = "robomimic"
     suffixes = (".hdf5", ".h5")
 
     def matches(self, path: Path) -> bool:
@@ -39,6 +49,10 @@ class Robomimic(Format):
             key: fixed.get(key, f"{_OBS}{key}" if entry.role == "observation" else key)
             for key, entry in entries.items()
         }
+
+    def file_shape(self, entry: Entry) -> tuple[int, ...]:
+        """Return the shape of a step: results are numbers."""
+        return () if entry.role == "result" else super().file_shape(entry)
 
     def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
         """Write one file, built in memory: HDF5 ends the process if its own file cannot grow."""
@@ -65,30 +79,62 @@ class Robomimic(Format):
                         _store(demo, name, values[:, 0] if name in results else values)
         path.write_bytes(content.getbuffer())
 
-    def read(self, path: Path) -> list[Arrays]:
+    def read(self, path: Path) -> list[StoredArrays]:
         """Read every group of ``data``; ``obs`` gets its last row from ``next_obs``."""
         h5py = self.library("h5py")
         episodes = []
         with h5py.File(path, "r") as file:
             data = file["data"]
             for demo in sorted(data, key=lambda name: (len(name), name)):
-                group, arrays = data[demo], {}
-                group.visititems(
-                    lambda name, item, arrays=arrays: (
-                        arrays.update({name: plain(item[()])})
-                        if isinstance(item, h5py.Dataset)
-                        else None
-                    )
-                )
+                arrays: dict[str, Any] = {
+                    name: _rows(h5py, item) for name, item in _datasets(h5py, data[demo])
+                }
                 for name in [name for name in arrays if name.startswith(_OBS)]:
                     following = arrays.get(name.replace(_OBS, _NEXT_OBS, 1))
                     if following is not None:
-                        arrays[name] = np.concatenate([arrays[name], following[-1:]])
-                language = json.loads(group.attrs.get("ep_meta", "{}")).get("lang")
-                if language is not None:
+                        arrays[name] = arrays[name].then(following)
+                if language := _language(data[demo].attrs.get("ep_meta", "")):
                     arrays[_LANGUAGE] = np.array([language])
                 episodes.append(arrays)
         return episodes
+
+
+def _datasets(h5py: Any, group: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the datasets below a group by their paths, links of any kind included.
+
+    Args:
+        h5py: the library.
+        group: in which they are.
+        above: the groups around it, which a link may name again.
+    """
+    above = (*above, group)
+    for name in group:
+        item = group.get(name)  # None for a link without a target
+        if isinstance(item, h5py.Dataset):
+            yield name, item
+        elif isinstance(item, h5py.Group) and item not in above:
+            for below, dataset in _datasets(h5py, item, above):
+                yield f"{name}/{below}", dataset
+
+
+def _rows(h5py: Any, dataset: Any) -> Rows:
+    """Return a dataset that is read later, from the file that has it."""
+    file, name = dataset.file.filename, dataset.name
+
+    def read() -> Any:
+        with h5py.File(file, "r") as opened:
+            return opened[name][()]
+
+    return Rows(dataset.shape or (), dataset.dtype, read)
+
+
+def _language(meta: str | bytes) -> str | None:
+    """Return the instruction in robomimic's ``ep_meta``; None if there is none."""
+    try:
+        values = json.loads(meta)
+    except ValueError:
+        return None
+    return values.get("lang") if isinstance(values, dict) else None
 
 
 def _store(group: object, name: str, values: np.ndarray) -> None:

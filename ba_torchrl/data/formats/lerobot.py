@@ -26,6 +26,7 @@ class LeRobot(Format):
 
     has_last_observation = False
     package = "lerobot"
+    tag = "LeRobot"
     hint = ". LeRobot needs Python 3.12 or later"
 
     def matches(self, path: Path) -> bool:

@@ -13,7 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from ba_torchrl.data.formats.base import FORMATS, Arrays, Card, Entry, Format, plain
+from ba_torchrl.data.formats.base import (
+    FORMATS,
+    Arrays,
+    Card,
+    Entry,
+    Format,
+    StoredArrays,
+    flatten,
+    rows_of,
+)
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.registration import gym_id, register_task
 from ba_torchrl.errors import ConfigError
@@ -37,6 +46,8 @@ class Minari(Format):
     """
 
     package = "minari"
+    tag = "minari"
+    before_first_step = _INFOS
 
     def matches(self, path: Path) -> bool:
         """Return whether it is the folder of a data set."""
@@ -52,6 +63,11 @@ class Minari(Format):
             key: _FIXED.get(key, f"{_OBSERVATIONS if is_observed else _INFOS}{key}")
             for key, is_observed in observed.items()
         }
+
+    def file_shape(self, entry: Entry) -> tuple[int, ...]:
+        """Return the shape of a step: rewards and ends are numbers."""
+        is_number = entry.role == "result" and not entry.name.startswith(_INFOS)
+        return () if is_number else super().file_shape(entry)
 
     def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
         """Write by Minari, with an environment that `recover_environment` makes."""
@@ -78,8 +94,9 @@ class Minari(Format):
                 terminations=arrays["terminations"][:, 0],
                 truncations=arrays["truncations"][:, 0],
                 infos={
-                    name: list(map(str, values)) if values.dtype.kind == "U" else values
-                    for name, values in _below(arrays, _INFOS).items()
+                    entry.name.removeprefix(_INFOS): _info(entry, arrays[entry.name])
+                    for entry in card.entries.values()
+                    if entry.name.startswith(_INFOS)
                 },
             )
             for i, arrays in enumerate(episodes)
@@ -110,18 +127,20 @@ class Minari(Format):
         finally:
             env.close()
 
-    def read(self, path: Path) -> list[Arrays]:
-        """Read every episode; observations of a single space are named ``observations``."""
+    def read(self, path: Path) -> list[StoredArrays]:
+        """Read every episode; observations of a single space are named ``observations``.
+
+        Those of nested spaces are named ``observations/a/b``.
+        """
         minari = self.library("minari")
         episodes = []
         for episode in minari.MinariDataset(path / "data").iterate_episodes():
-            arrays = {name: getattr(episode, name) for name in _FIXED.values()}
-            for place, values in ((_OBSERVATIONS, episode.observations), (_INFOS, episode.infos)):
-                if isinstance(values, dict):
-                    arrays |= {f"{place}{name}": part for name, part in values.items()}
-                elif values is not None:
-                    arrays[place.rstrip("/")] = values
-            episodes.append({name: plain(values) for name, values in arrays.items()})
+            found = {
+                name: values
+                for place in (*_FIXED.values(), _OBSERVATIONS[:-1], _INFOS[:-1])
+                for name, values in flatten(place, getattr(episode, place))
+            }
+            episodes.append({name: rows_of(values) for name, values in found.items()})
         return episodes
 
 
@@ -136,6 +155,14 @@ def _check_space(folder: Path, episodes: Sequence[Arrays]) -> None:
     if free < needed + _EMPTY:
         what = f"{needed / 1e6:.1f} MB are needed, {free / 1e6:.1f} MB are free"
         raise OSError(errno.ENOSPC, f"{os.strerror(errno.ENOSPC)}: {what}", str(folder))
+
+
+def _info(entry: Entry, values: np.ndarray) -> np.ndarray | list[str]:
+    """Return an entry as Minari's infos, whose first row is that of the reset: T + 1 rows."""
+    if entry.dtype == "str":
+        return list(map(str, values))
+    missing = np.zeros_like(values[:1])
+    return np.concatenate([missing, values] if entry.role == "result" else [values, missing])
 
 
 def _plain_space(space: Any) -> Any:
