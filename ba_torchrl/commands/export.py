@@ -12,6 +12,7 @@ ba-torchrl export demos=demos/picking format=zarr path=exports/picking.zarr    #
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -101,7 +102,9 @@ def _export_policy(source: str, settings: Settings) -> None:
         f"{card.episodes} episodes of {card.task}"
     )
     print(f"  policy  {path}, {path.stat().st_size / 1e6:.2f} MB")
-    print(f"  check   {card.evaluate}")
+    named = f"policy={path.name}"  # the card may be moved with its file
+    words = [f"policy={path}" if word == named else word for word in shlex.split(card.evaluate)]
+    print(f"  check   {shlex.join(words)}")
 
 
 COMMAND = Command(main, Settings, positional="policy")

@@ -5,6 +5,7 @@ A policy in a file is ``NAME.safetensors``, its parameters, and ``NAME.json``, i
 
 from __future__ import annotations
 
+import shlex
 import textwrap
 from importlib.resources import files
 from pathlib import Path
@@ -67,7 +68,7 @@ class PolicyCard(StrictModel):
     seed: int
     """Of these episodes."""
     evaluate: str
-    """The command that plays them again."""
+    """The command that plays them again, in the folder of the file."""
     env_steps: int | None = None
     """Environment steps of the run, demonstrations not counted."""
     minutes: float | None = None
@@ -238,7 +239,12 @@ def save_policy(
     for name in ("run_dir", "resume", "device", *_OF_TRAINING):
         del config[name]
     is_shipped = path.resolve() == shipped_file(policy.task)
-    named = f"policy=trained task={policy.task}" if is_shipped else f"policy={path.name}"
+    words = ["policy=trained", f"task={policy.task}"] if is_shipped else [f"policy={path.name}"]
+    words += [f"{episodes=}", f"{num_envs=}"]
+    if seed != policy.test_seed:
+        words.append(f"{seed=}")
+    if policy.config.plugins:
+        words.append(f"plugins=[{','.join(policy.config.plugins)}]")
     card = PolicyCard(
         task=policy.task,
         label=policy.config.label,
@@ -248,8 +254,7 @@ def save_policy(
         interval=wilson_interval(successes, episodes),
         episodes=episodes,
         seed=seed,
-        evaluate=f"ba-torchrl evaluate {named} {episodes=} {num_envs=}"
-        + (f" {seed=}" if seed != policy.test_seed else ""),
+        evaluate=shlex.join(["ba-torchrl", "evaluate", *words]),
         **run,
     )
     tensors = {name: value.detach().cpu() for name, value in policy.policy.state_dict().items()}

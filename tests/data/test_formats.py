@@ -1,8 +1,11 @@
 """Demonstrations in other libraries' formats; most episodes are made by hand."""
 
 import json
+import pickle
 import shutil
 import sys
+import zipfile
+from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
@@ -16,6 +19,7 @@ from torchrl.data.datasets import MinariExperienceReplay
 import ba_torchrl
 from ba_torchrl.data import (
     collect_demonstrations,
+    exchange,
     export_demonstrations,
     load_demonstrations,
     save_demonstrations,
@@ -24,7 +28,12 @@ from ba_torchrl.data.demo_files import check_demonstrations, read_demonstrations
 from ba_torchrl.data.demos import source_config
 from ba_torchrl.data.formats import base
 from ba_torchrl.data.formats.base import FORMATS, Format, read_card
-from ba_torchrl.errors import ConfigError, MissingPackageError, UnknownNameError
+from ba_torchrl.errors import (
+    ConfigError,
+    DamagedFilesError,
+    MissingPackageError,
+    UnknownNameError,
+)
 from tests.training.test_limits import limited
 
 TASK, ENV, SIZE = "close_loop/block_picking", {"obs_size": 64}, 64
@@ -312,16 +321,103 @@ def test_demonstrations_of_another_robot_are_mapped(as_file, tmp_path):
         assert first[key].shape[1:] == plain[key].shape[1:], key
 
 
-def test_results_of_another_robot_are_mapped(tmp_path):
-    path = foreign(tmp_path / "a.hdf5", won=np.array([0, 1, 1]))
-    found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
-    assert found[0]["next", "reward"].flatten().tolist() == [0, 1, 1]
-    assert found[0]["next", "terminated"].flatten().tolist() == [False, False, True]
+def test_failures_of_another_robot_are_mapped(tmp_path):
     path = foreign(tmp_path / "b.hdf5", won=np.zeros(3))
     found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
     assert not any(each["next", "success"].any() for each in found)
     assert found[0]["next", "truncated"].flatten().tolist() == [False, False, True]
     assert found[0]["next", "reward"].sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("results", "success", "terminated"),
+    [
+        ({"success": "won"}, True, True),
+        ({"reward": "won"}, True, True),
+        ({"terminated": "won"}, True, True),
+        ({"success": "won", "terminated": "never"}, True, True),
+        ({"success": "won", "reward": "won", "truncated": "won"}, True, True),
+        ({"success": "never", "terminated": "won"}, False, True),
+        ({"success": "never", "truncated": "won"}, False, False),
+    ],
+)
+def test_an_episode_ends_at_its_first_success_or_end(
+    results, success, terminated, tmp_path, caplog
+):
+    path = foreign(tmp_path / "a.hdf5", won=np.array([0, 1, 1]), never=np.zeros(3))
+    mapping = {**FOREIGN, **results}
+    check_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert caplog.messages == []
+    first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert caplog.messages == [
+        f"{path}: 1 of 5 steps are left out, those after the first success or end of an episode"
+    ]
+    whole, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    assert torch.equal(first["next", "pixels"], whole["next", "pixels"][:2])
+    for each in (first, second):
+        following = each["next"]
+        assert following["done"].flatten().tolist() == [False, True]
+        assert following["reward"].flatten().tolist() == [0, float(success)]
+        assert following["success"].flatten().tolist() == [False, success]
+        assert following["terminated"].flatten().tolist() == [False, terminated]
+
+
+def test_rewards_without_success_tell_it(tmp_path, caplog):
+    path = foreign(tmp_path / "a.hdf5", rewards=np.array([0, 0, 1]), zero=np.zeros(3))
+    options = {"task": TASK, "env": ENV}
+    found = load_demonstrations(path, mapping={**FOREIGN, "reward": "rewards"}, **options)
+    assert [each["next", "success"].sum() for each in found] == [1, 0]
+    assert caplog.messages == []
+    found = load_demonstrations(path, mapping={**FOREIGN, "reward": "zero"}, **options)
+    assert [each["next", "success"].sum() for each in found] == [1, 1]
+    (message,) = caplog.messages
+    assert "the rewards are all 0, and every episode counts as a success: map success" in message
+
+
+def test_a_constant_entry_is_named(tmp_path, caplog):
+    path = foreign(tmp_path / "a.hdf5", still=np.zeros((3, 5)))
+    load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "action": "still"})
+    assert caplog.messages == [f"{path}: action is 0 in all steps; is it the right entry?"]
+
+
+def test_an_episode_of_a_task_that_terminates_at_its_limit_is_terminated():
+    arrays = {"action": np.zeros((2, 4)), "success": np.zeros((2, 1))}
+    found = exchange._with_results(arrays, "open_loop/object_grasping", {})
+    assert found["terminated"].tolist() == [[False], [True]]
+    assert not found["truncated"].any()
+
+
+def test_a_sentence_that_is_observed_is_needed(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    env = {**ENV, "observations": ["instruction"]}
+    with pytest.raises(ConfigError, match="the mapping has no instruction"):
+        check_demonstrations(path, task=TASK, env=env, mapping=FOREIGN)
+
+
+@pytest.mark.parametrize(
+    ("results", "message"),
+    [
+        ({"success": "half"}, r"success: has values from 0 to 0\.6, needed 0 or 1"),
+        ({"reward": "minus"}, "reward: has values from -1 to 0, needed 0 or 1; set scale"),
+        ({"success": "won", "reward": "late"}, "step 1 of 2 has the reward 0 and the success 1"),
+        ({"success": "late", "reward": "won"}, "step 1 of 3 has the reward 1 and the success 0"),
+        ({"success": {"source": "won", "components": [0]}}, "one number per step, no components"),
+        ({"instruction": "words"}, r"instruction: found \['lift', 'push'\], needed one sentence"),
+        ({"instruction": "empty"}, r"instruction: found \[''\], needed one sentence"),
+    ],
+)
+def test_results_that_contradict_their_meaning_are_refused(results, message, tmp_path):
+    path = foreign(
+        tmp_path / "a.hdf5",
+        won=np.array([0, 1, 1]),
+        late=np.array([0, 0, 1]),
+        half=np.array([0, 0.3, 0.6]),
+        minus=np.array([-1, -1, 0]),
+        words=["push", "lift", "lift"],
+        empty=[""] * 3,
+    )
+    with pytest.raises(ConfigError, match=rf"a\.hdf5, episode 0: .*{message}"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, **results})
 
 
 @pytest.mark.parametrize(
@@ -374,13 +470,15 @@ def test_flags_without_an_axis_of_components_fit(tmp_path):
     assert first["holding"].tolist() == [[True], [False], [True]]
 
 
-@pytest.mark.parametrize("names", [("ends", "cuts"), ("ends",), ("cuts",)])
+@pytest.mark.parametrize(
+    "names", [("ends", "cuts"), ("ends",), ("cuts",), ("ends", "cuts", "wins"), ("wins",)]
+)
 def test_an_episode_whose_file_marks_no_end_is_truncated(names, tmp_path):
-    path = foreign(tmp_path / "a.hdf5", ends=np.zeros(3), cuts=np.zeros((3, 1)))
-    keys = {"ends": "terminated", "cuts": "truncated"}
+    path = foreign(tmp_path / "a.hdf5", ends=np.zeros(3), cuts=np.zeros((3, 1)), wins=np.zeros(3))
+    keys = {"ends": "terminated", "cuts": "truncated", "wins": "success"}
     mapping = {**FOREIGN, **{keys[name]: name for name in names}}
     first, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
-    is_truncated = "ends" in names  # else the success of the last step terminates
+    is_truncated = "wins" in names  # else the success of the last step terminates
     last = first["next"][-1]
     assert (last["truncated"].item(), last["terminated"].item()) == (is_truncated, not is_truncated)
     assert first["next", "done"].flatten().tolist() == [False, False, True]
@@ -489,14 +587,142 @@ def test_a_card_that_does_not_fit_its_file_is_refused(damage, message, episodes,
         load_demonstrations(path, task=TASK, env=ENV)
 
 
-def test_a_zarr_folder_without_its_ends_is_refused(episodes, tmp_path):
-    path = exported(tmp_path, episodes, "zarr")
-    zarr.open(str(path), mode="a")["meta/episode_ends"][:] = [3, 5, 8]
-    with pytest.raises(ConfigError, match=r"has 9 rows, the episodes \[8\]"):
-        load_demonstrations(path, task=TASK, env=ENV)
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("hdf5", "picking.hdf5", "picking.hdf5 was altered: .* delete 'checksums' in .*card.json"),
+        ("zarr", "picking.zarr/data/reward/0.0", "reward/0.0 was altered"),
+        (
+            "zarr",
+            "picking.zarr/last_observations.safetensors",
+            "observations.safetensors is missing",
+        ),
+        ("minari", "picking-v0/data/main_data.hdf5", "main_data.hdf5 is missing"),
+    ],
+)
+def test_an_export_that_was_altered_is_refused(name, damage, message, collected, tmp_path):
+    path = exported(tmp_path, collected, name)
+    file = tmp_path / damage
+    content = file.read_bytes()
+    file.unlink()
+    if "altered" in message:
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    for read in (check_demonstrations, load_demonstrations):
+        with pytest.raises(DamagedFilesError, match=message):
+            read(path, task=TASK, env=ENV)
+
+
+def zarr_group(path, version=2):
+    """Return a new group in a folder, of a version of the format."""
+    if version == 2 and zarr.__version__.startswith("2."):
+        return zarr.open_group(str(path), mode="w")
+    return zarr.open_group(str(path), mode="w", zarr_format=version)
+
+
+def foreign_zarr(path, version=2, **changes):
+    """Write two episodes of 3 and 2 steps, every chunk of them."""
+    rng = np.random.default_rng(0)
+    arrays = {
+        "data/camera/depth": rng.uniform(0.1, 0.2, (5, SIZE, SIZE)).astype(np.float32),
+        "data/state": np.linspace(0, 1, 10).reshape(5, 2),
+        "data/action": rng.uniform(-1, 1, (5, 5)),
+        "data/success": np.array([0, 0, 1, 0, 0]),
+        "meta/episode_ends": np.array([3, 5]),
+        **changes,
+    }
+    root = zarr_group(path, version)
+    for name, rows in arrays.items():
+        options = {"shape": rows.shape, "dtype": rows.dtype, "chunks": (2, *rows.shape[1:])}
+        if hasattr(root, "create_array"):
+            array = root.create_array(name, **options, config={"write_empty_chunks": True})
+        else:
+            array = root.create_dataset(name, **options)
+        array[:] = rows
+    return path
+
+
+ZARR = {
+    "pixels": "camera/depth",
+    "holding": {"source": "state", "components": [1]},
+    "action": "action",
+    "success": "success",
+}
+
+
+def zipped(folder):
+    archive = folder.with_name(f"{folder.name}.zip")
+    with zipfile.ZipFile(archive, "w") as file:
+        for path in filter(Path.is_file, folder.rglob("*")):
+            file.write(path, path.relative_to(folder))
+    return archive
+
+
+needs_zarr_3 = pytest.mark.skipif(zarr.__version__.startswith("2."), reason="zarr 3")
+VERSIONS = [2, pytest.param(3, marks=needs_zarr_3)]
+
+
+@pytest.mark.parametrize("is_zip", [False, True])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_groups_and_archives_of_zarr_are_read(version, is_zip, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr", version, **{"data/note": np.arange(7)})
+    depth = zarr.open_group(str(path), mode="r")["data/camera/depth"][:]
+    path = zipped(path) if is_zip else path
+    check_demonstrations(path, task=TASK, env=ENV, least=2, mapping=ZARR)
+    first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=ZARR)
+    np.testing.assert_array_equal(first["pixels"][:, 0], depth[:3])
+    np.testing.assert_array_equal(second["pixels"][:, 0], depth[3:])
+    assert first["next", "success"].flatten().tolist() == [False, False, True]
+    assert not second["next", "success"].any()
+    with pytest.raises(ConfigError, match=r"data/note has the shape \[7\], the episodes end at"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping={**ZARR, "reward": "note"})
+
+
+@pytest.mark.parametrize("is_zip", [False, True])
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("name", ["data/camera/depth", "data/action", "data/success"])
+def test_a_missing_chunk_of_zarr_is_refused(name, version, is_zip, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr", version)
+    chunks = sorted(
+        file for file in (path / name).rglob("*") if file.name[0].isdecimal() and file.is_file()
+    )
+    chunks[-1].unlink()
+    mapped = zipped(path) if is_zip else path
+    for read in (check_demonstrations, load_demonstrations):
+        with pytest.raises(ConfigError, match=rf"1 of 3 chunks of {name} are missing, .*Copy"):
+            read(mapped, task=TASK, env=ENV, mapping=ZARR)
+    if name == "data/success":
+        others = {key: source for key, source in ZARR.items() if key != "success"}
+        assert len(load_demonstrations(mapped, task=TASK, env=ENV, mapping=others)) == 2
+
+
+@needs_zarr_3
+@pytest.mark.parametrize("version", [2, 3])
+def test_chunks_that_were_left_out_are_written_as_the_message_says(version, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr", version)
+    array = zarr.open_group(str(path), mode="r+")["data/success"]
+    array[:] = array[:]
+    options = {"task": TASK, "env": ENV, "mapping": ZARR}
+    with pytest.raises(ConfigError, match="2 of 3 chunks of data/success") as error:
+        load_demonstrations(path, **options)
+    assert "zarr.config.set({'array.write_empty_chunks': True}), then array[:] = array[:]" in str(
+        error.value
+    )
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        array = zarr.open_group(str(path), mode="r+")["data/success"]
+        array[:] = array[:]
+    assert len(load_demonstrations(path, **options)) == 2
+
+
+def test_a_zarr_folder_without_its_ends_is_refused(tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr")
+    options = {"task": TASK, "env": ENV, "mapping": ZARR}
+    for ends, message in (([3, 4], r"has the shape \[5.*end at \[4\]"), ([3, 3], "do not rise")):
+        zarr.open(str(path), mode="a")["meta/episode_ends"][:] = ends
+        with pytest.raises(ConfigError, match=message):
+            load_demonstrations(path, **options)
     (path / "meta/episode_ends/0").unlink()
-    with pytest.raises(ConfigError, match="do not rise"):
-        load_demonstrations(path, task=TASK, env=ENV)
+    with pytest.raises(ConfigError, match="1 of 1 chunks of meta/episode_ends are missing"):
+        load_demonstrations(path, **options)
 
 
 def test_an_instruction_that_was_not_observed_is_that_of_the_task(episodes, tmp_path):
@@ -571,14 +797,23 @@ def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
         {"compressor": {"id": "pickle"}},
     ],
 )
-def test_pickles_in_zarr_are_refused(pickled, episodes, tmp_path):
-    path = exported(tmp_path, episodes, "zarr")
-    array = {"shape": [9], "chunks": [9], "dtype": "<f4", "filters": None, "compressor": None}
+def test_pickles_in_zarr_are_refused(pickled, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr")
+    array = {"shape": [5], "chunks": [5], "dtype": "<f4", "filters": None, "compressor": None}
     array |= {"fill_value": None, "order": "C", "zarr_format": 2, **pickled}
     (path / "data/note").mkdir()
     (path / "data/note/.zarray").write_text(json.dumps(array))
-    with pytest.raises(ConfigError, match=r"note is not opened|No Zarr data type"):
-        load_demonstrations(path, task=TASK, env=ENV)
+    (path / "data/note/0").write_bytes(pickle.dumps(Exploding()))
+    options = {"task": TASK, "env": ENV}
+    assert len(load_demonstrations(path, mapping=ZARR, **options)) == 2
+    for read in (check_demonstrations, load_demonstrations):
+        with pytest.raises(ConfigError, match=r"note is not opened|No Zarr data type"):
+            read(path, mapping={**ZARR, "reward": "note"}, **options)
+
+
+class Exploding:
+    def __reduce__(self):
+        return pytest.exit, ("a pickle was loaded",)
 
 
 @pytest.mark.parametrize("name", ["hdf5", "zarr", "minari", "lerobot"])
