@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium
 import h5py
 import numpy as np
 import pytest
@@ -134,6 +135,12 @@ def test_every_value_comes_back(name, episodes, tmp_path):
         path / "README.md" if path.is_dir() else path.with_name("picking.hdf5.card.md")
     ).read_text()
     assert f"| `{card.entries['proprio'].name}` | observation `proprio` | float32 | [8] |" in page
+    image = [1, SIZE, SIZE] if name == "lerobot" else [SIZE, SIZE, 1]
+    assert f"| `{card.entries['pixels'].name}` | observation `pixels` | float32 | {image} |" in page
+    reward = [] if name == "hdf5" else [1]
+    assert f"| result `reward` | float32 | {reward} |" in page
+    assert ("LeRobot" in page) == (name == "lerobot")
+    assert card.entries["pixels"].shape == (1, SIZE, SIZE)
 
 
 @pytest.mark.parametrize("name", ["minari", "hdf5", "zarr", "lerobot"])
@@ -229,6 +236,56 @@ def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_p
             export_demonstrations(tmp_path / name, collected, **options)
     with pytest.raises(ConfigError, match=r"does not observe .*wrist_rgb"):
         export_demonstrations(tmp_path / "a-v0", episodes, **options)
+
+
+def test_minari_has_infos_of_the_reset(collected, tmp_path):
+    minari = pytest.importorskip("minari")
+    path = exported(tmp_path, collected, "minari")
+    for found, ours in zip(
+        minari.MinariDataset(path / "data").iterate_episodes(), collected, strict=True
+    ):
+        steps = len(ours)
+        assert {len(rows) for rows in found.infos.values()} == {steps + 1}
+        np.testing.assert_array_equal(found.infos["success"][1:], ours["next", "success"])
+        assert not found.infos["success"][0]
+        np.testing.assert_array_equal(found.infos["expert_action"][:-1], ours["expert_action"])
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of what a card of Minari lacks
+@pytest.mark.parametrize("rows", [3, 4])  # without and with those of the reset
+def test_nested_observations_and_infos_of_minari_are_mapped(rows, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    spaces = gymnasium.spaces
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    depth = np.random.default_rng(0).uniform(0.1, 0.2, (4, SIZE, SIZE)).astype(np.float32)
+    buffer = minari.data_collector.EpisodeBuffer(
+        id=0,
+        observations={"arm": {"depth": depth, "grip": np.linspace(0, 1, 4)[:, None]}},
+        actions=np.full((3, 5), np.linspace(-1, 1, 3)[:, None]),
+        rewards=np.zeros(3),
+        terminations=np.array([False, False, True]),
+        truncations=np.zeros(3, dtype=bool),
+        infos={"won": {"all": np.array([0, 0, 0, 1])[4 - rows :]}},
+    )
+    arm = {"depth": spaces.Box(0, 1, depth.shape[1:]), "grip": spaces.Box(0, 1, (1,), np.float64)}
+    minari.create_dataset_from_buffers(
+        "theirs-v0",
+        [buffer],
+        observation_space=spaces.Dict({"arm": spaces.Dict(arm)}),
+        action_space=spaces.Box(-1, 1, (5,), np.float64),
+    )
+    mapping = {
+        "pixels": "observations/arm/depth",
+        "holding": "observations/arm/grip",
+        "action": "actions",
+        "success": "infos/won/all",
+    }
+    options = {"task": TASK, "env": ENV, "mapping": mapping}
+    check_demonstrations(tmp_path / "theirs-v0", **options)
+    (found,) = load_demonstrations(tmp_path / "theirs-v0", **options)
+    np.testing.assert_array_equal(found["next", "pixels"][:, 0], depth[1:])
+    assert found["holding"].flatten().tolist() == [False, False, True]
+    assert found["next", "success"].flatten().tolist() == [False, False, True]
 
 
 def test_hdf5_has_the_layout_of_robomimic(episodes, tmp_path):
@@ -453,6 +510,69 @@ def test_colours_between_0_and_1_are_scaled_and_rounded(dtype, tmp_path):
     mapping = {**FOREIGN, "wrist_rgb": {"source": "rgb", "scale": 255}}
     first, _ = load_demonstrations(path, task=TASK, env=env, mapping=mapping)
     np.testing.assert_array_equal(first["wrist_rgb"], colours.transpose(0, 3, 1, 2))
+
+
+def test_depth_without_an_axis_of_channels_fits(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    wanted, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo["flat"] = demo["obs/depth"][..., 0]
+    mapping = {**FOREIGN, "pixels": {"source": "flat", "scale": 0.001}}
+    check_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    found, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert torch.equal(found["pixels"], wanted["pixels"])
+
+
+def test_numbers_that_yaml_reads_as_text_are_numbers(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    wanted, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    text = json.dumps(FOREIGN).replace("0.001", "1e-3").replace("[2, 20", "[2e0, 2e1")
+    (tmp_path / "a.yaml").write_text(text.replace('"offset": 1}', '"offset": 1e0}'))
+    options = {"task": TASK, "env": ENV, "mapping": tmp_path / "a.yaml"}
+    found, _ = load_demonstrations(path, **options)
+    assert_equal([found], [wanted])
+    (tmp_path / "a.yaml").write_text(text.replace("1e-3", "1e-3m"))
+    with pytest.raises(ConfigError, match=r"pixels\.scale: .*could not convert string to float"):
+        load_demonstrations(path, **options)
+
+
+def test_links_in_hdf5_are_followed(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    wanted = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        for name, demo in file["data"].items():
+            file.move(f"data/{name}/obs/depth", f"images/{name}")
+            demo["obs/depth"] = h5py.SoftLink(f"/images/{name}")
+            demo["obs/second"] = demo["actions"]  # a hard link
+            demo["obs/loop"] = h5py.SoftLink(f"/data/{name}")
+            demo["obs/lost"] = h5py.SoftLink("/nowhere")
+            demo["obs/elsewhere"] = h5py.ExternalLink("none.hdf5", "/a")
+    mapping = {**FOREIGN, "action": {**FOREIGN["action"], "source": "obs/second"}}
+    check_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV, mapping=mapping), wanted)
+
+
+def test_hdf5_is_read_where_it_is_mapped_and_checked_by_shapes(tmp_path, monkeypatch):
+    path = foreign(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo.create_dataset("obs/camera", (3, 1 << 20, 1 << 20), "f8", chunks=(1, 64, 64))
+            demo["obs/nothing"] = h5py.Empty("f4")
+            demo.attrs["ep_meta"] = ""
+    assert len(load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)) == 2
+    read = []
+    monkeypatch.setattr(base, "plain", lambda values: read.append(values))
+    check_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    assert read == []
+    for changes, message in (
+        ({"pixels": "obs/camera"}, r"pixels: has the shape \[1048576, 1048576\], needed"),
+        ({"success": "obs/nothing"}, "success has 0 rows, and there are 3 actions"),
+        ({"reward": "obs/state"}, r"reward: has the shape \[2\], needed one number"),
+        ({"instruction": "ep_meta/lang"}, "instruction: there is no 'ep_meta/lang'"),
+    ):
+        with pytest.raises(ConfigError, match=f"episode 0: {message}"):
+            check_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, **changes})
 
 
 def test_actions_beyond_their_bounds_by_rounding_are_clipped(tmp_path):

@@ -1,6 +1,7 @@
 """Trained policies: from a run, in a file with its card, and shipped."""
 
 import json
+import shlex
 import sys
 
 import pytest
@@ -78,6 +79,9 @@ def test_a_file_acts_like_the_run(run, tmp_path):
     assert card.evaluate == f"{command} seed=9"
     own = {"successes": 3, "episodes": 4, "num_envs": 2, "seed": policy.test_seed}
     assert policies.save_policy(policy, tmp_path / "p.safetensors", **own).evaluate == command
+    policy.config = policy.config.model_copy(update={"plugins": ["mine", "yours.nets"]})
+    with_plugins = policies.save_policy(policy, tmp_path / "p.safetensors", **own)
+    assert with_plugins.evaluate == f"{command} 'plugins=[mine,yours.nets]'"
     assert card.env_steps >= 0
     assert again.env_config == policy.env_config
     assert str(run) not in path.with_suffix(".json").read_text()
@@ -176,6 +180,12 @@ def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsy
     out = capsys.readouterr().out
     success = float(out.split("success_rate ")[1].split()[0])
     assert f"  card      {success:.2f} (" in out  # the same episodes
+    recipe("export", str(run), "path=my files/p.safetensors", *options)
+    out = capsys.readouterr().out
+    check = shlex.split(out.split("  check   ")[1])
+    assert check[2] == "policy=my files/p.safetensors"
+    recipe(*check[1:])
+    assert f"success_rate {success:.2f} (" in capsys.readouterr().out
     recipe("play", f"policy={file}", "video=film.gif")
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF")
 
