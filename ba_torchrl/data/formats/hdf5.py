@@ -86,13 +86,13 @@ class Robomimic(Format):
         with h5py.File(path, "r") as file:
             data = file["data"]
             for demo in sorted(data, key=lambda name: (len(name), name)):
-                arrays: dict[str, Any] = {
-                    name: _rows(h5py, item) for name, item in _datasets(h5py, data[demo])
-                }
-                for name in [name for name in arrays if name.startswith(_OBS)]:
-                    following = arrays.get(name.replace(_OBS, _NEXT_OBS, 1))
-                    if following is not None:
-                        arrays[name] = arrays[name].then(following)
+                datasets = dict(_datasets(h5py, data[demo]))
+                arrays: dict[str, Any] = {}
+                for name, dataset in datasets.items():
+                    arrays[name] = _rows(h5py, dataset)
+                    following = datasets.get(name.replace(_OBS, _NEXT_OBS, 1))
+                    if name.startswith(_OBS) and following is not None:
+                        arrays[name] = arrays[name].then(_rows(h5py, following, np.s_[-1:]))
                 if language := _language(data[demo].attrs.get("ep_meta", "")):
                     arrays[_LANGUAGE] = np.array([language])
                 episodes.append(arrays)
@@ -117,13 +117,13 @@ def _datasets(h5py: Any, group: Any, above: tuple[Any, ...] = ()) -> Iterator[tu
                 yield f"{name}/{below}", dataset
 
 
-def _rows(h5py: Any, dataset: Any) -> Rows:
-    """Return a dataset that is read later, from the file that has it."""
+def _rows(h5py: Any, dataset: Any, part: Any = ()) -> Rows:
+    """Return a dataset, or a part of it, that is read later, from the file that has it."""
     file, name = dataset.file.filename, dataset.name
 
     def read() -> Any:
         with h5py.File(file, "r") as opened:
-            return opened[name][()]
+            return opened[name][part]
 
     return Rows(dataset.shape or (), dataset.dtype, read)
 
