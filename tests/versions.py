@@ -257,7 +257,7 @@ def check_quick_start() -> None:
     )
     assert done.returncode == 0, done.stderr[-2000:]
     policy = ba_torchrl.load_policy("run")
-    env = ba_torchrl.make(policy.task, **policy.env_config)
+    env = policy.make_env()
     env.rollout(3, policy)
     env.close()
 

@@ -61,7 +61,7 @@ def main(config: ExperimentConfig) -> None:
     print(f"  result      {result.record}")
     print("  to use it in Python:")
     print(f'    policy = ba_torchrl.load_policy("{config.run_dir}")')
-    print("    env = ba_torchrl.make(policy.task, **policy.env_config)")
+    print("    env = policy.make_env()")
     print("    env.rollout(env.max_steps, policy)")
 
 

@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.checks import check_policy
 
 logger = logging.getLogger(__name__)
 
@@ -54,8 +55,10 @@ def collect_episodes(
         Episodes as TensorDicts [T], in the order of the environments.
 
     Raises:
+        ConfigError: a trained policy is for another environment.
         RuntimeError: more than ``max_lost`` episodes were lost to faults.
     """
+    check_policy(policy, env)
     (num_envs,) = env.batch_size
     wanted = quotas(episodes, num_envs)
     finished: list[list[TensorDict]] = [[] for _ in wanted]

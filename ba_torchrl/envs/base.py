@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl import _segment_tree
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.checks import checked_action
+from ba_torchrl.envs.checks import ChecksPolicy, checked_action
 from ba_torchrl.envs.copying import CopiesWithState
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_observation
@@ -39,7 +39,7 @@ from ba_torchrl.tasks.workspace import ActionLimits
 _segment_tree.install()  # for TorchRL's prioritised buffers of users
 
 
-class ManipulationEnv(CopiesWithState, EnvBase):
+class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
     """A manipulation task as an unbatched TorchRL environment on the CPU.
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any

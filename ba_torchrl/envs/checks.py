@@ -1,13 +1,42 @@
-"""Validation of actions before they are executed."""
+"""Validation of actions before they are executed, and of policies before they act."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
 
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import InvalidActionError
+
+
+class ChecksPolicy:
+    """Mix-in of environments: ``rollout`` lets a trained policy check the environment first."""
+
+    def rollout(
+        self, max_steps: int, policy: Any = None, *args: Any, **kwargs: Any
+    ) -> TensorDictBase:
+        """Play at most ``max_steps`` steps; see `EnvBase.rollout`.
+
+        Raises:
+            ConfigError: see `check_policy`.
+        """
+        check_policy(policy, self)
+        return super().rollout(max_steps, policy, *args, **kwargs)
+
+
+def check_policy(policy: Any, env: EnvBase) -> None:
+    """Let a policy with the method ``check_env``, such as `TrainedPolicy`, check an environment.
+
+    Raises:
+        ConfigError: the policy was trained with other observations or actions.
+    """
+    if hasattr(policy, "check_env"):
+        policy.check_env(env)
 
 
 def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: str) -> np.ndarray:

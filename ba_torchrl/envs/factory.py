@@ -76,6 +76,6 @@ def make_vector_env(
         workers = workers.model_copy(update={"parallel": processes_save_time(num_envs)})
     if workers.parallel and workers.start_method == "spawn":
         resolved.check_spawned_process_knows()
-    return make_vector(
-        partial(make, resolved), num_envs, seed=resolved.config.seed, workers=workers
-    )
+    env = make_vector(partial(make, resolved), num_envs, seed=resolved.config.seed, workers=workers)
+    env.resolved = resolved
+    return env

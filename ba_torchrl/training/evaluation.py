@@ -17,6 +17,7 @@ from ba_torchrl import make
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.data.episodes import Policy, collect_episodes, mean_length, success_rate
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.checks import check_policy
 from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.record.video import FrameRecorder
 
@@ -110,11 +111,15 @@ def record_episodes(
 
     Returns:
         Images [H, W, 3] uint8 in the order of time.
+
+    Raises:
+        ConfigError: a trained policy is for another environment.
     """
     env = make(resolved, seed=seed)
     recorder = FrameRecorder(env, motion=True)
     act = env.rand_action if policy is None else policy
     try:
+        check_policy(policy, env)
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
             for number in range(1, episodes + 1):
                 state = env.reset()

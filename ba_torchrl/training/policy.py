@@ -5,8 +5,10 @@ A policy in a file is ``NAME.safetensors``, its parameters, and ``NAME.json``, i
 
 from __future__ import annotations
 
+import logging
 import shlex
 import textwrap
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -17,13 +19,17 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
-from ba_torchrl.algorithms.base import SeedUse
+from ba_torchrl.algorithms.base import Learner, SeedUse
 from ba_torchrl.config import StrictModel, explain
 from ba_torchrl.data.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, known_names
 from ba_torchrl.record.results import RESULT_FILE, read_result, wilson_interval
@@ -37,6 +43,8 @@ from ba_torchrl.training.checkpoint import (
 )
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
 
+logger = logging.getLogger(__name__)
+
 TENSORS, CARD = ".safetensors", ".json"
 _OF_TRAINING = {
     "logger": "csv",
@@ -45,6 +53,11 @@ _OF_TRAINING = {
     "demonstrations_mapping": None,
 }
 """Fields of a run that its policy does not need, with values that need no package or file."""
+
+
+_OF_IMAGES = ("workspace", "in_hand_mode", "view_type", "view_scale")
+"""Parameters of an environment that change the content of images and not their shape."""
+_WAY_OUT = "policy.make_env() makes the environment that it was trained in"
 
 
 class PolicyCard(StrictModel):
@@ -82,8 +95,11 @@ class PolicyCard(StrictModel):
 class TrainedPolicy(TensorDictModuleBase):
     """A greedy policy in evaluation mode: no gradients, no exploration, constant weights.
 
+    It refuses observations of other shapes than in training. The actions and the task of an
+    environment are compared by `check_env`, which the package's ``rollout`` and commands call.
+
     Args:
-        policy: from a root TensorDict to ``action``.
+        learner: whose policy it is.
         config: of the run that trained it.
         updates: gradient updates of the policy.
         source: file or folder that it is from.
@@ -92,15 +108,21 @@ class TrainedPolicy(TensorDictModuleBase):
 
     def __init__(
         self,
-        policy: TensorDictModuleBase,
+        learner: Learner,
         config: ExperimentConfig,
         updates: int,
         source: Path,
         card: PolicyCard | None = None,
     ) -> None:
         super().__init__()
-        self.policy = policy.requires_grad_(False)
-        self.in_keys, self.out_keys = list(policy.in_keys), [keys.ACTION]
+        self.policy = learner.policy.requires_grad_(False)
+        self.in_keys, self.out_keys = list(learner.policy.in_keys), [keys.ACTION]
+        images = {key: image.shape for key, image in learner.images.items()}
+        vectors = {key: (length,) for key, length in learner.vectors.items()}
+        known = {**images, **vectors, keys.HOLDING: (1,)}
+        self.shapes = {key: known[key] for key in self.in_keys if key in known}
+        """Shape of each image and vector that the policy reads, without batch dimensions."""
+        self._warned: set[str] = set()
         self.config, self.updates, self.source, self.card = config, updates, source, card
         self.eval()
 
@@ -124,29 +146,91 @@ class TrainedPolicy(TensorDictModuleBase):
         """Seed of episodes that training did not use."""
         return self.config.derived_seed(SeedUse.TEST)
 
+    def make_env(self, **changes: Any) -> ManipulationEnv:
+        """Make the environment that the policy was trained in.
+
+        Args:
+            changes: fields of `ba_torchrl.config.EnvConfig` with other values, such as ``seed=0``.
+
+        Raises:
+            ConfigError: as `ba_torchrl.make`.
+        """
+        return make(self.task, **{**self.env_config, **changes})
+
+    def check_env(self, env: EnvBase) -> None:
+        """Check that an environment observes what the policy reads and takes its actions.
+
+        Another task, or images with other content, are logged as a warning, once. Other parameters,
+        such as the robot, may differ. Of environments that are not `make`'s or `make_vector_env`'s,
+        with or without transforms, only the observations are known.
+
+        Raises:
+            ConfigError: it observes other shapes, or its actions have another meaning.
+        """
+        specs = env.observation_spec
+        observed = {key: specs[key].shape for key in self.shapes if key in specs.keys(True)}
+        self._check_observed(self.shapes, observed)
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
+        here, trained = vars(env).get("resolved"), self.config.resolved_env
+        if here is None:
+            return
+        if here.actions != trained.actions:
+            raise ConfigError(
+                f"the policy of {self.task} gives {trained.actions}, the environment takes "
+                f"{here.actions}: {_WAY_OUT}"
+            )
+        changes = [("task", self.task, here.task_id)]
+        changes += [
+            (name, getattr(trained.config, name), getattr(here.config, name)) for name in _OF_IMAGES
+        ]
+        found = ", ".join(f"{name} {new}, not {old}" for name, old, new in changes if new != old)
+        if found and found not in self._warned:
+            self._warned.add(found)
+            logger.warning("the policy was trained in another environment; here: %s", found)
+
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action``; the observation may be on another device than the policy.
 
         Raises:
-            ConfigError: the observation lacks an entry that the policy reads.
+            ConfigError: the observation lacks an entry that the policy reads, or its shape is
+                another than in training.
         """
-        if missing := [key for key in self.in_keys if key not in tensordict.keys(True)]:
-            raise ConfigError(
-                f"the policy of {self.task} reads {', '.join(map(str, missing))}, which is not "
-                "observed: make the environment with **policy.env_config"
-            )
+        entries = {key: tensordict.get(key, None) for key in self.in_keys}
+        observed = {key: value.shape for key, value in entries.items() if value is not None}
+        self._check_observed(self.in_keys, observed)
         device = next(self.parameters()).device
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
             found = self.policy(tensordict.select(*self.in_keys).to(device))[keys.ACTION]
         return tensordict.set(keys.ACTION, found.to(tensordict.device or found.device))
+
+    def _check_observed(
+        self, wanted: Iterable[NestedKey], observed: Mapping[NestedKey, torch.Size]
+    ) -> None:
+        """Check that entries are observed, with shapes that end in those of training."""
+        if missing := [key for key in wanted if key not in observed]:
+            raise ConfigError(
+                f"the policy of {self.task} reads {', '.join(map(str, missing))}, which is not "
+                f"observed: {_WAY_OUT}"
+            )
+        others = [
+            f"{key} of shape {list(shape)}, and this is {list(observed[key][-len(shape) :])}"
+            for key, shape in self.shapes.items()
+            if observed[key][-len(shape) :] != shape
+        ]
+        if others:
+            raise ConfigError(f"the policy of {self.task} reads {'; '.join(others)}: {_WAY_OUT}")
 
     def __repr__(self) -> str:
         return f"TrainedPolicy({self.task}, {self.config.label}, update {self.updates})"
 
 
 def load_policy(
-    source: str | Path, which: Which = "best", device: str = "cpu", **changes: Any
+    source: str | Path,
+    which: Which = "best",
+    device: str | torch.device = "cpu",
+    **changes: Any,
 ) -> TrainedPolicy:
     """Load a trained policy.
 
@@ -158,14 +242,14 @@ def load_policy(
         changes: further fields of `ExperimentConfig` to override.
 
     Returns:
-        A TensorDict module that reads `in_keys` and writes ``action``. ``make(policy.task,
-        **policy.env_config)`` makes its environment.
+        A TensorDict module that reads `in_keys` and writes ``action``. ``policy.make_env()`` makes
+        its environment.
 
     Raises:
         ConfigError: there is no such policy, its files are damaged, or it names plugins that are
             neither imported nor installed.
     """
-    changes = {**_OF_TRAINING, "device": device, **changes}
+    changes = {**_OF_TRAINING, "device": str(device), **changes}
     if str(source) in TASKS:
         path = shipped_file(str(source))
         if not path.exists():
@@ -181,17 +265,17 @@ def load_policy(
     if path.suffix != TENSORS:
         checkpoint = find_checkpoint(path, which)
         config, algorithm = load(checkpoint, **changes)
-        return TrainedPolicy(algorithm.policy, config, algorithm.updates, checkpoint)
+        return TrainedPolicy(algorithm, config, algorithm.updates, checkpoint)
     card = read_card(path)
     changes = {"run_dir": str(path.parent), "resume": False, **changes}
     config = parse_saved(card.config, path.with_suffix(CARD), **changes)
-    policy = build_algorithm(config).policy
+    learner = build_algorithm(config)
     try:
-        policy.load_state_dict(load_file(path, device=str(config.torch_device)))
+        learner.policy.load_state_dict(load_file(path, device=str(config.torch_device)))
     except (OSError, RuntimeError, SafetensorError) as error:
         reason = textwrap.shorten(str(error), 300)
         raise ConfigError(f"{path} does not hold the policy of its card: {reason}") from None
-    return TrainedPolicy(policy, config, card.updates, path, card)
+    return TrainedPolicy(learner, config, card.updates, path, card)
 
 
 def round_weights(policy: TrainedPolicy) -> None:

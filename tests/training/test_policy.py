@@ -1,12 +1,15 @@
 """Trained policies: from a run, in a file with its card, and shipped."""
 
 import json
+import re
 import shlex
 import sys
+from contextlib import closing
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import StepCounter, TransformedEnv
 
 import ba_torchrl
 from ba_torchrl.commands import evaluate
@@ -29,7 +32,7 @@ def run(tmp_path_factory):
 
 def observed(policy):
     """An observation of the policy's environment."""
-    env = ba_torchrl.make(policy.task, seed=1, **policy.env_config)
+    env = policy.make_env(seed=1)
     state = env.reset()
     env.close()
     return state
@@ -45,7 +48,7 @@ def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
     assert not policy.training
     torch.testing.assert_close(first["action"], second["action"], rtol=0, atol=0)
     config, _ = load(run)
-    env = ba_torchrl.make(policy.task, **policy.env_config)
+    env = policy.make_env()
     assert env.config.model_copy(update={"seed": None}) == config.resolved_env.config
     env.rollout(2, policy)
     env.close()
@@ -54,8 +57,84 @@ def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
 def test_an_observation_without_what_the_policy_reads_is_named(run):
     policy = ba_torchrl.load_policy(run)
     state = TensorDict({"holding": torch.zeros(1, dtype=torch.bool)}, batch_size=[])
-    with pytest.raises(ConfigError, match=r"reads pixels, which is not observed: make the env"):
+    with pytest.raises(ConfigError, match=r"reads pixels, which is not observed: policy\.make_env"):
         policy(state)
+
+
+SHIPPED = {"close_loop": "close_loop/block_picking", "open_loop": "open_loop/block_stacking"}
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    """The policies of `SHIPPED`, with 64 px each."""
+    return {control: ba_torchrl.load_policy(task) for control, task in SHIPPED.items()}
+
+
+@pytest.mark.parametrize(
+    ("control", "changes", "message"),
+    [
+        ("open_loop", {"obs_size": 128}, r"pixels of shape \[1, 64, 64\], and this is \[1, 128"),
+        ("open_loop", {"in_hand_size": 32}, r"in_hand of shape \[1, 24, 24\], and this is \[1, 32"),
+        ("open_loop", {"action_sequence": "pyxr"}, "the environment takes .*'pyxr'"),
+        ("open_loop", {"half_rotation": False}, "the environment takes .*half_rotation=False"),
+        ("close_loop", {"obs_size": 128}, r"pixels of shape \[1, 64, 64\], and this is \[1, 128"),
+        ("close_loop", {"obs_type": "vec"}, "reads pixels, which is not observed"),
+        ("close_loop", {"action_sequence": "xyzpr"}, "the environment takes .*'xyzpr'"),
+        ("close_loop", {"dpos": 0.02}, "the environment takes .*dpos_m=0.02"),
+    ],
+)
+def test_another_environment_than_in_training_is_refused(
+    shipped, control, changes, message, capsys
+):
+    policy = shipped[control]
+    with closing(policy.make_env(**changes)) as env:
+        with pytest.raises(ConfigError, match=f"{message}.*policy.make_env"):
+            env.rollout(50, policy)
+        with pytest.raises(ConfigError, match=message):
+            policy.check_env(TransformedEnv(env, StepCounter()))
+        if "environment takes" not in message:  # else it is not visible in an observation
+            with pytest.raises(ConfigError, match=message):
+                policy(env.reset())
+    options = {**policy.env_config, **changes, "parallel": False}
+    with closing(ba_torchrl.make_vector_env(policy.task, 1, **options)) as envs:
+        with pytest.raises(ConfigError, match=message):
+            envs.rollout(50, policy)
+        with pytest.raises(ConfigError, match=message):
+            evaluation.evaluate(envs, policy, 1, seed=0)
+    words = [f"env.{name}={value}" for name, value in changes.items()]
+    with pytest.raises(SystemExit):
+        recipe("play", policy.task, "policy=trained", "video=null", *words)
+    assert re.search(message, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"task": "close_loop/block_reaching"},
+            "task close_loop/block_reaching, not close_loop/block_picking",
+        ),
+        ({"view_scale": 1.2}, "view_scale 1.2, not 1.5"),
+        ({"robot": "panda", "max_steps": 2, "expert": True}, None),
+    ],
+)
+def test_another_task_or_view_is_a_warning(shipped, changes, message, caplog):
+    policy = shipped["close_loop"]
+    made = {"task": policy.task, **policy.env_config, **changes}
+    with closing(ba_torchrl.make(**made)) as env:
+        for _ in range(2):
+            env.rollout(1, policy)
+    assert [record.message for record in caplog.records] == (
+        [f"the policy was trained in another environment; here: {message}"] if message else []
+    )
+
+
+def test_any_batch_shape_is_taken(shipped):
+    policy = shipped["close_loop"]
+    state = observed(policy)
+    action = policy(state.clone())["action"]
+    batch = policy(state.expand(2, 3).clone())["action"]
+    torch.testing.assert_close(batch, action.expand(2, 3, -1))
 
 
 def test_a_file_acts_like_the_run(run, tmp_path):

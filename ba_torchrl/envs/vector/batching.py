@@ -11,12 +11,12 @@ from tensordict import TensorDictBase
 from torchrl.envs import ParallelEnv
 from typing_extensions import Self
 
-from ba_torchrl.envs.checks import check_actions
+from ba_torchrl.envs.checks import ChecksPolicy, check_actions
 from ba_torchrl.envs.positions import Position
 
 
-class SeededVector:
-    """Mix-in of both vectors: seeds of the environments and validation of actions."""
+class SeededVector(ChecksPolicy):
+    """Mix-in of both vectors: seeds of the environments, validation of actions and policies."""
 
     _base_seed: int | None = None
 
