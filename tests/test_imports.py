@@ -26,7 +26,7 @@ EXTRA = {
     "__main__": {"cli"},
     "recipes": {"__init__", "record"},
 }
-SHARED = {"_malloc", "_segment_tree", "_jit"}
+SHARED = {"_generators", "_malloc", "_segment_tree", "_jit"}
 APART = {
     "__init__": BASE | {"sim", "tasks", "envs", "training.policy"},
     "__main__": {"cli"},
@@ -34,6 +34,7 @@ APART = {
     "modules": BASE | {"modules", "envs.keys", "envs.images", "hardware"},
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
+    "_generators": set(),
     "_malloc": set(),
     "_segment_tree": set(),
     "_jit": set(),

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
+from ba_torchrl._generators import seeded_generator
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, Problem, SeedUse
 from ba_torchrl.algorithms.spatial_actions import (
     RigidAugmentationConfig,
@@ -169,7 +170,7 @@ class MixedPolicy(TensorDictModuleBase):
         self.in_keys = list(policy.in_keys)
         self.out_keys = [keys.ACTION]
         self._actions = actions
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = seeded_generator(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of a root TensorDict of any batch shape.

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ba_torchrl._generators import seeded_generator
 from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
 from ba_torchrl.data.time_reversal import DeconstructionEnv, is_reversible, reverse_episode
 from ba_torchrl.envs import keys
@@ -139,7 +140,7 @@ class RandomActions:
         self._is_drawn = torch.ones_like(self._is_turn)
         if primitive is not None:
             self._is_drawn[primitive] = False
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = seeded_generator(seed)
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action and ``is_expert`` of every environment.

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from torch import Tensor
 
+from ba_torchrl._generators import seeded_generator
 from ba_torchrl.objectives.sacfd import SACfDLoss
 
 
@@ -60,7 +61,7 @@ class RLPDLoss(SACfDLoss):
         )
         self.subset = subset
         # On the CPU, so that the subsets of a seed are the same on all devices.
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = seeded_generator(seed)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

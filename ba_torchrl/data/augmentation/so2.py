@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from ba_torchrl._generators import seeded_generator
 from ba_torchrl.data.transfer import to_device
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
@@ -126,7 +127,7 @@ class SeededModule(nn.Module):
 
     def __init__(self, seed: int) -> None:
         super().__init__()
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = seeded_generator(seed)
 
     def get_extra_state(self) -> Tensor:
         """Return the generator's state, so that a checkpoint continues the same draws."""

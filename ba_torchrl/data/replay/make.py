@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-import torch
 from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
 
+from ba_torchrl._generators import seeded_generator
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
@@ -58,5 +58,5 @@ def make_replay(
         storage=FrameStorage(capacity, codecs, returns_codes=returns_codes),
         sampler=sampler,
         batch_size=batch_size,
-        generator=torch.Generator().manual_seed(seed),
+        generator=seeded_generator(seed),
     )

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
+from ba_torchrl._generators import seeded_generator
 from ba_torchrl.data.files import StateFolder
 from ba_torchrl.data.replay.storage import OneProcess, stored_flags
 from ba_torchrl.envs import keys
@@ -28,9 +29,7 @@ class SymmetricSampler(OneProcess, StateFolder, Sampler):
     """
 
     def __init__(self, seed: int) -> None:
-        self.generators = {
-            side: torch.Generator().manual_seed(2 * seed + i) for i, side in enumerate(_SIDES)
-        }
+        self.generators = {side: seeded_generator(2 * seed + i) for i, side in enumerate(_SIDES)}
 
     def sample(
         self, storage: Storage, batch_size: int

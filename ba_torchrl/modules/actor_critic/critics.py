@@ -51,6 +51,10 @@ class FieldNorm(nn.Module):
         return F.layer_norm(x, x.shape[-2:]) * self.weight + self.bias
 
 
+def _unchanged(action: Tensor) -> Tensor:
+    return action
+
+
 class EnsembleCritic(nn.Module):
     """Values of an action from several critics on shared features.
 
@@ -72,7 +76,7 @@ class EnsembleCritic(nn.Module):
         heads: int,
         fields: int,
         group_order: int = 1,
-        arrange: Callable[[Tensor], Tensor] = lambda action: action,
+        arrange: Callable[[Tensor], Tensor] = _unchanged,
     ) -> None:
         super().__init__()
         self.heads = heads

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from ba_torchrl._generators import seeded_generator
 from ba_torchrl.actions import PLACE, TILTS, GridAxis, OpenLoopActions
 from ba_torchrl.envs import keys
 from ba_torchrl.modules.layers import widened, widest_float
@@ -221,7 +222,7 @@ class SpatialPolicy(nn.Module):
         super().__init__()
         self.values = values
         self.register_buffer("epsilon", torch.zeros(()))
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = seeded_generator(seed)
 
     @torch.no_grad()
     def forward(self, *observation: Tensor) -> Tensor:
