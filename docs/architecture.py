@@ -20,6 +20,7 @@ BASE = (
     "plugins",
     "actions",
     "hardware",
+    "_generators",
     "_malloc",
     "_segment_tree",
     "_jit",

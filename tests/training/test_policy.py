@@ -39,7 +39,7 @@ def observed(policy):
 
 
 def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
-    policy = ba_torchrl.load_policy(run)
+    policy = ba_torchrl.load_policy(run, device=torch.device("cpu"))
     state = observed(policy)
     first, second = policy(state.clone()), policy(state.clone())
     assert policy.out_keys == ["action"]
