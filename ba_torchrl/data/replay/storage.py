@@ -194,20 +194,6 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
             (len(codecs), self.max_size, 2), -1, dtype=torch.int32, device="cpu"
         )
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy.
-
-        Raises:
-            TypeError: it is for a spawned process. TorchRL would share the columns with it, and the
-                frames are in the memory of this process.
-        """
-        if get_spawning_popen() is not None:
-            raise TypeError(
-                "a replay of images is of one process: give the other one replay.state_dict(), for "
-                "load_state_dict of a replay of its own"
-            )
-        return super().__getstate__()
-
     def set(
         self,
         cursor: int | Sequence[int] | slice | Tensor,
