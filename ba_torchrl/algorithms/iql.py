@@ -93,7 +93,8 @@ class IQL(Learner):
         )
 
     def make_loss(self, networks: IQLNetworks) -> IQLLoss:
-        """Return TorchRL's loss, without ``vmap``, which steerable convolutions do not support."""
+        """Return TorchRL's loss without ``vmap``, under which the CPU's compiled convolutions and
+        pools are not available."""
         inputs = [*self.observation_keys, keys.ACTION]
         loss = IQLLoss(
             self.make_policy(networks),

@@ -105,9 +105,8 @@ class CastConv2d(nn.Conv2d):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the convolution of x [B, C, H, W], in x's dtype."""
-        weight = self.weight.to(dtype=x.dtype, memory_format=torch.channels_last)
         bias = None if self.bias is None else self.bias.to(x.dtype)
-        return F.conv2d(x, weight, bias, self.stride, self.padding)
+        return F.conv2d(x, self.weight.to(x.dtype), bias, self.stride, self.padding)
 
 
 def initialise_plain(module: nn.Module) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -22,18 +23,23 @@ WeightedTerms = Literal["none", "critic", "critic_and_policy", "all"]
 """Terms of a loss that importance weights multiply: the error of the values; also the policy's
 objective; also the terms on demonstrations and the entropy temperature."""
 WeightNorm = Literal["max", "mean"]
-"""Statistic of a batch's importance weights by which they are divided."""
+"""Normalisation of a batch's importance weights, see `TransitionLoss`."""
 
 
 class TransitionLoss(LossModule):
-    """A loss with one-step targets and optional importance weights of the samples.
+    """A loss with one-step targets, reduced over a batch by TorchRL's rules.
+
+    Samples that a mask excludes (TorchRL's ``loss_mask_key``) do not count.
 
     Args:
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
-        weighted_terms: terms that the importance weights multiply.
-        weight_norm: statistic by which a batch's weights are divided. With "max", no weight
-            exceeds one and their mean falls as the priorities spread; with "mean", their mean is
-            one.
+        weighted_terms: terms that the importance weights w multiply.
+        weight_norm: "mean", as in TorchRL: the mean of losses l is sum(w l) / sum(w), and their sum
+            is sum(w l). "max" differs from TorchRL: the weights are divided by the batch's largest
+            (Schaul et al., 2016), so that the mean of N losses is sum(w l) / (N max w), which falls
+            as the priorities spread.
+        use_prioritized_weights: False ignores the weights in the batch; "auto" and True use them if
+            there are any, as in TorchRL.
     """
 
     @dataclass
@@ -58,7 +64,8 @@ class TransitionLoss(LossModule):
         reduction: Reduction | None = None,
         *,
         weighted_terms: WeightedTerms = "critic_and_policy",
-        weight_norm: WeightNorm = "max",
+        weight_norm: WeightNorm = "mean",
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
         super().__init__()
         if weighted_terms not in get_args(WeightedTerms) or weight_norm not in get_args(WeightNorm):
@@ -68,6 +75,7 @@ class TransitionLoss(LossModule):
             )
         self.weighted_terms: WeightedTerms = weighted_terms
         self.weight_norm: WeightNorm = weight_norm
+        self.use_prioritized_weights = use_prioritized_weights
         self.reduction: Reduction = "mean" if reduction is None else reduction
         if self.reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be none, mean or sum, got {reduction!r}")
@@ -131,48 +139,54 @@ class TransitionLoss(LossModule):
         names = [self.tensor_keys.action, *observation, *map(_next, (*observation, *ends))]
         return list(dict.fromkeys(names))
 
+    def _set_batch_size(self, tensordict: TensorDictBase, dims: int) -> None:
+        """Give tensors that were passed by name, and have no batch size yet, one of ``dims``."""
+        if not tensordict.batch_size:
+            tensordict.auto_batch_size_(dims)
+
     def _importance_weights(self, tensordict: TensorDictBase) -> dict[str, Tensor | None]:
-        """Return the weights [...] of a term's samples, divided by their largest or their mean, by
-        the narrowest of `WeightedTerms` that includes the term; None if the term is not weighted.
-        """
-        weights = tensordict.get(self.tensor_keys.priority_weight, None)
+        """Return the weights [...] of a term's samples, by the narrowest of `WeightedTerms` that
+        includes the term; None if the term is not weighted."""
+        weights = None
+        if self.use_prioritized_weights:
+            weights = tensordict.get(self.tensor_keys.priority_weight, None)
         if weights is not None:
             weights = weights.reshape(tensordict.batch_size)
-            weights = weights / (weights.amax() if self.weight_norm == "max" else weights.mean())
+            if self.weight_norm == "max":  # of the samples that a mask leaves
+                weights = weights / self._reduce_loss(weights, tensordict, reduction="none").amax()
         choices = get_args(WeightedTerms)
         last = choices.index(self.weighted_terms)
         return {term: weights if number <= last else None for number, term in enumerate(choices)}
 
+    def _reduced(
+        self,
+        losses: Tensor,
+        tensordict: TensorDictBase,
+        weights: Tensor | None = None,
+        chosen: Tensor | None = None,
+        reduction: Reduction | None = None,
+    ) -> Tensor:
+        """Return the losses of samples, their mean or their sum, without those that are masked.
 
-def weighted(losses: Tensor, weights: Tensor | None) -> Tensor:
-    """Return the losses of samples [...] times their weights [...], if there are any."""
-    return losses if weights is None else weights * losses
-
-
-def reduce_loss(losses: Tensor, reduction: Reduction) -> Tensor:
-    """Return the losses of samples, their mean or their sum.
-
-    Args:
-        losses: of the samples, of any shape.
-        reduction: "none", "mean" or "sum".
-    """
-    if reduction == "none":
-        return losses
-    return losses.sum() if reduction == "sum" else losses.mean()
-
-
-def reduce_over(losses: Tensor, chosen: Tensor, reduction: Reduction) -> Tensor:
-    """Return the losses of the chosen samples, their mean or their sum; zero if there are none.
-
-    Args:
-        losses: of the samples, [...].
-        chosen: bool [...]; the other samples are excluded from the mean and the sum.
-        reduction: "none", "mean" or "sum"; "none" returns zeros for the other samples.
-    """
-    share = chosen.to(losses.dtype)
-    if reduction == "mean":
-        return (losses * share).sum() / share.sum().clamp_min(1)
-    return reduce_loss(losses * share, reduction)
+        Args:
+            losses: of the samples, [...].
+            tensordict: the batch, which may have a mask.
+            weights: importance weights [...] from `_importance_weights`.
+            chosen: bool [...]; the other samples have no loss and are left out of the mean, which
+                is zero if there are none.
+            reduction: None for that of the module.
+        """
+        reduction, counted = reduction or self.reduction, None
+        if weights is not None and self.weight_norm == "max":
+            losses, weights = weights * losses, None
+        if chosen is not None:
+            chosen = self._reduce_loss(chosen, tensordict, reduction="none")
+            losses = torch.where(chosen, losses, 0.0)
+            if reduction == "mean":
+                counted = chosen | ~chosen.any()
+        return self._reduce_loss(
+            losses, tensordict, mask=counted, reduction=reduction, weights=weights
+        )
 
 
 def _next(key: NestedKey) -> tuple[str, ...]:

@@ -18,9 +18,6 @@ from ba_torchrl.objectives.base import (
     TransitionLoss,
     WeightedTerms,
     WeightNorm,
-    reduce_loss,
-    reduce_over,
-    weighted,
 )
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
@@ -155,7 +152,8 @@ class LevelDQNLoss(TransitionLoss):
         reduction: of the samples' losses; the formulas above are "mean".
         weighted_terms: terms that the importance weights multiply; "all" includes
             loss_demonstration.
-        weight_norm: statistic by which a batch's weights are divided.
+        weight_norm: see `TransitionLoss`; "mean" is TorchRL's.
+        use_prioritized_weights: whether importance weights in the batch are used, as in TorchRL.
     """
 
     value_network: nn.Module
@@ -182,9 +180,15 @@ class LevelDQNLoss(TransitionLoss):
         later_beta: float = 1.0,
         reduction: Reduction | None = None,
         weighted_terms: WeightedTerms = "critic_and_policy",
-        weight_norm: WeightNorm = "max",
+        weight_norm: WeightNorm = "mean",
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
-        super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
+        super().__init__(
+            reduction,
+            weighted_terms=weighted_terms,
+            weight_norm=weight_norm,
+            use_prioritized_weights=use_prioritized_weights,
+        )
         if isinstance(value_network, QValueActor):
             value_network = SingleLevelValues(value_network)
         self.demonstrations = demonstrations
@@ -202,7 +206,7 @@ class LevelDQNLoss(TransitionLoss):
             names if self.demonstrations == "none" else [*names, self.tensor_keys.is_demonstration]
         )
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the losses and detached diagnostics of a batch of transitions.
 
@@ -219,6 +223,7 @@ class LevelDQNLoss(TransitionLoss):
             KeyError: an entry is missing, such as the demonstration flag if there is a term on
                 demonstrations.
         """
+        self._set_batch_size(tensordict, 1)
         target = self._target(tensordict)
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             levels = self.value_network(
@@ -228,24 +233,27 @@ class LevelDQNLoss(TransitionLoss):
         q = torch.stack([values.gather(1, chosen[:, None]) for values, chosen in levels], dim=-1)
         errors = F.huber_loss(q, target[..., None].expand_as(q), reduction="none")
         weights = self._importance_weights(tensordict)
-        td_weights = weights["critic"]
-        errors = weighted(errors, None if td_weights is None else td_weights[:, None, None])
+        of_levels = [
+            self._reduced(level[:, 0], tensordict, weights["critic"]) for level in errors.unbind(-1)
+        ]
         difference = (q.detach() - target[..., None]).abs().mean(dim=-1)
         tensordict.set(self.tensor_keys.priority, difference)
-        demonstration, is_demonstration = self._demonstration_losses(tensordict, levels)
-        of_batch = self._reduce_demonstrations(
-            weighted(demonstration, weights["all"]), is_demonstration, self.reduction
-        )
+        losses, is_demonstration = self._demonstration_losses(tensordict, levels)
+        # The mean of "sdqfd" is over the batch.
+        chosen = None if self.demonstrations == "sdqfd" else is_demonstration
+        demonstration = self._reduced(losses, tensordict, weights["all"], chosen)
+
+        def mean(values: Tensor, chosen: Tensor | None = None) -> Tensor:
+            return self._reduced(values.detach(), tensordict, chosen=chosen, reduction="mean")
+
         return TensorDict(
             {
-                "loss_qvalue": self._sum_over_levels(errors[:, 0]),
-                "loss_demonstration": self.demonstration_weight * of_batch,
-                "demonstration_error": self._reduce_demonstrations(
-                    demonstration.detach(), is_demonstration, "mean"
-                ),
-                "td_error": difference.mean(),
-                "q_value": q.detach().mean(),
-                "target_value": target.mean(),
+                "loss_qvalue": torch.stack(of_levels).sum(dim=0),
+                "loss_demonstration": self.demonstration_weight * demonstration,
+                "demonstration_error": mean(losses, chosen),
+                "td_error": mean(difference),
+                "q_value": mean(q),
+                "target_value": mean(target),
             }
         )
 
@@ -258,12 +266,6 @@ class LevelDQNLoss(TransitionLoss):
             observation = (following[key] for key in self.value_network.in_keys)
             _, value = self.value_network.greedy(*observation)
         return self.value_estimator.value_estimate(tensordict, next_value=value)
-
-    def _sum_over_levels(self, losses: Tensor) -> Tensor:
-        """Return losses [B, levels] summed over the levels and reduced over the batch."""
-        if self.reduction == "none":
-            return losses.sum(dim=-1)
-        return (losses.mean(dim=0) if self.reduction == "mean" else losses.sum(dim=0)).sum()
 
     def _demonstration_losses(
         self, tensordict: TensorDictBase, levels: list[tuple[Tensor, Tensor]]
@@ -291,11 +293,3 @@ class LevelDQNLoss(TransitionLoss):
             return cross_entropy(q, chosen, self.later_beta if level else self.first_beta)
         term = large_margin if self.demonstrations == "dqfd" else strict_large_margin
         return term(q, chosen, self.margin)
-
-    def _reduce_demonstrations(
-        self, losses: Tensor, is_demonstration: Tensor, reduction: Reduction
-    ) -> Tensor:
-        """Return losses [B] reduced over the demonstrations, for "sdqfd" over the batch."""
-        if self.demonstrations == "sdqfd":
-            return reduce_loss(losses, reduction)
-        return reduce_over(losses, is_demonstration, reduction)

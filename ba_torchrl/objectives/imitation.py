@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
@@ -45,7 +45,8 @@ def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance)
 
 
 class _ImitationLoss(LossModule):
-    """A loss on observations and the actions to imitate."""
+    """A loss on observations and the actions to imitate, a mean over the samples of a batch that no
+    mask excludes (TorchRL's ``loss_mask_key``)."""
 
     @dataclass
     class _AcceptedKeys:
@@ -99,6 +100,7 @@ class BehaviourCloningLoss(_ImitationLoss):
         self.out_keys = ["loss_bc", "entropy"] if entropy_weight else ["loss_bc"]
         self._set_observation(actor_network.in_keys)
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_bc`` and, with the entropy term, ``entropy`` without gradient.
 
@@ -116,10 +118,11 @@ class BehaviourCloningLoss(_ImitationLoss):
         action = tensordict[self.tensor_keys.action]
         if sample.ndim > action.ndim:
             action = action.unsqueeze(-2).expand_as(sample)
-        loss = action_distance(sample, action, self.distance).mean()
+        distance = action_distance(sample, action, self.distance)
+        loss = self._reduce_loss(distance, tensordict, reduction="mean")
         if not self.entropy_weight:
             return TensorDict({"loss_bc": loss})
-        log_prob = log_prob.mean()
+        log_prob = self._reduce_loss(log_prob, tensordict, reduction="mean")
         return TensorDict(
             {"loss_bc": loss + self.entropy_weight * log_prob, "entropy": -log_prob.detach()}
         )
@@ -146,13 +149,16 @@ class LevelCrossEntropyLoss(_ImitationLoss):
         self.convert_to_functional(value_network, "value_network")
         self._set_observation(value_network.in_keys)
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_bc`` of observations and expert actions [B], and the fraction of choices
         that are the expert's as ``accuracy``."""
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             levels = self.value_network(*(tensordict[key] for key in self.in_keys))
-        losses = [F.cross_entropy(values, chosen) for values, chosen in levels]
-        hits = [(values.argmax(dim=1) == chosen).float().mean() for values, chosen in levels]
-        return TensorDict(
-            {"loss_bc": torch.stack(losses).sum(), "accuracy": torch.stack(hits).mean().detach()}
+        losses = [F.cross_entropy(*level, reduction="none") for level in levels]
+        hits = [(values.argmax(dim=1) == chosen).float() for values, chosen in levels]
+        losses, hits = (
+            torch.stack([self._reduce_loss(each, tensordict, reduction="mean") for each in terms])
+            for terms in (losses, hits)
         )
+        return TensorDict({"loss_bc": losses.sum(), "accuracy": hits.mean()})

@@ -23,8 +23,7 @@ class RLPDLoss(SACfDLoss):
         loss_actor = mean_i (alpha log pi(a | s_i) - mean_k q_k(s_i, a))
 
     h_i is alpha log pi(a'|s'_i), or 0 without entropy backup. TorchRL's ``REDQLoss`` has the same
-    terms for critics that are whole networks, each with an encoder of its own, under ``vmap``,
-    which steerable convolutions do not support.
+    terms for critics that are whole networks, each with an encoder of its own.
 
     Args:
         actor_network: policy; from the observation to a distribution with ``rsample``.
@@ -63,7 +62,7 @@ class RLPDLoss(SACfDLoss):
         # On the CPU, so that the subsets of a seed are the same on all devices.
         self.generator = seeded_generator(seed)
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the losses and detached diagnostics of transitions [B]."""
         return super().forward(tensordict).select(*self.out_keys)
@@ -78,7 +77,7 @@ class RLPDLoss(SACfDLoss):
         return TensorDict({"loss_qvalue": loss, **values})
 
     def _diagnostics(self, q: Tensor) -> dict[str, Tensor]:
-        return {"q_value": q.mean(), "q_std": q.std(dim=-1).mean()}
+        return {"q_value": q, "q_std": q.std(dim=-1)}
 
     def _target_value(self, q: Tensor) -> Tensor:
         chosen = torch.randperm(q.shape[-1], generator=self.generator, device="cpu")[: self.subset]

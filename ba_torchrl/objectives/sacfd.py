@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import get_args
+from typing import Any, Literal, get_args
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +15,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 from torchrl.objectives.sac import compute_rsample_log_prob
+from typing_extensions import Self
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.base import (
@@ -22,9 +23,6 @@ from ba_torchrl.objectives.base import (
     TransitionLoss,
     WeightedTerms,
     WeightNorm,
-    reduce_loss,
-    reduce_over,
-    weighted,
 )
 from ba_torchrl.objectives.imitation import ActionDistance, action_distance
 
@@ -73,7 +71,8 @@ class SACfDLoss(TransitionLoss):
         demonstration_distance: of the behaviour term.
         reduction: of the samples' losses; the formulas above are "mean".
         weighted_terms: terms that the importance weights multiply.
-        weight_norm: statistic by which a batch's weights are divided.
+        weight_norm: see `TransitionLoss`; "mean" is TorchRL's.
+        use_prioritized_weights: whether importance weights in the batch are used, as in TorchRL.
         views: number of views of the observation. If there are several, the entries of the
             observation have a dimension of views after the batch.
         target_views: number of views of the next observation, likewise.
@@ -128,7 +127,8 @@ class SACfDLoss(TransitionLoss):
         demonstration_distance: ActionDistance = "mse",
         reduction: Reduction | None = None,
         weighted_terms: WeightedTerms = "critic_and_policy",
-        weight_norm: WeightNorm = "max",
+        weight_norm: WeightNorm = "mean",
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
         views: int = 1,
         target_views: int = 1,
         contrastive: nn.Module | None = None,
@@ -144,24 +144,27 @@ class SACfDLoss(TransitionLoss):
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
-        super().__init__(reduction, weighted_terms=weighted_terms, weight_norm=weight_norm)
+        super().__init__(
+            reduction,
+            weighted_terms=weighted_terms,
+            weight_norm=weight_norm,
+            use_prioritized_weights=use_prioritized_weights,
+        )
         self.convert_to_functional(actor_network, "actor_network")
         self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
         self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
-        # Parameters that the actor shares with the encoder are constants in the actor's terms, so
-        # that the critics alone train them. The constants share the parameters' memory: the
-        # networks are on their device before, and the loss is neither copied nor moved afterwards.
-        shared = set(encoder_network.parameters())
-        for key, parameter in list(self.actor_network_params.items(True, True)):
-            if parameter in shared:
-                self.actor_network_params.set(key, parameter.data)
+        encoder = {id(p): key for key, p in self.encoder_network_params.items(True, True)}
+        actor = self.actor_network_params.items(True, True)
+        self._shared = {key: encoder[id(p)] for key, p in actor if id(p) in encoder}
+        """Keys of the parameters that the actor shares with the encoder, in both networks."""
+        self._share_encoder()
         device = self._default_device
         self.register_coeff_buffer("target_entropy", float(target_entropy), device=device)
         self.register_coeff_buffer(
             "demonstration_weight", float(demonstration_weight), device=device
         )
+        self.demonstration_weight = demonstration_weight  # for `__setattr__`
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), device=device))
-        self._needs_demonstration_flag = demonstration_weight != 0
         self.demonstration_distance: ActionDistance = demonstration_distance
         self.entropy_backup = entropy_backup
         self.views = views
@@ -169,6 +172,35 @@ class SACfDLoss(TransitionLoss):
         self.contrastive = None if contrastive is None else contrastive.to(device)
         # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=device)
+
+    def _share_encoder(self) -> None:
+        """Make shared parameters constants in the actor's terms, in the memory of the encoder's, so
+        that the critics alone train them."""
+        for key, of_encoder in self._shared.items():
+            self.actor_network_params.set(key, self.encoder_network_params.get(of_encoder).data)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor]) -> Self:
+        """Convert or move all tensors; the actor keeps sharing the encoder's."""
+        super()._apply(fn)
+        self._share_encoder()
+        return self
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy or a pickled loss, whose actor shares the encoder's parameters."""
+        super().__setstate__(state)
+        self._share_encoder()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; a behaviour weight other than 0 needs the flag of demonstrations."""
+        super().__setattr__(name, value)
+        if name == "demonstration_weight":
+            self._needs_demonstration_flag = bool(value != 0)
+            self._in_keys = None
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        """Restore the loss; whether it needs the flag follows from the saved behaviour weight."""
+        super()._load_from_state_dict(*args)
+        self.demonstration_weight = float(self.demonstration_weight)
 
     @property
     def alpha(self) -> Tensor:
@@ -187,7 +219,7 @@ class SACfDLoss(TransitionLoss):
             names.append(self.tensor_keys.is_demonstration)
         return list(dict.fromkeys(names))
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the losses and detached diagnostics of a batch of transitions.
 
@@ -204,6 +236,7 @@ class SACfDLoss(TransitionLoss):
             KeyError: an entry is missing, such as the flag of demonstrations if the behaviour term
                 has a weight.
         """
+        self._set_batch_size(tensordict, tensordict[self.tensor_keys.action].ndim - 1)
         weights = self._importance_weights(tensordict)
         state = self._observation(tensordict, self.views)
         features = self._features(state, self.encoder_network_params)
@@ -216,22 +249,22 @@ class SACfDLoss(TransitionLoss):
         policy_term = self._over_views(self.alpha * log_prob - self._policy_value(q_pi))
         is_demonstration = self._demonstration_flag(tensordict)
         error = self._demonstration_error(tensordict, sample)
-        demonstration = reduce_over(
-            weighted(error, weights["all"]), is_demonstration, self.reduction
-        )
-        policy_term = self._reduced(policy_term, weights["critic_and_policy"])
+        demonstration = self._reduced(error, tensordict, weights["all"], is_demonstration)
+        policy_term = self._reduced(policy_term, tensordict, weights["critic_and_policy"])
         loss_actor = policy_term + self.demonstration_weight * demonstration
         log_prob = self._over_views(log_prob.detach())
         temperature_term = self.log_alpha * (log_prob + self.target_entropy)
-        loss_alpha = -self._reduced(temperature_term, weights["all"])
+        loss_alpha = -self._reduced(temperature_term, tensordict, weights["all"])
         return TensorDict(
             {
                 "loss_actor": loss_actor,
                 "loss_qvalue": loss_qvalue,
                 "loss_alpha": loss_alpha,
                 "alpha": self.alpha,
-                "entropy": -log_prob.mean(),
-                "demonstration_error": reduce_over(error.detach(), is_demonstration, "mean"),
+                "entropy": -self._reduced(log_prob, tensordict, reduction="mean"),
+                "demonstration_error": self._reduced(
+                    error.detach(), tensordict, chosen=is_demonstration, reduction="mean"
+                ),
                 **values,
             }
         )
@@ -247,11 +280,15 @@ class SACfDLoss(TransitionLoss):
         priority = self._over_views(error.detach().abs().mean(dim=-1))
         tensordict.set(self.tensor_keys.priority, priority.unsqueeze(-1))
         squared = self._over_views(error.square().sum(dim=-1))
-        return self._reduced(squared, weights["critic"]), self._diagnostics(q.detach())
+        loss = self._reduced(squared, tensordict, weights["critic"])
+        return loss, {
+            name: self._reduced(value, tensordict, reduction="mean")
+            for name, value in self._diagnostics(q.detach()).items()
+        }
 
     def _diagnostics(self, q: Tensor) -> dict[str, Tensor]:
-        """Return scalars of the values [..., K] of the stored actions."""
-        return {"q_value": q.mean()}
+        """Return statistics, of any shape, of the values [..., K] of the stored actions."""
+        return {"q_value": q}
 
     def _target_value(self, q: Tensor) -> Tensor:
         """Return the value [...] of the target critics' values [..., K]."""
@@ -279,7 +316,7 @@ class SACfDLoss(TransitionLoss):
             other = tensordict.get(keys.POSITIVE)
             positives = self._features(other, self.target_encoder_network_params)
         losses = self.contrastive(anchors, positives)
-        return TensorDict({"loss_contrastive": reduce_loss(losses, self.reduction)})
+        return TensorDict({"loss_contrastive": self._reduced(losses, tensordict)})
 
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
@@ -355,9 +392,6 @@ class SACfDLoss(TransitionLoss):
             )
         action = tensordict[self.tensor_keys.action]
         return torch.zeros(tensordict.batch_size, dtype=torch.bool, device=action.device)
-
-    def _reduced(self, losses: Tensor, weights: Tensor | None) -> Tensor:
-        return reduce_loss(weighted(losses, weights), self.reduction)
 
 
 class BilinearInfoNCE(nn.Module):

@@ -135,22 +135,17 @@ class ImageTrunk(nn.Module):
         return torch.cat([features, *vectors], dim=-1) if vectors else features
 
     def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:
-        batch, channels, height, width = pixels.shape
-        x = torch.empty(
-            (batch, self.config.input_channels(channels), height, width),
-            dtype=compute_dtype(self.config.precision, pixels.device),
-            device=pixels.device,
-            memory_format=torch.channels_last,
-        )
+        """Return the input of the first convolution [B, C', H, W], channels-last."""
+        dtype = compute_dtype(self.config.precision, pixels.device)
         center, scale = self.config.depth_center_m, self.config.depth_scale_m
         if self.config.depth_reference == "floor":
             floor = pixels.amax((-2, -1), keepdim=True)
-            x[:, :channels] = (floor - pixels) / scale
-            x[:, channels:-1] = (floor - center) / scale
+            parts = [(floor - pixels) / scale, ((floor - center) / scale).expand_as(pixels)]
         else:
-            x[:, :channels] = pixels if (center, scale) == (0, 1) else (pixels - center) / scale
-        x[:, -1:] = holding.reshape(batch, 1, 1, 1)
-        return x
+            parts = [pixels if (center, scale) == (0, 1) else (pixels - center) / scale]
+        parts.append(holding.reshape(-1, 1, 1, 1).expand(-1, 1, *pixels.shape[-2:]))
+        channels_last = [part.movedim(1, -1).to(dtype) for part in parts]
+        return torch.cat(channels_last, dim=-1).movedim(-1, 1)
 
 
 def scale_from_log_std(log_std: Tensor) -> Tensor:

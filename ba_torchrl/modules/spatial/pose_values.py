@@ -23,8 +23,8 @@ _POOLS = 3
 
 def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Return the padded 3x3 convolution of x [B, C, H, W] in its dtype."""
-    weight = weight.to(dtype=x.dtype, memory_format=torch.channels_last)
-    return F.conv2d(x, weight, None if bias is None else bias.to(x.dtype), padding=1)
+    bias = None if bias is None else bias.to(x.dtype)
+    return F.conv2d(x, weight.to(x.dtype), bias, padding=1)
 
 
 class SceneMapVector(nn.Module):

@@ -140,7 +140,8 @@ class PlainPixelValues(nn.Module):
         if hand.shape[-2:] != inner.shape[-2:]:
             hand = F.interpolate(hand, inner.shape[-2:], mode="bilinear", align_corners=False)
         views = len(pixels) // len(in_hand)
-        scene = self.fuse(torch.cat([inner, hand.repeat(views, 1, 1, 1)], dim=1))
+        fused = torch.cat([inner, hand.repeat(views, 1, 1, 1)], dim=1)
+        scene = self.fuse(fused.contiguous(memory_format=torch.channels_last))
         # bfloat16 would round values near one to multiples of 1/256, so many pixels would share the
         # maximum.
         values = self.head(self.unet.decode([*skips, scene]).float())
