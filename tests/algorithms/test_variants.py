@@ -1,5 +1,7 @@
 """Every preset of an algorithm with every network of its control: two updates on small networks."""
 
+import copy
+import pickle
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -203,6 +205,49 @@ def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_trai
     batch = ferm.sample()
     loss(batch)["loss_actor"].backward()
     assert all(value.grad is None for value in encoder.values(True, True))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        copy.deepcopy,
+        lambda loss: pickle.loads(pickle.dumps(loss)),
+        lambda loss: loss.double(),
+        lambda loss: copy.deepcopy(loss).double().float().share_memory(),
+    ],
+    ids=["deepcopy", "pickle", "double", "several"],
+)
+def test_copies_and_conversions_of_the_loss_share_the_encoder_too(change):
+    loss = change(build("ferm", "ferm").loss)
+    actor = loss.actor_network_params["module", "0", "module", "trunk"]
+    encoder = loss.encoder_network_params["module", "trunk"]
+    for key, value in encoder.items(True, True):
+        assert value.data_ptr() == actor[key].data_ptr()
+        assert value.dtype == actor[key].dtype
+        assert not actor[key].requires_grad
+    assert loss.state_dict().keys() == build("ferm", "ferm").loss.state_dict().keys()
+
+
+@pytest.mark.parametrize(
+    ("preset", "network"),
+    [
+        *(("sac", "cnn"), ("sacfd", "equi"), ("drq", "cnn"), ("ferm", "ferm"), ("rlpd", "cnn")),
+        *(("bc", "cnn"), ("bc", "asr"), ("sdqfd", "equi_asr")),
+    ],
+)
+def test_the_loss_takes_tensors_by_name(preset, network):
+    learner = build(preset, network)
+    loss, found = learner.loss, []
+    data = learner.augmentation(transitions(learner)).select(*loss.in_keys)
+    named = {"_".join([key] if isinstance(key, str) else key): data[key] for key in loss.in_keys}
+    for call in (lambda: loss(data), lambda: loss(**named)):
+        torch.manual_seed(0)
+        if preset == "rlpd":
+            loss.generator.manual_seed(0)
+        found.append(call())
+    values = found[1] if len(loss.out_keys) > 1 else [found[1]]
+    for name, value in zip(loss.out_keys, values, strict=True):
+        torch.testing.assert_close(value, found[0][name])
 
 
 def test_the_acting_policy_sees_the_centre_of_larger_images():

@@ -3,9 +3,14 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.data import Bounded
+from torchrl.objectives import CQLLoss, IQLLoss, REDQLoss, SACLoss, SoftUpdate
 
-from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
+from ba_torchrl.modules.actor_critic.critics import ActionValue, EnsembleCritic, StateValue
+from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from tests.modules.networks import actor_critic
 
 
@@ -58,3 +63,55 @@ def test_the_values_of_an_equivariant_ensemble_are_invariant():
     rotated = networks.encoder(torch.rot90(pixels, 1, (-2, -1)), holding)
     torch.testing.assert_close(networks.critic(rotated, turned), values, atol=1e-4, rtol=1e-4)
     assert not torch.allclose(networks.critic(rotated, action), values, atol=1e-3)
+
+
+OBSERVATION = ["pixels", "holding"]
+
+
+def transitions(n=4):
+    def state():
+        return {"pixels": torch.rand(n, 1, 64, 64), "holding": torch.rand(n, 1) > 0.5}
+
+    ends = {name: torch.arange(n)[:, None] == 1 for name in ("done", "terminated")}
+    action = 1.8 * torch.rand(n, 5) - 0.9
+    following = {**state(), "reward": torch.rand(n, 1), **ends}
+    return TensorDict({**state(), "action": action, "next": following}, [n])
+
+
+@pytest.mark.parametrize("kind", [SACLoss, CQLLoss, IQLLoss, REDQLoss])
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        ("cnn", {}),
+        ("cnn", {"depth_reference": "floor", "negative_slope": 0.1}),
+        ("ferm", {"width": 0.125}),
+        ("equi", {}),
+        ("equi_strided", {}),
+    ],
+)
+def test_critics_under_vmap_are_a_loop_over_critics(name, fields, kind):
+    """The losses of TorchRL, on critics that are whole networks."""
+    networks = [actor_critic(name, seed=seed, **fields) for seed in range(3)]
+    parts = [squashed_gaussian_policy(networks[0].actor, OBSERVATION)]
+    inputs = [*OBSERVATION, "action"]
+    values = [ActionValue(each.encoder, each.critic) for each in networks[1:]]
+    parts.append([TensorDictModule(value, inputs, ["state_action_value"]) for value in values])
+    options = {"target_entropy": -5.0}
+    if kind is IQLLoss:
+        state_value = StateValue(networks[0].encoder, networks[0].critic, 5)
+        parts.append(TensorDictModule(state_value, OBSERVATION, ["state_value"]))
+        options = {}
+    if kind is CQLLoss:
+        options["action_spec"] = Bounded(-1.0, 1.0, (5,))
+    if kind is REDQLoss:
+        options |= {"num_qvalue_nets": 2, "sub_sample_len": 1}
+    data, found = transitions(), []
+    for is_loop in (False, True):
+        loss = kind(*parts, **options, deactivate_vmap=is_loop)
+        SoftUpdate(loss, tau=0.01)
+        torch.manual_seed(1)
+        terms = {key: x for key, x in loss(data.clone()).items() if key.startswith("loss_")}
+        sum(terms.values()).backward()
+        gradient = loss.qvalue_network_params["module", "encoder"].flatten_keys()
+        found.append((terms, {key: value.grad for key, value in gradient.items()}))
+    torch.testing.assert_close(found[0], found[1], atol=1e-4, rtol=1e-4)

@@ -2,12 +2,14 @@
 
 import itertools
 import math
+import statistics
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import QValueActor
+from torchrl.objectives import DQNLoss
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
@@ -158,10 +160,14 @@ def test_importance_weights_multiply_the_chosen_terms(terms, norm, kind):
     data = batch()
     drawn = [0.1 + 0.05 * i for i in range(len(data))]
     data["priority_weight"] = torch.tensor(drawn)
-    divisor = max(drawn) if norm == "max" else sum(drawn) / len(drawn)
-    weights = [weight / divisor for weight in drawn]
+    is_demonstration = data["is_demonstration"][:, 0].tolist()
+    counted = [
+        w for w, flag in zip(drawn, is_demonstration, strict=True) if flag or kind == "sdqfd"
+    ]
+    divisors = [max(drawn) if norm == "max" else statistics.mean(w) for w in (drawn, counted)]
+    of_td, of_term = ([weight / divisor for weight in drawn] for divisor in divisors)
     loss = make_loss(demonstrations=kind, weighted_terms=terms, weight_norm=norm)
-    chosen = None if terms == "none" else weights, weights if terms == "all" else None
+    chosen = None if terms == "none" else of_td, of_term if terms == "all" else None
     td, demonstration, _ = by_hand(loss, data, kind, *chosen)
     out = loss(data)
     assert float(out["loss_qvalue"].detach()) == pytest.approx(td, rel=1e-5)
@@ -262,14 +268,51 @@ def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstr
     torch.testing.assert_close(of("mean"), losses.sum() / share)
 
 
-@pytest.mark.parametrize("action_space", ["one_hot", "categorical"])
-def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
+def q_value_actor(action_space="categorical"):
+    """An actor of TorchRL with five actions, and a batch for it."""
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), nn.Linear(9, 5))
     actor = QValueActor(network, in_keys=["pixels"], action_space=action_space)
     data = batch().select("pixels", "is_demonstration", "next")
     index = torch.randint(5, (10,))
     data["action"] = nn.functional.one_hot(index, 5) if action_space == "one_hot" else index
+    return network, actor, data, index
+
+
+@pytest.mark.parametrize("uses_weights", ["auto", True, False])
+@pytest.mark.parametrize("is_masked", [False, True])
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+def test_without_demonstrations_the_loss_is_torchrls(reduction, is_masked, uses_weights):
+    _, actor, data, _ = q_value_actor()
+    data["next", "reward"] *= 3
+    data["priority_weight"] = torch.linspace(0.1, 1, 10)
+    if is_masked:
+        data["collector", "mask"] = torch.arange(10)[:, None] % 3 > 0
+    options = {"reduction": reduction, "use_prioritized_weights": uses_weights}
+    ours = LevelDQNLoss(actor, demonstrations="none", **options)
+    theirs = DQNLoss(actor, loss_function="smooth_l1", action_space="categorical", **options)
+    for loss in (ours, theirs):
+        loss.make_value_estimator(gamma=GAMMA)
+    expected = theirs(data.clone())["loss"]
+    torch.testing.assert_close(ours(data)["loss_qvalue"], expected)
+
+
+@pytest.mark.parametrize("norm", ["max", "mean"])
+@pytest.mark.parametrize("kind", ["none", *KINDS])
+def test_masked_samples_do_not_count(kind, norm):
+    data, options = batch(), {"weighted_terms": "all", "weight_norm": norm}
+    data["priority_weight"] = torch.linspace(0.1, 1, 10)
+    mask = torch.arange(10) % 4 > 0
+    expected = make_loss(demonstrations=kind, **options)(data[mask])
+    data["collector", "mask"] = mask[:, None]
+    data["next", "reward"][~mask] = torch.nan
+    found = make_loss(demonstrations=kind, **options)(data)
+    torch.testing.assert_close(dict(found), dict(expected))
+
+
+@pytest.mark.parametrize("action_space", ["one_hot", "categorical"])
+def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
+    network, actor, data, index = q_value_actor(action_space)
     loss = LevelDQNLoss(actor, demonstrations="sdqfd", margin=0.3).make_value_estimator(gamma=GAMMA)
     found = loss(data)
     with torch.no_grad():

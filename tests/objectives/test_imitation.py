@@ -150,3 +150,20 @@ def test_the_divergence_leaves_the_wrong_end_of_the_range(kind, is_free):
     distance.sum().backward()
     assert bool((loc.grad > 1).all()) is is_free
     assert bool((loc.grad.abs() < 1e-4).all()) is not is_free
+
+
+@pytest.mark.parametrize("is_level", [False, True])
+def test_masked_samples_do_not_count(is_level):
+    data = batch()
+    if is_level:
+        loss = LevelCrossEntropyLoss(TwoLevels())
+        data[keys.ACTION] = torch.tensor([[2.0, 0.0], [1.0, 1.0], [0.0, 1.0], [2.0, 1.0]])
+    else:
+        loss = BehaviourCloningLoss(squashed_gaussian_policy(Shifted(), OBSERVATION))
+        data[keys.PIXELS] /= 2
+    mask = torch.tensor([True, False, True, False])
+    expected = dict(loss(data[mask]))
+    data["collector", "mask"] = mask[:, None]
+    torch.testing.assert_close(dict(loss(data)), expected)
+    loss.loss_mask_key = None
+    assert loss(data)["loss_bc"] != expected["loss_bc"]

@@ -6,8 +6,10 @@ import statistics
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torch.distributions import Bernoulli, kl_divergence
-from torchrl.objectives import SoftUpdate, ValueEstimators
+from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from ba_torchrl.envs import keys
 from ba_torchrl.objectives.rlpd import RLPDLoss
@@ -40,7 +42,7 @@ def by_hand(
     target_entropy,
     demonstration_weight,
     terms="critic_and_policy",
-    norm="max",
+    norm="mean",
     entropy_backup=True,
     of_policy=min,
 ):
@@ -73,7 +75,8 @@ def by_hand(
     critic, policy_weights, others = importance(data, terms, norm)
     qvalue = actor_term = alpha_term = entropy = value = spread = 0.0
     behaviour = weighted_behaviour = 0.0
-    experts, priorities = 0, []
+    experts = 0
+    share, priorities = 0.0, []  # of the demonstrations in the mean of their term
     for i in range(n):
         x, following = observation(data, i), observation(data[keys.NEXT], i)
         stored = data[keys.ACTION][i].tolist()
@@ -94,12 +97,13 @@ def by_hand(
         alpha_term -= others[i] * math.log(alpha) * (log_prob + target_entropy) / n
         entropy -= log_prob / n
         if keys.IS_DEMONSTRATION in data and data[keys.IS_DEMONSTRATION][i]:
+            share += others[i] if norm == "mean" else 1
             experts += 1
             error = sum((a - e) ** 2 for a, e in zip(action, stored, strict=True)) / 2
             behaviour += error
             weighted_behaviour += others[i] * error
     behaviour /= max(experts, 1)
-    weighted_behaviour /= max(experts, 1)
+    weighted_behaviour /= share or 1
     return {
         "loss_qvalue": qvalue,
         "loss_actor": actor_term + demonstration_weight * weighted_behaviour,
@@ -245,6 +249,7 @@ def test_coefficients_can_be_scheduled_and_saved():
     loss, data = make(), batch()
     before = loss(data.clone())
     loss.demonstration_weight = 0.0
+    assert keys.IS_DEMONSTRATION not in loss.in_keys
     loss.target_entropy = -3.0
     after = loss(data.clone())
     change = (before["loss_actor"] - after["loss_actor"]).detach()
@@ -254,6 +259,64 @@ def test_coefficients_can_be_scheduled_and_saved():
     other = make(seed=5)
     other.load_state_dict(state)
     torch.testing.assert_close(other(data.clone())["loss_actor"], after["loss_actor"])
+
+
+@pytest.mark.parametrize("is_loaded", [False, True])
+def test_a_behaviour_weight_that_rises_from_zero_counts(is_loaded):
+    loss, data = make(demonstration_weight=0.0), batch()
+    expected = make(demonstration_weight=0.3)(data.clone())
+    if is_loaded:
+        loss.load_state_dict(make(demonstration_weight=0.3).state_dict())
+    else:
+        loss.demonstration_weight = 0.3
+    assert keys.IS_DEMONSTRATION in loss.in_keys
+    torch.testing.assert_close(dict(loss(data.clone())), dict(expected))
+    with pytest.raises(KeyError, match="the batch lacks 'is_demonstration'"):
+        loss(data.exclude(keys.IS_DEMONSTRATION))
+
+
+class OneValue(nn.Module):
+    """A single one of the critics' values, from the observation."""
+
+    def __init__(self, loss, number):
+        super().__init__()
+        self.encoder, self.critics = loss.encoder_network.module, loss.qvalue_network.module
+        self.register_buffer("share", torch.eye(2, dtype=torch.float64)[number])
+
+    def forward(self, pixels, holding, action):
+        values = self.critics(self.encoder(pixels, holding), action)
+        return (self.share * values).sum(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize("uses_weights", ["auto", False])
+@pytest.mark.parametrize("is_masked", [False, True])
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+def test_without_demonstrations_the_loss_is_torchrls(reduction, is_masked, uses_weights):
+    data, options = batch(), {"reduction": reduction, "use_prioritized_weights": uses_weights}
+    if is_masked:
+        data["collector", "mask"] = torch.tensor([[True], [False], [True], [True]])
+    settings = {"alpha_init": 0.2, "target_entropy": -1.5}
+    ours = make(demonstration_weight=0.0, weighted_terms="all", **settings, **options)
+    inputs = [keys.PIXELS, keys.HOLDING, keys.ACTION]
+    critics = [TensorDictModule(OneValue(ours, k), inputs, ["state_action_value"]) for k in (0, 1)]
+    theirs = SACLoss(ours.actor_network, critics, loss_function="l2", **settings, **options)
+    SoftUpdate(theirs, tau=0.01)
+    for name in ("encoder", "critics"):
+        theirs.target_qvalue_network_params["module", name].data.mul_(0.7)
+    expected, found = theirs(data.clone()), ours(data)
+    for name in ("loss_actor", "loss_qvalue", "loss_alpha"):
+        torch.testing.assert_close(found[name], expected[name])
+
+
+@pytest.mark.parametrize("norm", ["max", "mean"])
+@pytest.mark.parametrize("experts", [(True, False, True, False), (False, True, False, False)])
+def test_masked_samples_do_not_count(experts, norm):
+    data, mask = batch(experts), torch.tensor([True, False, True, True])
+    loss = make(weighted_terms="all", weight_norm=norm)
+    expected = loss(data[mask])
+    data["collector", "mask"] = mask[:, None]
+    data[keys.NEXT, keys.REWARD][~mask] = torch.nan
+    torch.testing.assert_close(dict(loss(data)), dict(expected))
 
 
 @pytest.mark.parametrize(
@@ -276,7 +339,7 @@ def test_invalid_arguments_are_refused(settings, message):
 def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum():
     data, found = batch(experts=(True,) * 4), {}
     for reduction in ("none", "mean", "sum"):
-        found[reduction] = make(reduction=reduction)(data.clone())
+        found[reduction] = make(reduction=reduction, weight_norm="max")(data.clone())
     for name in ("loss_actor", "loss_qvalue", "loss_alpha"):
         losses = found["none"][name]
         assert losses.shape == (4,)
@@ -332,12 +395,11 @@ def test_the_term_with_the_divergence_of_actions():
     found = loss(data.clone())
     flags = torch.tensor(EXPERTS)
     torch.testing.assert_close(found["demonstration_error"], distances[flags].mean())
-    weights = torch.tensor(WEIGHTS, dtype=distances.dtype) / max(WEIGHTS)
+    weights = torch.tensor(WEIGHTS, dtype=distances.dtype)[flags]
     without = make(demonstration_weight=0.0, **options)(data.clone())  # with the same parameters
     difference = found["loss_actor"] - without["loss_actor"]
-    assert difference.item() == pytest.approx(
-        0.3 * (weights * distances)[flags].mean().item(), rel=1e-5
-    )
+    expected = 0.3 * (weights * distances[flags]).sum() / weights.sum()
+    torch.testing.assert_close(difference, expected, rtol=1e-5, atol=0)
 
 
 def test_the_term_is_against_the_entry_of_the_expert():
