@@ -184,7 +184,7 @@ class LearnerConfig(StrictModel, ABC):
     appendix does not say; the reference implementation computes weights and does not use them."""
     importance_norm: WeightNorm = "max"
     """Statistic of a batch by which its importance weights are divided: "max", as in Schaul et al.
-    (2016), or "mean"."""
+    (2016), or "mean", for the weighted mean of TorchRL's losses."""
     expert_bonus: float = Field(default=1.0, ge=0)
     """Added to the priority of demonstrations."""
     init: Literal["random", "bc"] = "random"

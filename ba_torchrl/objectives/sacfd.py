@@ -43,9 +43,9 @@ class SACfDLoss(TransitionLoss):
     entry. d(a, e_i) is the mean over components of (a - e_i)^2, or another `action_distance`.
     Without ``entropy_backup``, y_i has no term in alpha (Ball et al., 2023).
 
-    u is the batch's normalised weights unless ``weighted_terms`` is "none"; v for
+    u is the batch's normalised weights (``weight_norm``) unless ``weighted_terms`` is "none"; v for
     "critic_and_policy" and "all"; w for "all". Otherwise, and without prioritised replay, they are
-    ones.
+    ones. Samples that a mask excludes are in no mean.
 
     With several views of an observation, every term of a sample is the mean over its views, and y
     over the views of the next observation (DrQ: Kostrikov et al., 2021, equation 3).

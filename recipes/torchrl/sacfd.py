@@ -108,6 +108,7 @@ def make_loss(config: Config, networks: ActorCritic) -> SACfDLoss:
         demonstration_weight=config.demonstration_weight,
         demonstration_distance="kl",  # reference implementation: the squared error
         entropy_backup=False,  # as in the quick start; reference implementation: true
+        weight_norm="max",  # Schaul et al., 2016; TorchRL's losses: "mean"
     )
     return loss.make_value_estimator(gamma=config.gamma).to(config.device)
 
