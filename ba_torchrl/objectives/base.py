@@ -183,7 +183,7 @@ class TransitionLoss(LossModule):
             chosen = self._reduce_loss(chosen, tensordict, reduction="none")
             losses = torch.where(chosen, losses, 0.0)
             if reduction == "mean":
-                counted = chosen | ~chosen.any()
+                counted = chosen | ~chosen.any()  # all zeros if there are none, not 0 / 0
         return self._reduce_loss(
             losses, tensordict, mask=counted, reduction=reduction, weights=weights
         )

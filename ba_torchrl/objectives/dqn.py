@@ -13,12 +13,7 @@ from torch import Tensor, nn
 from torchrl.modules import QValueActor
 
 from ba_torchrl.envs import keys
-from ba_torchrl.objectives.base import (
-    Reduction,
-    TransitionLoss,
-    WeightedTerms,
-    WeightNorm,
-)
+from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
 """The loss on demonstrated actions that is added to the TD loss."""
