@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 import numpy as np
-import pybullet
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -19,7 +18,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.envs.checks import ChecksPolicy, checked_action
 from ba_torchrl.envs.copying import CopiesWithState
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
-from ba_torchrl.envs.faults import FaultCounter, check_observation
+from ba_torchrl.envs.faults import FaultCounter, check_bodies, check_observation
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import (
     enabled_observations,
@@ -283,7 +282,6 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
         self._step_count = 0
         self._observation = self._begin_episode(with_new_objects=self._episode == 1)
         self._ends, self._conditions = {}, None
-        self._instruction = self.scene.task.instruction()
         return self._tensordict(self._observation)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -292,15 +290,13 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
         self._step_count += 1
         success = valid = fault = False
         try:
-            self._act(scene, action)
-            scene.task.after_action()
-            self._conditions, valid = evaluate_at_rest(scene)
-            success = valid and all(self._conditions.values())
-            self._observation = self._observe(scene)
-            before, self._progress = self._progress, self._measure_progress(scene)
-        except ConfigError:
-            raise
-        except Exception:
+            with self._acting():
+                self._act(scene, action)
+                self._conditions, valid = evaluate_at_rest(scene)
+                success = valid and all(self._conditions.values())
+                self._observation = self._observe(scene)
+                before, self._progress = self._progress, self._measure_progress(scene)
+        except SIMULATOR_ERRORS:
             fault, self._conditions = True, dict.fromkeys(self._condition_names, False)
             self._on_fault()
         else:
@@ -432,33 +428,53 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
         while True:
             rng = np.random.default_rng([self.base_seed, self._episode - 1])
             try:
-                scene = self._episodes.begin(rng, with_new_objects=with_new_objects)
-                self._progress = self._measure_progress(scene)
-                return self._observe(scene)
+                with self._acting():
+                    scene = self._episodes.begin(rng, with_new_objects=with_new_objects)
+                    self._progress = self._measure_progress(scene)
+                    self._instruction = scene.task.instruction()
+                    return self._observe(scene)
             except SIMULATOR_ERRORS:
                 self._on_fault()
+
+    @contextlib.contextmanager
+    def _acting(self) -> Iterator[None]:
+        """Context in which task and robot act.
+
+        An error of the code is raised as it is, with a note on the episode, which tracebacks show
+        from Python 3.11 on.
+
+        Raises:
+            SIMULATOR_ERRORS: of the simulator, or any error in a scene that is not finite.
+        """
+        try:
+            yield
+        except (*SIMULATOR_ERRORS, PlacementError):
+            raise
+        except Exception as error:
+            if self._episodes.scene is not None:
+                check_bodies(self._episodes.scene, may_be_lost=True)
+            where = f"seed {self.base_seed}, episode {self._episode}, step {self._step_count}"
+            note = f"{self.task_id}, {where}: an error of the code, not of the simulator"
+            error.__notes__ = [*getattr(error, "__notes__", ()), note]
+            raise
 
     def _measure_progress(self, scene: Scene) -> float:
         """Return the task's progress, 0 if the reward is sparse.
 
         Raises:
-            ConfigError: the task's method raises, or returns no number in [0, 1).
-            SIMULATOR_ERRORS: PyBullet fails.
+            ConfigError: the task's method returns no number in [0, 1).
         """
         if self.config.reward == "sparse":
             return 0.0
-        method = f"{self.task_id}: {self.task_class.__name__}.progress"
-        try:
-            with scene.world.fixed_poses():
-                value = scene.task.progress()
-        except (pybullet.error, SimulationError):
-            raise
-        except Exception as error:
-            raise ConfigError(f"{method} raised {type(error).__name__}: {error}") from error
+        with scene.world.fixed_poses():
+            value = scene.task.progress()
         with contextlib.suppress(TypeError, ValueError, RuntimeError, OverflowError):
             if 0 <= (progress := float(value)) < 1:
                 return progress
-        raise ConfigError(f"{method} must be a number in [0, 1), not {value!r}")
+        raise ConfigError(
+            f"{self.task_id}: {self.task_class.__name__}.progress must be a number in [0, 1), not "
+            f"{value!r}"
+        )
 
     def _dense_reward(self, progress_before: float, sparse: float) -> float:
         """Return the reward of the last step; see `EnvConfig.reward`.

@@ -131,6 +131,7 @@ class Episodes:
                 several attempts did not fit.
         """
         invalid = refused = 0
+        outside: list[str] = []
         for _ in range(RESET_ATTEMPTS):
             scene.world.restore_pristine()
             self._place_robot(scene)
@@ -147,23 +148,31 @@ class Episodes:
             scene.world.settle(max_steps=SETTLE_STEPS)
             if scene.task.is_valid_start():
                 return
-            invalid += not scene.task.is_valid()
+            if not scene.task.is_valid():
+                invalid += 1
+                outside = scene.task.outside()
+        last = f" (the last one {', '.join(outside)})" if outside else ""
         raise PlacementError(
-            f"of {RESET_ATTEMPTS} random scenes {invalid} had an object outside the workspace, "
-            f"{RESET_ATTEMPTS - invalid - refused} were solved from the start, and in {refused} "
-            "the objects did not fit; objects of this size need another workspace"
+            f"of {RESET_ATTEMPTS} random scenes {invalid} had an object outside the workspace or "
+            f"tipped over{last}, {RESET_ATTEMPTS - invalid - refused} were solved from the start, "
+            f"and in {refused} the objects did not fit; objects of this size need another workspace"
         )
 
 
 def evaluate_at_rest(scene: Scene) -> tuple[dict[str, bool], bool]:
-    """Return the conditions of success of the scene at rest, and whether it is valid.
+    """Carry out the events of the task after an action.
 
-    The scene is settled only if all conditions hold before.
+    Return the conditions of success of the scene at rest, and whether it is valid. The scene is
+    settled only if all conditions hold before.
 
     Raises:
         SimulationError: the state of the scene is a fault; see `check_bodies`.
     """
     check_bodies(scene)
+    steps = scene.world.steps
+    scene.task.after_action()
+    if scene.world.steps > steps:
+        check_bodies(scene)
     conditions = scene.task.conditions()
     if all(conditions.values()):
         scene.world.settle(max_steps=SETTLE_STEPS)

@@ -3,7 +3,7 @@
 A fault is an error of PyBullet or of its connection, a pose or an observation that is not finite,
 or a body that passed through the floor or was thrown away. In a step, it ends the episode
 truncated, and the next reset builds a new world. In a reset, the episode starts again in a new
-world.
+world. Any other error is one of the code, such as that of a task, and is raised.
 """
 
 from __future__ import annotations
@@ -27,8 +27,12 @@ FARTHEST_M = 10.0
 """Distance from the robot's base that only a diverging solver gives a body within one step."""
 
 
-def check_bodies(scene: Scene) -> None:
+def check_bodies(scene: Scene, *, may_be_lost: bool = False) -> None:
     """Check that the state of a scene is one that the physics engine can continue from.
+
+    Args:
+        scene: the scene.
+        may_be_lost: check only that poses and joint angles are finite.
 
     Raises:
         SimulationError: a pose or a joint angle is not finite, or a visible body is below the floor
@@ -43,7 +47,7 @@ def check_bodies(scene: Scene) -> None:
         if not math.isfinite(sum(position) + sum(orientation)):
             raise SimulationError(f"the pose of {body.name!r} is not finite")
         is_lost = position[2] < LOWEST_M or math.hypot(*position) > FARTHEST_M
-        if is_lost and not body.is_hidden:
+        if is_lost and not (body.is_hidden or may_be_lost):
             place = ", ".join(f"{x:.3g}" for x in position)
             raise SimulationError(f"{body.name!r} is lost at ({place}) m")
 

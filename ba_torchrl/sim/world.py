@@ -82,8 +82,8 @@ def _remove_state(state: int, client: int, connection: weakref.finalize) -> None
 MAX_CLIENTS = 1024
 """Number of worlds that a process can have, a limit of PyBullet."""
 
-SIMULATOR_ERRORS = (pybullet.error, SimulationError, ArithmeticError)
-"""Errors of PyBullet, among them a lost connection, and of computations with values from it."""
+SIMULATOR_ERRORS = (pybullet.error, SimulationError)
+"""Errors of PyBullet, among them a lost connection, and values from it that are not finite."""
 
 
 @dataclass(frozen=True)

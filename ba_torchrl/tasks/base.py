@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -38,6 +38,10 @@ ORANGE: Color = (0.9, 0.55, 0.15, 1.0)
 PAIR_ATTEMPTS = 2000
 """Random layouts before a `PlacementError`. The least likely one, that of two pulling blocks with
 fixed orientations, is found in 1 of 30 attempts."""
+
+BELOW_FLOOR_M = -0.05
+"""Height of a body that has passed through the floor. The workspace bounds the tool from below; a
+flat body that rests on the floor may be lower."""
 
 SCALE_STEP = 0.02
 """Step of the scales between the ends of `object_scale_range`."""
@@ -149,7 +153,7 @@ class Task(ABC):
         """Return the conditions of success in the present scene.
 
         Returns:
-            Bools, named ``is_...``; success is their conjunction.
+            Bools, also of NumPy or torch, named ``is_...``; success is their conjunction.
         """
 
     def progress(self) -> float:
@@ -187,14 +191,16 @@ class Task(ABC):
         Raises:
             TypeError: there are none, or they are not bools whose names begin with ``is_``.
         """
-        conditions = self.evaluate()
-        are_named = all(name.startswith("is_") and name != "is_success" for name in conditions)
-        if not conditions or not are_named or any(type(v) is not bool for v in conditions.values()):
+        conditions, method = self.evaluate(), f"{type(self).__name__}.evaluate"
+        are_named = isinstance(conditions, Mapping) and all(
+            name.startswith("is_") and name != "is_success" for name in conditions
+        )
+        if not conditions or not are_named:
             raise TypeError(
-                f"{type(self).__name__}.evaluate must return bools whose names begin with 'is_', "
-                f"other than 'is_success', not {conditions}"
+                f"{method} must return bools whose names begin with 'is_', other than "
+                f"'is_success', not {conditions}"
             )
-        return conditions
+        return {name: _as_bool(value, f"{method}: {name}") for name, value in conditions.items()}
 
     def is_success(self) -> bool:
         """Whether every condition of success holds."""
@@ -202,8 +208,13 @@ class Task(ABC):
 
     def is_valid(self) -> bool:
         """Whether every object is inside the workspace or held."""
+        return not self.outside()
+
+    def outside(self) -> list[str]:
+        """Return which objects are outside the workspace and not held, each with axis and value."""
         held = self.robot.held_body()
-        return all(self._is_inside(body) for body in self.objects if body is not held)
+        found = (self._outside(body) for body in self.objects if body is not held)
+        return [text for text in found if text is not None]
 
     def is_valid_start(self) -> bool:
         """Whether an episode may start from the present scene."""
@@ -249,13 +260,21 @@ class Task(ABC):
         """Limits of the displacement and rotation of one action."""
         return self.settings.action_limits
 
-    def _is_inside(self, body: Body) -> bool:
+    def _outside(self, body: Body) -> str | None:
+        """Return along which axis a body is outside the workspace; None if it is inside."""
+        if self.settings.bounding_box_check:
+            lowest, highest = body.bounding_box()
+        else:
+            lowest = highest = body.position
         workspace = self.settings.workspace
-        if not self.settings.bounding_box_check:
-            return workspace.contains(body.position)
-        (x0, y0, _), (x1, y1, top) = body.bounding_box()
-        # not the bottom corners: a resting body penetrates its support by micrometres
-        return workspace.contains((x0, y0, top)) and workspace.contains((x1, y1, top))
+        floor_m = min(workspace.z[0], BELOW_FLOOR_M)
+        ranges = workspace.x, workspace.y, (floor_m, workspace.z[1])
+        for axis, least, most, (low, high) in zip("xyz", lowest, highest, ranges, strict=True):
+            if not low < least:
+                return f"{body.name!r} at {axis} = {least:.4g} m, below {low:g} m"
+            if not most < high:
+                return f"{body.name!r} at {axis} = {most:.4g} m, above {high:g} m"
+        return None
 
     # -- random poses ------------------------------------------------------------------------
 
@@ -362,3 +381,17 @@ def check_scales(task_id: str, scales: tuple[float, float]) -> None:
         raise ConfigError(
             f"{task_id}: `object_scale_range` must lie within {allowed}, not ({low:g}, {high:g})"
         )
+
+
+def _as_bool(value: Any, what: str) -> bool:
+    """Return a bool of Python, NumPy or torch, also as an array of one element, as Python's.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if type(value) is bool:
+        return value
+    array = np.asarray(value)
+    if array.dtype != bool or array.size != 1:
+        raise TypeError(f"{what} must be one bool, not {value!r}")
+    return bool(array.item())

@@ -1,6 +1,7 @@
 """The named conditions of success, their conjunction, and their entries in Gymnasium's info."""
 
 import gymnasium
+import numpy as np
 import pybullet
 import pytest
 import torch
@@ -66,12 +67,34 @@ def test_conditions_are_those_of_a_restored_state():
 
 
 @pytest.mark.parametrize(
-    "conditions", [{}, {"grasped": True}, {"is_success": True}, {"is_grasped": 1}]
+    ("conditions", "message"),
+    [
+        *((wrong, " must return bools") for wrong in ({}, {"grasped": True}, {"is_success": True})),
+        (True, " must return bools"),
+        *(
+            ({"is_grasped": value}, ": is_grasped must be one bool, not ")
+            for value in (1, None, 0.01, "yes", np.array([True, False]), torch.ones(()))
+        ),
+    ],
 )
-def test_ill_formed_conditions_are_refused(monkeypatch, conditions):
+def test_ill_formed_conditions_are_refused(monkeypatch, conditions, message):
     monkeypatch.setattr(BlockPicking, "evaluate", lambda task: conditions)
-    with pytest.raises(TypeError, match=r"BlockPicking.evaluate must return bools"):
+    with pytest.raises(TypeError, match=rf"BlockPicking.evaluate{message}"):
         ba_torchrl.make("close_loop/block_picking", obs_size=32)
+
+
+@pytest.mark.parametrize(
+    "kind", [np.bool_, np.array, torch.tensor, lambda value: torch.tensor([value])]
+)
+def test_conditions_are_bools_of_any_library(monkeypatch, kind):
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=16, seed=0)
+    state = env.reset()
+    conditions = {"is_near": kind(True), "is_far": kind(False)}
+    monkeypatch.setattr(BlockPicking, "evaluate", lambda _: conditions)
+    assert not env.step(state.set(keys.ACTION, env.action_spec.zero()))[keys.NEXT][keys.SUCCESS]
+    assert env.conditions == {"is_near": True, "is_far": False}
+    assert all(type(holds) is bool for holds in env.conditions.values())
+    env.close()
 
 
 def test_the_info_of_gymnasium_has_the_conditions():

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pybullet
 import pytest
 import torch
@@ -149,6 +150,66 @@ def test_a_reset_that_always_fails_is_an_error(monkeypatch):
     monkeypatch.setattr(env.task_class, "initialize_episode", fail)
     with pytest.raises(SimulationError, match="3 times in a row"):
         env.reset()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("method", "error", "when"),
+    [
+        ("expert_command", TypeError("no command"), "step"),
+        ("evaluate", IndexError("no such block"), "step"),
+        ("instruction", KeyError("colour"), "step"),
+        ("progress", ZeroDivisionError("no distance"), "step"),
+        ("after_action", FloatingPointError("overflow"), "step"),
+        ("is_valid", np.linalg.LinAlgError("singular"), "step"),
+        ("expert_command", OverflowError("too large"), "reset"),
+        ("evaluate", ValueError("no block"), "reset"),
+        ("instruction", KeyError("colour"), "reset"),
+        ("progress", ZeroDivisionError("no distance"), "reset"),
+        ("initialize_episode", AttributeError("no block"), "reset"),
+    ],
+)
+def test_an_error_of_a_task_is_raised_as_it_is(monkeypatch, method, error, when):
+    env = make(expert=True, reward="dense", observations=["instruction"])
+    state = env.reset()
+
+    def wrong(*_):
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(env.task_class, method, wrong)
+        with pytest.raises(type(error)) as raised:
+            step(env, state) if when == "step" else env.reset()
+    assert raised.value is error
+    assert raised.traceback[-1].name == "wrong"
+    place = "episode 1, step 1" if when == "step" else "episode 2, step 0"
+    assert error.__notes__ == [
+        f"{TASK}, seed 0, {place}: an error of the code, not of the simulator"
+    ]
+    assert env.faults == 0
+    assert not step(env, env.reset())["fault"]
+    env.close()
+
+
+def test_any_error_in_a_scene_that_is_not_finite_is_a_fault(monkeypatch):
+    env = make()
+    state = env.reset()
+
+    def diverge(scene, action):
+        give_nan(env)
+        raise ValueError("cannot convert float NaN to integer")
+
+    monkeypatch.setattr(env, "_act", diverge)
+    assert step(env, state)["fault"]
+    env.close()
+
+
+def test_a_task_does_not_see_poses_that_are_not_finite(monkeypatch):
+    env = make()
+    state = env.reset()
+    give_nan(env)
+    monkeypatch.setattr(env.task_class, "after_action", lambda _: pytest.fail("it was called"))
+    assert step(env, state)["fault"]
     env.close()
 
 

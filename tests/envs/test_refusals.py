@@ -36,7 +36,10 @@ def test_render_needs_a_display(monkeypatch):
         ({"dpos": math.nan}, "dpos"),
         ({"view_scale": math.inf}, "finite"),
         ({"action_sequence": ""}, "pxyzr"),
-        ({"workspace": ((0.3, 0.6), (-0.15, 0.15), (0.0, 0.02))}, "50 had an object outside"),
+        (
+            {"workspace": ((0.3, 0.6), (-0.15, 0.15), (0.0, 0.02))},
+            r"50 had an object outside .*'block' at z = 0.02\d+ m, above 0.02 m",
+        ),
     ],
 )
 def test_parameters_without_a_meaning_are_refused(settings, message):

@@ -247,7 +247,7 @@ def test_value_targets_continue_behind_a_success_with_dense_rewards_only(make):
 def test_a_fault_has_no_reward(make, monkeypatch):
     env = make(PICKING, reward="dense", obs_type="vec", expert=False)
     state = env.reset()
-    monkeypatch.setattr(type(env), "_act", lambda *_: 1 / 0)
+    monkeypatch.setattr(type(env), "_act", lambda _, scene, action: scene.world.close())
     state = env.step(state.set(keys.ACTION, torch.zeros(5)))[keys.NEXT]
     assert state[keys.FAULT]
     assert state[keys.REWARD] == 0
@@ -262,10 +262,9 @@ def test_a_fault_has_no_reward(make, monkeypatch):
         (lambda _: math.nan, "must be a number in [0, 1), not nan"),
         (lambda _: None, "must be a number in [0, 1), not None"),
         (lambda _: torch.zeros(2), "must be a number in [0, 1), not tensor([0., 0.])"),
-        (lambda _: 1 / 0, "raised ZeroDivisionError: division by zero"),
     ],
 )
-def test_an_error_of_progress_is_no_fault_of_the_simulator(
+def test_a_progress_outside_its_range_is_no_fault_of_the_simulator(
     make, monkeypatch, progress, message, at_reset
 ):
     env = make(PICKING, reward="dense", obs_type="vec")

@@ -1,6 +1,7 @@
 """Conditions of success on both sides of their thresholds; invalid scenes; random initial poses."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -61,6 +62,29 @@ def test_the_bounding_box_check_is_stricter_than_the_point_check(make):
         env = make("block_picking", workspace_check=check)
         env.scene.task.block.place((0.45, 0.13, 0.025))
         assert env.scene.task.is_valid() is valid
+
+
+@pytest.mark.parametrize("check", ["point", "bounding_box"])
+@pytest.mark.parametrize(
+    ("position", "message"),
+    [
+        ((0.45, 0.0, 0.01), None),  # as the origin of a flat body on the floor
+        ((0.45, 0.0, 0.004), None),
+        ((0.45, 0.16, 0.025), r"'block' at y = 0\.1\d+ m, above 0\.15 m"),
+        ((0.29, 0.0, 0.025), r"'block' at x = 0\.2\d+ m, below 0\.3 m"),
+        ((0.45, 0.0, 0.26), r"'block' at z = 0\.2\d+ m, above 0\.25 m"),
+        ((0.45, 0.0, -0.06), r"'block' at z = -0\.0\d+ m, below -0\.05 m"),
+    ],
+)
+def test_objects_outside_the_workspace_are_named_with_axis_and_value(
+    make, check, position, message
+):
+    task = make("block_picking", workspace_check=check).scene.task
+    task.block.place(position)
+    assert task.is_valid() is (message is None)
+    assert [bool(re.fullmatch(message or "", text)) for text in task.outside()] == (
+        [] if message is None else [True]
+    )
 
 
 def test_the_bounding_box_of_a_bowl_does_not_depend_on_its_yaw(make):

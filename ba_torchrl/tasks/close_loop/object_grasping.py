@@ -161,19 +161,3 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
 
     def _is_lifted(self) -> bool:
         return self.robot.tool_pose()[0][2] > self.lift_height_m
-
-    def _is_inside(self, body: Body) -> bool:
-        # without the lower bound of z: thin objects lie below it
-        workspace = self.settings.workspace
-        if self.settings.bounding_box_check:
-            (x0, y0, _), (x1, y1, top) = body.bounding_box()
-        else:
-            x0, y0, top = x1, y1, _ = body.position
-        return (
-            workspace.x[0] < x0
-            and x1 < workspace.x[1]
-            and workspace.y[0] < y0
-            and y1 < workspace.y[1]
-            and math.isfinite(top)
-            and top < workspace.z[1]
-        )
