@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.errors import ConfigError, SimulationError
 
 FLAGS = ("done", "terminated", "truncated")
 
@@ -24,7 +25,8 @@ class FakeEnv(EnvBase):
     """Pixels are drawn from the seed; the reward is the sum of the action.
 
     A file named ``<pid>.<when>`` (when: step, reset) in ``folder`` makes that process raise,
-    refuse, hang or die as the file says; it is removed first, unless the word starts with "always".
+    refuse, make a mistake, exit, hang or die as the file says; it is removed first, unless the word
+    starts with "always".
     A file named ``build`` makes every constructor raise, kill its process (``kill``), or wait until
     the file is removed (``wait``).
     """
@@ -75,8 +77,14 @@ class FakeEnv(EnvBase):
                     path.unlink()
                 if order == "refuse":
                     raise ConfigError("the task is wrong")
+                if order == "mistake":
+                    raise KeyError("colour")
+                if order == "private mistake":
+                    raise type("PrivateError", (Exception,), {})("colour")
+                if order == "exit":
+                    sys.exit(0)
                 if order.endswith("raise"):
-                    raise ArithmeticError("the simulator exploded")
+                    raise SimulationError("the simulator exploded")
                 if order.endswith("hang"):
                     time.sleep(1000)
                 os.kill(os.getpid(), 9)

@@ -21,7 +21,7 @@ from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
 from ba_torchrl.envs.vector.replacement import Replacements, seed_worker
 from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker, wait_until
-from ba_torchrl.errors import ConfigError, WorkerError
+from ba_torchrl.errors import WorkerError
 
 MakeEnv = Callable[[], EnvBase]
 
@@ -41,13 +41,14 @@ _HEALTH_CHECK_S = 5e-3
 
 
 class VectorEnv(SeededVector, ParallelEnv):
-    """Environments in worker processes; a worker that raises, ends or hangs is replaced.
+    """Environments in worker processes; a worker that ends or hangs is replaced.
 
     The other workers keep their episodes, and step while the new worker starts. For the environment
     of the failed worker, the step returns the last valid observation with ``fault``, ``truncated``
     and ``done`` set and a reward of zero; TorchRL then resets it like any environment that is done.
-    Actions are validated in this process before they are sent. A `ConfigError` that an environment
-    raises is raised in this process; only the next reset or step replaces its worker.
+    Actions are validated in this process before they are sent. An error that an environment raises
+    is raised in this process, caused by one with the worker's traceback; only the next reset or
+    step replaces the worker. Errors of the simulator and of memory replace it at once.
 
     This reset waits for the new worker, unless ``workers.wait_for_restarts`` is False. Then the
     environment is absent until the worker is ready: the reset returns the last valid observation
@@ -456,7 +457,7 @@ def ask_all(
 
     Raises:
         WorkerError: a worker has failed.
-        ConfigError: an environment raised it.
+        Exception: an environment raised it.
     """
     for worker, args in zip(workers, arguments, strict=True):
         worker.check()
@@ -465,7 +466,7 @@ def ask_all(
     for worker in workers:
         try:
             results.append(worker.read(timeout_s)[1])
-        except (WorkerError, ConfigError) as error:
+        except Exception as error:
             worker.abort()  # a late answer would be taken for that to the next command
             failure = error
     if failure is not None:

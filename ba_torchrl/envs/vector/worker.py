@@ -18,16 +18,17 @@ from multiprocessing import util
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 import torchrl
 from torch import multiprocessing as mp
+from typing_extensions import Self
 
 from ba_torchrl.errors import ConfigError, WorkerError
+from ba_torchrl.sim.world import SIMULATOR_ERRORS
 
 logger = logging.getLogger(__name__)
 
-_FAILED = "failed"
 _IDLE_TIMEOUT_S = 1e6  # by default TorchRL's workers end after 10,000 s without a command
 _PR_SET_PDEATHSIG = 1
 _BUSY_WAIT_S = 100e-6
@@ -37,6 +38,52 @@ _POLL_INTERVAL_S = 30e-6
 class EnvironmentRaisedError(WorkerError):
     """The environment of a worker raised an exception, or the process ended by an exception before
     it could make the environment; in contrast to a process that was ended."""
+
+
+class SentError(NamedTuple):
+    """An exception on its way to the parent process."""
+
+    pickled: bytes
+    """The exception; empty if it cannot be pickled."""
+    summary: str
+    """Its type and message."""
+    text: str
+    """Its traceback."""
+
+    @classmethod
+    def of(cls, error: BaseException) -> Self:
+        """Return an exception of this process."""
+        try:
+            pickled = pickle.dumps(error)
+        except Exception:  # whatever the methods of its class raise
+            pickled = b""
+        summary = f"{type(error).__name__}: {error}"
+        return cls(pickled, summary, "".join(traceback.format_exception(error)))
+
+    def received(self) -> Exception:
+        """Return the exception, whose cause is an `EnvironmentRaisedError` with the traceback.
+
+        It is a RuntimeError if this process cannot make one of that type, or that would end it.
+        """
+        try:
+            error = pickle.loads(self.pickled)
+        except Exception:  # whatever the methods of its class raise, or there is no such class
+            error = None
+        if not isinstance(error, Exception):
+            error = RuntimeError(self.summary)
+        error.__cause__ = EnvironmentRaisedError(f"it raised\n{self.text}")
+        return error
+
+
+def is_of_code(error: Exception) -> bool:
+    """Return whether an error would occur again in a new process.
+
+    Those of the simulator and of the machine's memory may not.
+
+    Args:
+        error: of an environment.
+    """
+    return not isinstance(error, (*SIMULATOR_ERRORS, WorkerError, MemoryError))
 
 
 class Worker:
@@ -141,8 +188,10 @@ class Worker:
 
         Raises:
             WorkerError: the worker has ended, or sends nothing for ``timeout_s`` seconds.
-            EnvironmentRaisedError: the environment raised, or what it needs cannot be imported.
-            ConfigError: the environment raised it; in a new process it would again.
+            EnvironmentRaisedError: the simulator or the machine failed, or the environment cannot
+                be made.
+            Exception: any other error of the environment, with its traceback as the cause; in a new
+                process it would occur again.
         """
         try:
             if not self.pipe.poll(timeout_s):
@@ -158,12 +207,10 @@ class Worker:
                     'its traceback above, or the script lacks `if __name__ == "__main__":`'
                 ) from None
             raise WorkerError(reason) from None
-        if isinstance(message, tuple) and message[0] == _FAILED:
-            _, config_error, text = message
-            error = EnvironmentRaisedError(f"it raised\n{text}")
-            if config_error is not None:
-                raise ConfigError(config_error) from error
-            raise error
+        if isinstance(message, SentError):
+            error = message.received()
+            is_final = isinstance(error, ConfigError) or (self.is_ready and is_of_code(error))
+            raise error if is_final else error.__cause__
         return message
 
     def check(self) -> None:
@@ -231,9 +278,8 @@ def _run_worker(loop: Callable[..., None], options: dict[str, Any], parent: int)
     try:
         loop(**options)
     except BaseException as error:
-        config_error = str(error) if isinstance(error, ConfigError) else None
         with contextlib.suppress(OSError):  # the parent has ended
-            pipe.send((_FAILED, config_error, traceback.format_exc()))
+            pipe.send(SentError.of(error))
         os._exit(1)  # skip the clean-up of the failed environment
 
 

@@ -151,12 +151,24 @@ class TestFailures:
         assert env.is_closed
 
     @pytest.mark.parametrize("when", ["step", "reset"])
-    def test_of_the_configuration_are_raised_at_once(self, make_fakes, tmp_path, when):
+    @pytest.mark.parametrize(
+        ("order", "error", "message"),
+        [
+            ("refuse", ConfigError, "the task is wrong"),
+            ("mistake", KeyError, "'colour'"),
+            ("private mistake", RuntimeError, "PrivateError: colour"),
+            ("exit", RuntimeError, "SystemExit: 0"),
+        ],
+    )
+    def test_of_the_code_are_raised_at_once(
+        self, make_fakes, tmp_path, when, order, error, message
+    ):
         env = make_fakes(3, folder=tmp_path)
         state = act(env, env.reset())
-        (tmp_path / f"{env.worker_pids[1]}.{when}").write_text("refuse")
-        with pytest.raises(ConfigError, match=r"^the task is wrong$"):
+        (tmp_path / f"{env.worker_pids[1]}.{when}").write_text(order)
+        with pytest.raises(error, match=f"^{message}$") as raised:
             env.step(state) if when == "step" else env.reset()
+        assert "in _misbehave" in str(raised.value.__cause__)  # the worker's traceback
         assert env.restarts == 0
         state = env.reset()
         assert_stepped(env.step(act(env, state.clone())), 1, state)
