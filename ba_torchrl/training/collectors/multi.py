@@ -11,13 +11,15 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from multiprocessing.queues import SimpleQueue
 from queue import Empty
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import multiprocessing as mp
 from torchrl.collectors import (
+    Collector,
     MultiAsyncCollector,
     MultiSyncCollector,
     _multi_async,
@@ -27,7 +29,7 @@ from torchrl.collectors import (
 from torchrl.weight_update import MultiProcessWeightSyncScheme
 
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.envs.vector.worker import end_with
+from ba_torchrl.envs.vector.worker import SentError, end_with, is_of_code
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
 from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig
 
@@ -65,7 +67,8 @@ class MultiAsyncConfig(WorkersConfig):
 class MultiCollection(WorkerCollection):
     """Batches of worker processes: of all workers if they are synchronous, else of one of them.
 
-    If a worker process ends, all are replaced, and their episodes in progress are lost.
+    If a worker process ends, all are replaced, and their episodes in progress are lost. An error of
+    the code in a worker, such as that of a task, is raised instead.
 
     Args:
         problem: the run's environments and policy.
@@ -123,12 +126,14 @@ class MultiCollection(WorkerCollection):
         self._patience_s = workers.start_timeout_s + workers.timeout_s  # until the first batch
         # A worker is killed when the thread that started it ends, so only for the main thread.
         is_main = threading.current_thread() is threading.main_thread()
+        self._errors = mp.get_context(workers.start_method).SimpleQueue()
         with _start_method(workers.start_method):
             return self._collector_class(
                 self.make_envs(problem.make_env, self._restarts),
                 # TorchRL sends its weights at first, and moves them to shared memory.
                 policy=copy.deepcopy(self.policy).to("cpu"),
                 policy_factory=self.make_policies(self._restarts),
+                collector_class=partial(_WorkersCollector, errors=self._errors),
                 frames_per_batch=self._frames,
                 total_frames=-1,
                 storing_device="cpu",
@@ -143,8 +148,11 @@ class MultiCollection(WorkerCollection):
 
         Raises:
             RuntimeError: there were too many in a row.
+            Exception: a worker sent it.
         """
         self.close()
+        if not self._errors.empty():
+            raise self._errors.get().received()
         self._failures_in_a_row += 1
         if self._failures_in_a_row > self.problem.workers.max_restarts:
             raise RuntimeError(
@@ -157,6 +165,27 @@ class MultiCollection(WorkerCollection):
         logger.warning("workers are replaced (restart %d): %s", self._restarts, cause)
         self._collector = self._start()
         self._batches = iter(self._collector)
+
+
+class _WorkersCollector(Collector):
+    """TorchRL's collector in a worker process, which sends errors of the code to the parent.
+
+    Args:
+        errors: where to.
+    """
+
+    def __init__(self, *args: Any, errors: SimpleQueue[SentError], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._errors = errors
+
+    def iterator(self) -> Iterator[TensorDictBase]:
+        """Yield batches."""
+        try:
+            yield from super().iterator()
+        except Exception as error:
+            if is_of_code(error):
+                self._errors.put(SentError.of(error))
+            raise
 
 
 class _WeightSync(MultiProcessWeightSyncScheme):

@@ -1,5 +1,6 @@
 """Collection in worker processes of this machine."""
 
+import itertools
 import os
 import signal
 import time
@@ -12,6 +13,7 @@ from ba_torchrl.envs.vector.make import SerialVectorEnv
 from ba_torchrl.envs.vector.parallel import VectorEnv
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
 from ba_torchrl.training.experiment import Experiment
 from tests.training.collectors.runs import (
     assert_each_transition_once,
@@ -134,6 +136,27 @@ def test_workers_that_hang_are_replaced_after_the_timeout(kind, collecting):
         next(collection)
     assert collection.scalars["restarts"] == 1
     assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_error_of_a_task_is_raised_and_workers_do_not_restart(
+    kind, collecting, monkeypatch, tmp_path
+):
+    evaluate, is_wrong = BlockReaching.evaluate, tmp_path / "wrong"
+
+    def evaluate_or_raise(task):
+        if is_wrong.exists():
+            raise IndexError("no such block")
+        return evaluate(task)
+
+    monkeypatch.setattr(BlockReaching, "evaluate", evaluate_or_raise)
+    collection, _ = collecting(kind)
+    next(collection)
+    is_wrong.touch()
+    with pytest.raises(IndexError, match="no such block") as raised:
+        list(itertools.islice(collection, 9))
+    assert "in evaluate_or_raise" in str(raised.value.__cause__)
+    assert collection.scalars["restarts"] == 0
 
 
 def test_too_many_failures_in_a_row_end_the_collection(collecting):
