@@ -1,5 +1,5 @@
 """Contract checks of tasks, for tests of tasks inside and outside the package."""
 
-from ba_torchrl.testing.tasks import check_task
+from ba_torchrl.testing.tasks import ExpertReport, check_task
 
-__all__ = ["check_task"]
+__all__ = ["ExpertReport", "check_task"]

@@ -40,11 +40,26 @@ def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
     return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION])
 
 
-def play_expert(env: ManipulationEnv, episodes: int) -> list[TensorDict]:
-    """Return episodes [T] of the expert."""
+def play_expert(env: ManipulationEnv, episodes: int, *, noise: float = 0.0) -> list[TensorDict]:
+    """Return episodes [T] of the expert.
+
+    Args:
+        env: with ``expert=True``.
+        episodes: how many.
+        noise: standard deviation of the Gaussian noise of its actions, as a share of the range of
+            each component.
+    """
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    generator = torch.Generator().manual_seed(0)
+
+    def policy(tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict[keys.EXPERT_ACTION]
+        if noise:
+            action = action + noise * (high - low) * torch.randn(len(low), generator=generator)
+        return tensordict.set(keys.ACTION, action.clamp(low, high) if noise else action)
+
     return [
-        env.rollout(MAX_EPISODE_STEPS, expert_policy, auto_cast_to_device=False)
-        for _ in range(episodes)
+        env.rollout(MAX_EPISODE_STEPS, policy, auto_cast_to_device=False) for _ in range(episodes)
     ]
 
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 import functools
 import math
 import pickle
+import warnings
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -35,6 +36,45 @@ from ba_torchrl.testing.progress import check_progress
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
+POLICY_NOISE = 0.1
+"""Standard deviation of the actions of a learned policy, as a share of the range of a component."""
+MAX_NOISE_LOSS = 0.3
+"""Largest difference of an expert's success rates without and with this noise that gives no
+warning; that of the package's close-loop tasks is at most 0.1."""
+
+
+class ExpertReport(NamedTuple):
+    """The results of an expert from random starts, and what they say about imitation."""
+
+    task: str
+    """Id of the task."""
+    success_rate: float
+    """Share of solved episodes."""
+    mean_steps: float
+    """Mean number of steps of solved episodes."""
+    noisy_success_rate: float | None
+    """Share of episodes that are solved with Gaussian noise of `POLICY_NOISE`, about that of a
+    learned policy. None in open loop, where a policy chooses a pixel."""
+
+    @property
+    def warning(self) -> str | None:
+        """What to change if noise lowers the success rate by more than `MAX_NOISE_LOSS`."""
+        noisy = self.noisy_success_rate
+        if noisy is None or noisy >= self.success_rate - MAX_NOISE_LOSS:
+            return None
+        return (
+            f"{self.task}: the expert solves {self.success_rate:.2f} of its episodes, and "
+            f"{noisy:.2f} with the noise of a learned policy, which will hardly imitate it. Widen "
+            "the tolerances of `evaluate` and the thresholds between the expert's phases"
+        )
+
+    def __str__(self) -> str:
+        text = f"{self.task}: the expert solves {self.success_rate:.2f} of its episodes in "
+        text += f"{self.mean_steps:.1f} steps"
+        if self.noisy_success_rate is not None:
+            text += f", and {self.noisy_success_rate:.2f} with the noise of a learned policy"
+        return text if self.warning is None else f"{text}\nwarning: {self.warning}"
+
 
 def check_task(
     task: str,
@@ -44,8 +84,10 @@ def check_task(
     min_success_rate: float = 0.9,
     min_recovery_rate: float = 0.85,
     max_typical_steps: float | None = None,
-) -> None:
+) -> ExpertReport:
     """Check that a task fulfils the contract of this package's tasks; takes about a minute.
+
+    An expert whose success depends on exact actions passes, with a warning.
 
     Args:
         task: id of a registered task.
@@ -57,13 +99,17 @@ def check_task(
         max_typical_steps: largest mean (close loop) or median (open loop) number of the expert's
             steps; None for no limit.
 
+    Returns:
+        The expert's results, which print as a sentence.
+
     Raises:
         AssertionError: a check fails; the message states the reason.
         ConfigError: the task is unknown.
+        Exception: the task's code raises it.
     """
     for check in CHECKS:
         check(task, robot=robot)
-    check_expert(
+    report = check_expert(
         task,
         episodes=episodes,
         min_success_rate=min_success_rate,
@@ -72,6 +118,12 @@ def check_task(
     )
     check_recovery(task, episodes=episodes, min_success_rate=min_recovery_rate, robot=robot)
     check_progress(task, episodes=episodes, robot=robot)
+    if TASKS[task].control == "close_loop":
+        rate = noisy_success_rate(task, episodes=episodes, robot=robot)
+        report = report._replace(noisy_success_rate=rate)
+    if report.warning is not None:
+        warnings.warn(report.warning, stacklevel=2)
+    return report
 
 
 def check_specs(task: str, **config: Any) -> None:
@@ -136,6 +188,7 @@ def check_observations_are_copies(task: str, **config: Any) -> None:
         while True:
             kept, copy = state[keys.PIXELS], state[keys.PIXELS].clone()
             following = env.step(expert_policy(state))[keys.NEXT]
+            assert not following[keys.FAULT], f"{task}: a simulator fault, which the log shows"
             assert torch.equal(kept, copy), f"{task}: a step changed an image returned before it"
             if following[keys.DONE]:
                 break
@@ -199,7 +252,7 @@ def check_expert(
     min_success_rate: float,
     max_typical_steps: float | None = None,
     **config: Any,
-) -> None:
+) -> ExpertReport:
     """Check the expert's success rate and steps, and the rewards and ends of its episodes.
 
     ``max_typical_steps`` is the largest mean (close loop) or median (open loop) number of steps of
@@ -207,6 +260,8 @@ def check_expert(
     """
     with closing(make_small(task, expert=True, **config)) as env:
         played = play_expert(env, episodes)
+        faults = env.faults
+    assert faults == 0, f"{task}: {faults} simulator faults, which the log shows"
     lengths = [len(episode) for episode in played if episode[keys.NEXT, keys.SUCCESS][-1]]
     assert len(lengths) >= min_success_rate * episodes, (
         f"{task}: the expert solves {len(lengths)} of {episodes} episodes, "
@@ -228,6 +283,15 @@ def check_expert(
         assert following[keys.TERMINATED][-1] or following[keys.TRUNCATED][-1], (
             f"{task}: an episode has not ended after {MAX_EPISODE_STEPS} steps"
         )
+    mean_steps = float(np.mean(lengths)) if lengths else math.nan
+    return ExpertReport(task, len(lengths) / episodes, mean_steps, None)
+
+
+def noisy_success_rate(task: str, *, episodes: int, **config: Any) -> float:
+    """Return the expert's success rate with Gaussian noise of `POLICY_NOISE`."""
+    with closing(make_small(task, expert=True, **config)) as env:
+        played = play_expert(env, episodes, noise=POLICY_NOISE)
+    return float(np.mean([bool(episode[keys.NEXT, keys.SUCCESS][-1]) for episode in played]))
 
 
 def check_recovery(task: str, *, episodes: int, min_success_rate: float, **config: Any) -> None:

@@ -4,6 +4,7 @@ Each file of ``mine/`` is one addition. None of them edits a file of the package
 shows some of them.
 """
 
+import itertools
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from ba_torchrl.data.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import downward
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
 from ba_torchrl.testing.episodes import play_expert
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
@@ -47,7 +50,42 @@ def _start(envs, task, **config):
 @pytest.mark.parametrize("task", NEW_TASKS)
 def test_new_tasks_keep_the_contract_and_experts_solve_them(task):
     steps = 4 if task == "mine/bridge" else None
-    testing.check_task(task, min_success_rate=1.0, max_typical_steps=steps)
+    report = testing.check_task(task, min_success_rate=1.0, max_typical_steps=steps)
+    assert report.success_rate == 1.0
+    assert report.warning is None
+    has_noise = TASKS[task].control == "close_loop"
+    assert (report.noisy_success_rate is not None) is has_noise
+    assert ("with the noise of a learned policy" in str(report)) is has_noise
+
+
+def test_an_expert_whose_success_needs_exact_actions_passes_with_a_warning(monkeypatch):
+    monkeypatch.setattr("ba_torchrl.testing.tasks.CHECKS", ())
+    monkeypatch.setattr(BlockReaching, "goal_distance_m", 0.003)
+    with pytest.warns(UserWarning, match=r"solves 1\.00 .* and 0\.[0-6]0 with the noise"):
+        report = testing.check_task("close_loop/block_reaching", episodes=5)
+    assert str(report).endswith(f"warning: {report.warning}")
+
+
+@pytest.mark.parametrize(
+    ("method", "error"),
+    [
+        ("expert_command", TypeError("no command")),
+        ("evaluate", IndexError("no such block")),
+        ("instruction", KeyError("colour")),
+    ],
+)
+def test_an_error_of_a_task_fails_its_check_as_it_is(monkeypatch, method, error):
+    correct, calls = getattr(BlockReaching, method), itertools.count()
+
+    def wrong_later(task):
+        if next(calls) == 3:
+            raise error
+        return correct(task)
+
+    monkeypatch.setattr(BlockReaching, method, wrong_later)
+    with pytest.raises(type(error)) as raised:
+        testing.check_task("close_loop/block_reaching")
+    assert raised.value is error
 
 
 def test_a_structure_has_its_fewest_steps_and_its_deconstruction(started):
