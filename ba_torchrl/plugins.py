@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import sys
+import traceback
 import warnings
 from collections.abc import Iterable
 from importlib.metadata import entry_points
@@ -23,6 +25,9 @@ GROUP = "ba_torchrl.plugins"
 
 MAIN = ("__main__", "__mp_main__")
 """Names of a process's main module, in the process itself and in its spawned children."""
+
+_IMPORT_FILES = re.compile(rf"importlib|{re.escape(__file__)}")
+"""Part of the names of files that import a plugin."""
 
 _loaded_groups: set[str] = set()
 
@@ -42,11 +47,11 @@ def load_entry_points() -> None:
     for point in entry_points(group=GROUP):
         try:
             point.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             package = f" of {point.dist.name}" if point.dist is not None else ""
             warnings.warn(
                 f"the plugin {point.name!r} ({point.value}){package} is not loaded: "
-                f"{type(error).__name__}: {error}",
+                + _summary(error),
                 PluginWarning,
                 stacklevel=2,
             )
@@ -66,20 +71,32 @@ def import_modules(names: Iterable[str]) -> None:
         names: dotted names of modules.
 
     Raises:
-        ConfigError: a module does not exist; the message names possible fixes.
+        ConfigError: a module does not exist, and the message names possible fixes; or it raises at
+            its import, which is the cause.
     """
     for name in names:
         if not (isinstance(name, str) and all(map(str.isidentifier, name.split(".")))):
             raise ConfigError(f"plugins: {name!r} is not the name of a module, such as my.tasks")
         try:
             importlib.import_module(name)
-        except ModuleNotFoundError as error:
-            if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-                raise  # the plugin exists, and one of its own imports is missing
+        except (Exception, SystemExit) as error:
+            missing = error.name if isinstance(error, ModuleNotFoundError) else None
+            if missing is None or not f"{name}.".startswith(f"{missing}."):
+                raise ConfigError(
+                    f"cannot import the plugin {name!r}: {_summary(error)}"
+                ) from error
             raise ConfigError(
-                f"cannot import the plugin {name!r}: there is no module {error.name!r}. Run from "
+                f"cannot import the plugin {name!r}: there is no module {missing!r}. Run from "
                 "the folder that holds it, put that folder on PYTHONPATH, or install the package"
             ) from None
+
+
+def _summary(error: BaseException) -> str:
+    """Return an error of an import on one line, with the last place in the plugin's files."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    frames = traceback.extract_tb(error.__traceback__)
+    places = [frame for frame in frames if not _IMPORT_FILES.search(frame.filename)]
+    return f"{text} ({places[-1].filename}, line {places[-1].lineno})" if places else text
 
 
 def load_plugins(names: Iterable[str]) -> None:

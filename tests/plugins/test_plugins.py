@@ -14,6 +14,8 @@ from types import ModuleType
 import pytest
 
 from ba_torchrl import make_vector_env
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.plugins import import_modules
 from tests.fresh import run_script
 
 ROOT = Path(__file__).parents[2]
@@ -204,19 +206,44 @@ def install(folder, name, module):
     (info / "entry_points.txt").write_text(f"[ba_torchrl.plugins]\n{name} = {module}\n")
 
 
-def test_installed_plugins_are_found_and_a_broken_one_does_not_stop_the_others(tmp_path):
+BROKEN = {
+    "refusing": ("raise RuntimeError('no\\nlicence')", "RuntimeError: no licence"),
+    "exiting": ("import sys\nsys.exit(0)", "SystemExit: 0"),
+    "unfinished": ("def f(:", "SyntaxError: invalid syntax"),
+    "incomplete": ("import no_such_package", "ModuleNotFoundError: No module named"),
+}
+"""Plugins that cannot be imported: their content, and a part of the message."""
+
+
+def test_installed_plugins_are_found_and_broken_ones_do_not_stop_the_others(tmp_path):
     packages = tmp_path / "site-packages"
     packages.mkdir()
     shutil.copy(Path(__file__).parent / "my_tasks.py", packages)
-    (packages / "broken_plugin.py").write_text("raise RuntimeError('no licence')\n")
-    install(packages, "broken", "broken_plugin")
+    for name, (content, _) in BROKEN.items():
+        (packages / f"{name}_plugin.py").write_text(content)
+        install(packages, name, f"{name}_plugin")
     install(packages, "good", "my_tasks")
     code = "import json, ba_torchrl; print(json.dumps(ba_torchrl.list_tasks()))"
     done = run_script(tmp_path, code, (packages,))
     assert "mine/reach_near" in last_line(done)
-    assert done.stderr.count("PluginWarning") == 1
-    assert "plugin 'broken' (broken_plugin) of broken is not loaded" in done.stderr
-    assert "RuntimeError: no licence" in done.stderr
+    assert done.stderr.count("PluginWarning") == len(BROKEN)
+    for name, (_, message) in BROKEN.items():
+        start = f"plugin {name!r} ({name}_plugin) of {name} is not loaded: {message}"
+        assert start in done.stderr
+        assert f"{name}_plugin.py, line " in done.stderr
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_plugin_that_cannot_be_imported_is_named_with_its_error(tmp_path, monkeypatch, name):
+    content, message = BROKEN[name]
+    (tmp_path / f"{name}_plugin.py").write_text(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError) as raised:
+        import_modules([f"{name}_plugin"])
+    text = str(raised.value)
+    assert text.startswith(f"cannot import the plugin '{name}_plugin': {message}")
+    assert f"{name}_plugin.py, line " in text
+    assert "\n" not in text
 
 
 def test_a_users_task_passes_or_fails_the_contract(folder):
