@@ -8,7 +8,16 @@ from functools import cache
 from typing import Any, Literal, TypedDict, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import CoreSchema
 from typing_extensions import Self
 
 from ba_torchrl.errors import ConfigError, known_names
@@ -52,8 +61,23 @@ def parse(model: type[Model], values: dict[str, Any], what: str) -> Model:
         raise explain(error, model.model_fields, what) from None
 
 
+def _take_any_sequence(schema: Any) -> None:
+    """Let the lists and tuples of a schema take both; their elements remain strict."""
+    if isinstance(schema, dict):
+        if schema.get("type") in ("list", "tuple"):
+            schema["strict"] = False
+        for part in schema.values():
+            _take_any_sequence(part)
+    elif isinstance(schema, list | tuple):
+        for part in schema:
+            _take_any_sequence(part)
+
+
 class StrictModel(BaseModel):
-    """Immutable settings that refuse unknown names, wrong types and infinite numbers."""
+    """Immutable settings that refuse unknown names, wrong types and infinite numbers.
+
+    A list is a tuple where the type asks for one, and the reverse: YAML and JSON have lists only.
+    """
 
     model_config = ConfigDict(
         extra="forbid",
@@ -62,6 +86,14 @@ class StrictModel(BaseModel):
         allow_inf_nan=False,
         use_attribute_docstrings=True,  # the docstring below a field is its description
     )
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: type[BaseModel], handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        schema = handler(source)
+        _take_any_sequence(schema)
+        return schema
 
 
 def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str]:
@@ -111,25 +143,8 @@ _CLOSE_LOOP = {"control": "close_loop"}
 _OPEN_LOOP = {"control": "open_loop"}
 
 
-_GENERAL_FIELDS: set[str] = set()
-"""Names of the fields of `EnvConfig`."""
-
-
-def _as_tuple(value: Any) -> Any:
-    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
-
-
 class TaskParameters(StrictModel):
     """The parameters that one task adds to `EnvConfig`; a task without any uses this class."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _lists_as_tuples(cls, values: Any) -> Any:
-        """Convert lists to tuples: YAML and JSON have lists only."""
-        if not isinstance(values, dict):
-            return values
-        own = cls.model_fields.keys() - _GENERAL_FIELDS
-        return {name: _as_tuple(value) if name in own else value for name, value in values.items()}
 
 
 class EnvConfig(StrictModel):
@@ -255,12 +270,7 @@ class EnvConfig(StrictModel):
             raise ValueError("must be a number or a (low, high) pair")
         if isinstance(value, int | float):
             return (float(value), float(value))
-        return tuple(value) if isinstance(value, list) else value
-
-    @field_validator("observations", mode="before")
-    @classmethod
-    def _as_names(cls, value: Any) -> Any:
-        return tuple(value) if isinstance(value, list) else value
+        return value
 
     @field_validator("floor_color", "workspace_color", mode="before")
     @classmethod
@@ -315,9 +325,6 @@ class EnvConfig(StrictModel):
             if needed != control and getattr(self, name) != field.default:
                 kind = needed.replace("_", "-")
                 raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")
-
-
-_GENERAL_FIELDS.update(EnvConfig.model_fields)
 
 
 class EnvKeywords(TypedDict, total=False):

@@ -2,6 +2,7 @@ import json
 import pickle
 
 import pytest
+from omegaconf import OmegaConf
 
 import ba_torchrl
 from ba_torchrl.config import EnvConfig, TaskParameters, env_config_model, parse
@@ -36,14 +37,41 @@ def test_wrong_values_say_what_is_allowed(values, message):
         parse(EnvConfig, values, "configuration")
 
 
-def test_a_tuple_among_the_parameters_of_a_task_is_a_list_in_json():
-    class Parameters(TaskParameters):
-        sizes: tuple[tuple[float, float], ...] = ((1.0, 2.0),)
+class Sequences(TaskParameters):
+    sizes: tuple[tuple[float, float], ...] = ((1.0, 2.0),)
+    vector_keys: tuple[str, ...] = ()
+    names: list[str] = []  # noqa: RUF012 -- pydantic copies it
+    by_name: dict[str, tuple[int, ...] | None] = {}  # noqa: RUF012
 
-    model = env_config_model(Parameters)
-    config = parse(model, {"sizes": [[3.0, 4.0], [5.0, 6.0]]}, "c")
-    assert config.sizes == ((3.0, 4.0), (5.0, 6.0))
-    assert parse(model, json.loads(config.model_dump_json()), "c") == config
+
+@pytest.mark.parametrize("model", [Sequences, env_config_model(Sequences)])
+def test_lists_and_tuples_are_what_the_types_ask_for(model):
+    given = {"sizes": [[3.0, 4.0]], "vector_keys": ["a"], "names": ("b",), "by_name": {"c": [1]}}
+    config = parse(model, given, "c")
+    assert config.sizes == ((3.0, 4.0),)
+    assert config.vector_keys == ("a",)
+    assert config.names == ["b"]
+    assert config.by_name == {"c": (1,)}
+    for each in (config, model()):
+        assert parse(model, json.loads(each.model_dump_json()), "c") == each
+        values = OmegaConf.to_container(OmegaConf.create(each.model_dump()))  # as Hydra composes
+        assert parse(model, values, "c") == each
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"vector_keys": "ab"},
+        {"names": "ab"},
+        {"vector_keys": [1]},
+        {"sizes": [[1.0]]},
+        {"names": 1},
+    ],
+)
+def test_sequences_remain_strict(values):
+    (name,) = values
+    with pytest.raises(ConfigError, match=rf"\n  {name}"):
+        parse(Sequences, values, "c")
 
 
 def test_a_parameter_of_a_task_cannot_repeat_one_of_every_environment():

@@ -14,6 +14,7 @@ from ba_torchrl.data.episodes import (
 )
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import SimulationError
 
 TASK = "close_loop/block_reaching"
 
@@ -86,7 +87,7 @@ def test_episodes_with_faults_are_replaced(expert_env, monkeypatch):
         nonlocal calls
         calls += 1
         if calls == 2:
-            raise RuntimeError("exploded")
+            raise SimulationError("exploded")
         original(*args)
 
     monkeypatch.setattr(scene.controller, "move_to", fail_once)

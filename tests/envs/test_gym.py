@@ -14,7 +14,7 @@ from torchrl.data import Categorical
 import ba_torchrl
 from ba_torchrl.envs import gym
 from ba_torchrl.envs.registration import gym_id
-from ba_torchrl.errors import ConfigError, InvalidActionError
+from ba_torchrl.errors import ConfigError, InvalidActionError, SimulationError
 from ba_torchrl.tasks.base import TASKS as REGISTRY
 from tests.specs import slow_except
 
@@ -209,7 +209,7 @@ def test_the_step_limit_truncates(make):
 
 def test_a_simulator_fault_truncates_and_is_in_info(make, monkeypatch, caplog):
     def fail(*_):
-        raise RuntimeError("the solver exploded")
+        raise SimulationError("the solver exploded")
 
     env = make(expert=True)
     _, expected = env.reset()

@@ -98,7 +98,7 @@ def test_repeated_faults_are_an_error(env, monkeypatch):
 
 
 def _fail(*_):
-    raise RuntimeError("the solver exploded")
+    raise SimulationError("the solver exploded")
 
 
 def test_collectors_reset_each_environment_on_its_own():

@@ -48,7 +48,7 @@ class FlatConfig(StrictModel):
 
     control: ClassVar[str] = "close_loop"
     image_keys: ClassVar[tuple[str, ...]] = ("pixels",)
-    vector_keys: ClassVar[tuple[str, ...]] = ()
+    vector_keys: tuple[str, ...] = ()
     hidden: int = 8
 
     def build(self, spec):

@@ -300,7 +300,7 @@ def test_the_recipes_take_a_plugin(folder):
     assert config["plugins"] == list(PLUGINS)
     result = json.loads((folder / "runs/one/result.json").read_text())
     assert result["label"] == "mine/sac mine/flat"
-    assert result["config"]["network"] == {"name": "mine/flat", "hidden": 4}
+    assert result["config"]["network"] == {"name": "mine/flat", "vector_keys": [], "hidden": 4}
     assert result["config"]["algorithm"]["gamma"] == 0.9
 
     evaluate = (recipes / "evaluate.py", "policy=runs/one", "episodes=2")
@@ -362,7 +362,7 @@ def test_the_other_recipes_take_a_plugin(folder):
     ).stdout
     assert "| `mine/reach_near` | mine/kuka |" in out
     run(folder, recipes / "gallery.py", PLUGIN, tasks, "deconstructions=[]", "overview=null")
-    assert (folder / "docs/gallery/mine_reach_near.png").exists()
+    assert (folder / "runs/gallery/mine_reach_near.png").exists()
 
 
 def test_an_unknown_task_names_the_way_to_plugins(folder):
