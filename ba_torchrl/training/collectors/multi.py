@@ -104,7 +104,8 @@ class MultiCollection(WorkerCollection):
                 with _waiting_at_most(self._patience_s):
                     self._collector.update_policy_weights_(self.weights())
                     batch = next(self._batches)
-            except (RuntimeError, OSError, EOFError) as error:
+            # ValueError: TorchRL closes the other processes, which ignore its SIGTERM
+            except (RuntimeError, OSError, EOFError, ValueError) as error:
                 self._replace(error)
                 continue
             self._failures_in_a_row = 0
