@@ -3,12 +3,17 @@
 import subprocess
 import sys
 
+import pytest
+
+from tests.fresh import run_script
+
 CODE = """
 import sys
 for name in ("lie_learn", "py3nj"):
     sys.modules[name] = None  # not installed
 import warnings
 warnings.simplefilter("error")
+BEFORE
 from ba_torchrl.errors import MissingPackageError
 from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 gspaces = import_escnn("escnn.gspaces")
@@ -23,9 +28,31 @@ else:
 """
 
 
-def test_planar_groups_work_and_rotations_in_space_name_what_they_need():
-    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+@pytest.mark.parametrize("before", ["", "import escnn"])
+def test_planar_groups_work_and_rotations_in_space_name_what_they_need(before, tmp_path):
+    run_script(tmp_path, CODE.replace("BEFORE", before))
+
+
+CACHES_ONLY = """
+import sys
+from importlib.machinery import ModuleSpec
+
+class Caches:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name == "escnn":  # a folder without modules
+            return ModuleSpec(name, None, is_package=True)
+
+sys.meta_path.insert(0, Caches)
+from ba_torchrl.cli import main
+main(["doctor"])
+"""
+
+
+def test_a_folder_of_caches_is_no_escnn(tmp_path):
+    out = run_script(tmp_path, CACHES_ONLY).stdout
+    assert "escnn                  not usable" in out
+    assert "pip install --no-deps escnn==" in out
 
 
 BESIDE_SCIKIT_LEARN = """

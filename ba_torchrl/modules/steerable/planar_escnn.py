@@ -37,11 +37,15 @@ def import_escnn(name: str = "escnn") -> ModuleType:
         ImportError: escnn is not installed; the message names the fix.
     """
     _replace_lie_learn()
+    if "escnn.nn" not in sys.modules:  # imported before in part, without lie_learn
+        _forget("escnn")
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*py3nj")
             importlib.import_module("escnn")
             module = importlib.import_module(name)
+            numerical = importlib.import_module("escnn.group._numerical")
+            coefficients = importlib.import_module("escnn.group._clebsh_gordan")
     except ImportError as error:
         other = (error.name or "").split(".")[0]  # a package that escnn imports
         fix = ESCNN_FIX
@@ -50,8 +54,8 @@ def import_escnn(name: str = "escnn") -> ModuleType:
         raise MissingPackageError(fix) from error
     # scikit-learn's singular value decomposition refuses the matrices that escnn gives it; where
     # scikit-learn is not installed, escnn takes SciPy's.
-    importlib.import_module("escnn.group._numerical").randomized_svd = None
-    _fix_signs(importlib.import_module("escnn.group._clebsh_gordan"))
+    numerical.randomized_svd = None
+    _fix_signs(coefficients)
     return module
 
 
@@ -93,12 +97,17 @@ def _replace_lie_learn() -> None:
     try:
         importlib.import_module(full)
     except (ImportError, ValueError, AttributeError):  # absent, or built for another NumPy
-        for name in [name for name in sys.modules if name.split(".")[0] == _NAMES[0]]:
-            del sys.modules[name]
+        _forget(_NAMES[0])
         for end in range(len(_NAMES)):
             name = ".".join(_NAMES[: end + 1])
             sys.modules[name] = ModuleType(name, "Stands in for a package that is not installed.")
         sys.modules[full].wigner_D_matrix = _raise
+
+
+def _forget(package: str) -> None:
+    """Remove the modules of a package from those that are imported."""
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        del sys.modules[name]
 
 
 def _raise(*_: Any, **__: Any) -> None:
