@@ -8,8 +8,10 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -39,6 +41,20 @@ def command_names() -> list[str]:
     return sorted(path.stem for path in _FOLDER.glob("[!_]*.py"))
 
 
+@contextmanager
+def ends_with_reader() -> Iterator[None]:
+    """Context in which the end of the reader of the standard output ends the process silently."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
+
+
+@ends_with_reader()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command that a command line names.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import functools
-import os
 import signal
 import sys
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ba_torchrl.cli import EXIT_CODE
+from ba_torchrl.cli import EXIT_CODE, ends_with_reader
 from ba_torchrl.errors import ConfigError, as_os_error
 from ba_torchrl.training import hydra_schema
 
@@ -48,14 +47,12 @@ def plain_errors(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def decorated(*args: Any, **kwargs: Any) -> Any:
         try:
-            return function(*args, **kwargs)
+            with ends_with_reader():
+                return function(*args, **kwargs)
         except ConfigError as error:
             _end(error)
         except OmegaConfBaseException as error:  # a missing value, or a wrong interpolation
             _end(error, lines=1)
-        except BrokenPipeError:  # of the standard output, whose reader has ended
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(128 + signal.SIGPIPE)
         except OSError as error:
             if error.errno not in _RESOURCES:
                 raise

@@ -1,6 +1,7 @@
 """The command line: names, mistakes, help, and what it is given to resume."""
 
 import random
+import signal
 
 import pytest
 
@@ -9,6 +10,7 @@ from ba_torchrl.cli.command import Arguments
 from ba_torchrl.commands import train
 from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.config import ExperimentConfig
+from tests.fresh import run_script
 from tests.recipes import load_recipe
 from tests.training.test_experiment import tiny
 
@@ -30,6 +32,17 @@ def test_the_overview_lists_every_command_with_its_first_line(capsys):
     for name in cli.command_names():
         first = load_recipe(name).__doc__.splitlines()[0]
         assert f"{name:10} {first}" in out
+
+
+@pytest.mark.parametrize("words", [["--help"], ["doctor"], ["train", "--help"], ["tasks"]])
+def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
+    code = (
+        "import os\nreader, writer = os.pipe()\nos.close(reader)\nos.dup2(writer, 1)\n"
+        f"from ba_torchrl import cli\ncli.main({words})\n"
+    )
+    done = run_script(tmp_path, code, check=False)
+    assert done.returncode == 128 + signal.SIGPIPE
+    assert "Broken" not in done.stderr
 
 
 @pytest.mark.parametrize(
