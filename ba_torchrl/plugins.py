@@ -133,7 +133,7 @@ def check_known(names: Iterable[str], file: str | Path) -> None:
         listed = ",".join(unknown)
         raise ConfigError(
             f"{file} uses the plugins [{listed}]: modules outside this package, whose import runs "
-            f"their code. If you trust them, add plugins=[{listed}], or import them first"
+            f"their code. If you trust them, add 'plugins=[{listed}]', or import them first"
         )
 
 

@@ -94,7 +94,7 @@ class Registry(Generic[T]):
             raise UnknownNameError(
                 f"unknown {self.kind} {name!r}.{known_names(str(name), list(self))}. Entries from "
                 "outside the package are known once their module is imported (recipes: "
-                "plugins=[module]; worker processes: register_modules=[module])"
+                "'plugins=[module]'; worker processes: register_modules=[module])"
             ) from None
 
     def __contains__(self, name: object) -> bool:

@@ -2,7 +2,7 @@
 
 python recipes/gallery.py                       # pictures in runs/gallery
 python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png overwrite=true
-python recipes/gallery.py tasks=[close_loop/block_picking] folder=pictures overview=null
+python recipes/gallery.py 'tasks=[close_loop/block_picking]' folder=pictures overview=null
 """
 
 from pathlib import Path

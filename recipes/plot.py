@@ -1,6 +1,6 @@
 """Draw the learning curves of several runs in one picture.
 
-python recipes/plot.py runs=[runs/first,runs/second] path=curves.png
+python recipes/plot.py 'runs=[runs/first,runs/second]' path=curves.png
 """
 
 import csv

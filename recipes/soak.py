@@ -2,7 +2,7 @@
 
 python recipes/soak.py                                        # the same command continues it
 python recipes/soak.py steps=100 long_steps=500 folder=/tmp/soak
-python recipes/soak.py tasks=[open_loop/bin_packing] steps=5000
+python recipes/soak.py 'tasks=[open_loop/bin_packing]' steps=5000
 
 Each task has a process of its own, and its figures are written to a file when it is complete. The
 same call continues with the tasks without a file.

@@ -1,5 +1,6 @@
 """README and the pages: Python that runs, valid command lines, links with targets."""
 
+import ast
 import dataclasses
 import importlib
 import re
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ba_torchrl.cli import command_names
+from ba_torchrl.cli import command_names, main
 from ba_torchrl.cli.command import Command
 from ba_torchrl.errors import ConfigError
 from tests.fresh import run_script
@@ -64,6 +65,30 @@ def command_lines() -> list[tuple[str, str]]:
         for page, line in found
         if line.startswith("ba-torchrl ") and not re.search(r"\.\.\.|=NAME|\[my_", line)
     )
+
+
+UNQUOTED = re.compile(r"""(?:^|[ `])(\+?[a-z_.]+=\[(?!["\].]).*)""")
+"""A word whose brackets zsh takes as a pattern."""
+
+
+def unquoted(text: str) -> list[str]:
+    return [found[1] for line in text.splitlines() if (found := UNQUOTED.search(line))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+def test_brackets_in_a_command_of_a_page_are_quoted(page):
+    spans = re.findall(r"`[^`\n]+`", page.read_text())
+    assert unquoted("\n".join([*blocks(page, ""), *blocks(page, "bash"), *spans])) == []
+
+
+def test_brackets_in_a_command_of_a_help_or_a_configuration_are_quoted(capsys):
+    for name in command_names():
+        main([name, "--help"])
+    sources = [path.read_text() for path in (ROOT / "recipes").glob("*.py")]
+    texts = [capsys.readouterr().out, *(ast.get_docstring(ast.parse(text)) for text in sources)]
+    configs = (path.read_text() for path in (ROOT / "configs").rglob("*.yaml"))
+    comments = re.findall(r"#.*", "\n".join(configs))
+    assert unquoted("\n".join([*texts, *comments])) == []
 
 
 @pytest.fixture(scope="module")

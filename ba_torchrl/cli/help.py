@@ -86,9 +86,12 @@ def _parts(
 
 
 def _field(name: str, field: FieldInfo, value: Any) -> list[str]:
-    shown = "" if field.is_required() and value in (None, "???") else f"={_short(value)}"
+    shown = name
+    if not field.is_required() or value not in (None, "???"):
+        shown = f"{name}={_short(value)}"
+        shown = f"'{shown}'" if isinstance(value, list | tuple | dict) else shown  # for zsh
     choices = _choices(name.split(".")[-1], field.annotation)
-    lines = [f"  {name}{shown}" + (f"   {{{', '.join(choices)}}}" if choices else "")]
+    lines = [f"  {shown}" + (f"   {{{', '.join(choices)}}}" if choices else "")]
     if field.description:
         text = " ".join(field.description.replace("`", "").split())
         first = re.split(r"(?<=[^ ]{2}\.) (?=[A-Z\"])", text)[0]
@@ -99,7 +102,7 @@ def _field(name: str, field: FieldInfo, value: Any) -> list[str]:
 def _short(value: Any) -> str:
     if value is None:
         return "null"
-    text = str(value).lower() if isinstance(value, bool) else str(value)
+    text = str(value).lower() if isinstance(value, bool) else str(value).replace("'", "")
     return text if len(text) < 60 else f"{text[:57]}..."
 
 

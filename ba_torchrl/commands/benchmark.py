@@ -2,7 +2,7 @@
 
 ba-torchrl benchmark benchmark=close_loop_4d seeds=4
 ba-torchrl benchmark benchmark=close_loop_4d dry_run=true       # list the states of the runs
-ba-torchrl benchmark tasks=[close_loop/block_picking] networks=[cnn] total_updates=600 \
+ba-torchrl benchmark 'tasks=[close_loop/block_picking]' 'networks=[cnn]' total_updates=600 \
     env.obs_size=64 network.width=0.5 folder=runs/small
 ba-torchrl benchmark benchmark=close_loop_4d launcher=ray launcher.cpus=4
 ba-torchrl benchmark benchmark=close_loop_4d launcher=submitit launcher.options.partition=gpu

@@ -4,7 +4,7 @@ With source=graded, sets for offline learning are made: TASK/GRADE in the folder
 random, expert, medium (a policy of half success) and mixed. The same command makes missing ones.
 
 ba-torchrl collect task=close_loop/block_picking episodes=100 path=demos/picking
-ba-torchrl collect source=graded task=[close_loop/block_picking,ramp/block_stacking] path=graded
+ba-torchrl collect source=graded 'task=[close_loop/block_picking,ramp/block_stacking]' path=graded
 ba-torchrl collect task=open_loop/house_building_4 source=deconstruction
 ba-torchrl collect task=open_loop/house_building_4 source=deconstruction replays=200
 """

@@ -1,7 +1,7 @@
 """Measure the experts: success rate and length of random episodes, as a table in Markdown.
 
 ba-torchrl experts                                 # every task, kuka, with and without yaw
-ba-torchrl experts robots=[panda,ur5] episodes=50 tasks=[close_loop/block_picking]
+ba-torchrl experts 'robots=[panda,ur5]' episodes=50 'tasks=[close_loop/block_picking]'
 """
 
 from __future__ import annotations

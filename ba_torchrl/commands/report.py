@@ -1,7 +1,7 @@
 """Report the results of runs: a folder with a page, curves, tables, values by seed and videos.
 
 ba-torchrl report runs/
-ba-torchrl report runs=[runs/close_loop_3d,runs/close_loop_4d] folder=report axis=env_steps
+ba-torchrl report 'runs=[runs/close_loop_3d,runs/close_loop_4d]' folder=report axis=env_steps
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 ba-torchrl speed
 ba-torchrl speed open_loop/bin_packing num_envs=8 updates=0
-ba-torchrl speed close_loop/block_picking env.obs_size=128 networks=[equi] device=cuda
+ba-torchrl speed close_loop/block_picking env.obs_size=128 'networks=[equi]' device=cuda
 """
 
 from __future__ import annotations

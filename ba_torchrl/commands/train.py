@@ -3,7 +3,7 @@
 ba-torchrl train --config-name quickstart
 ba-torchrl train task=close_loop/block_picking algorithm=sacfd rotation=none network=equi
 ba-torchrl train run_dir=runs/mine resume=true
-ba-torchrl train plugins=[my_tasks] task=mine/push_far
+ba-torchrl train 'plugins=[my_tasks]' task=mine/push_far
 ba-torchrl train num_envs=8 collector=multi_async collector.workers=4
 """
 

@@ -125,7 +125,7 @@ def test_the_help_describes_every_setting(name, capsys):
     model = load_recipe(name).COMMAND.settings
     for field, info in model.model_fields.items():
         assert info.description, field
-        assert f"\n  {field}" in out or f"\n  {field}." in out
+        assert f"\n  {field}" in out or f"\n  '{field}=" in out
 
 
 def test_the_help_shows_the_fields_of_the_chosen_presets_and_their_choices(capsys):
