@@ -22,6 +22,8 @@ Backend = Literal["csv", "tensorboard", "wandb"]
 
 SCALARS_FILE = "scalars.csv"
 FILE_INTERVAL_S = 10.0
+LAST_BYTES = 1000
+"""Bytes at the end of the file that hold its last row."""
 _COLUMNS = ("step", "name", "value")
 
 
@@ -147,6 +149,19 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
         name: Series(np.array(sorted(points)), np.array([points[step] for step in sorted(points)]))
         for name, points in found.items()
     }
+
+
+def last_step(run_dir: str | Path) -> int | None:
+    """Return the step of the last row in a run's scalars, without reading those before it; None if
+    there is none yet."""
+    path = Path(run_dir) / SCALARS_FILE
+    if not path.exists():
+        return None
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - LAST_BYTES))
+        rows = file.read().split(b"\n")
+    step = rows[-2].split(b",")[0] if len(rows) > 1 else b""
+    return int(step) if step.isdigit() else None
 
 
 def _drop_incomplete_row(path: Path) -> None:

@@ -141,17 +141,14 @@ def open_run_folder(config: ExperimentConfig) -> None:
             ``resume`` does not ask for; the message names the reason.
     """
     folder = config.folder
-    if not (folder / CONFIG_FILE).exists():
-        if config.resume:
-            logger.warning("no run to resume in %s: starting one", folder)
-    elif (folder / RESULT_FILE).exists():
-        raise ConfigError(f"{folder} holds a finished run; choose another run_dir")
-    elif not config.resume:
-        raise ConfigError(
-            f"{folder} holds a run that did not finish: resume=true continues it, another run_dir "
-            "starts a new one"
-        )
-    else:
+    if (folder / CONFIG_FILE).exists():
+        if (folder / RESULT_FILE).exists():
+            raise ConfigError(f"{folder} holds a finished run; choose another run_dir")
+        if not config.resume:
+            raise ConfigError(
+                f"{folder} holds a run that did not finish: resume=true continues it, another "
+                "run_dir starts a new one"
+            )
         check_same_run(config)
         if resumable_updates(folder) is None:
             if (folder / "checkpoints").exists():

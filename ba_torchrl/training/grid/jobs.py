@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import os
 import signal
 import subprocess
@@ -20,6 +21,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from ba_torchrl.data.files import write_text
+from ba_torchrl.record.logging import FILE_INTERVAL_S, last_step
 from ba_torchrl.record.results import FAILURE_FILE, now
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import status
@@ -29,6 +31,8 @@ LOG_FILE = "run.log"
 LOG_LINES = 20
 """Last lines of a failed run's output that are recorded."""
 POLL_S = 0.2
+REFRESH_S = 1.0
+"""Time between two readings of the runs' updates, for the progress bar on a terminal."""
 SAVE_S = 60.0
 """Time for a run to save its state before it is killed."""
 WORKER = (sys.executable, "-m", "ba_torchrl.training.grid.run_one")
@@ -60,7 +64,14 @@ def run_all(
     waiting = deque(unfinished(runs))
     running: list[_Job] = []
     failures: dict[Path, str] = {}
-    bar = tqdm(total=len(runs), initial=len(runs) - len(waiting), unit="run", disable=not progress)
+    bar = tqdm(
+        total=len(runs),
+        initial=len(runs) - len(waiting),
+        bar_format="{n_fmt}/{total_fmt} runs [{elapsed}<{remaining}{postfix}]",
+        disable=not progress,
+    )
+    refresh_s = REFRESH_S if sys.stderr.isatty() else FILE_INTERVAL_S
+    shown_at = -math.inf
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
@@ -70,7 +81,9 @@ def run_all(
                 except BlockingIOError:
                     _report_skipped(run, lock_holder(run.folder) or "another process")
                     bar.update()
-                bar.set_postfix_str(", ".join(f"{job}" for job in running))
+            if time.monotonic() - shown_at > refresh_s:
+                bar.set_postfix_str("; ".join(job.progress() for job in running))
+                shown_at = time.monotonic()
             time.sleep(POLL_S)
             for job in [job for job in running if job.has_ended()]:
                 running.remove(job)
@@ -80,6 +93,8 @@ def run_all(
                     tqdm.write(f"failed: {job}: {reason}; see {job.run.folder / LOG_FILE}")
                 bar.update()
     finally:
+        if running:
+            tqdm.write("stopping: the present runs save their states")
         for job in running:
             job.terminate()
         for job in running:
@@ -128,6 +143,8 @@ class _Job:
     ) -> None:
         self.run = run
         self._deadline = None if max_hours is None else time.monotonic() + 3600 * max_hours
+        self._first: tuple[float, int] | None = None
+        """Time and update at the first reading of the run's scalars."""
         self._timed_out = False
         self._is_asked_to_end = False
         run.folder.mkdir(parents=True, exist_ok=True)
@@ -154,6 +171,20 @@ class _Job:
 
     def __str__(self) -> str:
         return f"{self.run.task} {self.run.label} seed {self.run.seed}"
+
+    def progress(self) -> str:
+        """Return the latest logged update, the estimated time of the others, and the run."""
+        updates = last_step(self.run.folder)
+        if updates is None:
+            return str(self)
+        total, seen = self.run.total_updates, (time.monotonic(), updates)
+        self._first = self._first or seen
+        start, first = self._first
+        left = ""
+        if updates > first:
+            seconds = (seen[0] - start) / (updates - first) * (total - updates)
+            left = f", {tqdm.format_interval(seconds)} left"
+        return f"update {updates}/{total}{left}: {self}"
 
     def has_ended(self) -> bool:
         """Whether the process has ended; one that exceeds its time limit is ended here."""

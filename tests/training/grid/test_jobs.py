@@ -147,7 +147,22 @@ def test_jobs_run_at_the_same_time(tmp_path, fake):
     assert fake(runs, {0: "meet", 1: "meet"}, jobs=2) == {}
 
 
-def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
+def test_the_bar_shows_the_update_and_the_estimated_time_of_a_run(tmp_path, fake, monkeypatch):
+    run = planned(tmp_path, seeds=1, common={"total_updates": 100})[0]
+    rows = run.folder / "scalars.csv"
+    seen, clock = [], iter(range(0, 10**6, 60))
+    monkeypatch.setattr(jobs.time, "monotonic", lambda: next(clock))
+    job = jobs._Job(run, [sys.executable, "-c", ""], None)
+    for content in (None, "step,name,value\n", "step,name,value\n0,a,1\n", "25,b,2.0\n50,b,1"):
+        if content is not None:
+            rows.open("a").write(content)
+        seen.append(job.progress())
+    job.stop()
+    name = f"{REACH} sac small seed 0"
+    assert seen == [name, name, f"update 0/100: {name}", f"update 25/100, 03:00 left: {name}"]
+
+
+def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch, capsys):
     runs = planned(tmp_path)
     processes, interrupted = [], []
     start = subprocess.Popen
@@ -167,6 +182,7 @@ def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch):
         fake(runs, {0: "hang"})
     assert [process.returncode for process in processes] == [-signal.SIGTERM]
     assert status(runs[0]).state == "missing"
+    assert "the present runs save their states" in capsys.readouterr().out
 
 
 SLOW_TO_SAVE = """
@@ -343,6 +359,14 @@ def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monk
     assert "1 of 2 runs done" in out
     assert "failed  " in out
     assert "2 runs: 1 done, 1 failed" in printed("seeds=2", "dry_run=true")
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(local, "run_all", interrupted)
+    with pytest.raises(SystemExit):
+        printed("seeds=2")
+    assert "the same command continues the grid\n" in capsys.readouterr().err
     page = write_report([tmp_path / "grid"], tmp_path / "report").read_text()
     assert "close_loop_4d" in page
     assert "sacfd cnn" in page
